@@ -30,6 +30,7 @@ from sceneprint_client.api import (
     ValidationOptions,
 )
 from sceneprint_client.api.admin import NewKey, NewModel
+from sceneprint_client.api.coverage import NewMapCoverage
 from sceneprint_client.api.listing import FrameEdit, MapEdit, SessionEdit
 from sceneprint_client.api.reconstructions import NewReconstruction
 from sceneprint_client.api.sessions import NewAssociation
@@ -42,6 +43,7 @@ from service.middleware import RequestMiddleware
 from service.rate_limits import RateLimits
 from service.routes import (
     admin,
+    coverage,
     frame_data,
     frames,
     jobs,
@@ -76,6 +78,7 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
                 (NewMap, "validation"),
                 (NewKey, "validation"),
                 (NewAssociation, "validation"),
+                (NewMapCoverage, "validation"),
                 (NewModel, "validation"),
                 (NewReconstruction, "validation"),
                 (Problem, "serialization"),
@@ -101,7 +104,8 @@ ROUTERS = (
     maps.router, frames.router, frame_data.router, frame_data.points_router, maps.edits_router,
     sessions.router, frames.imports_router, queries.router, results.history_router,
     results.router,
-    queries.similarity_router, sessions.associations_router, reconstructions.router, jobs.router,
+    queries.similarity_router, sessions.associations_router, coverage.router,
+    reconstructions.router, jobs.router,
     jobs.events_router, admin.operations_router, admin.snapshots_router, admin.keys_router,
 )  # fmt: skip
 #: Uploads that are in hand at once, so that one wait for the disk is enough for all of them.

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from typing import Annotated, Any, BinaryIO, cast, get_args
+from typing import Annotated, Any, BinaryIO, TypeVar, cast, get_args
 
 from fastapi import Header, Request, Response
 from pydantic import BaseModel, ValidationError
@@ -41,6 +41,8 @@ from sceneprint_client.api.frames import (
 from sceneprint_client.file_formats import HEAD, format_of
 from service.auth import Caller
 from service.problems import invalid
+
+_Record = TypeVar("_Record", bound=BaseModel)
 
 # A frame as the whole body of a request, and what is known of it in the query string.
 #
@@ -454,6 +456,44 @@ async def read_json(request: Request) -> Any:
         return from_json(bytes(body))  # unlike `json`, no text that is not Unicode
     except ValueError as error:
         raise MalformedBody(f"The body is not JSON ({error}). Send a JSON object.") from error
+
+
+async def read_record(
+    request: Request, kind: type[_Record], what: str, *, optional: bool = False
+) -> _Record:
+    """A record that is sent as JSON.
+
+    Parameters
+    ----------
+    request : with the body
+    kind : of the record
+    what : to begin an error with, such as "The association"
+    optional : whether a request may come without a body: a record of defaults
+
+    Raises
+    ------
+    UnsupportedType, MalformedBody, TooLarge : not JSON; see `read_json`.
+    InvalidRequest : not such a record.
+    """
+    headers = request.headers
+    if optional and headers.get("content-length", "0") == "0" and (
+        "transfer-encoding" not in headers
+    ):  # fmt: skip
+        return kind()
+    if media_type(request) != "application/json":
+        raise UnsupportedType(
+            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
+            f"application/json{', or no body' if optional else ''}."
+        )
+    document = await read_json(request)
+    if not isinstance(document, dict):
+        raise InvalidRequest(
+            f"{what} is not a JSON object. See /docs for its fields.", (("", "not an object"),)
+        )
+    try:
+        return kind.model_validate(document)
+    except ValidationError as error:
+        raise invalid(error, what) from error
 
 
 def _meta(text: str | None) -> FrameMeta:

@@ -162,7 +162,7 @@ def served(line: str, folder: Path, environment: dict[str, str]) -> Iterator[Non
 def test_readme_commands_are_known() -> None:
     lines = [line for block in blocks(README, "sh") for line in block.strip().splitlines()]
     commands = [line.split()[1:] for line in lines if line.startswith(".venv/bin/sceneprint ")]
-    assert len(commands) == 21
+    assert len(commands) == 22
     known = parser()
     for command in commands:
         assert known.parse_args(command).command == command[0]
@@ -175,7 +175,7 @@ def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
     makes = [line for line in commands if line.startswith("make")]
     assert makes == ["make demo"]
     serve, *rest = [line for line in commands if line not in makes]
-    assert len(rest) == 20
+    assert len(rest) == 21
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -204,7 +204,9 @@ def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
     assert "found" in printed["query"]
     assert ": found (strong); " in printed["localize"]
     assert "EDGE_SE3:QUAT" in (tmp_path / "loops.g2o").read_text()
-    assert "room-000/seq-01" in printed["frames"]
+    assert ": 2 frames queried against the rest of 6" in printed["coverage"]
+    assert (tmp_path / "plan.png").stat().st_size > 10_000
+    assert "room-000/seq-01" in printed["sessions"]
     assert "frame.indexed" in printed["events"]
     assert "building" in printed["maps"]
     assert (tmp_path / "restored/sceneprint.db").stat().st_size > 3_000_000  # the model is in it

@@ -1,17 +1,32 @@
-"""What a job does: jobs themselves, imports, associations of sessions, reconstructions."""
+"""What a job does: jobs themselves, imports, associations, coverage, reconstructions."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, get_args
+from typing import Any, BinaryIO, Literal, TypeVar, get_args
 
 import httpx
 
-from sceneprint_client.api import Answer, Filter, Job, JobState, Page, ValidationOptions
+from sceneprint_client.api import (
+    Answer,
+    Filter,
+    Job,
+    JobState,
+    Page,
+    Progress,
+    ValidationOptions,
+)
 from sceneprint_client.api.admin import RetriedJobs
 from sceneprint_client.api.base import checked
+from sceneprint_client.api.coverage import (
+    CoverageChanges,
+    CoverageFrame,
+    CoverageOutcome,
+    MapCoverage,
+    NewMapCoverage,
+)
 from sceneprint_client.api.frames import ImportItem, ImportOptions
 from sceneprint_client.api.reconstructions import NewReconstruction, Reconstruction
 from sceneprint_client.api.sessions import Association, Edge, GraphFormat, NewAssociation
@@ -19,6 +34,7 @@ from sceneprint_client.errors import InvalidRequest, UnreadableArchive
 from sceneprint_client.http import ServiceConnection, error_of, read_record
 from sceneprint_client.requests import (
     association_path,
+    coverage_path,
     given,
     job_path,
     map_path,
@@ -26,6 +42,8 @@ from sceneprint_client.requests import (
     reconstruction_path,
 )
 
+#: A record of what a job does, with its `state`.
+_Begun = TypeVar("_Begun", Association, MapCoverage, Reconstruction)
 #: Pauses between two looks at a job, seconds: the first, and the longest.
 _PAUSES_S = (0.02, 0.5)
 #: Jobs that are looked at in one round; workers take them in about this order.
@@ -135,6 +153,30 @@ class JobMethods(ServiceConnection):
                 break
             self._let_work(pause)
         return [known[job_id] if job_id in known else self.job(job_id) for job_id in order]
+
+    def _until_over(
+        self, begun: _Begun, look: Callable[[], _Begun], timeout_s: float,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> _Begun:  # fmt: skip
+        """What a job does, once it is over, or as it is when the time has come.
+
+        Parameters
+        ----------
+        begun : as it is known
+        look : asks for it once more
+        timeout_s : for its end
+        progress : called with the steps that are done, and of how many, where it tells them
+        """
+        pauses = growing_pauses(time.monotonic() + timeout_s)
+        while True:
+            done: Progress | None = getattr(begun, "progress", None)
+            if progress is not None and done is not None and done.total is not None:
+                progress(done.done, done.total)
+            pause = next(pauses, None)
+            if begun.state.over or pause is None:
+                return begun
+            self._let_work(pause)
+            begun = look()
 
     # archives: imports are jobs
 
@@ -252,16 +294,10 @@ class JobMethods(ServiceConnection):
         progress: Callable[[int, int], None] | None = None,
     ) -> Association:  # fmt: skip
         """An association once it is over, or as it is when the time has come; see `associate`."""
-        pauses = growing_pauses(time.monotonic() + timeout_s)
-        while True:
-            done = association.progress
-            if progress is not None and done is not None and done.total is not None:
-                progress(done.done, done.total)
-            pause = next(pauses, None)
-            if association.state.over or pause is None:
-                return association
-            self._let_work(pause)
-            association = self.association(association.map, association.association_id)
+        return self._until_over(
+            association, lambda: self.association(association.map, association.association_id),
+            timeout_s, progress,
+        )  # fmt: skip
 
     def association(self, map_name: str, association_id: str) -> Association:
         """An association; UnknownMap or UnknownJob where there is none."""
@@ -332,6 +368,116 @@ class JobMethods(ServiceConnection):
         path = f"{association_path(map_name, association_id)}/graph"
         return self._bytes(path, params=asked).decode()
 
+    # coverage
+
+    def coverage(
+        self, map_name: str, *, session: str | None = None, robot: str | None = None,
+        every: int = 1, most: int = 1000, not_within_s: float | None = None,
+        other_sessions: bool = False, tolerance_m: float = 0.5, tolerance_deg: float = 15.0,
+        cell_m: float | None = None, seed: int = 0, like: MapCoverage | None = None,
+        timeout_s: float = 3600.0, progress: Callable[[int, int], None] | None = None,
+    ) -> MapCoverage:  # fmt: skip
+        """Measure where in a map a robot would be found: query frames of it against the rest.
+
+        Parameters
+        ----------
+        map_name : of the map
+        session, robot : query only frames of these
+        every, most : every n-th frame, and at most so many
+        not_within_s : leave out frames of the queried frame's session taken within so many
+            seconds; default: 10
+        other_sessions : leave out all of its session
+        tolerance_m, tolerance_deg : within which a pose that was found is right
+        cell_m : width of the plans' cells; default: one that fits
+        seed : of the queries
+        like : an earlier result, whose options are taken in place of all above, and the width of
+            its cells: `coverage_changes` can compare the two
+        timeout_s : for its end; 0 to return at once. It goes on, whoever waits
+        progress : called with the number of frames that are done, and of all
+
+        Returns
+        -------
+        coverage : `coverage.state.over` is False where the time ran out
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : it has no such frames, or an option is out of its range.
+        """
+        wanted = checked(
+            NewMapCoverage, "The coverage", every=every, most=most, tolerance_m=tolerance_m,
+            tolerance_deg=tolerance_deg, seed=seed, other_sessions=other_sessions,
+            **given(session=session, robot=robot, not_within_s=not_within_s, cell_m=cell_m),
+        )  # fmt: skip
+        if like is not None:
+            width = None if like.result is None else like.result.cell_m
+            wanted = like.asked.model_copy(update=given(cell_m=width))
+        begun = self._ask(
+            MapCoverage, "POST", f"{map_path(map_name)}/coverage",
+            json=wanted.model_dump(mode="json", exclude_unset=True),
+        )  # fmt: skip
+        return self.wait_for_coverage(begun, timeout_s=timeout_s, progress=progress)
+
+    def wait_for_coverage(
+        self, coverage: MapCoverage, *, timeout_s: float = 3600.0,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> MapCoverage:  # fmt: skip
+        """A coverage job once it is over, or as it is when the time has come; see `coverage`."""
+        return self._until_over(
+            coverage, lambda: self.coverage_result(coverage.map, coverage.coverage_id), timeout_s,
+            progress,
+        )  # fmt: skip
+
+    def coverage_result(self, map_name: str, coverage_id: str) -> MapCoverage:
+        """A coverage job as it is now; UnknownMap or UnknownJob where there is none."""
+        return self._ask(MapCoverage, "GET", coverage_path(map_name, coverage_id))
+
+    def coverage_jobs(self, map_name: str) -> Iterator[MapCoverage]:
+        """Coverage jobs of a map without their plans, the newest first; UnknownMap."""
+        return self._items(Page[MapCoverage], f"{map_path(map_name)}/coverage")
+
+    def coverage_frames(
+        self, map_name: str, coverage_id: str, outcome: CoverageOutcome | None = None
+    ) -> Iterator[CoverageFrame]:
+        """Queried frames of a coverage job; those of one outcome where asked for.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : there is none.
+        """
+        path = f"{coverage_path(map_name, coverage_id)}/frames"
+        return self._items(Page[CoverageFrame], path, outcome=outcome)
+
+    def coverage_changes(self, map_name: str, coverage_id: str, since: str) -> CoverageChanges:
+        """Which cells became better or worse since an earlier result of the same options.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : one of them is not there.
+        NotIndexed : one of them is not over, or did not succeed.
+        InvalidRequest : they cannot be compared.
+        """
+        path = f"{coverage_path(map_name, coverage_id)}/changes"
+        return self._ask(CoverageChanges, "GET", path, params={"since": since})
+
+    def coverage_plan(
+        self, map_name: str, coverage_id: str, parent_frame: str | None = None
+    ) -> bytes:
+        """A plan of a coverage job as a PNG file: of most queried frames, or of a parent frame.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : there is none.
+        NotIndexed : it is not over, did not succeed, or no queried frame has a pose.
+        InvalidRequest : it has no plan of that parent frame.
+        """
+        path = f"{coverage_path(map_name, coverage_id)}/plan.png"
+        return self._bytes(path, params=given(parent_frame=parent_frame))
+
+    def delete_coverage(self, map_name: str, coverage_id: str) -> None:
+        """Delete a coverage job with its result; UnknownMap or UnknownJob where there is none."""
+        self._delete(coverage_path(map_name, coverage_id))
+
     # reconstructions
 
     def reconstruct(
@@ -369,8 +515,7 @@ class JobMethods(ServiceConnection):
         )  # fmt: skip
         if wait_s is None:
             return begun
-        self.wait([begun.job_id], timeout_s=wait_s)
-        return self.reconstruction(begun.job_id)
+        return self._until_over(begun, lambda: self.reconstruction(begun.job_id), wait_s)
 
     def reconstruction(self, job_id: str) -> Reconstruction:
         """A reconstruction as it is now; UnknownJob where there is none."""

@@ -127,6 +127,11 @@ def association_path(map_name: str, association_id: str) -> str:
     return f"{map_path(map_name)}/associations/{_part(association_id, 'association', UnknownJob)}"
 
 
+def coverage_path(map_name: str, coverage_id: str) -> str:
+    """Path of a coverage job; UnknownMap or UnknownJob as `map_path`."""
+    return f"{map_path(map_name)}/coverage/{_part(coverage_id, 'coverage', UnknownJob)}"
+
+
 def _part(name: str, what: str, error: type[SceneprintError]) -> str:
     """A name that stays one part of a path: `..` would lead to another resource."""
     if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name):

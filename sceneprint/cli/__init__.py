@@ -30,6 +30,7 @@ COMMANDS = {
     "queries": "inventory",
     "similarity": "query",
     "associate": "sessions",
+    "coverage": "coverage",
     "frames": "inventory",
     "sessions": "sessions",
     "reconstruct": "sessions",

@@ -18,6 +18,8 @@ from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.jobs.lifecycle import Work, put_back
 from sceneprint.engine.jobs.tasks import LongJob, Tasks
 from sceneprint.engine.maps import map_lifecycle, reencoding
+from sceneprint.engine.maps.coverage_job import COVERAGE, CoverageHandler
+from sceneprint.engine.maps.map_coverage import CoverageJobs
 from sceneprint.engine.maps.map_frames import FrameFiles, list_frames
 from sceneprint.engine.maps.reencoding import Reencodings
 from sceneprint.engine.reconstruction import ReconstructionJobs
@@ -112,6 +114,9 @@ class Engine:
         self.associations = AssociationJobs(self.store, self.tasks)
         associating = Associating(self.store, self.signers, self._readers)
         self.tasks.register(ASSOCIATE, associating)
+        self.coverage = CoverageJobs(self.store, self.tasks)
+        measuring = CoverageHandler(self.store, self.signers, self.queries)
+        self.tasks.register(COVERAGE, measuring)
         self.audit = Audit(self.store)
         self.outputs = FrameFiles(self.store, self.signers)
         self.points = PointClouds(self.store, self.inspection.pairs, self.kept)

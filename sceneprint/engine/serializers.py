@@ -196,13 +196,17 @@ def frame_records(connection: Connection, row: MapRow, found: list[FrameRow]) ->
     return [_frame(row, frame, jobs[frame.number]) for frame in found]
 
 
+def job_progress(job: JobRow) -> Progress | None:
+    """How far a long job has come; None before its first slice is over."""
+    if job.progress is None:
+        return None
+    return Progress(done=job.progress.get("done", 0), total=job.progress.get("total"))
+
+
 def job_record(
     job: JobRow, frame_id: str | None, map_name: str | None, followed_by: str | None = None
 ) -> Job:
     """A job, and the names of what it is about."""
-    progress = None
-    if job.progress is not None:
-        progress = Progress(done=job.progress.get("done", 0), total=job.progress.get("total"))
     return Job(
         job_id=job.id,
         kind=job.kind,
@@ -216,7 +220,7 @@ def job_record(
         finished_at=when(job.finished_at),
         error=job.error,
         traceback=job.traceback,
-        progress=progress,
+        progress=job_progress(job),
         result=job.result,
         followed_by=followed_by,
     )

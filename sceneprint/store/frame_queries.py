@@ -510,6 +510,23 @@ def numbers_of_session(
     return list(connection.execute(asked.order_by(*TAKEN_ORDER)).scalars())
 
 
+def numbers_of_runs(
+    connection: Connection, map_number: int, session: str | None, robot: str | None
+) -> list[int]:
+    """Numbers of the indexed frames of a map, of one session or robot where they are given.
+
+    Run after run, each in the order of time, then as they came; those without a time come last.
+    """
+    c = frames.c
+    asked = select(c.number).where(c.map_number == map_number, c.state == FrameState.INDEXED)
+    for column, name in ((c.session, session), (c.robot, robot)):
+        if name is not None:
+            asked = asked.where(column == name)
+    run = (func.coalesce(c.session, ""), func.coalesce(c.robot, ""))
+    order = (*run, c.captured_at.is_(None), c.captured_at, c.number)
+    return list(connection.execute(asked.order_by(*order)).scalars())
+
+
 def stops_of(connection: Connection, numbers: Iterable[int]) -> dict[int, PathFrame]:
     """Frames by their numbers; those that are deleted, or not indexed any more, are left out."""
     asked = select(
@@ -607,6 +624,21 @@ def placed_frames(
         .limit(most)
     )
     return [PlacedFrame(*row) for row in connection.execute(asked)]
+
+
+def positions_of_map(connection: Connection, map_number: int) -> dict[str, NDArray[np.float64]]:
+    """Where the indexed frames of a map were taken: (n, 3) of each parent frame, metres."""
+    c = frames.c
+    asked = select(c.pose_parent, c.pose_x, c.pose_y, c.pose_z).where(
+        c.map_number == map_number, c.state == FrameState.INDEXED, c.pose_x.is_not(None)
+    )
+    found: dict[str, list[NDArray[np.float64]]] = {}
+    for rows in connection.execute(asked).partitions(10_000):  # as numbers: a row weighs much more
+        parents = np.array([row[0] for row in rows], object)
+        at = np.array([row[1:] for row in rows], np.float64)
+        for parent in dict.fromkeys(parents):
+            found.setdefault(parent, []).append(at[parents == parent])
+    return {parent: np.concatenate(blocks) for parent, blocks in found.items()}
 
 
 def has_parent_frame(connection: Connection, map_number: int, parent: str) -> bool:

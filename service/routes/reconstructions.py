@@ -7,17 +7,16 @@ from typing import Any
 
 from anyio import to_thread
 from fastapi import Request, Response
-from pydantic import ValidationError
 
 from sceneprint.engine.reconstruction import MEDIA_TYPES, MESH, PICTURE
 from sceneprint.engine.results.stored_results import StoredResult, unknown_query
-from sceneprint.errors import DamagedBlob, InvalidRequest, UnsupportedType
+from sceneprint.errors import DamagedBlob
 from sceneprint.store.queue import unknown_job
 from sceneprint_client.api.reconstructions import NewReconstruction, Reconstruction
 from service.auth import Asking, Caller, v1_router
-from service.bodies import media_type, read_json
+from service.bodies import read_record
 from service.context import Context, Here
-from service.problems import declared, invalid
+from service.problems import declared
 from service.responses import files, is_known, send_file
 
 router = v1_router(tag="reconstructions")
@@ -47,7 +46,7 @@ async def reconstruct(
     `state` is `succeeded`; then mesh.ply and picture.png are there. It takes the scope `write`.
     """
     kept = await to_thread.run_sync(lambda: _stored_answer(here, asking, query_id))
-    wanted = await _wanted(request)
+    wanted = await read_record(request, NewReconstruction, "The reconstruction", optional=True)
     made = await to_thread.run_sync(lambda: here.engine.reconstructions.begin(kept, wanted))
     response.headers["Location"] = f"/v1/reconstructions/{made.job_id}"
     return made
@@ -135,23 +134,3 @@ def _file(request: Request, here: Context, job_id: str, name: str) -> Response:
     raise DamagedBlob(
         f"{name} of reconstruction {job_id} is damaged. Start the reconstruction again."
     )
-
-
-async def _wanted(request: Request) -> NewReconstruction:
-    """What the body asks for; without a body, the defaults."""
-    if request.headers.get("content-length", "0") == "0" and (
-        "transfer-encoding" not in request.headers
-    ):
-        return NewReconstruction()
-    if media_type(request) != "application/json":
-        raise UnsupportedType(
-            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
-            "application/json, or no body."
-        )
-    given = await read_json(request)
-    if not isinstance(given, dict):
-        raise InvalidRequest("The body is not a JSON object.", (("", "not an object"),))
-    try:
-        return NewReconstruction.model_validate(given)
-    except ValidationError as error:
-        raise invalid(error, "The reconstruction") from error

@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 from anyio import to_thread
 from fastapi import Depends, Query, Request, Response
-from pydantic import BaseModel, ValidationError
 
 from sceneprint.engine.maps.map_frames import growth, list_sessions, trajectory, trajectory_file
 from sceneprint.engine.sessions.associations import MEDIA_TYPES
 from sceneprint.engine.sessions.session_edits import delete_session, edit_session
-from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint_client.api import Page
 from sceneprint_client.api.base import Label
 from sceneprint_client.api.listing import Run, Session, SessionChange, SessionEdit, Trajectory
 from sceneprint_client.api.maps import Growth, GrowthOf
 from sceneprint_client.api.sessions import Association, Edge, Graph, GraphFormat, NewAssociation
 from service.auth import may_read, may_write, v1_router
-from service.bodies import media_type, read_json
+from service.bodies import read_record
 from service.context import Here
-from service.problems import declared, invalid
+from service.problems import declared
 from service.responses import preferred_media_type
 
 router = v1_router("/maps/{map_name}", "sessions", may_read)
 
-_Record = TypeVar("_Record", bound=BaseModel)
 _PLAIN, _JSON = "text/plain", "application/json"
 _TRAJECTORY: dict[int | str, dict[str, Any]] = {
     200: {
@@ -98,7 +95,7 @@ async def patch_session(
 
     A call ends after ten seconds: repeat it with `after` while `remaining` is not 0.
     """
-    edit = _record_of(SessionEdit, await _read_document(request), "The edit of the session")
+    edit = await read_record(request, SessionEdit, "The edit of the session")
     request.state.audited = {"session": session, "robot": robot} | edit.model_dump(
         exclude_defaults=True
     )
@@ -106,25 +103,6 @@ async def patch_session(
         return await here.gate.run(
             partial(edit_session, here.engine.store, map_name, session, edit, robot, after)
         )
-
-
-async def _read_document(request: Request) -> object:
-    if media_type(request) != _JSON:
-        raise UnsupportedType(
-            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as {_JSON}."
-        )
-    return await read_json(request)
-
-
-def _record_of(kind: type[_Record], document: object, what: str) -> _Record:
-    if not isinstance(document, dict):
-        raise InvalidRequest(
-            f"{what} is not a JSON object. See /docs for its fields.", (("", "not an object"),)
-        )
-    try:
-        return kind.model_validate(document)
-    except ValidationError as error:
-        raise invalid(error, what) from error
 
 
 @router.get("/trajectory", response_class=Response, responses=_TRAJECTORY)
@@ -192,7 +170,7 @@ async def begin_association(
     accepts is an edge. Edges near each other must agree with how the robots moved between their
     frames, and those that are left vote on how the sessions' parent frames lie to each other.
     """
-    asked = _record_of(NewAssociation, await _read_document(request), "The association")
+    asked = await read_record(request, NewAssociation, "The association")
     begun = await to_thread.run_sync(here.engine.associations.begin, map_name, asked)
     response.headers["Location"] = f"/v1/maps/{map_name}/associations/{begun.association_id}"
     return begun

@@ -96,6 +96,13 @@ OF_A_MAP = {
     "DELETE /v1/maps/{map_name}/associations/{job_id}": Case("write"),
     "GET /v1/maps/{map_name}/associations/{job_id}/edges": Case(),
     "GET /v1/maps/{map_name}/associations/{job_id}/graph": Case(),
+    "POST /v1/maps/{map_name}/coverage": Case("write", body={"session": "{session}"}),
+    "GET /v1/maps/{map_name}/coverage": Case(),
+    "GET /v1/maps/{map_name}/coverage/{job_id}": Case(),
+    "DELETE /v1/maps/{map_name}/coverage/{job_id}": Case("write"),
+    "GET /v1/maps/{map_name}/coverage/{job_id}/frames": Case(),
+    "GET /v1/maps/{map_name}/coverage/{job_id}/changes": Case(query={"since": "{coverage}"}),
+    "GET /v1/maps/{map_name}/coverage/{job_id}/plan.png": Case(),
     "GET /v1/jobs": Case(query={"map": "{map}"}),
     "GET /v1/jobs/{job_id}": Case(),
     "POST /v1/jobs/{job_id}/cancel": Case("write"),
@@ -109,6 +116,7 @@ OF_A_MAP = {
 #: In the key's own map, an id or session may be named as another map has it: it says nothing.
 MADE_OF_ANYTHING = (
     "PUT /v1/maps/{map_name}/frames/{frame_id}", "POST /v1/maps/{map_name}/associations",
+    "POST /v1/maps/{map_name}/coverage",
 )  # fmt: skip
 #: The operator's: 403 for who has a map, whatever is asked for.
 OF_ALL = (
@@ -135,11 +143,15 @@ class There:
     job: str
     association: str
     reconstruction: str
+    coverage: str
     session: str
 
     def of(self, operation: str, what: str) -> str:
         """The id that a part of a path stands for."""
-        kinds = {"associations": self.association, "reconstructions": self.reconstruction}
+        kinds = {
+            "associations": self.association, "reconstructions": self.reconstruction,
+            "coverage": self.coverage,
+        }  # fmt: skip
         jobs = [one for kind, one in kinds.items() if f"/{kind}" in operation]
         return {
             "map_name": self.map, "frame_id": self.frame, "query_id": self.query,
@@ -149,17 +161,25 @@ class There:
     def fill(self, text: str) -> str:
         return (
             text.replace("{map}", self.map).replace("{frame}", self.frame)
-            .replace("{session}", self.session)
+            .replace("{session}", self.session).replace("{coverage}", self.coverage)
         )  # fmt: skip
 
     @property
     def ids(self) -> list[str]:
-        return [self.map, self.frame, self.query, self.job, self.association, self.reconstruction]
+        return [
+            self.map,
+            self.frame,
+            self.query,
+            self.job,
+            self.association,
+            self.reconstruction,
+            self.coverage,
+        ]
 
 
 @pytest.fixture(scope="module")
 def there(walled, small_shots) -> dict[str, There]:
-    """Two maps with two frames each, an answer, an association and a reconstruction of each."""
+    """Two maps with two frames each, and of each an answer and a job of every kind."""
     found = {}
     for name, pair in ((OWN, small_shots[:2]), (THEIRS, small_shots[1:3])):
         made = walled.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
@@ -181,9 +201,11 @@ def there(walled, small_shots) -> dict[str, There]:
         assert begun.status_code == 202, begun.text
         fused = walled.ask("boss", "POST", f"/v1/queries/{query}/reconstruction", json={})
         assert fused.status_code == 202, fused.text
-        jobs = [one.headers["location"].rpartition("/")[2] for one in (begun, fused)]
+        measured = walled.ask("boss", "POST", f"/v1/maps/{name}/coverage")
+        assert measured.status_code == 202, measured.text
+        jobs = [one.headers["location"].rpartition("/")[2] for one in (begun, fused, measured)]
         found[name] = There(name, frame, query, sent[0]["job_id"], *jobs, session)
-    found[NONE] = There(NONE, *[NO_ID] * 5, f"run-of-{NONE}")
+    found[NONE] = There(NONE, *[NO_ID] * 6, f"run-of-{NONE}")
     return found
 
 
@@ -274,7 +296,8 @@ def test_lists_have_nothing_of_another_map(walled, there, operations):
               "/v1/events?limit=1000",
               f"/v1/stats?map={OWN}", f"/v1/jobs?map={OWN}", f"/v1/events?map={OWN}",
               "/v1/jobs?kind=associate", "/v1/jobs?kind=reconstruct", "/readyz", "/openapi.json",
-              f"/v1/maps/{OWN}/associations", f"/v1/maps/{OWN}/sessions"]  # fmt: skip
+              f"/v1/maps/{OWN}/associations", f"/v1/maps/{OWN}/coverage",
+              f"/v1/maps/{OWN}/sessions"]  # fmt: skip
     for path in listed:
         for key in ("admin", "reader"):
             answer = walled.ask(key, "GET", path)
@@ -287,7 +310,7 @@ def test_lists_have_nothing_of_another_map(walled, there, operations):
     assert [one["name"] for one in mine] == [OWN]
     jobs = walled.ask("reader", "GET", "/v1/jobs?limit=1000").json()["items"]
     assert {job["map"] for job in jobs} == {OWN}
-    assert len(jobs) == 4  # two frames, an association, a reconstruction
+    assert len(jobs) == 5  # two frames, an association, a reconstruction, a coverage
     events = walled.ask("reader", "GET", "/v1/events?limit=1000").json()["items"]
     assert {event["map"] for event in events} == {OWN}
 
@@ -357,7 +380,7 @@ def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
 def unseen(walled: Any, method: str, path: str, id_: str) -> None:
     """See that an id is to the key as one that nothing has."""
     answers = [
-        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"----"))
+        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"-----"))
         for one in (id_, NO_ID)
     ]
     assert told(*answers[0]) == told(*answers[1])
@@ -440,6 +463,7 @@ def test_what_is_not_noted_is_said(operations):
         "create_key", "revoke_key", "create_map", "patch_map", "delete_map", "patch_frame",
         "delete_frame", "patch_session", "delete_session_frames", "cancel_job", "retry_job",
         "retry_dead_jobs", "reencode", "cancel_reencoding",
-        "begin_association", "delete_association", "reconstruct", "delete_reconstruction",
+        "begin_association", "delete_association", "begin_coverage", "delete_coverage",
+        "reconstruct", "delete_reconstruction",
         "add_import", "take_snapshot", "delete_snapshot", "delete_queries",
     }  # fmt: skip

@@ -95,6 +95,11 @@ def live(one: Twin, small_model: Any) -> None:
         assert begun.status_code == 202, begun.text
         one.ids["association"] = begun.json()["association_id"]
         one.disturb()
+    for _ in range(2):
+        measured = one.ask("boss", "POST", f"{path}/coverage", json={"not_within_s": 0})
+        assert measured.status_code == 202, measured.text
+        one.ids["coverage"] = measured.json()["coverage_id"]
+        one.disturb()
     one.house.work()
     fused = one.ask("boss", "POST", f"/v1/queries/{one.ids['query_id']}/reconstruction", json={})
     one.ids["reconstruction"] = fused.json()["job_id"]
@@ -103,7 +108,9 @@ def live(one: Twin, small_model: Any) -> None:
 
 def path_of(one: Twin, pattern: str) -> str:
     """A path of the document, about what there is in alpha."""
-    kinds = [kind for kind in ("association", "reconstruction") if f"/{kind}s/" in pattern]
+    paths = {"association": "associations", "reconstruction": "reconstructions",
+             "coverage": "coverage"}  # fmt: skip
+    kinds = [kind for kind, path in paths.items() if f"/{path}/" in pattern]
     names = {
         "map_name": "alpha", "frame_id": "frame-1", "query_id": one.ids["query_id"],
         "job_id": one.ids[kinds[0] if kinds else "job_id"], "key_name": "k2", "snapshot_id": "x",
@@ -119,12 +126,14 @@ def everything(one: Twin) -> Iterator[str]:
         "/v1/jobs": ["", "?map=alpha", "?state=queued", "?kind=associate"],
         "/v1/events": ["?order=oldest", "?map=alpha&kind=frame.", "?after=0&limit=1000"],
         "/v1/queries/{query_id}/matches/{frame_id}": ["", "?detail=true"],
+        "/v1/maps/{map_name}/coverage/{job_id}/changes": [f"?since={one.ids['coverage']}"],
     }  # fmt: skip
     for pattern, methods in sorted(document["paths"].items()):
         if "get" in methods:
             for query in queries.get(pattern, [""]):
                 yield one.told("reader", "GET", path_of(one, pattern) + query)
     for path in ("frames?limit=3", "frames?limit=2&order=desc", "associations?limit=1",
+                 "coverage?limit=1",
                  "jobs?limit=3", "events?limit=5", "events?limit=5&order=oldest"):  # fmt: skip
         path = path if path.startswith(("jobs", "events")) else f"maps/alpha/{path}"
         cursor = ""
@@ -143,6 +152,7 @@ def everything(one: Twin) -> Iterator[str]:
         ("PATCH", "/v1/maps/alpha/frames/frame-3", {"tags": ["x"]}),
         ("DELETE", "/v1/maps/alpha/frames/frame-3", None),
         ("DELETE", f"/v1/maps/alpha/associations/{one.ids['association']}", None),
+        ("DELETE", f"/v1/maps/alpha/coverage/{one.ids['coverage']}", None),
         ("POST", "/v1/maps", {"name": "bravo"}),
         ("GET", "/v1/events", None),
         ("GET", "/v1/maps/alpha", None),
@@ -195,7 +205,8 @@ def test_it_is_all_there(both):
     """Else the test above would prove nothing."""
     text = "".join(both[0])
     # the frames' poses contradict what they show, so that their matches disagree
-    for part in ("frame.indexed", "association.found", "cursor=", '"status":"ambiguous"',
+    for part in ("frame.indexed", "association.found", "coverage.measured", "cursor=",
+                 '"status":"ambiguous"',
                  "end_header",
                  '"frame_id":"frame-3"', "POST /v1/similarity\n200", "VERTEX_SE3"):  # fmt: skip
         assert part in text, part

@@ -43,6 +43,22 @@ def known_ups(connection: Connection, numbers: Iterable[int]) -> dict[int, Float
     return {number: up for group in found.values() for number, up in _of_parent(group).items()}
 
 
+def parent_up(connection: Connection, numbers: Iterable[int]) -> Floats | None:
+    """Up in the parent frame of frames that share one: as the map was given it, or learnt.
+
+    Parameters
+    ----------
+    connection : of the database
+    numbers : of frames whose poses lead to one parent frame
+
+    Returns
+    -------
+    up : (3,) unit vector; None where the map has none, and too few frames say or agree
+    """
+    group = frame_ups(connection, numbers)
+    return _shared_up(group)[0] if group else None
+
+
 def _of_parent(group: Sequence[FrameUp]) -> dict[int, Floats]:
     """Ups of frames of one parent frame."""
     shared, sure = _shared_up(group)

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
+from sceneprint.engine.jobs.map_jobs import MapJobs
 from sceneprint.engine.jobs.tasks import Tasks
-from sceneprint.engine.serializers import sensor_frame, transform, when
-from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
-from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
+from sceneprint.engine.serializers import job_progress, sensor_frame, transform, when
+from sceneprint.errors import InvalidRequest, NotIndexed
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.formats.pose_graph import PoseEdge, g2o, information_of
 from sceneprint.geometry.pose.rigid import inverse, rotation_angle
@@ -30,7 +30,7 @@ from sceneprint.store.frame_queries import (
 )
 from sceneprint.store.maps import find_map
 from sceneprint.store.opaque_ids import row_of
-from sceneprint.store.queue import find_job, items_of, list_jobs, remove_job
+from sceneprint.store.queue import items_of
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats
 from sceneprint_client.api import JobState, Page, Progress
@@ -141,6 +141,7 @@ class AssociationJobs:
 
     def __init__(self, store: Store, tasks: Tasks) -> None:
         self._store, self._tasks = store, tasks
+        self._jobs = MapJobs(store, ASSOCIATE, "association", "associations")
 
     def begin(self, map_name: str, asked: NewAssociation) -> Association:
         """Queue an association.
@@ -171,19 +172,14 @@ class AssociationJobs:
         UnknownMap : no such map.
         InvalidRequest : a cursor that was not given out.
         """
-        seals = self._store.seals
-        before = seals.row("job", cursor)
-        with self._store.database.read() as connection:
-            find_map(connection, map_name)
-            found = list_jobs(connection, before, limit + 1, None, ASSOCIATE, [map_name])
-        items = [_association_record(one.job, map_name) for one in found[:limit]]
-        more = seals.next_cursor("job", [one.job.number for one in found], limit)
+        found, more = self._jobs.page(map_name, cursor, limit)
+        items = [_association_record(job, map_name) for job in found]
         return Page[Association](items=items, next_cursor=more)
 
     def get(self, map_name: str, job_id: str) -> Association:
         """An association; UnknownMap or UnknownJob where there is none."""
         with self._store.database.read() as connection:
-            return _association_record(_find(connection, map_name, job_id), map_name)
+            return _association_record(self._jobs.find(connection, map_name, job_id), map_name)
 
     def remove(self, map_name: str, job_id: str) -> None:
         """Forget an association with its edges; one that is not over is given up.
@@ -192,9 +188,7 @@ class AssociationJobs:
         ------
         UnknownMap, UnknownJob : there is none.
         """
-        with self._store.database.write() as connection:
-            blobs = remove_job(connection, _find(connection, map_name, job_id))
-        collect_deleted_blobs(self._store, blobs)
+        self._jobs.remove(map_name, job_id)
 
     def edges(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
@@ -219,7 +213,7 @@ class AssociationJobs:
         at = 0 if after is None else after + 1
         found: list[Edge] = []
         with self._store.database.read() as connection:
-            job = _find(connection, map_name, job_id)
+            job = self._jobs.find(connection, map_name, job_id)
             while len(found) <= limit:
                 block = _items(connection, job, at, _BLOCK)
                 stops = stops_of(connection, {item[s] for item in block for s in ("from", "to")})
@@ -251,7 +245,7 @@ class AssociationJobs:
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
-            job = _find(connection, map_name, job_id)
+            job = self._jobs.find(connection, map_name, job_id)
             if job.state != JobState.SUCCEEDED or job.result is None:
                 raise NotIndexed(
                     f"Association {job.id} is {job.state}; its graph exists once it has "
@@ -275,28 +269,10 @@ class AssociationJobs:
         return graph_text(graph, kind)
 
 
-def _find(connection: Connection, map_name: str, job_id: str) -> JobRow:
-    row = find_map(connection, map_name)
-    message = (
-        f"There is no association {job_id!r:.80} in map {row.name!r}. List them with "
-        f"GET /v1/maps/{row.name}/associations."
-    )
-    try:
-        job = find_job(connection, job_id)
-    except UnknownJob:
-        raise UnknownJob(message) from None
-    if job.kind != ASSOCIATE or job.map_number != row.number:
-        raise UnknownJob(message)
-    return job
-
-
 def _association_record(job: JobRow, map_name: str) -> Association:
-    progress = None
-    if job.progress is not None:
-        progress = Progress(done=job.progress["done"], total=job.progress["total"])
     return Association(
         association_id=job.id, map=map_name, asked=NewAssociation.model_validate(job.data or {}),
-        state=job.state, progress=progress,
+        state=job.state, progress=job_progress(job),
         result=None if job.result is None else AssociationResult.model_validate(job.result),
         error=job.error, created_at=when(job.created_at), finished_at=when(job.finished_at),
     )  # fmt: skip

@@ -1,0 +1,331 @@
+"""Coverage of maps: jobs begun, listed, read, drawn, compared and removed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection
+
+from sceneprint.engine.jobs.map_jobs import MapJobs
+from sceneprint.engine.jobs.tasks import Tasks
+from sceneprint.engine.maps.coverage_job import COVERAGE, PRIORITY, frames_to_query
+from sceneprint.engine.maps.coverage_picture import DrawnFrame, coverage_picture
+from sceneprint.engine.maps.coverage_plan import plan_changes
+from sceneprint.engine.maps.map_frames import Output
+from sceneprint.engine.serializers import job_progress, tag_of, when
+from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnreadableGeometry
+from sceneprint.geometry.pose.rigid import moved
+from sceneprint.store import Store
+from sceneprint.store.frame_queries import PathFrame, stops_of
+from sceneprint.store.maps import find_map
+from sceneprint.store.opaque_ids import row_of
+from sceneprint.store.queue import items_of
+from sceneprint.store.signatures import geometry_blobs
+from sceneprint.store.tables import JobRow
+from sceneprint.types import Floats
+from sceneprint_client.api import JobState, Page, Progress, Vector
+from sceneprint_client.api.coverage import (
+    CELL_TRENDS,
+    CoverageChanges,
+    CoverageFrame,
+    CoverageOutcome,
+    CoveragePlan,
+    CoverageResult,
+    MapCoverage,
+    NewMapCoverage,
+)
+
+#: Items that are read at once.
+_BLOCK = 500
+#: Frames whose surfaces a plan shows, at most.
+_SEEN_FRAMES = 48
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """A coverage job that has succeeded."""
+
+    job: JobRow
+    asked: NewMapCoverage
+    result: CoverageResult
+    plans: list[CoveragePlan]
+
+
+class CoverageJobs:
+    """Coverage of maps."""
+
+    def __init__(self, store: Store, tasks: Tasks) -> None:
+        self._store, self._tasks = store, tasks
+        self._jobs = MapJobs(store, COVERAGE, "coverage", "coverage")
+
+    def begin(self, map_name: str, asked: NewMapCoverage) -> MapCoverage:
+        """Queue a coverage job.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : there is no frame to query.
+        """
+        with self._store.database.read() as connection:
+            total = len(frames_to_query(connection, find_map(connection, map_name), asked))
+        data = asked.model_dump(mode="json", exclude_unset=True)
+        job, _ = self._tasks.begin(COVERAGE, map_name, data, PRIORITY)
+        return MapCoverage(
+            coverage_id=job.job_id, map=map_name, asked=asked, state=job.state,
+            progress=Progress(done=0, total=total), result=None, error=None,
+            created_at=job.created_at, finished_at=None,
+        )  # fmt: skip
+
+    def list_all(
+        self, map_name: str, cursor: str | None = None, limit: int = 100
+    ) -> Page[MapCoverage]:
+        """Coverage jobs of a map without their plans, the newest first; see `MapJobs.page`."""
+        found, more = self._jobs.page(map_name, cursor, limit)
+        items = [_coverage_record(job, map_name) for job in found]
+        return Page[MapCoverage](items=items, next_cursor=more)
+
+    def get(self, map_name: str, job_id: str) -> MapCoverage:
+        """A coverage job; UnknownMap or UnknownJob where there is none."""
+        with self._store.database.read() as connection:
+            job = self._jobs.find(connection, map_name, job_id)
+            plans = None if job.result is None else _plans(connection, job)
+        return _coverage_record(job, map_name, plans)
+
+    def remove(self, map_name: str, job_id: str) -> None:
+        """Delete a coverage job with its result; see `MapJobs.remove`."""
+        self._jobs.remove(map_name, job_id)
+
+    def frames(
+        self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
+        outcome: CoverageOutcome | None = None,
+    ) -> Page[CoverageFrame]:  # fmt: skip
+        """Queried frames that are still there, also while more are queried.
+
+        Parameters
+        ----------
+        map_name, job_id : of the coverage job
+        cursor, limit : of the page
+        outcome : of the frames; default: of any
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : there is none.
+        InvalidRequest : a cursor that was not given out.
+        """
+        after = row_of(cursor)
+        at = 0 if after is None else after + 1
+        found: list[CoverageFrame] = []
+        with self._store.database.read() as connection:
+            job = self._jobs.find(connection, map_name, job_id)
+            while len(found) <= limit:
+                block = _frame_items(connection, job, at, _BLOCK)
+                stops = stops_of(connection, _numbers(block))
+                found += [
+                    _frame_record(at + i, item, stops)
+                    for i, item in enumerate(block)
+                    if item["frame"] in stops and outcome in (None, item["outcome"])
+                ]
+                at += len(block)
+                if len(block) < _BLOCK:
+                    break
+        more = str(found[limit - 1].number) if len(found) > limit else None
+        return Page[CoverageFrame](items=found[:limit], next_cursor=more)
+
+    def picture(self, map_name: str, job_id: str, parent: str | None = None) -> Output[bytes]:
+        """A plan as a PNG, with the queried frames that are still there.
+
+        Parameters
+        ----------
+        map_name, job_id : of the coverage job
+        parent : frame of the plan; default: that of most queried frames
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : there is none.
+        NotIndexed : it did not succeed, or no queried frame has a pose.
+        InvalidRequest : it has no plan of that parent frame.
+        """
+        with self._store.database.read() as connection:
+            measured = self._measured(connection, map_name, job_id)
+            items = _frame_items(connection, measured.job, 0, measured.result.frames)
+            plan = _chosen_plan(measured.plans, parent)
+            items = [item for item in items if item["parent"] == plan.parent_frame]
+            stops = stops_of(connection, _numbers(items))
+            own = [item["frame"] for item in items if item["frame"] in stops]
+            row = find_map(connection, map_name)
+            blobs = geometry_blobs(connection, _spread(own, _SEEN_FRAMES), row.model_id)
+        drawn = [_drawn_frame(item, stops, plan) for item in items if item["frame"] in stops]
+        tag = tag_of("coverage", job_id, plan.parent_frame, [repr(one) for one in drawn])
+        title = f"Coverage of {map_name}, parent frame {plan.parent_frame}"
+
+        def make() -> bytes:
+            points = self._points([(stops[number], blob) for number, blob in blobs.items()], plan)
+            return coverage_picture(plan, measured.result, drawn, points, title)
+
+        return Output(tag, make)
+
+    def changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
+        """A result compared with an earlier one of the same map and the same options.
+
+        Parameters
+        ----------
+        map_name, job_id : of the coverage job
+        since : id of the earlier one
+
+        Raises
+        ------
+        UnknownMap, UnknownJob, NotIndexed : one of them is not there, or did not succeed.
+        InvalidRequest : they cannot be compared.
+        """
+        with self._store.database.read() as connection:
+            after = self._measured(connection, map_name, job_id)
+            before = self._measured(connection, map_name, since)
+        _require_comparable(before, after)
+        plans = plan_changes(before.plans, after.plans)
+        trends = Counter(cell.trend for plan in plans for cell in plan.cells)
+        return CoverageChanges(
+            before=since, after=job_id, cell_m=after.result.cell_m,
+            trends={name: trends[name] for name in CELL_TRENDS}, result_before=before.result,
+            result_after=after.result, plans=plans,
+        )  # fmt: skip
+
+    def _points(self, seen: Sequence[tuple[PathFrame, str]], plan: CoveragePlan) -> Floats:
+        """(n, 2) what frames see, along the axes of a plan; without those that are damaged."""
+        axes, found = np.array([plan.x_axis, plan.y_axis]), [np.empty((0, 2))]
+        for stop, blob in seen:
+            if stop.pose is None or stop.parent != plan.parent_frame:
+                continue  # edited since
+            with suppress(DamagedBlob, UnreadableGeometry):
+                surface = self._store.geometries.read(blob).surface
+                points = surface.points[surface.valid].astype(np.float64)
+                found.append(moved(np.array(stop.pose), points) @ axes.T)
+        return np.concatenate(found)
+
+    def _measured(self, connection: Connection, map_name: str, job_id: str) -> _Measured:
+        job = self._jobs.find(connection, map_name, job_id)
+        if job.state != JobState.SUCCEEDED or job.result is None:
+            raise NotIndexed(
+                f"Coverage {job.id} is {job.state}; its plans exist once it has succeeded. See "
+                f"GET /v1/maps/{map_name}/coverage/{job.id}."
+            )
+        asked = NewMapCoverage.model_validate(job.data or {})
+        result = CoverageResult.model_validate(job.result)
+        return _Measured(job, asked, result, _plans(connection, job))
+
+
+def _require_comparable(before: _Measured, after: _Measured) -> None:
+    """InvalidRequest where two results say different things about the same place."""
+    names = [
+        name
+        for name in NewMapCoverage.model_fields
+        if name != "cell_m" and getattr(before.asked, name) != getattr(after.asked, name)
+    ]
+    if names:
+        raise InvalidRequest(
+            f"The two results cannot be compared: {', '.join(names)} of their requests differ. "
+            "Measure again with the same options.",
+            (("since", "other options"),),
+        )
+    if before.result.cell_m != after.result.cell_m:
+        raise InvalidRequest(
+            f"The two results cannot be compared: their cells are {before.result.cell_m:g} m and "
+            f"{after.result.cell_m:g} m wide. Measure again with `cell_m` = "
+            f"{before.result.cell_m:g}.",
+            (("since", "cells of another width"),),
+        )
+    axes = {plan.parent_frame: [*plan.x_axis, *plan.y_axis] for plan in before.plans}
+    for plan in after.plans:
+        own = [*plan.x_axis, *plan.y_axis]
+        if not np.allclose(axes.get(plan.parent_frame, own), own, atol=1e-3):
+            raise InvalidRequest(
+                f"The two results cannot be compared: the vertical of parent frame "
+                f"{plan.parent_frame!r:.80} was another. Give the map its `up`, and measure both "
+                "again.",
+                (("since", "another vertical"),),
+            )
+
+
+def _chosen_plan(plans: Sequence[CoveragePlan], parent: str | None) -> CoveragePlan:
+    for plan in plans:
+        if parent in (None, plan.parent_frame):
+            return plan
+    if not plans:
+        raise NotIndexed(
+            "There is no plan, as no queried frame has a pose. Upload frames with poses."
+        )
+    names = ", ".join(plan.parent_frame for plan in plans)
+    raise InvalidRequest(
+        f"There is no plan of parent frame {parent!r:.80}. Choose from {names!r:.400}.",
+        (("parent_frame", "no such plan"),),
+    )
+
+
+def _coverage_record(
+    job: JobRow, map_name: str, plans: list[CoveragePlan] | None = None
+) -> MapCoverage:
+    return MapCoverage(
+        coverage_id=job.id, map=map_name, asked=NewMapCoverage.model_validate(job.data or {}),
+        state=job.state, progress=job_progress(job),
+        result=None if job.result is None else CoverageResult.model_validate(job.result),
+        plans=plans, error=job.error, created_at=when(job.created_at),
+        finished_at=when(job.finished_at),
+    )  # fmt: skip
+
+
+def _plans(connection: Connection, job: JobRow) -> list[CoveragePlan]:
+    """Plans of a job that has succeeded: the items behind those of its frames."""
+    found = items_of(connection, job.number, (job.result or {})["frames"])
+    return [CoveragePlan.model_validate(one) for one in found]
+
+
+def _frame_items(
+    connection: Connection, job: JobRow, first: int, limit: int
+) -> list[dict[str, Any]]:
+    """Items of queried frames, from number `first` on."""
+    if job.result is not None:
+        limit = max(min(limit, job.result["frames"] - first), 0)
+    return items_of(connection, job.number, first, limit)
+
+
+def _spread(numbers: Sequence[int], most: int) -> list[int]:
+    """At most so many of some numbers, evenly spaced."""
+    return list(numbers[:: -(-len(numbers) // most) or 1])
+
+
+def _numbers(items: Sequence[dict[str, Any]]) -> set[int]:
+    """Numbers of the frames that items name."""
+    return {number for item in items for number in (item["frame"], *item["look_alikes"])}
+
+
+def _frame_record(number: int, item: dict[str, Any], stops: dict[int, PathFrame]) -> CoverageFrame:
+    stop = stops[item["frame"]]
+    at = item["at"]
+    same = ("outcome", "reason", "cause", "error_m", "error_deg")
+    return CoverageFrame(
+        number=number, frame_id=stop.id, robot=stop.robot, session=stop.session,
+        parent_frame=item["parent"],
+        position=None if at is None else Vector(x=at[0], y=at[1], z=at[2]),
+        look_alikes=[stops[one].id for one in item["look_alikes"] if one in stops],
+        **{name: item[name] for name in same},
+    )  # fmt: skip
+
+
+def _drawn_frame(
+    item: dict[str, Any], stops: dict[int, PathFrame], plan: CoveragePlan
+) -> DrawnFrame:
+    """A queried frame on its plan, with where its look-alikes of the same plan were taken."""
+    axes = np.array([plan.x_axis, plan.y_axis])
+    others = [stops[one] for one in item["look_alikes"] if one in stops]
+    return DrawnFrame(
+        tuple((axes @ item["at"]).tolist()), item["outcome"],
+        tuple(
+            tuple((axes @ np.array(other.pose)[:3, 3]).tolist())
+            for other in others
+            if other.pose is not None and other.parent == plan.parent_frame
+        ),
+    )  # fmt: skip

@@ -1,0 +1,233 @@
+"""Coverage by client, raw HTTP and command."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import httpx
+import pytest
+
+from sceneprint.cli import main
+from sceneprint.cli.coverage import change_lines, coverage_lines
+from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
+from sceneprint.formats.dataset import write_depth_png
+from sceneprint.lab.synth import synthesise_room
+from sceneprint_client import Client
+from sceneprint_client.api import FrameMeta, JobState
+from sceneprint_client.api.coverage import (
+    CellChange,
+    CoverageCell,
+    CoverageChanges,
+    CoveragePlan,
+    CoverageResult,
+    MapCoverage,
+    NewMapCoverage,
+    PlanChanges,
+)
+
+MAP = "covered"
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture(scope="module")
+def covered(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
+    """A client of a map with four frames along a path, a second apart."""
+    path = tmp_path_factory.mktemp("covered") / "depth.png"
+    with Client(service_url) as client:
+        client.create_map(MAP, model="depth")
+        jobs = []
+        for i, frame in enumerate(synthesise_room(21, 0, 4, along_path=True).frames):
+            write_depth_png(path, frame.depth, 1000.0)
+            k = frame.intrinsics
+            assert frame.pose is not None
+            fields = {
+                "intrinsics": {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy,
+                               "cx": k.cx, "cy": k.cy},
+                "session": "a", "robot": "ann", "pose": {"matrix": frame.pose.tolist()},
+                "captured_at": datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=i),
+            }  # fmt: skip
+            jobs.append(client.upload(MAP, path, FrameMeta.model_validate(fields)).job_id)
+        assert {job.state for job in client.wait(jobs)} == {JobState.SUCCEEDED}
+        yield client
+
+
+@pytest.fixture(scope="module")
+def whole(covered: Client) -> MapCoverage:
+    steps: list[tuple[int, int]] = []
+    told = covered.coverage(MAP, not_within_s=0.0, cell_m=0.5, progress=lambda *n: steps.append(n))
+    assert told.state is JobState.SUCCEEDED
+    assert steps[-1] == (4, 4)
+    return told
+
+
+def test_a_result_with_its_frames_plan_and_changes(covered: Client, whole: MapCoverage) -> None:
+    of = MAP, whole.coverage_id
+    assert covered.coverage_result(*of) == whole
+    assert whole.result is not None
+    assert (whole.result.frames, whole.result.found) == (4, 4)
+    frames = list(covered.coverage_frames(*of))
+    assert {frame.frame_id for frame in frames} == {one.frame_id for one in covered.frames(MAP)}
+    assert list(covered.coverage_frames(*of, "not_found")) == []
+    assert covered.coverage_plan(*of).startswith(PNG)
+    again = covered.coverage(MAP, like=whole)
+    assert (again.result, again.plans) == (whole.result, whole.plans)
+    told = covered.coverage_changes(MAP, again.coverage_id, whole.coverage_id)
+    assert set(told.trends) - {"same"} == {"better", "worse", "new", "gone"}
+    assert told.trends["same"] == sum(len(plan.cells) for plan in told.plans) > 0
+    listed = [one.coverage_id for one in covered.coverage_jobs(MAP)]
+    assert listed[:2] == [again.coverage_id, whole.coverage_id]
+    covered.delete_coverage(MAP, again.coverage_id)
+    assert again.coverage_id not in [one.coverage_id for one in covered.coverage_jobs(MAP)]
+
+
+def test_refusals(covered: Client, whole: MapCoverage) -> None:
+    for name in ("0" * 32, "../jobs"):
+        with pytest.raises(UnknownJob):
+            covered.coverage_result(MAP, name)
+    with pytest.raises(UnknownMap):
+        covered.coverage("nowhere")
+    with pytest.raises(InvalidRequest, match="no indexed frame"):
+        covered.coverage(MAP, session="nobody")
+    with pytest.raises(InvalidRequest, match="every"):
+        covered.coverage(MAP, every=0)
+    with pytest.raises(InvalidRequest, match="no plan of parent frame"):
+        covered.coverage_plan(MAP, whole.coverage_id, "nowhere")
+    begun = covered.coverage(MAP, timeout_s=0, most=1)
+    covered.cancel_job(begun.coverage_id)
+    with pytest.raises(NotIndexed, match="is cancelled"):
+        covered.coverage_plan(MAP, begun.coverage_id)
+    covered.delete_coverage(MAP, begun.coverage_id)
+
+
+def test_over_http(covered: Client, whole: MapCoverage, service_url: str) -> None:
+    root = f"/v1/maps/{MAP}/coverage"
+    with httpx.Client(base_url=service_url, trust_env=False, timeout=60) as http:
+        begun = http.post(root)  # without a body: the defaults
+        assert begun.status_code == 202
+        place = begun.headers["Location"]
+        assert place == f"{root}/{begun.json()['coverage_id']}"
+        assert begun.json()["asked"] == NewMapCoverage().model_dump(mode="json")
+        done = covered.wait_for_coverage(MapCoverage.model_validate(begun.json()))
+        assert done.result is not None
+        assert done.result.not_found == 4  # all within ten seconds
+        job = http.get(f"/v1/jobs/{done.coverage_id}").json()
+        assert (job["kind"], job["priority"]) == ("coverage", -11)
+        plan = http.get(f"{root}/{whole.coverage_id}/plan.png")
+        assert plan.headers["Content-Type"] == "image/png"
+        assert plan.content == covered.coverage_plan(MAP, whole.coverage_id)
+        known = {"If-None-Match": plan.headers["ETag"]}
+        assert http.get(f"{root}/{whole.coverage_id}/plan.png", headers=known).status_code == 304
+        page = http.get(f"{root}/{whole.coverage_id}/frames", params={"limit": 3}).json()
+        assert [frame["number"] for frame in page["items"]] == [0, 1, 2]
+        rest = {"cursor": page["next_cursor"]}
+        rest_of = http.get(f"{root}/{whole.coverage_id}/frames", params=rest).json()
+        assert [frame["number"] for frame in rest_of["items"]] == [3]
+        since = {"since": done.coverage_id}
+        for status, method, path, more in (
+            (404, "GET", f"{root}/{'0' * 32}", {}),
+            (404, "DELETE", f"{root}/nothing", {}),
+            (422, "GET", f"{root}/{whole.coverage_id}/frames", {"params": {"outcome": "lost"}}),
+            (422, "GET", f"{root}/{whole.coverage_id}/changes", {}),
+            (422, "GET", f"{root}/{whole.coverage_id}/changes", {"params": since}),
+            (422, "POST", root, {"json": {"every": 0}}),
+            (422, "POST", root, {"json": []}),
+            (415, "POST", root, {"content": b"every=5"}),
+            (400, "POST", root, {"content": b"{", "headers": {"Content-Type": "application/json"}}),
+        ):
+            refused = http.request(method, path, **more)
+            assert refused.status_code == status, (method, path, refused.text)
+            assert refused.headers["Content-Type"] == "application/problem+json"
+        assert http.delete(place).status_code == 204
+        assert http.get(place).status_code == 404
+
+
+def test_the_command(
+    covered: Client, whole: MapCoverage, service_url: str, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    out = tmp_path / "plan.png"
+    of = ["coverage", MAP, "--url", service_url]
+    assert main([*of, "--every", "2", "--not-within", "0", "--out", str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    newest = next(iter(covered.coverage_jobs(MAP)))
+    assert (newest.asked.every, newest.asked.not_within_s) == (2, 0.0)
+    told = covered.coverage_result(MAP, newest.coverage_id)
+    assert lines == [*coverage_lines(told), f"wrote {out}"]
+    assert out.read_bytes() == covered.coverage_plan(MAP, newest.coverage_id)
+    assert main([*of, "--since", newest.coverage_id, "--json"]) == 0
+    changes = json.loads(capsys.readouterr().out)
+    assert changes["before"] == newest.coverage_id
+    assert changes["trends"]["worse"] == 0
+    begun = len(list(covered.coverage_jobs(MAP)))
+    for arguments, why in (
+        (["--since", whole.coverage_id, "--every", "2"], "Leave the other options out"),
+        (["--out", str(tmp_path / "no" / "plan.png")], "No such file or directory"),
+        (["--tolerance", "0"], "tolerance_m"),
+    ):
+        assert main([*of, *arguments]) == 2
+        assert why in capsys.readouterr().err
+    assert len(list(covered.coverage_jobs(MAP))) == begun  # refused before a job began
+
+
+# What people read, by hand.
+
+RESULT = CoverageResult(
+    found=7, wrong=1, ambiguous=0, not_found=2, frames=10, skipped=1, unchecked=2, model="depth",
+    revision=12, last_revision=12, map_frames=12, cell_m=0.5,
+)  # fmt: skip
+CELLS = [
+    CoverageCell(column=-1, row=0, frames=1, found=0, wrong=1, ambiguous=0, not_found=0),
+    CoverageCell(column=2, row=3, frames=9, found=1, wrong=0, ambiguous=0, not_found=2),
+    CoverageCell(column=3, row=3, frames=2, found=6, wrong=0, ambiguous=0, not_found=0),
+]
+TOLD = MapCoverage.model_validate(
+    {
+        "coverage_id": "5c1e", "map": "hall", "asked": {}, "state": "succeeded", "progress": None,
+        "result": RESULT, "error": None, "created_at": datetime(2026, 1, 1, tzinfo=UTC),
+        "finished_at": None,
+        "plans": [
+            CoveragePlan(
+                parent_frame="hall", x_axis=[1, 0, 0], y_axis=[0, 1, 0], up_from="map", cells=CELLS
+            )
+        ],
+    }
+)  # fmt: skip
+
+
+def test_the_summary_names_the_worst_cells() -> None:
+    assert coverage_lines(TOLD) == [
+        "coverage 5c1e: 10 frames queried against the rest of 12, 1 skipped",
+        "  found          7  70.0%",
+        "  wrong          1  10.0%",
+        "  ambiguous      0   0.0%",
+        "  not found      2  20.0%",
+        "  2 of those found have no pose to check them with",
+        "worst cells, 0.5 m wide:",
+        "  hall at 1.25 1.75 m: 1 found, 2 not found; 9 frames there",
+        "  hall at -0.25 0.25 m: 1 wrong; 1 frame there",
+    ]
+    failed = TOLD.model_copy(update={"result": None, "state": JobState.FAILED, "error": "no\nmap"})
+    assert coverage_lines(failed) == ["coverage 5c1e is failed: no\\nmap"]
+
+
+def test_the_changes_name_what_became_worse() -> None:
+    before = RESULT.model_copy(update={"found": 9, "wrong": 0, "not_found": 1})
+    cells = [
+        CellChange(column=-1, row=0, trend="worse", before=CELLS[2], after=CELLS[0]),
+        CellChange(column=3, row=3, trend="new", before=None, after=CELLS[2]),
+    ]
+    trends = {"better": 0, "worse": 1, "same": 0, "new": 1, "gone": 0}
+    changes = CoverageChanges.model_validate(
+        {
+            "before": "a1", "after": "b2", "cell_m": 0.5, "trends": trends,
+            "result_before": before, "result_after": RESULT,
+            "plans": [PlanChanges(parent_frame="hall", cells=cells)],
+        }
+    )  # fmt: skip
+    assert change_lines(changes) == [
+        "since a1: found 90.0% before, 70.0% now; cells: 1 worse, 1 new",
+        "  worse: hall at -0.25 0.25 m: 1 wrong; 1 frame there",
+    ]

@@ -1,0 +1,365 @@
+"""Coverage of a map through the engine: equal rooms, duplicates, slices that are lost, changes."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from sqlalchemy import select
+
+from sceneprint.engine import Engine
+from sceneprint.engine.jobs.lifecycle import Work, cancel
+from sceneprint.engine.jobs.tasks import LongJob
+from sceneprint.engine.maps.coverage_job import CoverageHandler, frames_to_query
+from sceneprint.engine.maps.coverage_picture import COLOURS, FOOTER, WIDTH
+from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
+from sceneprint.lab.synth import synthesise_room
+from sceneprint.settings import Settings
+from sceneprint.store.frame_queries import stops_of
+from sceneprint.store.maps import find_map
+from sceneprint.store.tables import events, job_items, jobs
+from sceneprint.types import Floats
+from sceneprint_client.api import JobState, NewMap
+from sceneprint_client.api.coverage import CoverageFrame, MapCoverage, NewMapCoverage
+
+BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
+WorkOff = Callable[[Engine], list[JobState | None]]
+#: How far the room that equals the first one is from it, metres.
+APART_M = 10.0
+
+
+#: Options of the two jobs that `rooms` has done.
+WHOLE = {"not_within_s": 0.0, "cell_m": 0.5}
+LATER_DAY = {"session": "a", "other_sessions": True}
+
+
+@dataclass(frozen=True)
+class Rooms:
+    """A data folder, and where the frames of its map `hall` were taken.
+
+    Parameters
+    ----------
+    folder : to be copied
+    positions : of the frames in the order in which they came
+    parents : of their poses: of the equal rooms, and of the other one
+    whole, later_day : ids of coverage jobs that are done
+    """
+
+    folder: Path
+    positions: list[Floats]
+    parents: tuple[str, str]
+    whole: str
+    later_day: str
+
+
+@pytest.fixture(scope="session")
+def rooms(
+    tmp_path_factory: pytest.TempPathFactory, uploads: Any, make_upload: Callable[..., Any],
+    work_off: WorkOff,
+) -> Rooms:  # fmt: skip
+    """A map `hall`: five frames of a room in session a, five of a room equal to it in session b,
+    and four of another room in session c, a second apart. The first two share a parent frame.
+
+    Map `pair` holds two frames of one session that differ by a millimetre of noise.
+    """
+    folder = tmp_path_factory.mktemp("rooms") / "data"
+    path = synthesise_room(21, 0, 10, along_path=True)
+    positions: list[Floats] = []
+    with Engine(Settings(data_dir=folder)) as engine:
+        for name in ("hall", "pair"):
+            engine.create_map(NewMap(name=name, model="depth"))
+
+        def add(name: str, frame: Any, room: str, session: str) -> None:
+            second = 5 * len(positions) if name == "pair" else len(positions)
+            made = make_upload(
+                frame, room, session=session, robot="ann",
+                captured_at=BEGIN + timedelta(seconds=second),
+            )  # fmt: skip
+            engine.add_frame(name, made.data, made.meta)
+            positions.append(frame.pose[:3, 3])
+
+        rng, frame = np.random.default_rng(5), path.frames[0]
+        noise = rng.choice((-0.001, 0.001), frame.depth.shape) * (frame.depth > 0)
+        for depth in (frame.depth, frame.depth + noise):
+            add("pair", replace(frame, depth=depth.astype(np.float32)), path.name, "a")
+        positions.clear()
+        shift = np.eye(4)
+        shift[0, 3] = APART_M
+        for i, frame in enumerate(path.frames):
+            assert frame.pose is not None
+            pose = (np.eye(4), shift)[i % 2] @ frame.pose
+            add("hall", replace(frame, pose=pose), path.name, "ab"[i % 2])
+        for one in uploads[6:10]:
+            add("hall", replace(one.frame, pose=one.pose), one.room, "c")
+        assert set(work_off(engine)) == {JobState.SUCCEEDED}
+        done = [measured(engine, work_off, **asked).coverage_id for asked in (WHOLE, LATER_DAY)]
+    return Rooms(folder, positions, (path.name, uploads[6].room), *done)
+
+
+@pytest.fixture
+def engine(rooms: Rooms, tmp_path: Path, make_engine: Callable[..., Engine]) -> Engine:
+    shutil.copytree(rooms.folder, tmp_path / "data")
+    return make_engine()
+
+
+def measured(
+    engine: Engine, work_off: WorkOff, map_name: str = "hall", **asked: Any
+) -> MapCoverage:
+    begun = engine.coverage.begin(map_name, NewMapCoverage.model_validate(asked))
+    assert begun.state is JobState.QUEUED
+    assert work_off(engine)[-1] is JobState.SUCCEEDED
+    return engine.coverage.get(map_name, begun.coverage_id)
+
+
+def frames_of(engine: Engine, told: MapCoverage) -> list[CoverageFrame]:
+    return engine.coverage.frames(told.map, told.coverage_id).items
+
+
+def test_equal_rooms_are_ambiguous_and_linked(engine: Engine, rooms: Rooms) -> None:
+    told = engine.coverage.get("hall", rooms.whole)
+    assert told.state is JobState.SUCCEEDED
+    result = told.result
+    assert result is not None
+    assert (result.frames, result.skipped, result.map_frames) == (14, 0, 14)
+    assert (result.found, result.ambiguous, result.wrong, result.not_found) == (4, 10, 0, 0)
+    assert (result.unchecked, result.revision, result.last_revision) == (0, 14, 14)
+    frames = frames_of(engine, told)
+    assert [frame.number for frame in frames] == list(range(14))
+    sessions = {frame.frame_id: frame.session for frame in frames}
+    for frame in frames:
+        others = {sessions[one] for one in frame.look_alikes}
+        if frame.session == "c":  # the room that nothing equals
+            assert (frame.outcome, others) == ("found", set())
+            assert frame.error_m is not None
+            assert frame.error_m < 0.05
+        else:
+            assert (frame.outcome, frame.error_m) == ("ambiguous", None)
+            assert others == {"b" if frame.session == "a" else "a"}
+    with engine.store.database.read() as connection:
+        kind = events.c.kind == "coverage.measured"
+        data = connection.execute(select(events.c.data).where(kind)).scalars().first()
+    assert data == result.model_dump(mode="json")
+
+
+def test_cells_count_the_frames_taken_in_them(engine: Engine, rooms: Rooms) -> None:
+    plans = engine.coverage.get("hall", rooms.whole).plans
+    assert plans is not None
+    assert [plan.parent_frame for plan in plans] == list(rooms.parents)
+    assert {plan.up_from for plan in plans} == {"cameras"}
+    for plan, positions in zip(plans, (rooms.positions[:10], rooms.positions[10:]), strict=True):
+        assert (plan.x_axis, plan.y_axis) == ([1, 0, 0], [0, 1, 0])  # z is up in these rooms
+        expected = Counter((int(x // 0.5), int(y // 0.5)) for x, y, _ in positions)
+        cells = {(cell.column, cell.row): cell for cell in plan.cells}
+        assert {place: cell.frames for place, cell in cells.items()} == expected
+        outcome = "ambiguous" if plan is plans[0] else "found"
+        assert {place: getattr(cell, outcome) for place, cell in cells.items()} == expected
+
+
+def test_only_another_session_of_an_equal_room_gives_wrong_poses(
+    engine: Engine, work_off: WorkOff, rooms: Rooms
+) -> None:
+    told = engine.coverage.get("hall", rooms.later_day)
+    assert told.result is not None
+    assert (told.result.frames, told.result.wrong) == (5, 5)
+    frames = frames_of(engine, told)
+    by_id = {one.frame_id: one for one in engine.list_frames("hall").items}
+    for frame in frames:
+        assert frame.error_m == pytest.approx(APART_M, abs=0.1)
+        assert frame.error_deg is not None
+        assert frame.error_deg < 2
+        (other,) = frame.look_alikes
+        assert by_id[other].session == "b"
+    wrong = engine.coverage.frames("hall", told.coverage_id, outcome="wrong", limit=3)
+    assert wrong.items == frames[:3]
+    rest = engine.coverage.frames("hall", told.coverage_id, wrong.next_cursor, outcome="wrong")
+    assert rest.items == frames[3:]
+    assert engine.coverage.frames("hall", told.coverage_id, outcome="found").items == []
+    wide = measured(engine, work_off, **LATER_DAY, every=5, tolerance_m=APART_M + 1)
+    assert wide.result is not None
+    assert (wide.result.frames, wide.result.found) == (1, 1)
+
+
+def test_a_duplicate_is_left_out_with_the_frames_around_it(
+    engine: Engine, work_off: WorkOff
+) -> None:
+    """Two frames of one place, five seconds apart: each finds the other, unless it is left out."""
+    near = measured(engine, work_off, "pair", not_within_s=0.0)
+    assert near.result is not None
+    assert (near.result.frames, near.result.found) == (2, 2)
+    for left_out in ({"not_within_s": 4.9}, {"not_within_s": 5.1}, {"other_sessions": True}):
+        told = measured(engine, work_off, "pair", **left_out)
+        assert told.result is not None
+        kept = left_out == {"not_within_s": 4.9}
+        assert (told.result.found, told.result.not_found) == ((2, 0) if kept else (0, 2))
+        if not kept:
+            assert {frame.cause for frame in frames_of(engine, told)} == {"no_frames"}
+
+
+def test_every_nth_frame_and_at_most_so_many(engine: Engine) -> None:
+    frames = [(one.session, one.frame_id) for one in engine.list_frames("hall").items]
+    order = [frame_id for _, frame_id in sorted(frames, key=lambda one: one[0] or "")]
+
+    def chosen(**asked: Any) -> list[str]:
+        with engine.store.database.read() as connection:
+            row = find_map(connection, "hall")
+            numbers = frames_to_query(connection, row, NewMapCoverage.model_validate(asked))
+            stops = stops_of(connection, numbers)
+        return [stops[number].id for number in numbers]
+
+    assert chosen() == order
+    assert chosen(every=5) == order[::5]
+    assert chosen(session="b", robot="ann") == order[5:10]
+    assert chosen(most=4) == [order[i] for i in (0, 3, 7, 10)]
+    assert chosen(every=2, most=100) == order[::2]
+
+
+def stored(engine: Engine, coverage_id: str) -> list[Any]:
+    with engine.store.database.read() as connection:
+        own = select(jobs.c.number).where(jobs.c.id == coverage_id).scalar_subquery()
+        asked = select(job_items.c.data).where(job_items.c.job_number == own)
+        return list(connection.execute(asked.order_by(job_items.c.number)).scalars())
+
+
+def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
+    engine: Engine, work_off: WorkOff, due_now: Callable[[Engine], None]
+) -> None:
+    asked = {"every": 5, "not_within_s": 0.0}  # a frame of each room
+    whole = measured(engine, work_off, **asked)
+    begun = engine.coverage.begin("hall", NewMapCoverage.model_validate(asked))
+    handler = CoverageHandler(engine.store, engine.signers, engine.queries)
+    slices = 0
+    while True:  # a frame a slice, and each is lost once
+        lost = engine.claim("dies")
+        assert isinstance(lost, LongJob)
+        first = handler(lost, 0.0)
+        due_now(engine)
+        again = engine.claim("lives")
+        assert isinstance(again, LongJob)
+        assert engine.tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
+        second = handler(again, 0.0)
+        assert asdict(first) == asdict(second)
+        engine.tasks._keep(again, second)
+        slices += 1
+        told = engine.coverage.get("hall", begun.coverage_id)
+        if told.state.over:
+            break
+        assert told.progress is not None
+        assert told.progress.done == slices
+        assert len(frames_of(engine, told)) == slices  # told while more are queried
+    assert slices == 4  # the last concludes
+    assert (told.result, told.plans) == (whole.result, whole.plans)
+    assert stored(engine, told.coverage_id) == stored(engine, whole.coverage_id)
+
+
+def test_an_upload_goes_before_the_next_slice(
+    engine: Engine, work_off: WorkOff, uploads: Any
+) -> None:
+    engine.coverage.begin("hall", NewMapCoverage(session="c"))
+    handler = CoverageHandler(engine.store, engine.signers, engine.queries)
+    task = engine.claim("w")
+    assert isinstance(task, LongJob)
+    engine.tasks._keep(task, handler(task, 0.0))
+    engine.add_frame("pair", uploads[9].data, uploads[9].meta, -10)  # of the least priority
+    frame = engine.claim("w")
+    assert isinstance(frame, Work)
+    engine.run(frame)
+    assert isinstance(engine.claim("w"), LongJob)
+
+
+def test_cells_that_became_better_are_told(engine: Engine, work_off: WorkOff, rooms: Rooms) -> None:
+    how = WHOLE | {"session": "a"}
+    before = measured(engine, work_off, **how)
+    for frame in engine.list_frames("hall").items:
+        if frame.session == "b":
+            engine.delete_frame("hall", frame.frame_id)
+    after = measured(engine, work_off, **how)
+    told = engine.coverage.changes("hall", after.coverage_id, before.coverage_id)
+    assert (told.result_before, told.result_after) == (before.result, after.result)
+    assert (told.result_before.ambiguous, told.result_after.found) == (5, 5)
+    assert told.result_after.revision == told.result_before.revision + 5
+    (plan,) = told.plans
+    places = {(int(x // 0.5), int(y // 0.5)) for x, y, _ in rooms.positions[:10:2]}
+    assert {(cell.column, cell.row) for cell in plan.cells} == places
+    assert {cell.trend for cell in plan.cells} == {"better"}
+    assert told.trends == dict.fromkeys(told.trends, 0) | {"better": len(places)}
+    backwards = engine.coverage.changes("hall", before.coverage_id, after.coverage_id)
+    assert backwards.trends["worse"] == len(places)
+    # frames that were deleted since are in no list and are no look-alikes
+    whole = frames_of(engine, engine.coverage.get("hall", rooms.whole))
+    assert {frame.session for frame in whole} == {"a", "c"}
+    assert not any(frame.look_alikes for frame in whole)
+    wider = measured(engine, work_off, **(how | {"cell_m": 1.0}))
+    for other, why in ((rooms.whole, "session of"), (wider.coverage_id, "0.5 m and 1 m")):
+        with pytest.raises(InvalidRequest, match=why):
+            engine.coverage.changes("hall", other, before.coverage_id)
+
+
+def test_the_plan_is_drawn_in_the_colours_of_its_cells(engine: Engine, rooms: Rooms) -> None:
+    output = engine.coverage.picture("hall", rooms.whole)
+    pixels = np.asarray(Image.open(io.BytesIO(output.make())).convert("RGB"))
+    assert pixels.shape[1] == WIDTH
+    plan, legend = pixels[:-FOOTER], pixels[-FOOTER:]
+    shown = {name for name, colour in COLOURS.items() if (plan == colour).all(axis=2).sum() > 20}
+    assert shown == {"ambiguous"}
+    assert all((legend == colour).all(axis=2).any() for colour in COLOURS.values())
+    other = engine.coverage.picture("hall", rooms.whole, rooms.parents[1])
+    assert other.tag != output.tag
+    first = engine.coverage.frames("hall", rooms.whole, limit=1).items[0]
+    engine.delete_frame("hall", first.frame_id)
+    assert engine.coverage.picture("hall", rooms.whole).tag != output.tag
+    assert engine.coverage.picture("hall", rooms.whole, rooms.parents[1]).tag == other.tag
+    with pytest.raises(InvalidRequest, match="no plan of parent frame 'x'"):
+        engine.coverage.picture("hall", rooms.whole, "x")
+
+
+def test_what_cannot_be_measured_is_refused(
+    engine: Engine, work_off: WorkOff, rooms: Rooms
+) -> None:
+    with pytest.raises(UnknownMap):
+        engine.coverage.begin("none", NewMapCoverage())
+    with pytest.raises(InvalidRequest, match="no indexed frame of session 'z'"):
+        engine.coverage.begin("hall", NewMapCoverage(session="z"))
+    with pytest.raises(ValueError, match="leaves out the whole session already"):
+        NewMapCoverage(other_sessions=True, not_within_s=3.0)
+    queued = engine.coverage.begin("hall", NewMapCoverage(every=6))
+    for ask in (engine.coverage.picture, lambda *of: engine.coverage.changes(*of, of[1])):
+        with pytest.raises(NotIndexed, match="is queued"):
+            ask("hall", queued.coverage_id)
+    with pytest.raises(UnknownJob, match="no coverage"):
+        engine.coverage.get("pair", queued.coverage_id)
+    cancel(engine.store, queued.coverage_id)
+    assert engine.coverage.get("hall", queued.coverage_id).state is JobState.CANCELLED
+    assert work_off(engine) == []
+    listed = engine.coverage.list_all("hall", limit=1)
+    assert [one.coverage_id for one in listed.items] == [queued.coverage_id]
+    engine.coverage.remove("hall", queued.coverage_id)
+    rest = engine.coverage.list_all("hall", listed.next_cursor).items
+    assert rest == engine.coverage.list_all("hall").items
+    assert [one.coverage_id for one in rest] == [rooms.later_day, rooms.whole]
+
+
+def test_frames_that_went_meanwhile_are_skipped(
+    engine: Engine, work_off: WorkOff, due_now: Callable[[Engine], None]
+) -> None:
+    begun = engine.coverage.begin("hall", NewMapCoverage(session="c", not_within_s=0.0))
+    task = engine.claim("w")
+    assert isinstance(task, LongJob)
+    handler = CoverageHandler(engine.store, engine.signers, engine.queries)
+    engine.tasks._keep(task, handler(task, 0.0))
+    last = [one for one in engine.list_frames("hall").items if one.session == "c"][-1]
+    engine.delete_frame("hall", last.frame_id)
+    due_now(engine)
+    work_off(engine)
+    told = engine.coverage.get("hall", begun.coverage_id)
+    assert told.result is not None
+    assert (told.result.frames, told.result.skipped, told.result.found) == (3, 1, 3)
+    assert told.result.last_revision == told.result.revision + 1
