@@ -48,7 +48,7 @@ SHORT_ID = 8
 #: Path of what is said of an answer; no space is called so.
 SUMMARY: EntityPath = ("answer",)
 #: Diameters of points: the query's stand out of the surfaces that its matches share with it.
-_QUERY_POINT_M, _POINT_M = 0.024, 0.012
+_QUERY_POINT_M, _POINT_M = 0.024, 0.018
 #: Where a label stands over the sensor that it is of, metres along its up.
 _LABEL_M = 0.12
 
@@ -173,8 +173,10 @@ class _Drawing:
 
     def entities(self) -> list[SceneEntity]:
         """Query, alternatives and matches."""
-        where = [self._match(one) for one in placed(self._answer.matches)]
-        return [*self._query(), *self._alternatives(), *(one for found in where for one in found)]
+        found = [*self._query(), *self._alternatives()]
+        for number, match in enumerate(placed(self._answer.matches), start=1):
+            found += self._match(match, f"{number}")
+        return found
 
     def axes(self) -> list[SceneEntity]:
         """Which way is up in the query's space, where that is a sensor's own frame."""
@@ -218,8 +220,11 @@ class _Drawing:
             found += _sensor(path, some, self._camera, UNSURE, label)
         return found
 
-    def _match(self, match: Match) -> list[SceneEntity]:
-        """A match where the map has it, with the pose of the query that it votes for."""
+    def _match(self, match: Match, name: str) -> list[SceneEntity]:
+        """A match where the map has it, with the pose of the query that it votes for.
+
+        It is called after its place in the answer: so paths stay few over many answers.
+        """
         try:
             frame = self._client.frame(match.map, match.frame_id)
             points = self._client.frame_points(
@@ -227,7 +232,7 @@ class _Drawing:
             ).points
         except (NotFound, NotIndexed):  # deleted since, or being signed anew
             return []
-        path, placement = self._place_of_match(match, frame)
+        path, placement = self._place_of_match(match, frame, name)
         if path is None:
             return []
         colour, label = _look_of_match(match)
@@ -239,10 +244,9 @@ class _Drawing:
         return found
 
     def _place_of_match(
-        self, match: Match, frame: Frame
+        self, match: Match, frame: Frame, name: str
     ) -> tuple[EntityPath | None, Placement | None]:
         """The path of a match, and where it lies in its space; no path where it lies in none."""
-        name = f"rank {match.rank}"
         if frame.pose is not None:
             space = self._space(match.map, frame.pose.parent_frame)
             placement = Placement(np.array(frame.pose.matrix), frame.pose.child_frame)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,13 +25,15 @@ SESSIONS: tuple[Colour, Colour] = (QUERY, STRONG)
 
 #: Depth at which the outline of a camera's picture is drawn, and length of axes, metres.
 FRUSTUM_M, AXES_M = 0.25, 0.5
+#: The same of a sensor that is one of many, and the width of its lines and of edges, pixels.
+SMALL_M, THIN_PX = 0.1, 1.0
 #: Percentiles of height at the ends of the colours: stray points must not flatten all others.
 _RANGE = (1.0, 99.0)
 #: What height leaves of a colour: the map is the background.
 _DIMMED = 0.6
 
 
-def frustum(camera: CameraIntrinsics, colour: Colour) -> LineSet:
+def frustum(camera: CameraIntrinsics, colour: Colour, depth_m: float = FRUSTUM_M) -> LineSet:
     """The outline of what a camera sees, in its optical frame, with a tick at the upper edge.
 
     Lens distortion is left out.
@@ -38,25 +41,31 @@ def frustum(camera: CameraIntrinsics, colour: Colour) -> LineSet:
     columns = np.array([-0.5, camera.width - 0.5])
     rows = np.array([-0.5, camera.height - 0.5])
     (left, right), (top, bottom) = (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
-    corners = FRUSTUM_M * np.array(
+    corners = depth_m * np.array(
         [(left, top, 1.0), (right, top, 1.0), (right, bottom, 1.0), (left, bottom, 1.0)]
     )
     centre = np.zeros(3)
-    tick = (corners[0] + corners[1]) / 2 - np.array([0.0, 0.2 * FRUSTUM_M, 0.0])
+    tick = (corners[0] + corners[1]) / 2 - np.array([0.0, 0.2 * depth_m, 0.0])
     sides = [np.array([centre, corner]) for corner in corners]
     strips = [*sides, corners[[0, 1, 2, 3, 0]], np.array([corners[0], tick, corners[1]])]
     return LineSet(strips, [colour] * len(strips))
 
 
-def sensor_axes() -> LineSet:
+def sensor_axes(length_m: float = AXES_M) -> LineSet:
     """The axes of a sensor that is no camera: x red, y green, z blue."""
-    strips = [np.array([np.zeros(3), AXES_M * axis]) for axis in np.eye(3)]
+    strips = [np.array([np.zeros(3), length_m * axis]) for axis in np.eye(3)]
     return LineSet(strips, [(230, 60, 60), (70, 190, 70), (70, 110, 240)])
 
 
 def sensor_outline(camera: CameraIntrinsics | None, colour: Colour) -> LineSet:
     """A camera's frustum, or the axes of another sensor."""
     return sensor_axes() if camera is None else frustum(camera, colour)
+
+
+def small_outline(camera: CameraIntrinsics | None, colour: Colour) -> LineSet:
+    """As `sensor_outline`, of one sensor of many."""
+    drawn = sensor_axes(SMALL_M) if camera is None else frustum(camera, colour, SMALL_M)
+    return replace(drawn, width_px=THIN_PX)
 
 
 def height_colours(points: Floats, up: Floats) -> Bytes:

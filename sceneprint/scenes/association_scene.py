@@ -16,6 +16,7 @@ from sceneprint.scenes.appearance import (
     CONFIRMED,
     OUTVOTED,
     SESSIONS,
+    THIN_PX,
     TRACK,
     height_colours,
     plain_colours,
@@ -140,6 +141,6 @@ def _edge_entities(edges: itertools.islice[Edge], vertices: list[Vertex]) -> lis
             ends = np.array([np.array(one.matrix)[:3, 3] for one in (a, b)])
             strips[a.parent_frame, *kinds[edge.consistent]].append(ends)
     return [
-        SceneEntity((space, "edges", kind), LineSet(lines, [colour] * len(lines)))
+        SceneEntity((space, "edges", kind), LineSet(lines, [colour] * len(lines), THIN_PX))
         for (space, kind, colour), lines in strips.items()
     ]

@@ -20,6 +20,7 @@ from sceneprint.scenes.appearance import (
     TRACK,
     height_colours,
     sensor_outline,
+    small_outline,
     up_of_sensors,
 )
 from sceneprint.scenes.scene import (
@@ -218,7 +219,7 @@ def frames_scene(client: Client, frames: Sequence[Frame], up: Floats | None, mos
             path = (one.pose.parent_frame, "frames", one.frame_id)
             placement = Placement(np.array(one.pose.matrix), one.pose.child_frame)
             entities.append(SceneEntity(path, placement))
-            outline = sensor_outline(one.intrinsics, TRACK)
+            outline = small_outline(one.intrinsics, TRACK)
             entities.append(SceneEntity((*path, "sensor"), outline))
     return Moment(entities)
 

@@ -46,8 +46,8 @@ if TYPE_CHECKING:
 
 #: Time between moments whose frames have no time stamps.
 STEP_NS = 1_000_000_000
-#: Width of lines in pixels, and height of letters in metres.
-_LINE_PIXELS, _FONT_M = 2.0, 0.08
+#: Height of letters, metres.
+_FONT_M = 0.08
 #: A point: its position, and its colour.
 _POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 4)])
 
@@ -240,8 +240,8 @@ class McapWriter:
                 points = [m.Point3(x=x, y=y, z=z) for x, y, z in np.asarray(strip, float).tolist()]
                 lines.append(
                     m.LinePrimitive(
-                        pose=self._pose(np.eye(4)), thickness=_LINE_PIXELS, scale_invariant=True,
-                        points=points, color=self._colour(colour),
+                        pose=self._pose(np.eye(4)), points=points, color=self._colour(colour),
+                        thickness=content.width_px, scale_invariant=True,
                     )
                 )  # fmt: skip
         else:

@@ -45,8 +45,6 @@ _SCHEMES = ("rerun", "rerun+http", "rerun+https")
 _START_S, _CONNECT_S, _FLUSH_S = 60.0, 2.0, 60.0
 #: Timelines: frames in the order in which they were asked, and when they were taken.
 INDEX, TIME = "frame", "time"
-#: Width of lines, in the viewer's points, not metres.
-_LINE_POINTS = -1.5
 #: Radius of the dot that carries a label, metres.
 _DOT_M = 0.01
 _COORDINATES = {
@@ -235,7 +233,8 @@ class RerunWriter:
             return [rr.Points3D(content.points, colors=content.colours, radii=radius)]
         if isinstance(content, LineSet):
             strips = [np.asarray(one, np.float32) for one in content.strips]
-            return [rr.LineStrips3D(strips, colors=content.colours, radii=_LINE_POINTS)]
+            radius = -content.width_px / 2  # negative: of the screen, not metres
+            return [rr.LineStrips3D(strips, colors=content.colours, radii=radius)]
         if isinstance(content, TextLabel):
             return [
                 rr.Points3D(

@@ -34,7 +34,7 @@ class PointSet:
 
     points: Floats
     colours: Bytes
-    size_m: float = 0.015
+    size_m: float = 0.012
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +59,12 @@ class LineSet:
     ----------
     strips : each (M, 3) metres
     colours : of each strip
+    width_px : on the screen
     """
 
     strips: Sequence[Floats]
     colours: Sequence[Colour]
+    width_px: float = 2.0
 
 
 @dataclass(frozen=True, eq=False)
