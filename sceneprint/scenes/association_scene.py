@@ -22,10 +22,10 @@ from sceneprint.scenes.appearance import (
     plain_colours,
 )
 from sceneprint.scenes.map_scene import (
-    MAP_POINTS,
     PosedRun,
     evenly_taken,
     placed_points,
+    points_of_each,
     up_of_runs,
 )
 from sceneprint.scenes.scene import (
@@ -118,7 +118,7 @@ def _run_entities(
     path = (run.parent_frame, "sessions", run.name)
     entities = []
     if chosen:
-        limit = max(MAP_POINTS // (2 * len(chosen)), 1)
+        limit = points_of_each(2 * len(chosen))
         points = np.concatenate([placed_points(client, *one, limit) for one in chosen])
         colours = height_colours(points, up) if alone else plain_colours(len(points), colour)
         entities.append(SceneEntity((*path, "points"), PointSet(points, colours)))

@@ -36,6 +36,7 @@ from sceneprint.types import Floats
 from sceneprint_client import Client
 from sceneprint_client.api import Frame, FrameState
 from sceneprint_client.api.listing import Session
+from sceneprint_client.api.results import MOST_DRAWN
 
 #: Frames of a map whose points are drawn, unless another number is asked for.
 MAP_FRAMES = 120
@@ -157,7 +158,7 @@ def map_entities(
     entities = [SceneEntity((space,), UpAxis(up))]
     chosen = evenly_taken(runs, most)
     if chosen:
-        limit = max(MAP_POINTS // len(chosen), 1)
+        limit = points_of_each(len(chosen))
         clouds = [placed_points(client, *one, limit) for one in chosen]
         points = np.concatenate([*clouds, np.zeros((0, 3))])
         colours = height_colours(points, up)
@@ -167,6 +168,11 @@ def map_entities(
         path = (space, "map", "tracks", f"{number} {run.name}")
         entities.append(SceneEntity(path, LineSet([track], [TRACK])))
     return entities
+
+
+def points_of_each(frames: int) -> int:
+    """How many points are drawn of each of so many frames."""
+    return min(max(MAP_POINTS // frames, 1), MOST_DRAWN)
 
 
 def up_of_runs(runs: Sequence[PosedRun]) -> Floats:

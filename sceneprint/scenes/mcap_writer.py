@@ -1,16 +1,17 @@
 """Scenes for Foxglove: an MCAP file with messages of its schemas. The boundary to foxglove-sdk.
 
-PointSet   --> PointCloud on a topic of its own, which is the entity's path
-Placement  --> FrameTransforms on /tf, and PoseInFrame on a topic of its own
-LineSet, TextLabel  --> SceneUpdate, on a topic for each group of a space
-TextPage   --> Log on /log
+PointSet: PointCloud on a topic of its own, which is the entity's path
+Placement: FrameTransforms on /tf, and PoseInFrame on a topic of its own
+UpAxis: a frame above the space, named "SPACE upright", whose z points up
+LineSet, TextLabel: SceneUpdate, on a topic for each group of a space
+TextPage: Log on /log
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ from sceneprint.scenes.scene import (
     SceneEntity,
     TextLabel,
     TextPage,
+    UpAxis,
     space_of,
 )
 from sceneprint.types import Floats
@@ -108,14 +110,10 @@ def mcap_file(path: Path) -> Iterator[McapWriter]:
     with whole_file(path) as part:
         context, file = foxglove.Context(), _OutputFile(part)
         try:
-            output = foxglove.open_mcap(file, context=context)
-            try:
+            with closing(file), closing(foxglove.open_mcap(file, context=context)):
                 writer = McapWriter(context, file)
                 yield writer
                 writer.finish()
-            finally:
-                output.close()
-                file.close()
         except (OSError, RuntimeError) as error:  # foxglove's own say nothing of the cause
             why = file.error
             if why is None:
@@ -197,18 +195,14 @@ class McapWriter:
         m = self._messages
         transforms: list[FrameTransform] = []
         for one in entities:
-            if isinstance(one.content, Placement):
-                parent = self._frame_of(one.path[:-1])
-                pose = self._pose(one.content.T_parent_child)
+            if isinstance(one.content, UpAxis):
+                space, T = space_of(one.path), upright(one.content.up)
+                transforms.append(self._transform(f"{space} upright", space, T, now))
+            elif isinstance(one.content, Placement):
+                parent, T = self._frame_of(one.path[:-1]), one.content.T_parent_child
                 self._frames[one.path] = one.content.child
-                transforms.append(
-                    m.FrameTransform(
-                        timestamp=now, parent_frame_id=parent, child_frame_id=one.content.child,
-                        translation=self._vector(one.content.T_parent_child[:3, 3]),
-                        rotation=self._quaternion(one.content.T_parent_child),
-                    )
-                )  # fmt: skip
-                told = m.PoseInFrame(timestamp=now, frame_id=parent, pose=pose)
+                transforms.append(self._transform(parent, one.content.child, T, now))
+                told = m.PoseInFrame(timestamp=now, frame_id=parent, pose=self._pose(T))
                 self._log("PoseInFrame", (*one.path, "pose"), told)
         if transforms:
             self._log("FrameTransforms", ("tf",), m.FrameTransforms(transforms=transforms))
@@ -295,6 +289,13 @@ class McapWriter:
             self._channels[kind, topic] = make(topic, context=self._context)
         self._channels[kind, topic].log(message, log_time=self._log_time)
 
+    def _transform(self, parent: str, child: str, T: Floats, now: Timestamp) -> FrameTransform:
+        transform: FrameTransform = self._messages.FrameTransform(
+            timestamp=now, parent_frame_id=parent, child_frame_id=child,
+            translation=self._vector(T[:3, 3]), rotation=self._quaternion(T),
+        )  # fmt: skip
+        return transform
+
     def _timestamp(self) -> Timestamp:
         seconds, nanoseconds = divmod(self._log_time, 1_000_000_000)
         return self._messages.Timestamp(seconds, nanoseconds)
@@ -313,6 +314,17 @@ class McapWriter:
     def _colour(self, colour: Colour) -> Any:
         r, g, b = (value / 255 for value in colour)
         return self._messages.Color(r=r, g=g, b=b, a=1.0)
+
+
+def upright(up: Floats) -> Floats:
+    """T (4, 4) that turns a unit vector (3,) to z, which Foxglove draws upwards."""
+    level = np.zeros(3)
+    level[int(np.argmin(np.abs(up)))] = 1.0
+    level -= (level @ up) * up
+    level /= np.linalg.norm(level)
+    T = np.eye(4)
+    T[:3, :3] = level, np.cross(up, level), up
+    return T
 
 
 def _topic(path: EntityPath) -> str:

@@ -5,15 +5,17 @@ An entity lies at its path, and below a placement's path is its frame, as Rerun 
 
 from __future__ import annotations
 
-import errno
+import os
+import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -69,6 +71,58 @@ def require_rerun() -> None:
         ) from cause
 
 
+class RerunSink(Protocol):
+    """Where a recording goes."""
+
+    def open(self, stream: rr.RecordingStream) -> None:
+        """Lead the stream there; before anything is logged."""
+
+    def check(self) -> None:
+        """Raise the OSError that has kept it from being written, if any."""
+
+
+class _FileSink:
+    """A file, written through a pipe.
+
+    Where a disk is full, rerun-sdk waits for ever for its own writer; so that writes to a pipe, and
+    a thread of ours from there to the file.
+    """
+
+    def __init__(self, part: Path, path: Path) -> None:
+        self._part, self._path = part, path
+        self._thread: threading.Thread | None = None
+        self._error: OSError | None = None
+
+    def open(self, stream: rr.RecordingStream) -> None:
+        reader, writer = os.pipe()
+        self._thread = threading.Thread(target=self._copy, args=(reader,), daemon=True)
+        self._thread.start()
+        try:
+            stream.save(f"/dev/fd/{writer}")
+        finally:
+            os.close(writer)  # the stream has its own
+
+    def check(self) -> None:
+        if self._error is not None:
+            why = self._error
+            raise type(why)(why.errno, why.strerror, str(self._path)) from why
+
+    def close(self) -> None:
+        """Wait for the last bytes of a stream that is disconnected."""
+        if self._thread is not None:
+            self._thread.join()
+
+    def _copy(self, reader: int) -> None:
+        with open(reader, "rb", buffering=0) as pipe:
+            try:
+                with self._part.open("wb") as file:
+                    shutil.copyfileobj(pipe, file)
+            except OSError as error:
+                self._error = error
+                while pipe.read(1 << 20):  # nobody must wait for us
+                    pass
+
+
 @contextmanager
 def rerun_file(path: Path, title: str) -> Iterator[RerunWriter]:
     """A writer of an .rrd file, which is there when the block ends well and wrote something.
@@ -78,14 +132,28 @@ def rerun_file(path: Path, title: str) -> Iterator[RerunWriter]:
     OSError : it cannot be written; nothing is left behind.
     """
     with whole_file(path) as part:
-        writer = RerunWriter(title, lambda stream: stream.save(part))
+        sink = _FileSink(part, path)
+        writer = RerunWriter(title, sink)
         try:
             yield writer
             writer.finish()
-        except RuntimeError as error:  # of rerun-sdk, which names the cause in its text
-            raise OSError(errno.EIO, str(error), str(path)) from error
         finally:
             writer.stream.disconnect()
+            sink.close()
+        sink.check()
+
+
+class _ViewerSink:
+    """A viewer that runs."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+
+    def open(self, stream: rr.RecordingStream) -> None:
+        stream.connect_grpc(self._url)
+
+    def check(self) -> None:
+        pass  # a viewer that went away is noticed at the end
 
 
 @contextmanager
@@ -106,7 +174,7 @@ def rerun_viewer(url: str | None, title: str) -> Iterator[RerunWriter]:
         start_viewer()
     else:
         check_viewer(url)
-    writer = RerunWriter(title, lambda stream: stream.connect_grpc(url or VIEWER_URL))
+    writer = RerunWriter(title, _ViewerSink(url or VIEWER_URL))
     try:
         yield writer
         writer.finish()
@@ -184,13 +252,13 @@ class RerunWriter:
     Parameters
     ----------
     title : of the recording
-    open_sink : says where the stream goes; called once, before the first moment
+    sink : where it goes; opened before the first moment
     """
 
-    def __init__(self, title: str, open_sink: Callable[[rr.RecordingStream], None]) -> None:
+    def __init__(self, title: str, sink: RerunSink) -> None:
         import rerun as rr
 
-        self._rr, self._title, self._open_sink = rr, title, open_sink
+        self._rr, self._title, self._sink = rr, title, sink
         self.stream = rr.RecordingStream(APPLICATION)
         self.stream.set_log_tick_enabled(False)
         self.stream.set_log_time_enabled(False)
@@ -202,7 +270,7 @@ class RerunWriter:
         """Log a moment; see `SceneWriter`."""
         if not self._is_open:
             self._is_open = True
-            self._open_sink(self.stream)
+            self._sink.open(self.stream)
             self.stream.send_recording_name(self._title)
         static = moment.index is None
         if moment.index is not None:
@@ -215,6 +283,7 @@ class RerunWriter:
         for one in moment.entities:
             self._log(one.path, self._archetypes(one), static=static)
         self._show(moment)
+        self._sink.check()
 
     def finish(self) -> None:
         """Wait until all is written; RuntimeError where it cannot be."""
