@@ -9,6 +9,7 @@ alone. A query that is not found lies in a space of its own.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,11 +18,14 @@ import numpy as np
 
 from sceneprint.errors import NotFound, NotIndexed
 from sceneprint.scenes.appearance import (
+    MATCH_POINT_M,
     QUERY,
+    QUERY_POINT_M,
     STRONG,
     UNSURE,
     WEAK,
     plain_colours,
+    point_size,
     sensor_outline,
 )
 from sceneprint.scenes.map_scene import MAP_FRAMES, map_entities, map_runs
@@ -43,12 +47,11 @@ from sceneprint_client import Client
 from sceneprint_client.api import Answer, Frame, Match, Transform
 from sceneprint_client.api.frames import CameraIntrinsics
 
-#: Digits of a frame's id that stand for it in a scene.
+#: An id that the service made, and how many of its digits stand for it in a scene.
+_MADE_ID = re.compile(r"[0-9a-f]{32}", re.ASCII)
 SHORT_ID = 8
 #: Path of what is said of an answer; no space is called so.
 SUMMARY: EntityPath = ("answer",)
-#: Diameters of points: the query's stand out of the surfaces that its matches share with it.
-_QUERY_POINT_M, _POINT_M = 0.024, 0.018
 #: Where a label stands over the sensor that it is of, metres along its up.
 _LABEL_M = 0.12
 
@@ -140,8 +143,8 @@ def space_name(map_name: str, parent_frame: str, *, several: bool) -> str:
 
 
 def short_name(frame_id: str) -> str:
-    """What a stored frame is called in labels."""
-    return frame_id[:SHORT_ID]
+    """What a stored frame is called in labels: its id, of one that the service made the start."""
+    return frame_id[:SHORT_ID] if _MADE_ID.fullmatch(frame_id) else frame_id
 
 
 def placed(matches: Sequence[Match]) -> list[Match]:
@@ -194,9 +197,10 @@ class _Drawing:
         location = self._answer.location
         if location is not None:
             return self._space(location.map, location.pose.parent_frame), location.pose
-        for match in self._answer.matches:  # of a map without poses: in the frame of the best
-            if match.validation.status == "accepted" and match.transform is not None:
-                return match.transform.parent_frame, match.transform
+        if self._answer.status == "found":  # in a map without poses: in the frame of the best
+            for match in placed(self._answer.matches):
+                if match.transform is not None:
+                    return match.transform.parent_frame, match.transform
         return f"query.{'optical' if self._answer.kind == 'depth' else 'sensor'}", None
 
     def _query(self) -> list[SceneEntity]:
@@ -249,7 +253,8 @@ class _Drawing:
         """The path of a match, and where it lies in its space; no path where it lies in none."""
         if frame.pose is not None:
             space = self._space(match.map, frame.pose.parent_frame)
-            placement = Placement(np.array(frame.pose.matrix), frame.pose.child_frame)
+            child = space_name(match.map, frame.pose.child_frame, several=self._several)
+            placement = Placement(np.array(frame.pose.matrix), child)
             return (space, "matches", name), placement
         space, _ = self._query_space()
         if match.transform is not None and match.transform.parent_frame == space:
@@ -272,7 +277,8 @@ def _sensor(
 ) -> list[SceneEntity]:
     """Points, outline and label of a sensor, in its own frame."""
     colours = plain_colours(len(points), colour)
-    size_m = _QUERY_POINT_M if colour == QUERY else _POINT_M
+    base_m = QUERY_POINT_M if colour == QUERY else MATCH_POINT_M
+    size_m = point_size(base_m, cameras=camera is not None)
     above = np.array([0.0, -_LABEL_M, 0.0] if camera is not None else [0.0, 0.0, _LABEL_M])
     return [
         SceneEntity((*path, "points"), PointSet(points, colours, size_m)),

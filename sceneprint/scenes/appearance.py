@@ -27,6 +27,10 @@ SESSIONS: tuple[Colour, Colour] = (QUERY, STRONG)
 FRUSTUM_M, AXES_M = 0.25, 0.5
 #: The same of a sensor that is one of many, and the width of its lines and of edges, pixels.
 SMALL_M, THIN_PX = 0.1, 1.0
+#: Diameters of points, metres: the query's stand out of the surfaces that its matches share with
+#: it, and these out of the map. A scanner sees farther than a camera, so its points are larger.
+MAP_POINT_M, MATCH_POINT_M, QUERY_POINT_M = 0.012, 0.018, 0.024
+_SCANNERS_TIMES = 4.0
 #: Percentiles of height at the ends of the colours: stray points must not flatten all others.
 _RANGE = (1.0, 99.0)
 #: What height leaves of a colour: the map is the background.
@@ -66,6 +70,11 @@ def small_outline(camera: CameraIntrinsics | None, colour: Colour) -> LineSet:
     """As `sensor_outline`, of one sensor of many."""
     drawn = sensor_axes(SMALL_M) if camera is None else frustum(camera, colour, SMALL_M)
     return replace(drawn, width_px=THIN_PX)
+
+
+def point_size(base_m: float, *, cameras: bool) -> float:
+    """The diameter of points of cameras, or of scanners, metres."""
+    return base_m if cameras else _SCANNERS_TIMES * base_m
 
 
 def height_colours(points: Floats, up: Floats) -> Bytes:

@@ -14,12 +14,14 @@ import numpy as np
 from sceneprint.scenes.answer_scene import SUMMARY
 from sceneprint.scenes.appearance import (
     CONFIRMED,
+    MAP_POINT_M,
     OUTVOTED,
     SESSIONS,
     THIN_PX,
     TRACK,
     height_colours,
     plain_colours,
+    point_size,
 )
 from sceneprint.scenes.map_scene import (
     PosedRun,
@@ -69,7 +71,7 @@ def association_scene(client: Client, told: Association, text: str, most: int) -
         entities.append(SceneEntity((space,), UpAxis(up)))
         alone = len(told.asked.sessions) == 1
         for run in there:
-            colour = TRACK if alone else SESSIONS[_place(told, run.name)]
+            colour = TRACK if alone else SESSIONS[_names(told).index(run.name)]
             entities += _run_entities(client, run, up, colour, most // len(runs), alone=alone)
     edges = itertools.islice(client.edges(told.map, told.association_id), MOST_EDGES)
     entities += _edge_entities(edges, graph.vertices)
@@ -102,12 +104,9 @@ def _names(told: Association) -> list[str]:
 
 
 def _session_of(told: Association, vertex: Vertex) -> str:
-    names = _names(told)
-    return next((n for n in names if n in (vertex.session, f"{vertex.robot}/{vertex.session}")), "")
-
-
-def _place(told: Association, name: str) -> int:
-    return min(_names(told).index(name), len(SESSIONS) - 1)
+    """What the session of a vertex is called."""
+    names, known = _names(told), (vertex.session, f"{vertex.robot}/{vertex.session}")
+    return next((name for name in names if name in known), names[0])
 
 
 def _run_entities(
@@ -120,8 +119,9 @@ def _run_entities(
     if chosen:
         limit = points_of_each(2 * len(chosen))
         points = np.concatenate([placed_points(client, *one, limit) for one in chosen])
+        size_m = point_size(MAP_POINT_M, cameras=run.cameras)
         colours = height_colours(points, up) if alone else plain_colours(len(points), colour)
-        entities.append(SceneEntity((*path, "points"), PointSet(points, colours)))
+        entities.append(SceneEntity((*path, "points"), PointSet(points, colours, size_m)))
     track = np.array([T[:3, 3] for T in run.poses])
     return [*entities, SceneEntity((*path, "track"), LineSet([track], [colour]))]
 

@@ -17,8 +17,10 @@ import numpy as np
 from sceneprint.errors import NotFound, NotIndexed
 from sceneprint.geometry.pose.rigid import moved, rotation_of
 from sceneprint.scenes.appearance import (
+    MAP_POINT_M,
     TRACK,
     height_colours,
+    point_size,
     sensor_outline,
     small_outline,
     up_of_sensors,
@@ -162,7 +164,8 @@ def map_entities(
         clouds = [placed_points(client, *one, limit) for one in chosen]
         points = np.concatenate([*clouds, np.zeros((0, 3))])
         colours = height_colours(points, up)
-        entities.append(SceneEntity((space, "map", "points"), PointSet(points, colours)))
+        size_m = point_size(MAP_POINT_M, cameras=all(run.cameras for run in runs))
+        entities.append(SceneEntity((space, "map", "points"), PointSet(points, colours, size_m)))
     for number, run in enumerate(runs, start=1):
         track = np.array([T[:3, 3] for T in run.poses])
         path = (space, "map", "tracks", f"{number} {run.name}")
@@ -246,12 +249,12 @@ def frame_scene(client: Client, frame: Frame) -> Moment:
         T = np.array(frame.pose.matrix)
         path, up = (frame.pose.parent_frame, frame.frame_id), up_of_sensors([T], cameras=optical)
         entities.append(SceneEntity(path, Placement(T, frame.pose.child_frame)))
-    colours = height_colours(points, own_up)
+    colours, size_m = height_colours(points, own_up), point_size(MAP_POINT_M, cameras=optical)
     return Moment(
         [
             SceneEntity(path[:1], UpAxis(up)),
             *entities,
-            SceneEntity((*path, "points"), PointSet(points, colours)),
+            SceneEntity((*path, "points"), PointSet(points, colours, size_m)),
             SceneEntity((*path, "sensor"), sensor_outline(frame.intrinsics, TRACK)),
         ]
     )

@@ -185,7 +185,7 @@ class McapWriter:
                 self._log("Log", ("log",), text)
         for one in gone:
             if isinstance(one.content, PointSet):  # an empty cloud takes its place
-                nothing = PointSet(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+                nothing = PointSet(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), one.content.size_m)
                 self._log("PointCloud", one.path, self._cloud(one.path, nothing, now))
         if self._file.error is not None:
             raise self._file.error

@@ -34,7 +34,7 @@ class PointSet:
 
     points: Floats
     colours: Bytes
-    size_m: float = 0.012
+    size_m: float
 
 
 @dataclass(frozen=True, eq=False)

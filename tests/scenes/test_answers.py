@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sceneprint.formats.dataset import FrameReference
-from sceneprint.scenes.answer_scene import MANY, ONE, AnswerScene
+from sceneprint.scenes.answer_scene import MANY, ONE, AnswerScene, short_name, space_name
 from sceneprint.scenes.appearance import QUERY, STRONG, UNSURE
 from sceneprint.scenes.map_scene import evenly_taken, listed_runs, map_runs
 from sceneprint.scenes.scene import Moment, Placement, SceneEntity, SceneStream, TextPage
@@ -112,7 +112,7 @@ def test_alternatives_are_told_from_the_answer(
         for one, score in ((pose, 0.5), (other, None))
     ]
     unsure = answer.model_copy(
-        update={"status": "ambiguous", "location": None, "alternatives": rivals, "matches": []}
+        update={"status": "ambiguous", "location": None, "alternatives": rivals}
     )
     there = drawn(client, unsure).contents()
     space = pose.parent_frame
@@ -127,6 +127,13 @@ def test_alternatives_are_told_from_the_answer(
     assert set(map(tuple, points.colours.tolist())) == {UNSURE}
     assert 1000 < len(points.points) <= 2 * ONE.match
     assert there["query.optical/query/label"].text == "my frame: ambiguous"
+
+
+def test_names_that_people_gave_are_not_cut() -> None:
+    assert short_name("frame-000012") == "frame-000012"
+    assert short_name("0123456789abcdef" * 2) == "01234567"
+    assert space_name("hall", "map", several=False) == "map"
+    assert space_name("hall", "map", several=True) == "hall: map"
 
 
 def test_what_is_not_found_lies_in_a_space_of_its_own(client: Client, answer: Answer) -> None:

@@ -12,6 +12,7 @@ from sceneprint.scenes.appearance import (
     frustum,
     height_colours,
     nearest_axis,
+    point_size,
     sensor_outline,
     small_outline,
     up_of_sensors,
@@ -55,6 +56,11 @@ def test_colours_rise_with_height() -> None:
     assert abs(outlier[:101].astype(int) - colours).max() < 12
     assert height_colours(np.zeros((0, 3)), up).shape == (0, 3)
     assert len({tuple(one) for one in height_colours(np.ones((5, 3)), up).tolist()}) == 1
+
+
+def test_points_of_scanners_are_larger() -> None:
+    assert point_size(0.02, cameras=True) == 0.02
+    assert point_size(0.02, cameras=False) == 0.08
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,7 @@ def written(stream: SceneStream) -> None:
         Moment(
             [
                 SceneEntity(("my hall",), UpAxis(np.array([0.0, -1.0, 0.0]))),
-                SceneEntity(("my hall", "map", "points"), PointSet(POINTS, COLOURS)),
+                SceneEntity(("my hall", "map", "points"), PointSet(POINTS, COLOURS, 0.012)),
             ]
         )
     )
@@ -219,7 +219,7 @@ def test_a_full_disk_is_told_and_nothing_is_left(
     tmp_path: Path, write_to: Callable[[Path], AbstractContextManager[SceneWriter]]
 ) -> None:
     rng = np.random.default_rng(0)
-    cloud = PointSet(rng.uniform(size=(100_000, 3)), np.zeros((100_000, 3), np.uint8))
+    cloud = PointSet(rng.uniform(size=(100_000, 3)), np.zeros((100_000, 3), np.uint8), 0.01)
     path = tmp_path / "scene"
 
     def fill() -> None:
