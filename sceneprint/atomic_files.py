@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -38,6 +40,27 @@ def write_whole(path: Path, data: bytes) -> None:
     OSError : it cannot be written; nothing is left behind.
     """
     _put(path, data, durable=False)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A path beside it for a library that writes files itself, such as in several steps.
+
+    What lies there when the block ends takes the file's place; where nothing does, or the block
+    fails, all stays as it was, and nothing is left behind.
+
+    Raises
+    ------
+    OSError : it cannot be put there.
+    """
+    part = _beside(path)
+    try:
+        yield part
+        if part.exists():
+            os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
 
 
 def write_durable(path: Path, data: bytes, *, folder_is_new: bool = True) -> None:

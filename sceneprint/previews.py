@@ -170,11 +170,8 @@ def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
     z, shown = vista.of(vista.distances), vista.shown
     seen = z[shown]
     near, far = np.percentile(seen, _RANGE).tolist() if seen.size else (0.0, 0.0)
-    place = np.clip((far - z) / max(far - near, 1e-9), 0.0, 1.0) * (len(_VIRIDIS) - 1)
-    if vista.what == "height":
-        place = len(_VIRIDIS) - 1 - place
-    steps = np.arange(len(_VIRIDIS))
-    mixed = np.stack([np.interp(place, steps, _VIRIDIS[:, c]) for c in range(3)], axis=-1)
+    share = (far - z) / max(far - near, 1e-9)
+    mixed = viridis(1.0 - share if vista.what == "height" else share)
     ends, words = ("near_m", "far_m"), (f"{near:.2f} m or nearer", f"{far:.2f} m or farther")
     if vista.what == "height":
         ends, words = ("low_m", "high_m"), (f"{far:.2f} m or higher", f"{near:.2f} m or lower")
@@ -182,7 +179,15 @@ def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
         **dict(zip(ends, (f"{near:.4f}", f"{far:.4f}"), strict=True)),
         "Description": f"{vista.what}: yellow {words[0]}, violet {words[1]}, dark grey unknown",
     }
-    return np.where(shown[..., None], np.rint(mixed).astype(np.uint8), UNKNOWN), meaning
+    return np.where(shown[..., None], mixed, UNKNOWN), meaning
+
+
+def viridis(shares: Floats) -> Bytes:
+    """Colours (..., 3) of shares: violet at 0 and below, yellow at 1 and above."""
+    place = np.clip(shares, 0.0, 1.0) * (len(_VIRIDIS) - 1)
+    steps = np.arange(len(_VIRIDIS))
+    mixed = np.stack([np.interp(place, steps, _VIRIDIS[:, c]) for c in range(3)], axis=-1)
+    return np.rint(mixed).astype(np.uint8)
 
 
 def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:

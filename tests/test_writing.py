@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from sceneprint.atomic_files import sync_folder, write_durable, write_whole
+from sceneprint.atomic_files import sync_folder, whole_file, write_durable, write_whole
 
 
 @pytest.fixture
@@ -131,3 +131,24 @@ def test_a_folder_that_is_not_there_is_named(
     long = tmp_path / ("n" * 255)  # the longest name a file may have
     write(long, b"content")
     assert long.read_bytes() == b"content"
+
+
+def test_a_library_writes_beside_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"old")
+    with whole_file(path) as part:
+        part.write_bytes(b"new")
+        assert path.read_bytes() == b"old"
+        assert part.parent == tmp_path
+    assert path.read_bytes() == b"new"
+    with whole_file(path):
+        pass  # nothing was written, so nothing changes
+
+    def interrupted() -> None:
+        with whole_file(path) as part:
+            part.write_bytes(b"half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert [(one.name, one.read_bytes()) for one in tmp_path.iterdir()] == [("a", b"new")]

@@ -23,6 +23,7 @@ from sceneprint_client.api import (
 from sceneprint_client.api.base import checked
 from sceneprint_client.api.results import (
     COLOURS,
+    MOST_DRAWN,
     TRANSFORMS,
     MatchDetails,
     OverlayColour,
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from sceneprint_client.requests import FrameInput, MetaInput
+    from sceneprint_client.surface_points import SurfacePoints
 
 #: Most frames of a ranking that are compared with each other.
 _MOST_ALIKE = 200
@@ -241,6 +243,13 @@ class QueryMethods(ServiceConnection):
         NotIndexed : it was asked without validation.
         """
         return self._bytes(f"{query_path(query_id)}/cloud.ply")
+
+    def query_points(self, query_id: str, limit: int = MOST_DRAWN) -> SurfacePoints:
+        """The points of `query_cloud` as arrays, at most so many. Errors as of `query_cloud`."""
+        from sceneprint_client.surface_points import decode_points  # it takes numpy
+
+        path = f"{query_path(query_id)}/points"
+        return decode_points(self._bytes(path, params={"limit": limit}))
 
     def similarities(self, query_id: str, limit: int = 50) -> Similarities:
         """How alike a query and its nearest frames are, each to each.

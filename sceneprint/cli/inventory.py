@@ -10,11 +10,13 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+import numpy as np
 from pydantic_core import from_json
 
 from sceneprint.atomic_files import write_whole
 from sceneprint.cli.numbers import positive, whole_number
 from sceneprint.cli.options import add_service_options, one_line, open_client, up_of
+from sceneprint.cli.scenes import add_scene_options, check_scene, open_scene, wants_scene
 from sceneprint.errors import InvalidRequest
 from sceneprint.models import PRESETS
 from sceneprint_client.api.base import FrameState, JobState
@@ -24,6 +26,7 @@ from sceneprint_client.api.results import CLOUD_FRAMES, RECORD_STATUSES, VIEWS, 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from sceneprint.scenes.scene import SceneStream
     from sceneprint_client import Client
     from sceneprint_client.api import Frame, Job, Map
     from sceneprint_client.api.admin import Event
@@ -46,6 +49,7 @@ def add_frames(commands: Any) -> None:
     command.add_argument("frame_id", nargs="?", metavar="FRAME", help="id of one frame")
     _add_listing(command.add_argument_group("select frames or poses"))
     _add_files(command.add_argument_group("actions on one frame"))
+    add_scene_options(command)
     command.add_argument("--json", action="store_true", help="print JSON")
     add_service_options(command)
     command.set_defaults(run=run_frames)
@@ -116,9 +120,16 @@ def run_frames(options: argparse.Namespace) -> int:
         raise InvalidRequest(f"--{of_one[0]} applies to one frame. Give its id after the map.")
     if options.trajectory is not None and len(options.session or ()) != 1:
         raise InvalidRequest("--trajectory needs a session. Name it with --session.")
-    with open_client(options) as client:
+    if options.trajectory is not None and wants_scene(options):
+        raise InvalidRequest("--trajectory writes no scene. Run the command once for each.")
+    check_scene(options)
+    with open_client(options) as client, open_scene(options, f"frames {options.map}") as stream:
         if options.frame_id is not None:
-            _one(client, options)
+            frame = _one(client, options)
+            if stream is not None:
+                from sceneprint.scenes.map_scene import frame_scene
+
+                stream.write(frame_scene(client, frame))
         elif options.trajectory is not None:
             _trajectory(client, options)
         else:
@@ -128,7 +139,13 @@ def run_frames(options: argparse.Namespace) -> int:
                 parent_frame=options.parent_frame, captured_after=options.after,
                 captured_before=options.before, name=options.name, order=_order(options),
             )  # fmt: skip
-            _print_frames(itertools.islice(found, options.limit), as_json=options.json)
+            found = itertools.islice(found, options.limit)
+            if stream is None:
+                _print_frames(found, as_json=options.json)
+            else:
+                frames = list(found)
+                _print_frames(frames, as_json=options.json)
+                _show_frames(client, stream, frames, options)
     return 0
 
 
@@ -138,7 +155,30 @@ def _order(options: argparse.Namespace) -> Literal["asc", "desc", "taken"]:
     return "taken" if len(options.session or ()) == 1 else "asc"
 
 
-def _one(client: Client, options: argparse.Namespace) -> None:
+def _show_frames(
+    client: Client, stream: SceneStream, frames: list[Frame], options: argparse.Namespace
+) -> None:
+    """Write the scene of frames that are listed.
+
+    Raises
+    ------
+    InvalidRequest : none has a pose.
+    """
+    from sceneprint.scenes.map_scene import frames_scene
+
+    posed = [one for one in frames if one.pose is not None]
+    if not posed:
+        raise InvalidRequest(
+            "No listed frame has a pose, so a scene has no place for them. Name one FRAME."
+        )
+    if len(posed) < len(frames):
+        print(f"{len(frames) - len(posed)} frames without a pose are not shown", file=sys.stderr)
+    up = client.map(options.map).up
+    direction = None if up is None else np.array([up.x, up.y, up.z])
+    stream.write(frames_scene(client, posed, direction, options.map_frames))
+
+
+def _one(client: Client, options: argparse.Namespace) -> Frame:
     of = options.map, options.frame_id
     frame = client.frame(*of) if options.edit is None else client.edit_frame(*of, options.edit)
     makers = {
@@ -158,6 +198,7 @@ def _one(client: Client, options: argparse.Namespace) -> None:
         print(frame.model_dump_json(indent=None if options.json else 2))
     else:
         print("\n".join(f"wrote {path}" for path in written))
+    return frame
 
 
 def _trajectory(client: Client, options: argparse.Namespace) -> None:

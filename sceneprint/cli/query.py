@@ -7,7 +7,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,12 +27,21 @@ from sceneprint.cli.options import (
     setting,
     settings_of,
 )
+from sceneprint.cli.scenes import (
+    add_scene_options,
+    check_kept,
+    check_scene,
+    open_scene,
+    stamps_of,
+)
 from sceneprint.errors import DatasetError, FrameError, MissingDependency, TooLarge, UnknownFrame
 from sceneprint.formats.dataset import FrameReference
+from sceneprint_client.api.frames import CameraIntrinsics
 from sceneprint_client.api.query import MOST_OF_SEQUENCE
 from sceneprint_client.api.results import COLOURS, TRANSFORMS
 
 if TYPE_CHECKING:
+    from sceneprint.scenes.scene import SceneStream
     from sceneprint_client import Client
     from sceneprint_client.api import (
         Alternative,
@@ -144,6 +153,7 @@ def add_query(commands: Any) -> None:
     add_asking_options(command)
     add_prior_option(command)
     add_overlay_options(command)
+    add_scene_options(command)
     add_recording_options(command)
     add_service_options(command)
     command.set_defaults(run=run_query)
@@ -151,6 +161,8 @@ def add_query(commands: Any) -> None:
 
 def run_query(options: argparse.Namespace) -> int:
     """Ask; returns 2 where a frame could not be looked up."""
+    check_scene(options)
+    check_kept(options)
     references = query_frames(options)
     how = {**options_of(options), "stages": options.stages, "prior": options.prior}
     several = options.map == "*" or options.also
@@ -158,7 +170,8 @@ def run_query(options: argparse.Namespace) -> int:
         how["maps"] = "*" if options.map == "*" else [options.map, *options.also]
     check_overlay(options, len(references))
     failed = 0
-    with open_client(options) as client:
+    with open_client(options) as client, open_scene(options, f"query {options.map}") as stream:
+        scene = _answer_scene(client, stream, references, options)
         for reference in references:
             try:
                 answer = client.query(
@@ -168,15 +181,44 @@ def run_query(options: argparse.Namespace) -> int:
                 failed += 1
                 print(f"{one_line(reference.name)}: {one_line(str(error))}", file=sys.stderr)
                 continue
+            text = "\n".join([*answer_lines(reference.name, answer), *explained_lines(answer)])
             if options.json:
                 told = {"name": reference.name, **answer.model_dump(mode="json")}
                 print(json.dumps(told), flush=True)
             else:
-                lines = [*answer_lines(reference.name, answer), *explained_lines(answer)]
-                print("\n".join(lines), flush=True)
+                print(text, flush=True)
+            if scene is not None:
+                scene(reference, answer, text)
             if options.overlay is not None:
                 print(save_overlay(client, answer, options), file=sys.stderr)
     return 2 if failed else 0
+
+
+def _answer_scene(
+    client: Client, stream: SceneStream | None, references: Sequence[FrameReference],
+    options: argparse.Namespace,
+) -> Callable[[FrameReference, Answer, str], None] | None:  # fmt: skip
+    """What adds a frame's answer, and its text, to the scene; None where there is no scene."""
+    if stream is None:
+        return None
+    from sceneprint.scenes.answer_scene import MANY, ONE, AnswerScene
+
+    limits = ONE if len(references) == 1 else MANY
+    scene = AnswerScene(stream, client, limits, options.map_frames)
+    places = {one.path: place for place, one in enumerate(references)}
+    stamps = stamps_of(references)
+
+    def add(reference: FrameReference, answer: Answer, text: str) -> None:
+        place = places[reference.path]
+        camera = None
+        if reference.camera is not None:
+            k = reference.camera.intrinsics
+            camera = CameraIntrinsics(
+                width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy
+            )
+        scene.add(answer, one_line(reference.name), text, camera, place, stamps[place])
+
+    return add
 
 
 def query_frames(options: argparse.Namespace) -> list[FrameReference]:
@@ -351,6 +393,7 @@ def add_localize(commands: Any) -> None:
     add_up_option(command)
     add_asking_options(command)
     add_prior_option(command)
+    add_scene_options(command)
     add_recording_options(command)
     add_service_options(command)
     command.set_defaults(run=run_localize)
@@ -358,11 +401,14 @@ def add_localize(commands: Any) -> None:
 
 def run_localize(options: argparse.Namespace) -> int:
     """Ask; returns 1 where a frame is not found, and 2 where one could not be looked up."""
+    check_scene(options)
+    check_kept(options)
     every = [frame for one in sequences_at(options.path, options) for frame in one.frames]
     chosen = _frames_to_localize(options, every)
     how = {**options_of(options), "prior": options.prior}
     lost = failed = 0
-    with open_client(options) as client:
+    with open_client(options) as client, open_scene(options, f"localize {options.map}") as stream:
+        scene = _answer_scene(client, stream, chosen, options)
         for reference in chosen:
             before = _frames_before(options, every, reference)
             try:
@@ -377,11 +423,14 @@ def run_localize(options: argparse.Namespace) -> int:
                 print(f"{one_line(reference.name)}: {one_line(str(error))}", file=sys.stderr)
                 continue
             lost += there.status != "found"
+            text = "\n".join(localization_lines(reference.name, there))
             if options.json:
                 told = {"name": reference.name, **there.model_dump(mode="json")}
                 print(json.dumps(told), flush=True)
             else:
-                print("\n".join(localization_lines(reference.name, there)), flush=True)
+                print(text, flush=True)
+            if scene is not None:
+                scene(reference, client.answer(there.query_id), text)
     return 2 if failed else min(lost, 1)
 
 

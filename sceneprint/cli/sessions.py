@@ -19,6 +19,7 @@ from sceneprint.cli.options import (
     one_line,
     open_client,
 )
+from sceneprint.cli.scenes import add_scene_options, check_scene, open_scene
 from sceneprint.errors import DatasetError, InvalidRequest
 from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint_client.api import JobState
@@ -210,6 +211,7 @@ def add_associate(commands: Any) -> None:
         "--odometry", action="store_true", help="include edges between consecutive frames"
     )
     command.add_argument("--json", action="store_true", help="print JSON")
+    add_scene_options(command)
     add_service_options(command)
     command.set_defaults(run=run_associate)
 
@@ -228,10 +230,12 @@ def run_associate(options: argparse.Namespace) -> int:
         )
     if options.out is not None:  # it may take an hour
         check_writable(options.out)
+    check_scene(options)
     times = {"captured_after": options.after, "captured_before": options.before}
     wanted = {name: value for name, value in times.items() if value is not None}
     with (
         open_client(options) as client,
+        open_scene(options, f"associate {options.map}") as stream,
         tqdm(desc="associate", unit="frame", disable=None) as bar,
     ):
 
@@ -248,6 +252,11 @@ def run_associate(options: argparse.Namespace) -> int:
         if kind is not None and told.state is JobState.SUCCEEDED:
             graph = client.graph(options.map, told.association_id, kind, odometry=options.odometry)
             write_whole(options.out, graph.encode())
+        if stream is not None and told.state is JobState.SUCCEEDED:
+            from sceneprint.scenes.association_scene import association_scene
+
+            text = "\n".join(association_lines(told))
+            stream.write(association_scene(client, told, text, options.map_frames))
     print(told.model_dump_json() if options.json else "\n".join(association_lines(told)))
     if told.state is JobState.SUCCEEDED and options.out is not None and not options.json:
         print(f"wrote {options.out}")

@@ -11,12 +11,12 @@ import pytest
 from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
 from sceneprint.formats.points.ply_export import points_of
-from sceneprint.formats.points.web import HEADER, POINT
 from sceneprint.geometry.pose.rigid import moved
 from sceneprint.geometry.validation.inspection import STEP_COLOURS, patches_at
 from sceneprint.pipeline import Signature
 from sceneprint.types import Geometry
 from sceneprint_client.api import Answer, Query
+from sceneprint_client.surface_points import HEADER, POINT
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]

@@ -104,6 +104,9 @@ VIEWS: tuple[View, ...] = ("depth", "normals", "patches")
 WIDTHS = (64, 1280)
 WIDTH = 320
 
+#: Points of a surface that are sent to be drawn, unless another number is asked for.
+MOST_DRAWN = 20_000
+
 Triple = tuple[float, float, float]
 
 

@@ -27,25 +27,26 @@ Then, of each point:
 
 from __future__ import annotations
 
-import struct
-
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.types import Bytes, Floats, Floats32, Ints32
+from sceneprint_client.api.results import MOST_DRAWN
+from sceneprint_client.surface_points import (
+    HEADER,
+    MAGIC,
+    NO_PATCH,
+    NORMALS,
+    PATCHES,
+    POINT,
+    RESIDUALS,
+    VERSION,
+)
 
 MEDIA_TYPE = "application/vnd.sceneprint.points"
-MAGIC, VERSION = b"SPPT", 1
-NORMALS, PATCHES, RESIDUALS = 1, 2, 4
 NOT_COMPARED = 255
-NO_PATCH = 65535
 #: Points that are told by default, and at most.
-LIMIT, MOST = 20_000, 100_000
-
-HEADER = struct.Struct("<4sHHII3f3fIf")
-POINT = np.dtype(
-    [("position", "<u2", 3), ("patch", "<u2"), ("normal", "i1", 3), ("residual", "u1")]
-)
+LIMIT, MOST = MOST_DRAWN, 100_000
 
 Indices = NDArray[np.intp]
 

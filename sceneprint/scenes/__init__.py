@@ -1,0 +1,1 @@
+"""Answers and maps as scenes that Rerun and Foxglove draw."""

@@ -1,0 +1,287 @@
+"""Answers as moments of a scene: the query, its matches and its alternatives in their map.
+
+Answer  --AnswerScene.add-->  Moment
+
+Only what an answer supports is placed in the map: accepted and ambiguous matches with the poses
+that they vote for, and the answer's own pose or its alternatives. Rejected matches are in the text
+alone. A query that is not found lies in a space of its own.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneprint.errors import NotFound, NotIndexed
+from sceneprint.scenes.appearance import (
+    MATCH_POINT_M,
+    QUERY,
+    QUERY_POINT_M,
+    STRONG,
+    UNSURE,
+    WEAK,
+    plain_colours,
+    point_size,
+    sensor_outline,
+)
+from sceneprint.scenes.map_scene import MAP_FRAMES, map_entities, map_runs
+from sceneprint.scenes.scene import (
+    Colour,
+    EntityPath,
+    LineSet,
+    Moment,
+    Placement,
+    PointSet,
+    SceneEntity,
+    SceneStream,
+    TextLabel,
+    TextPage,
+    UpAxis,
+)
+from sceneprint.types import Floats
+from sceneprint_client import Client
+from sceneprint_client.api import Answer, Frame, Match, Transform
+from sceneprint_client.api.frames import CameraIntrinsics
+
+#: An id that the service made, and how many of its digits stand for it in a scene.
+_MADE_ID = re.compile(r"[0-9a-f]{32}", re.ASCII)
+SHORT_ID = 8
+#: Path of what is said of an answer; no space is called so.
+SUMMARY: EntityPath = ("answer",)
+#: Where a label stands over the sensor that it is of, metres along its up.
+_LABEL_M = 0.12
+
+
+@dataclass(frozen=True)
+class PointLimits:
+    """How many points of each frame of an answer are drawn.
+
+    Parameters
+    ----------
+    query : of the frame that was asked
+    match : of each match, and of the query at each alternative
+    """
+
+    query: int
+    match: int
+
+
+#: Of a single answer, and of each of many.
+ONE, MANY = PointLimits(20_000, 6_000), PointLimits(5_000, 1_500)
+
+
+class AnswerScene:
+    """Draws answers, and the maps that they are of where these first occur.
+
+    Parameters
+    ----------
+    stream : where to
+    client : that has asked
+    limits : of points
+    map_frames : frames of each map whose points are drawn; 0 for none
+    """
+
+    def __init__(
+        self, stream: SceneStream, client: Client, limits: PointLimits = ONE,
+        map_frames: int = MAP_FRAMES,
+    ) -> None:  # fmt: skip
+        self._stream, self._client = stream, client
+        self._limits, self._map_frames = limits, map_frames
+        self._drawn: set[str] = set()
+        self._axes: set[str] = set()
+
+    def add(
+        self, answer: Answer, name: str, text: str, camera: CameraIntrinsics | None,
+        index: int = 0, stamp_ns: int | None = None,
+    ) -> None:  # fmt: skip
+        """Add an answer as the next moment.
+
+        Parameters
+        ----------
+        answer : kept by the service, with the stage `validate`
+        name : of the frame that was asked
+        text : about the answer, for people
+        camera : of that frame; None of a cloud
+        index, stamp_ns : of the moment
+
+        Raises
+        ------
+        UnknownQuery : the answer is not kept, or no longer.
+        """
+        for map_name in _maps_of(answer):
+            if map_name not in self._drawn:
+                self._draw_map(map_name, several=len(answer.maps) > 1)
+        drawing = _Drawing(self._client, answer, name, camera, self._limits)
+        entities = [*drawing.entities(), SceneEntity(SUMMARY, TextPage(text))]
+        axes = [one for one in drawing.axes() if one.path[0] not in self._axes]
+        if axes:
+            self._axes |= {one.path[0] for one in axes}
+            self._stream.write(Moment(axes))
+        self._stream.write(Moment(entities, index, stamp_ns))
+
+    def _draw_map(self, map_name: str, *, several: bool) -> None:
+        self._drawn.add(map_name)
+        runs = map_runs(self._client, map_name)
+        parents = sorted({run.parent_frame for run in runs})
+        given = self._client.map(map_name).up
+        up = None if given is None else np.array([given.x, given.y, given.z])
+        for parent in parents:
+            of_parent = [run for run in runs if run.parent_frame == parent]
+            space = space_name(map_name, parent, several=several)
+            most = self._map_frames // len(parents)
+            self._axes.add(space)
+            self._stream.write(Moment(map_entities(self._client, of_parent, space, up, most)))
+
+
+def space_name(map_name: str, parent_frame: str, *, several: bool) -> str:
+    """What the space of a parent frame is called; of several maps, with the map's name."""
+    return f"{map_name}: {parent_frame}" if several else parent_frame
+
+
+def short_name(frame_id: str) -> str:
+    """What a stored frame is called in labels: its id, of one that the service made the start."""
+    return frame_id[:SHORT_ID] if _MADE_ID.fullmatch(frame_id) else frame_id
+
+
+def placed(matches: Sequence[Match]) -> list[Match]:
+    """Matches whose transform the evidence supports."""
+    return [one for one in matches if one.validation.status in ("accepted", "ambiguous")]
+
+
+def _maps_of(answer: Answer) -> list[str]:
+    """The maps that an answer places something in; where only one was asked, that one."""
+    if len(answer.maps) == 1:
+        return answer.maps
+    named = [one.map for one in placed(answer.matches)]
+    return list(dict.fromkeys(named))
+
+
+class _Drawing:
+    """One answer as entities."""
+
+    def __init__(
+        self, client: Client, answer: Answer, name: str, camera: CameraIntrinsics | None,
+        limits: PointLimits,
+    ) -> None:  # fmt: skip
+        self._client, self._answer, self._name = client, answer, name
+        self._camera, self._limits = camera, limits
+        self._several = len(answer.maps) > 1
+        self._points = np.zeros((0, 3))
+        with suppress(NotIndexed):  # asked without validation, so there are none
+            self._points = client.query_points(answer.query_id, limits.query).points
+
+    def entities(self) -> list[SceneEntity]:
+        """Query, alternatives and matches."""
+        found = [*self._query(), *self._alternatives()]
+        for number, match in enumerate(placed(self._answer.matches), start=1):
+            found += self._match(match, f"{number}")
+        return found
+
+    def axes(self) -> list[SceneEntity]:
+        """Which way is up in the query's space, where that is a sensor's own frame."""
+        if self._answer.location is not None:
+            return []
+        space, _ = self._query_space()
+        up = np.array([0.0, -1.0, 0.0] if self._answer.kind == "depth" else [0.0, 0.0, 1.0])
+        return [SceneEntity((space,), UpAxis(up))]
+
+    def _space(self, map_name: str | None, parent_frame: str) -> str:
+        return space_name(map_name or "", parent_frame, several=self._several)
+
+    def _query_space(self) -> tuple[str, Transform | None]:
+        """The space that the query lies in, and where; no pose where that is the query's own."""
+        location = self._answer.location
+        if location is not None:
+            return self._space(location.map, location.pose.parent_frame), location.pose
+        if self._answer.status == "found":  # in a map without poses: in the frame of the best
+            for match in placed(self._answer.matches):
+                if match.transform is not None:
+                    return match.transform.parent_frame, match.transform
+        return f"query.{'optical' if self._answer.kind == 'depth' else 'sensor'}", None
+
+    def _query(self) -> list[SceneEntity]:
+        space, pose = self._query_space()
+        path, label = (space, "query"), f"{self._name}: {self._answer.status.replace('_', ' ')}"
+        found = _sensor(path, self._points, self._camera, QUERY, label)
+        if pose is None:
+            return found
+        return [SceneEntity(path, Placement(np.array(pose.matrix), pose.child_frame)), *found]
+
+    def _alternatives(self) -> list[SceneEntity]:
+        """The poses of an ambiguous answer, none of which is the answer."""
+        found: list[SceneEntity] = []
+        some = self._points[:: max(len(self._points) // self._limits.match, 1)]
+        for number, one in enumerate(self._answer.alternatives, start=1):
+            path = (self._space(one.map, one.pose.parent_frame), "alternatives", f"{number}")
+            child = f"{one.pose.child_frame} alternative {number}"
+            score = "" if one.score is None else f", score {one.score:.2f}"
+            label = f"alternative {number}: weight {one.weight:.1f}{score}"
+            found.append(SceneEntity(path, Placement(np.array(one.pose.matrix), child)))
+            found += _sensor(path, some, self._camera, UNSURE, label)
+        return found
+
+    def _match(self, match: Match, name: str) -> list[SceneEntity]:
+        """A match where the map has it, with the pose of the query that it votes for.
+
+        It is called after its place in the answer: so paths stay few over many answers.
+        """
+        try:
+            frame = self._client.frame(match.map, match.frame_id)
+            points = self._client.frame_points(
+                match.map, match.frame_id, limit=self._limits.match
+            ).points
+        except (NotFound, NotIndexed):  # deleted since, or being signed anew
+            return []
+        path, placement = self._place_of_match(match, frame, name)
+        if path is None:
+            return []
+        colour, label = _look_of_match(match)
+        found = [] if placement is None else [SceneEntity(path, placement)]
+        found += _sensor(path, points, frame.intrinsics, colour, label)
+        if match.transform is not None:
+            vote = np.array([np.zeros(3), np.array(match.transform.matrix)[:3, 3]])
+            found.append(SceneEntity((*path, "vote"), LineSet([vote], [colour])))
+        return found
+
+    def _place_of_match(
+        self, match: Match, frame: Frame, name: str
+    ) -> tuple[EntityPath | None, Placement | None]:
+        """The path of a match, and where it lies in its space; no path where it lies in none."""
+        if frame.pose is not None:
+            space = self._space(match.map, frame.pose.parent_frame)
+            child = space_name(match.map, frame.pose.child_frame, several=self._several)
+            placement = Placement(np.array(frame.pose.matrix), child)
+            return (space, "matches", name), placement
+        space, _ = self._query_space()
+        if match.transform is not None and match.transform.parent_frame == space:
+            return (space, "matches", name), None
+        return None, None
+
+
+def _look_of_match(match: Match) -> tuple[Colour, str]:
+    """Colour and label of a match: rank, name, strength or status, overlap."""
+    v = match.validation
+    colour = STRONG if v.strength == "strong" else WEAK
+    if v.status == "ambiguous":
+        colour = UNSURE
+    overlap = "" if v.overlap is None else f" {v.overlap:.2f}"
+    return colour, f"#{match.rank} {short_name(match.frame_id)} {v.strength or v.status}{overlap}"
+
+
+def _sensor(
+    path: EntityPath, points: Floats, camera: CameraIntrinsics | None, colour: Colour, label: str
+) -> list[SceneEntity]:
+    """Points, outline and label of a sensor, in its own frame."""
+    colours = plain_colours(len(points), colour)
+    base_m = QUERY_POINT_M if colour == QUERY else MATCH_POINT_M
+    size_m = point_size(base_m, cameras=camera is not None)
+    above = np.array([0.0, -_LABEL_M, 0.0] if camera is not None else [0.0, 0.0, _LABEL_M])
+    return [
+        SceneEntity((*path, "points"), PointSet(points, colours, size_m)),
+        SceneEntity((*path, "sensor"), sensor_outline(camera, colour)),
+        SceneEntity((*path, "label"), TextLabel(above, label, colour)),
+    ]

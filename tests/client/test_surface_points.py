@@ -1,0 +1,85 @@
+"""Points out of the bytes that the service packs them in."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import InvalidRequest, NotIndexed, Refused
+from sceneprint.formats.dataset import FrameReference
+from sceneprint.formats.points.web import encode_points
+from sceneprint_client import Client
+from sceneprint_client.surface_points import decode_points
+
+#: All of these are numbers of 32 bits, so corners of a box of them are told exactly.
+CORNERS = np.array([[x, y, z] for x in (-1.5, 2.25) for y in (0.0, 8.0) for z in (0.125, 0.5)])
+
+
+def test_corners_are_exact_and_all_others_within_half_a_step() -> None:
+    rng = np.random.default_rng(1)
+    points = np.concatenate([CORNERS, rng.uniform(CORNERS.min(0), CORNERS.max(0), (200, 3))])
+    told = decode_points(encode_points(points, total=900))
+    np.testing.assert_array_equal(told.points[: len(CORNERS)], CORNERS)
+    half = np.ptp(CORNERS, axis=0) / 65535 / 2
+    assert (abs(told.points - points) <= half * (1 + 1e-9)).all()
+    assert (told.total, told.tolerance_m) == (900, 0.0)
+    assert told.normals is told.patches is told.residuals is None
+
+
+def test_what_is_told_of_points() -> None:
+    normals = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0.6, 0.8]])
+    patches = np.array([4, -1, 0], np.int32)
+    residuals = np.array([1, 250, 254], np.uint8)
+    told = decode_points(encode_points(np.eye(3), normals, patches, residuals, scale=0.25))
+    assert told.normals is not None
+    np.testing.assert_array_equal(told.normals[:2], normals[:2])
+    np.testing.assert_allclose(told.normals[2], normals[2], atol=0.5 / 127)
+    assert told.patches is not None
+    assert told.patches.tolist() == [4, -1, 0]
+    assert told.residuals is not None
+    assert told.residuals.tolist() == [1, 250, 254]
+    assert told.tolerance_m == 0.25
+    assert len(decode_points(encode_points(np.zeros((0, 3)))).points) == 0
+
+
+def test_bytes_that_are_no_points_are_refused() -> None:
+    data = encode_points(CORNERS)
+    for bad, why in (
+        (b"", "do not begin"),
+        (b"PNG!" + data[4:], "do not begin"),
+        (data[:47], "do not begin"),
+        (data[:-1], "143 bytes are not those of 8 points"),
+        (data + b"\0", "145 bytes are not those of 8 points"),
+        (data[:8] + struct.pack("<I", 2**32 - 1) + data[12:], "of 4294967295 points"),
+        (data[:4] + b"\2\0" + data[6:], "version 2"),
+        (data[:12] + b"\x10" + data[13:], "16 bytes a point"),
+    ):
+        with pytest.raises(Refused, match=why):
+            decode_points(bad)
+
+
+def test_points_of_frames_and_queries(
+    client: Client, map_name: str, references: tuple[FrameReference, ...]
+) -> None:
+    client.create_map(map_name)
+    frame_id = client.upload(map_name, references[0], wait_s=60).frame_id
+    cloud = client.cloud(map_name, frame_id).partition(b"end_header\n")[2]
+    exact = np.frombuffer(cloud, "<f4").reshape(-1, 6)[:, :3]
+    told = client.frame_points(map_name, frame_id)
+    assert told.total == len(told.points) == len(exact)
+    np.testing.assert_allclose(told.points, exact, atol=1e-4)
+    T = references[0].pose
+    assert T is not None
+    some = client.frame_points(map_name, frame_id, "parent", limit=50)
+    assert (some.points.shape, some.total) == ((50, 3), told.total)
+    back = (some.points - T[:3, 3]) @ T[:3, :3]
+    assert all(np.linalg.norm(told.points - one, axis=1).min() < 2e-4 for one in back)
+    with pytest.raises(InvalidRequest, match="no frame"):
+        client.frame_points(map_name, frame_id, "world")  # type: ignore[arg-type]
+    answer = client.query(map_name, references[0])
+    np.testing.assert_array_equal(client.query_points(answer.query_id).points, told.points)
+    unseen = client.query(map_name, references[0], stages=("retrieve",))
+    with pytest.raises(NotIndexed):
+        client.query_points(unseen.query_id)

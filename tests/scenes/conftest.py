@@ -1,0 +1,154 @@
+"""Readers of scenes, a real service with a map, and a way to run commands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from rerun.chunk import McapReader, RrdReader
+
+from sceneprint.cli import main
+from sceneprint.cli.demo import serving
+from sceneprint.formats.dataset import (
+    Camera,
+    FrameReference,
+    find_sequences,
+    write_depth_png,
+    write_intrinsics,
+    write_pose,
+)
+from sceneprint.scenes.scene import Moment, SceneEntity
+from sceneprint.types import DepthFrame
+from sceneprint_client import Client, meta_of
+
+MAP, WALK = "rooms", 8
+
+
+@dataclass
+class Logged:
+    """What a file has at one path and time: components by their names, one row each."""
+
+    path: str
+    index: int | None
+    time_ns: int | None
+    values: dict[str, Any]
+
+
+def _rows(reader: Any, index: str, time: str) -> Iterator[Logged]:
+    for chunk in reader.stream():
+        batch = chunk.to_record_batch()
+        for i in range(batch.num_rows):
+            row = {name: batch.column(name)[i] for name in batch.schema.names}
+            at = row.pop(time, None)
+            number = row.pop(index, None)
+            values = {
+                name: one.as_py() for name, one in row.items() if ":" in name and one.is_valid
+            }
+            yield Logged(
+                chunk.entity_path,
+                None if chunk.is_static or number is None else number.as_py(),
+                None if chunk.is_static or at is None else at.cast("int64").as_py(),
+                values,
+            )
+
+
+def rrd_rows(path: Path) -> list[Logged]:
+    """All of an .rrd file, in the order in which it was logged, but for what Rerun adds."""
+    rows = _rows(RrdReader(path), "frame", "time")
+    return [one for one in rows if not one.path.startswith("/__")]
+
+
+def mcap_rows(path: Path) -> list[Logged]:
+    """All messages of an MCAP file as Rerun understands them: a reader that is not Foxglove's."""
+    rows = _rows(McapReader(path), "no index", "message_log_time")
+    return [one for one in rows if not one.path.startswith("/__")]
+
+
+@dataclass
+class ListWriter:
+    """Keeps what it is given."""
+
+    moments: list[Moment] = field(default_factory=list)
+    gone: list[Collection[SceneEntity]] = field(default_factory=list)
+
+    def write(self, moment: Moment, gone: Collection[SceneEntity]) -> None:
+        self.moments.append(moment)
+        self.gone.append(gone)
+
+    def contents(self, moment: int = -1) -> dict[str, Any]:
+        """Contents of a moment by path."""
+        return {"/".join(one.path): one.content for one in self.moments[moment].entities}
+
+
+@pytest.fixture(scope="session")
+def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with serving(tmp_path_factory.mktemp("service"), 1) as url:
+        yield url
+
+
+@pytest.fixture(scope="session")
+def walk(building: Path) -> tuple[FrameReference, ...]:
+    """The first frames of a walk through a room, which the map has."""
+    return find_sequences(building / "room-0" / "seq-01")[0].frames[:WALK]
+
+
+@pytest.fixture(scope="session")
+def unseen(building: Path) -> tuple[FrameReference, ...]:
+    """Frames of the same walk that the map does not have."""
+    return find_sequences(building / "room-0" / "seq-02")[0].frames[:2]
+
+
+@pytest.fixture(scope="session")
+def client(
+    service_url: str, walk: tuple[FrameReference, ...], room_frames: tuple[DepthFrame, ...],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Client]:  # fmt: skip
+    """Of a service whose map MAP has a walk in `room`, and a frame in `yard`; only read."""
+    folder, far = tmp_path_factory.mktemp("yard"), room_frames[3]
+    assert far.pose is not None
+    write_intrinsics(folder, Camera(far.intrinsics))
+    write_depth_png(folder / "frame-000000.depth.png", far.depth, 1000.0)
+    write_pose(folder / "frame-000000.pose.txt", far.pose)
+    other = find_sequences(folder)[0].frames
+    with Client(service_url) as client:
+        client.create_map(MAP)
+        for space, frames in (("room", walk), ("yard", other)):
+            for one in frames:
+                client.upload(MAP, one, meta_of(one, session=space, parent_frame=space))
+        client.wait([one.job_id for one in client.frames(MAP)], timeout_s=240)
+        yield client
+
+
+class Said(NamedTuple):
+    """What a command printed."""
+
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def sceneprint(
+    service_url: str, client: Client, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[..., Said]:  # fmt: skip
+    """Runs a command in this process against the service and checks its exit code."""
+    monkeypatch.setenv("SCENEPRINT_URL", service_url)
+
+    def run(*arguments: object, expect: int = 0) -> Said:
+        capsys.readouterr()
+        code = main([str(one) for one in arguments])
+        said = Said(*capsys.readouterr())
+        assert code == expect, said
+        return said
+
+    return run
+
+
+def moved(T: Any, points: Any) -> Any:
+    """Points by a (4, 4), as text books have it."""
+    T = np.asarray(T, float)
+    return np.asarray(points, float) @ T[:3, :3].T + T[:3, 3]

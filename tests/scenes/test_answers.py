@@ -1,0 +1,224 @@
+"""What of an answer is placed where, against the service's own records and clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from sceneprint.formats.dataset import FrameReference
+from sceneprint.scenes.answer_scene import MANY, ONE, AnswerScene, short_name, space_name
+from sceneprint.scenes.appearance import QUERY, STRONG, UNSURE
+from sceneprint.scenes.map_scene import evenly_taken, listed_runs, map_runs
+from sceneprint.scenes.scene import Moment, Placement, SceneEntity, SceneStream, TextPage
+from sceneprint_client import Client, meta_of
+from sceneprint_client.api import Alternative, Answer
+
+from .conftest import MAP, ListWriter, moved
+
+
+@pytest.fixture(scope="module")
+def frame(unseen: tuple[FrameReference, ...]) -> FrameReference:
+    return unseen[0]
+
+
+@pytest.fixture(scope="module")
+def answer(client: Client, frame: FrameReference) -> Answer:
+    answer = client.query(MAP, frame)
+    assert answer.status == "found", answer.reason
+    assert answer.location is not None
+    return answer
+
+
+def drawn(client: Client, answer: Answer, map_frames: int = 3) -> ListWriter:
+    writer = ListWriter()
+    scene = AnswerScene(SceneStream([writer]), client, map_frames=map_frames)
+    camera = next(client.frames(MAP)).intrinsics
+    scene.add(answer, "my frame", "what is said", camera)
+    return writer
+
+
+def test_the_query_lies_where_the_answer_says(
+    client: Client, frame: FrameReference, answer: Answer
+) -> None:
+    writer = drawn(client, answer)
+    there = writer.contents()
+    assert answer.location is not None
+    space = answer.location.pose.parent_frame
+    placed = there[f"{space}/query"]
+    np.testing.assert_array_equal(placed.T_parent_child, answer.location.pose.matrix)
+    assert placed.child == "query.optical"
+    points = there[f"{space}/query/points"]
+    seen = client.query_points(answer.query_id).points
+    np.testing.assert_array_equal(points.points, seen)
+    assert set(map(tuple, points.colours.tolist())) == {QUERY}
+    assert there[f"{space}/query/label"].text == "my frame: found"
+    assert there["answer"].text == "what is said"
+    truth = frame.pose
+    assert np.linalg.norm(placed.T_parent_child - truth) < 0.05
+
+
+def test_matches_lie_where_the_map_has_them(
+    client: Client, frame: FrameReference, answer: Answer
+) -> None:
+    there = drawn(client, answer).contents()
+    placed = [m for m in answer.matches if m.validation.status in ("accepted", "ambiguous")]
+    assert len(placed) >= 2
+    assert answer.location is not None
+    space = answer.location.pose.parent_frame
+    for number, match in enumerate(placed, start=1):
+        path = f"{space}/matches/{number}"
+        record = client.frame(match.map, match.frame_id)
+        assert record.pose is not None
+        assert match.transform is not None
+        assert match.pose_in_map is not None
+        np.testing.assert_array_equal(there[path].T_parent_child, record.pose.matrix)
+        told = client.frame_points(MAP, match.frame_id, limit=ONE.match).points
+        np.testing.assert_array_equal(there[f"{path}/points"].points, told)
+        [vote] = there[f"{path}/vote"].strips  # from the match to where it puts the query
+        at = moved(record.pose.matrix, vote)
+        np.testing.assert_allclose(at[0], np.array(record.pose.matrix)[:3, 3], atol=1e-9)
+        np.testing.assert_allclose(at[1], np.array(match.pose_in_map.matrix)[:3, 3], atol=1e-6)
+        label = there[f"{path}/label"].text
+        assert label.startswith(f"#{match.rank} {match.frame_id[:8]} {match.validation.strength}")
+    assert f"{space}/matches/{len(placed) + 1}" not in there
+
+
+def test_rejected_matches_are_not_placed(
+    client: Client, frame: FrameReference, answer: Answer
+) -> None:
+    first, *others = answer.matches
+    verdict = first.validation.model_copy(update={"status": "rejected", "strength": None})
+    rejected = first.model_copy(update={"validation": verdict, "pose_in_map": None})
+    changed = answer.model_copy(update={"matches": [rejected, *others]})
+    before = drawn(client, answer).contents()
+    there = drawn(client, changed).contents()
+    children = [one.child for one in there.values() if isinstance(one, Placement)]
+    assert f"{first.frame_id}.optical" not in children
+    assert len(before) - len(there) == 5  # placement, points, sensor, label, vote
+
+
+def test_alternatives_are_told_from_the_answer(
+    client: Client, frame: FrameReference, answer: Answer
+) -> None:
+    assert answer.location is not None
+    pose = answer.location.pose
+    shifted = np.array(pose.matrix)
+    shifted[:3, 3] += (1.0, 2.0, 0.5)
+    other = pose.model_copy(update={"matrix": shifted.tolist()})
+    rivals = [
+        Alternative(pose=one, map=MAP, weight=1.4, support=2, score=score)
+        for one, score in ((pose, 0.5), (other, None))
+    ]
+    unsure = answer.model_copy(
+        update={"status": "ambiguous", "location": None, "alternatives": rivals}
+    )
+    there = drawn(client, unsure).contents()
+    space = pose.parent_frame
+    assert f"{space}/query" not in there
+    np.testing.assert_array_equal(there[f"{space}/alternatives/1"].T_parent_child, pose.matrix)
+    np.testing.assert_array_equal(there[f"{space}/alternatives/2"].T_parent_child, shifted)
+    one, two = (there[f"{space}/alternatives/{n}"].child for n in (1, 2))
+    assert one != two
+    assert there[f"{space}/alternatives/1/label"].text == "alternative 1: weight 1.4, score 0.50"
+    assert there[f"{space}/alternatives/2/label"].text == "alternative 2: weight 1.4"
+    points = there[f"{space}/alternatives/1/points"]
+    assert set(map(tuple, points.colours.tolist())) == {UNSURE}
+    assert 1000 < len(points.points) <= 2 * ONE.match
+    assert there["query.optical/query/label"].text == "my frame: ambiguous"
+
+
+def test_names_that_people_gave_are_not_cut() -> None:
+    assert short_name("frame-000012") == "frame-000012"
+    assert short_name("0123456789abcdef" * 2) == "01234567"
+    assert space_name("hall", "map", several=False) == "map"
+    assert space_name("hall", "map", several=True) == "hall: map"
+
+
+def test_what_is_not_found_lies_in_a_space_of_its_own(client: Client, answer: Answer) -> None:
+    lost = answer.model_copy(update={"status": "not_found", "location": None, "matches": []})
+    writer = drawn(client, lost)
+    there = writer.contents()
+    assert {path.partition("/")[0] for path in there} == {"query.optical", "answer"}
+    assert [one for one in there.values() if isinstance(one, Placement)] == []
+    assert writer.contents(-2)["query.optical"].up.tolist() == [0, -1, 0]
+
+
+def test_a_query_without_validation_has_no_points(client: Client, frame: FrameReference) -> None:
+    ranked = client.query(MAP, frame, stages=("retrieve",))
+    there = drawn(client, ranked, map_frames=0).contents()
+    assert len(there["query.optical/query/points"].points) == 0
+    assert there["query.optical/query/label"].text == "my frame: unvalidated"
+
+
+def test_the_map_is_drawn_once_and_where_its_frames_are(client: Client, answer: Answer) -> None:
+    writer = ListWriter()
+    scene = AnswerScene(SceneStream([writer]), client, MANY)
+    for index in (0, 3):
+        scene.add(answer, "my frame", "", None, index, 10**9 * index)
+    *maps, first, second = writer.moments
+    assert [one.index for one in maps] == [None] * len(maps)
+    assert [(one.index, one.stamp_ns) for one in (first, second)] == [(0, 0), (3, 3 * 10**9)]
+    spaces = {run.parent_frame for run in map_runs(client, MAP)}
+    assert len(maps) == len(spaces) == 2  # the rooms
+    for number in range(2):
+        there = writer.contents(number)
+        [space] = {path.partition("/")[0] for path in there}
+        frames = [f for f in client.frames(MAP) if f.pose and f.pose.parent_frame == space]
+        points = there[f"{space}/map/points"].points
+        expected = [client.frame_points(MAP, f.frame_id, "parent").points for f in frames]
+        assert len(points) == sum(map(len, expected))
+        low, high = (f(np.concatenate(expected), axis=0) for f in (np.min, np.max))
+        np.testing.assert_allclose((points.min(axis=0), points.max(axis=0)), (low, high), atol=1e-3)
+        [track] = (one for path, one in there.items() if "/tracks/" in path)
+        at = [np.array(f.pose.matrix)[:3, 3] for f in frames if f.pose is not None]
+        np.testing.assert_allclose(track.strips[0], at, atol=1e-5)
+        assert there[space].up.tolist() == [0, 0, 1]
+
+
+@pytest.fixture
+def unposed(client: Client, walk: tuple[FrameReference, ...]) -> Iterator[str]:
+    """A map of a frame without a pose."""
+    client.create_map("unposed")
+    client.upload("unposed", walk[0], meta_of(walk[0], with_pose=False), wait_s=120)
+    yield "unposed"
+    client.delete_map("unposed")
+
+
+def test_without_poses_the_query_lies_in_its_best_match(
+    client: Client, walk: tuple[FrameReference, ...], unposed: str
+) -> None:
+    answer = client.query(unposed, walk[1])
+    [match] = answer.matches
+    assert match.validation.status == "accepted"
+    assert match.transform is not None
+    writer = ListWriter()
+    AnswerScene(SceneStream([writer]), client).add(answer, "my frame", "", None)
+    there = writer.contents()
+    space = f"{match.frame_id}.optical"
+    np.testing.assert_array_equal(there[f"{space}/query"].T_parent_child, match.transform.matrix)
+    assert f"{space}/matches/1" not in there  # its frame is the space
+    assert set(map(tuple, there[f"{space}/matches/1/points"].colours.tolist())) <= {
+        STRONG, (120, 180, 255),
+    }  # fmt: skip
+    assert writer.contents(-2)[space].up.tolist() == [0, -1, 0]
+
+
+def test_frames_are_taken_evenly(client: Client) -> None:
+    runs = listed_runs(client.frames(MAP))
+    ids = [frame_id for run in runs for frame_id in run.frame_ids]
+    assert [one[1] for one in evenly_taken(runs, 100)] == ids
+    assert [one[1] for one in evenly_taken(runs, 3)] == [ids[0], ids[4], ids[8]]
+    assert evenly_taken(runs, 0) == evenly_taken([], 5) == []
+
+
+def test_a_moment_takes_the_place_of_the_one_before() -> None:
+    writer = ListWriter()
+    stream = SceneStream([writer])
+    assert stream.is_empty
+    a, b = (SceneEntity((name,), TextPage(name)) for name in "ab")
+    for moment in (Moment([a]), Moment([a, b], 0), Moment([]), Moment([b], 1), Moment([], 2)):
+        stream.write(moment)
+    assert [[one.path for one in gone] for gone in writer.gone] == [[], [], [], [("a",)], [("b",)]]
+    assert not stream.is_empty
