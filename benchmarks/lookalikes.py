@@ -19,7 +19,6 @@ import numpy as np
 from tqdm import tqdm
 
 from sceneprint.errors import UselessFrame
-from sceneprint.geometry.pose.rigid import rotation_of
 from sceneprint.lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
 from sceneprint.lab.evaluation.measures import answers
 from sceneprint.lab.evaluation.protocol import (
@@ -35,6 +34,7 @@ from sceneprint.localization import PosePrior
 from sceneprint.models import PRESETS, read_model
 from sceneprint.pipeline import Signer, open_signer, prepare
 from sceneprint.types import DepthFrame, Floats, Geometry
+from sceneprint_client.rotations import rotation_of
 
 #: From this overlap, smaller direction, a frame of the map is enough to answer a query.
 ANSWERABLE = 0.3

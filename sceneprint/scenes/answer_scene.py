@@ -142,8 +142,10 @@ def space_name(map_name: str, parent_frame: str, *, several: bool) -> str:
     return f"{map_name}: {parent_frame}" if several else parent_frame
 
 
-def short_name(frame_id: str) -> str:
-    """What a stored frame is called in labels: its id, of one that the service made the start."""
+def short_name(frame_id: str, name: str | None = None) -> str:
+    """What a stored frame is called in labels: its file, else the start of its id."""
+    if name:
+        return name.rpartition("/")[2]
     return frame_id[:SHORT_ID] if _MADE_ID.fullmatch(frame_id) else frame_id
 
 
@@ -269,7 +271,10 @@ def _look_of_match(match: Match) -> tuple[Colour, str]:
     if v.status == "ambiguous":
         colour = UNSURE
     overlap = "" if v.overlap is None else f" {v.overlap:.2f}"
-    return colour, f"#{match.rank} {short_name(match.frame_id)} {v.strength or v.status}{overlap}"
+    return (
+        colour,
+        f"#{match.rank} {short_name(match.frame_id, match.name)} {v.strength or v.status}{overlap}",
+    )
 
 
 def _sensor(

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.errors import NotFound, NotIndexed
-from sceneprint.geometry.pose.rigid import moved, rotation_of
+from sceneprint.geometry.pose.rigid import moved
 from sceneprint.scenes.appearance import (
     MAP_POINT_M,
     TRACK,
@@ -39,6 +39,7 @@ from sceneprint_client import Client
 from sceneprint_client.api import Frame, FrameState
 from sceneprint_client.api.listing import Session
 from sceneprint_client.api.results import MOST_DRAWN
+from sceneprint_client.rotations import rotation_of
 
 #: Frames of a map whose points are drawn, unless another number is asked for.
 MAP_FRAMES = 120
@@ -46,8 +47,8 @@ MAP_FRAMES = 120
 MAP_POINTS = 300_000
 #: Poses of one run that its line is drawn through.
 TRACK_POSES = 1000
-#: A run is in the order of capture, or where no frame says when, in that of arrival.
-CLOCKS: tuple[Literal["captured", "received"], ...] = ("captured", "received")
+#: A run is in the order in which it was taken, or where no frame says it, in that of arrival.
+CLOCKS: tuple[Literal["taken", "received"], ...] = ("taken", "received")
 #: Sessions, and frames without one, that are looked through for posed frames.
 MOST_LISTED = 1000
 

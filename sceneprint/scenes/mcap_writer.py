@@ -19,7 +19,6 @@ import numpy as np
 
 from sceneprint.atomic_files import whole_file
 from sceneprint.errors import MissingDependency
-from sceneprint.geometry.pose.rigid import quaternion_of
 from sceneprint.scenes.scene import (
     Colour,
     EntityPath,
@@ -34,6 +33,7 @@ from sceneprint.scenes.scene import (
     space_of,
 )
 from sceneprint.types import Floats
+from sceneprint_client.rotations import quaternion_of
 
 if TYPE_CHECKING:
     from foxglove.messages import (

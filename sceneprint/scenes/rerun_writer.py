@@ -22,7 +22,6 @@ import numpy as np
 
 from sceneprint.atomic_files import whole_file
 from sceneprint.errors import InvalidRequest, MissingDependency, Unreachable
-from sceneprint.geometry.pose.rigid import quaternion_of
 from sceneprint.scenes.scene import (
     EntityPath,
     LineSet,
@@ -35,6 +34,7 @@ from sceneprint.scenes.scene import (
     UpAxis,
     space_of,
 )
+from sceneprint_client.rotations import quaternion_of
 
 if TYPE_CHECKING:
     import rerun as rr

@@ -18,7 +18,6 @@ import rerun_cli
 from rerun.chunk import RrdReader
 
 from sceneprint.errors import InvalidRequest, Unreachable
-from sceneprint.geometry.pose.rigid import rotation_of
 from sceneprint.scenes.mcap_writer import mcap_file, upright
 from sceneprint.scenes.rerun_writer import check_viewer, rerun_file, rerun_viewer
 from sceneprint.scenes.scene import (
@@ -33,6 +32,7 @@ from sceneprint.scenes.scene import (
     TextPage,
     UpAxis,
 )
+from sceneprint_client.rotations import rotation_of
 
 from .conftest import Logged, mcap_rows, rrd_rows
 
