@@ -81,7 +81,9 @@ def test_matches_lie_where_the_map_has_them(
         np.testing.assert_allclose(at[0], np.array(record.pose.matrix)[:3, 3], atol=1e-9)
         np.testing.assert_allclose(at[1], np.array(match.pose_in_map.matrix)[:3, 3], atol=1e-6)
         label = there[f"{path}/label"].text
-        assert label.startswith(f"#{match.rank} {match.frame_id[:8]} {match.validation.strength}")
+        assert match.name is not None
+        name = match.name.rpartition("/")[2]
+        assert label.startswith(f"#{match.rank} {name} {match.validation.strength}")
     assert f"{space}/matches/{len(placed) + 1}" not in there
 
 

@@ -52,7 +52,7 @@ def test_a_query_is_shown_where_it_was_found(
             *(f"/room/matches/{n}/points" for n in range(1, len(placed) + 1)),
         }  # fmt: skip
     label = values(rows, "/room/matches/1/label", "Points3D:labels")
-    assert label[0].startswith(f"#{placed[0]['rank']} {placed[0]['frame_id'][:8]} ")
+    assert label[0].startswith(f"#{placed[0]['rank']} {Path(placed[0]['name']).name} ")
     text = values(rows, "/answer", "TextDocument:text")[0]
     assert f"{unseen[0].name}: found" in text
     # the query's frame, seen from the walk, lies on the room: on the truth to 5 cm
