@@ -108,8 +108,7 @@ class JobMethods(ServiceConnection):
         """
         cursor: str | None = None
         while True:
-            given = {"map": map_name, "cursor": cursor}
-            asked = {name: value for name, value in given.items() if value is not None}
+            asked = given(map=map_name, cursor=cursor)
             done = self._ask(RetriedJobs, "POST", "/v1/jobs/retry", params=asked)
             yield done
             cursor = done.next_cursor

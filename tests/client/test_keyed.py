@@ -71,7 +71,8 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Cl
 #: Arguments of every call by their names in its signature.
 GIVEN: dict[str, Any] = {
     "map_name": "hall", "name": "hall", "frame_id": ID, "job_id": ID, "query_id": ID,
-    "association_id": ID, "snapshot_id": ID, "session": "s", "changes": {"title": "x"},
+    "association_id": ID, "coverage_id": ID, "since": ID, "snapshot_id": ID, "session": "s",
+    "changes": {"title": "x"},
     "model": "depth", "grants": {"*": "read"}, "query": ID, "job_ids": [ID],
     "a": ("hall", ID), "b": ("hall", ID),
 }  # fmt: skip
@@ -89,11 +90,11 @@ def test_no_call_gets_by_without_a_key(
     own = GIVEN | {
         "frame": references[0], "frames": [references[0]], "archive": archive,
         "file": archive, "path": archive, "target": tmp_path / "target", "into": tmp_path / "into",
-        "association": None,
+        "association": None, "coverage": None,
     }  # fmt: skip
     asked = []
     for name, method in inspect.getmembers(Client, inspect.isfunction):
-        if name.startswith("_") or name in OPEN | {"wait_for_association"}:
+        if name.startswith("_") or name in OPEN | {"wait_for_association", "wait_for_coverage"}:
             continue
         needed = {
             one.name: own[one.name]
