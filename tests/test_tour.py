@@ -117,10 +117,11 @@ def test_there_are_other_ways_in(outputs: dict[str, list[str]]) -> None:
 
 @pytest.mark.thorough
 def test_frames_can_be_looked_at_and_edited(outputs: dict[str, list[str]]) -> None:
-    page, monday, posed = one(outputs, "Look around")
+    page, monday, posed, named = one(outputs, "Look around")
     assert len(page["items"]) == 2
     assert [f["session"] for f in monday["items"]] == ["monday"]
     assert [f["session"] for f in posed["items"]] == ["monday"]
+    assert all(f["name"].startswith("frame-0000") for f in named["items"])
     trajectory = outputs["Sessions and trajectories"][0]
     assert "1794821400.0 0.0 0.0 1.2 0.0 0.0 0.0 1.0" in trajectory
     edited, refused, titled = one(outputs, "Edit")

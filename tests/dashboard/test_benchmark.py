@@ -51,7 +51,7 @@ def test_pages_are_timed_and_weighed(browser, station, settle, open_page, monkey
     assert slow[0].seconds > 0.04  # an answer does not begin earlier
     assert json.loads(json.dumps(asdict(figures))) == asdict(figures)
     text = "\n".join(dashboard.table(figures))
-    assert f"| code of the first page, compressed | {figures.code / 1000:.1f} kB | 30 kB |" in text
+    assert f"| code of the first page, compressed | {figures.code / 1000:.1f} kB | 35 kB |" in text
     with pytest.raises(AssertionError, match="another canvas"):
         dashboard._figures(1, first, slow, both, {**drawn, "size": [1, 1]}, 60, gallery, shown)
 
