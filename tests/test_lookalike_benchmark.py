@@ -9,7 +9,8 @@ from benchmarks.lookalikes import Told, ask_site, prior_about, table
 from sceneprint.geometry.pose.rigid import difference
 from sceneprint.lab.evaluation.measures import upper_bound
 from sceneprint.lab.evaluation.protocol import Error, JudgedAnswer
-from sceneprint.pipeline import Signer
+from sceneprint.models import read_model
+from sceneprint.pipeline import Signer, open_signer
 
 
 def told(kind: str, number: int, answer: JudgedAnswer) -> Told:
@@ -73,3 +74,13 @@ def test_a_prior_is_off_by_as_much_as_asked_for() -> None:
     assert np.rad2deg(max(turns)) > 9.0
     assert {one.parent for one in priors} == {"object-000"}
     np.testing.assert_allclose(np.sqrt(np.diag(priors[0].covariance)), [0.3] * 3 + [np.pi / 18] * 3)
+
+
+@pytest.mark.thorough
+def test_a_prior_decides_between_places_that_look_alike() -> None:
+    signer = open_signer(read_model("depth"))
+    alone = ask_site(signer, ("object", 0, 2), seed=5)
+    assert [one.answer.status for one in alone] == ["ambiguous", "ambiguous"]
+    told_where = ask_site(signer, ("object", 0, 2), seed=5, prior=(0.0, 0.3))
+    assert [one.answer.status for one in told_where] == ["found", "found"]
+    assert max(one.answer.error.metres for one in told_where) < 0.1

@@ -20,7 +20,30 @@ _c = query_records.c
 
 
 @dataclass(frozen=True)
-class NewRecord:
+class _Recorded:
+    id: str
+    at: float
+    maps: Sequence[str] | None
+    robot: str | None
+    session: str | None
+    key_id: str | None
+    status: RecordStatus
+    cause: str | None
+    reason: str
+    pose_parent: str | None
+    pose: Sequence[float] | None
+    support: int | None
+    rival_ratio: float | None
+    alternatives: int
+    milliseconds: float
+    kind: Kind | None
+    frame_map: str | None
+    frame_id: str | None
+    kept: bool
+
+
+@dataclass(frozen=True)
+class NewRecord(_Recorded):
     """What came of a query.
 
     Parameters
@@ -41,53 +64,15 @@ class NewRecord:
     kept : whether the answer was to be kept
     """
 
-    id: str
-    at: float
     map: str
-    maps: tuple[str, ...] | None
-    robot: str | None
-    session: str | None
-    key_id: str | None
-    status: RecordStatus
-    cause: str | None
-    reason: str
-    pose_parent: str | None
-    pose: tuple[float, ...] | None
-    support: int | None
-    rival_ratio: float | None
-    alternatives: int
-    milliseconds: float
-    kind: Kind | None
-    frame_map: str | None
-    frame_id: str | None
-    kept: bool
 
 
 @dataclass(frozen=True)
-class RecordRow:
-    """A record; fields as in the table."""
+class RecordRow(_Recorded):
+    """A record as it is stored; fields as in NewRecord, and its number and that of its map."""
 
     number: int
-    id: str
-    at: float
     map_number: int
-    maps: list[str] | None
-    robot: str | None
-    session: str | None
-    key_id: str | None
-    status: RecordStatus
-    cause: str | None
-    reason: str
-    pose_parent: str | None
-    pose: list[float] | None
-    support: int | None
-    rival_ratio: float | None
-    alternatives: int
-    milliseconds: float
-    kind: Kind | None
-    frame_map: str | None
-    frame_id: str | None
-    kept: bool
 
 
 #: Characters of a reason; that of an answer has some 200.

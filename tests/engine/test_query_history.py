@@ -36,8 +36,10 @@ def record(number: int, **more: object) -> NewRecord:
     """A record of the query of a number; each came a second after the one before."""
     at = time.time() + number
     one = NewRecord(
-        f"{number:032x}", at, "hall", None, None, None, None, "not_found", "nothing_alike", "why",
-        None, None, None, None, 0, 12.5, "depth", None, None, False,
+        id=f"{number:032x}", at=at, map="hall", maps=None, robot=None, session=None, key_id=None,
+        status="not_found", cause="nothing_alike", reason="why", pose_parent=None, pose=None,
+        support=None, rival_ratio=None, alternatives=0, milliseconds=12.5, kind="depth",
+        frame_map=None, frame_id=None, kept=False,
     )  # fmt: skip
     return replace(one, **more)
 
@@ -65,9 +67,11 @@ def test_an_answer_and_a_failure_are_recorded_as_they_were(full, uploads):
     found = record_of(AskedQuery(["hall"], query, "spot", "monday", at=7.0), answer, 0.25)
     t, r = answer.location.pose.translation, answer.location.pose.rotation
     assert found == NewRecord(
-        answer.query_id, 7.0, "hall", None, "spot", "monday", None, "found", None, answer.reason,
-        one.room, (t.x, t.y, t.z, r.x, r.y, r.z, r.w), answer.location.support,
-        answer.location.rival_ratio, 0, 250.0, "depth", None, None, True,
+        id=answer.query_id, at=7.0, map="hall", maps=None, robot="spot", session="monday",
+        key_id=None, status="found", cause=None, reason=answer.reason, pose_parent=one.room,
+        pose=(t.x, t.y, t.z, r.x, r.y, r.z, r.w), support=answer.location.support,
+        rival_ratio=answer.location.rival_ratio, alternatives=0, milliseconds=250.0, kind="depth",
+        frame_map=None, frame_id=None, kept=True,
     )  # fmt: skip
     # the pose is where the frame was taken, and not just what the answer says
     assert found.pose[:3] == pytest.approx(one.pose[:3, 3], abs=0.03)
