@@ -251,3 +251,26 @@ def test_snapshots_are_taken_downloaded_and_deleted(station, page, settle, axe, 
     page.get_by_role("dialog").get_by_role("button", name="Delete").click()
     row.wait_for(state="detached")
     assert station.client.get("/v1/snapshots").json()["items"] == []
+
+
+@pytest.mark.thorough
+def test_a_stream_that_says_nothing_is_asked_for_again(station, page, settle, until):
+    asked = []
+
+    def hang(route):
+        if route.request.headers.get("accept") == "text/event-stream":
+            asked.append(route.request.url)  # and never answered
+        else:
+            route.continue_()
+
+    page.route("**/v1/events*", hang)
+    page.goto(f"{station.home}#/operations?tab=events")
+    settle(page)
+    until(lambda: len(asked) == 1)
+
+    def again():
+        page.wait_for_timeout(50)  # requests are told of while the page is waited for
+        return len(asked) >= 2
+
+    until(again)
+    assert page.locator("main .badge").first.inner_text() == "waiting"
