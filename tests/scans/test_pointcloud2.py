@@ -86,6 +86,17 @@ def test_what_a_sensor_missed_is_left_out(serialize: Any, points: np.ndarray) ->
         decode_scan(serialize(rows[:0]))
 
 
+def test_a_message_may_end_with_its_last_byte_and_no_earlier(
+    serialize: Any, points: np.ndarray
+) -> None:
+    rows = rows_of(points, LAYOUTS[0])
+    data = serialize(rows)
+    end = data.rindex(rows.tobytes()) + rows.nbytes + 1  # is_dense; what follows is padding
+    assert bytes(read_point_cloud(data[:end]).data) == rows.tobytes()
+    with pytest.raises(UnreadableCloud, match="ends early: 1 bytes are announced"):
+        read_point_cloud(data[: end - 1])
+
+
 def test_other_files_are_no_clouds(serialize: Any, points: np.ndarray) -> None:
     data = serialize(rows_of(points, LAYOUTS[0]))
     flat = serialize(np.zeros(3, [("x", "<f4"), ("y", "<f4")]))
