@@ -138,7 +138,9 @@ def ask_site(
             Candidate(j, j, database[j].scene, database[j].pose, 0.0, 0.0) for j in one.selection
         )
         rows = np.arange(len(database))
-        task = QueryTask(query.number, scene, query.pose, [], one.selection, among, rows)
+        task = QueryTask(
+            query.number, scene, query.pose, [], one.selection, among, rows, one.ranking
+        )  # fmt: skip
         believed = None if prior is None else prior_about(query.pose, site.name, *prior, rng)
         told.append(Told(site.name, kind, number, able[number], answer_of(judge, task, believed)))
     return told

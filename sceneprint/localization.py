@@ -11,7 +11,7 @@ nothing, the map alone may, if one pose explains the query far better than every
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -33,6 +33,7 @@ from sceneprint.geometry.validation.map_verification import (
     refined_starts,
     same_place,
     starts_about,
+    view_separations,
 )
 from sceneprint.geometry.validation.match_ranking import preferred
 from sceneprint.matches import PairMatch
@@ -66,6 +67,8 @@ class LocalizationParameters:
     prior_rival: float = 0.65  #: of its score that another pose near the prior may reach
     prior_share: float = 0.9  #: least score of that pose, beside the best anywhere
     most_noise: float = 0.2  #: violations of the map's own that are believed
+    rivals: int = 2  #: frames elsewhere that are compared before a pose is found, at most
+    rival_ranks: int = 10  #: ranks behind the last match for the pose that they may have in R
     map: MapParameters = field(default_factory=MapParameters)
 
 
@@ -308,6 +311,70 @@ def views_of_rows(
         )
 
     return views_of
+
+
+@dataclass(frozen=True, eq=False)
+class PosedFrame:
+    """A frame of the map: its parent frame, T_parent_sensor (4, 4), whether it looks along z."""
+
+    parent: str
+    T: Floats
+    ahead: bool
+
+
+def rival_rows(
+    estimate: PoseEstimate | None,
+    ranking: Sequence[int],
+    tried: Collection[int],
+    posed: Callable[[Sequence[int]], Mapping[int, PosedFrame]],
+    query_ahead: bool,
+    p: LocalizationParameters | None = None,
+) -> list[int]:
+    """The first of R that show another place than the one that is found.
+
+    Where two rooms are equal and were mapped from the same viewpoints, each signature is there
+    twice, and C keeps one of the two: all of C may be of the wrong room. So no pose is found
+    before frames elsewhere, which look like the query as those do that vote, were validated too.
+
+    Parameters
+    ----------
+    estimate : of `localize`
+    ranking : rows of R, nearest first
+    tried : rows that were validated
+    posed : describes those of some rows that have a pose
+    query_ahead : whether the query's sensor looks along z
+    p : see there
+
+    Returns
+    -------
+    rows : `p.rivals` at most; none where nothing is found, or where the prior decided
+    """
+    p = p or LocalizationParameters()
+    if estimate is None or estimate.average is None or estimate.verified_by == "prior":
+        return []
+    voters = estimate.members or tried
+    last = max((rank for rank, row in enumerate(ranking) if row in voters), default=-1)
+    untried = [row for row in ranking[: last + 1 + p.rival_ranks] if row not in tried]
+    known = {n: one for n, one in posed(untried).items() if one.parent == estimate.parent}
+    rows = [row for row in untried if row in known]
+    if not rows:
+        return []
+    poses = np.stack([known[row].T for row in rows])
+    ahead = np.array([known[row].ahead for row in rows])
+    apart = view_separations(poses, ahead, estimate.average.T, query_ahead, p.map)
+    return [row for row, far in zip(rows, apart >= 1.0, strict=True) if far][: p.rivals]
+
+
+def unconfirmed(estimate: PoseEstimate) -> PoseEstimate:
+    """A pose that was found, as ambiguous: frames that look alike elsewhere were not compared."""
+    if estimate.average is None:
+        return estimate
+    return replace(
+        estimate, status="ambiguous", average=None, covariance=None, strength=None,
+        verified_by=None, members=(), guided=0,
+        reason="the deadline passed before frames of another place that look alike were compared; "
+        "allow more time",
+    )  # fmt: skip
 
 
 _NONE = np.empty((0, 4, 4))
@@ -578,8 +645,10 @@ def _found(
     guided = sum(vote.match.validation.guided for vote in accepted)
     reason = _found_reason(average, len(accepted), guided, total, place.support, verified_by)
     strength: Strength = "strong" if place.strong else "weak"
+    score = None if place.scored is None else place.score
+    itself = AlternativePose(average.T, place.weight, place.support, score)
     return PoseEstimate(
-        "found", reason, parent, average, covariance, strength, verified_by, (), ratio,
+        "found", reason, parent, average, covariance, strength, verified_by, (itself,), ratio,
         total, tuple(vote.match.index for vote in accepted), guided,
     )  # fmt: skip
 

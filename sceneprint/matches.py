@@ -64,6 +64,7 @@ def associate(
     up_of: Callable[[int], Floats | None] = lambda _: None,
     pose_of: PoseOf = lambda _: None,
     known: Mapping[int, PairValidation] | None = None,
+    retry: bool = True,
 ) -> list[PairMatch]:
     """Candidates validated in the order of R until `k` are accepted: Sec. III-E.
 
@@ -85,6 +86,7 @@ def associate(
     pose_of : parent frame and T_parent_sensor (4, 4) of a row, None where it has no pose; default:
         none has, and every transform is searched for
     known : validations by row that are taken as they are
+    retry : whether the first few are tried in other ways where nothing is accepted
 
     Returns
     -------
@@ -127,7 +129,7 @@ def associate(
         accepted += validation.status == "accepted"
         if accepted == k:
             break
-    if not accepted and mode == "full":
+    if retry and not accepted and mode == "full":
         if up is not None:
             _retry_without_up(query, tried, open_geometry, seed, p, go_on)
         if all(match.validation.status != "accepted" for match in tried):

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,12 +27,15 @@ from sceneprint.lab.synth import KINECT, render, symmetric_box, synthesise_room
 from sceneprint.localization import (
     SAME_SURFACES_M,
     LocalizationParameters,
+    PosedFrame,
     PoseEstimate,
     PosePrior,
     QueryFrame,
     ViewsOf,
     is_expected,
     localize,
+    rival_rows,
+    unconfirmed,
     views_of_rows,
 )
 from sceneprint.matches import PairMatch, associate
@@ -106,7 +110,9 @@ def test_the_pose_of_a_match_leads_to_that_of_the_query(blank: Geometry) -> None
     np.testing.assert_allclose(found.average.T, turn @ shifted(2.0), atol=1e-12)
     assert (found.status, found.parent, found.votes, found.members) == ("found", "there", 1, (1,))
     assert found.reason == "one match gives the pose; one view, unconfirmed"
-    assert (found.rival_ratio, found.verified_by, found.alternatives) == (None, "matches", ())
+    assert (found.rival_ratio, found.verified_by) == (None, "matches")
+    [itself] = found.alternatives
+    assert (itself.T.tolist(), itself.weight, itself.support) == (found.average.T.tolist(), 1.0, 1)
 
 
 @pytest.mark.parametrize(
@@ -858,3 +864,61 @@ def test_a_prior_reaches_frames_within_sight_and_three_deviations() -> None:
     assert prior.reaches(pose)
     pose[0, 3] += 2e-6
     assert not prior.reaches(pose)
+
+
+# Frames elsewhere that look like the query
+
+#: Where eight frames stand side by side that look along z, 5 m apart.
+CORRIDOR = {row: shifted(5.0 * row) for row in range(8)}
+
+
+def corridor_rivals(
+    estimate: PoseEstimate | None, ranking: Sequence[int], tried: Sequence[int], *,
+    ahead: bool = True, **numbers: Any,
+) -> list[int]:  # fmt: skip
+    def posed(rows: Sequence[int]) -> dict[int, PosedFrame]:
+        parents = {**dict.fromkeys(CORRIDOR, ""), 6: "another floor"}
+        return {row: PosedFrame(parents[row], CORRIDOR[row], ahead) for row in rows if row != 7}
+
+    p = LocalizationParameters(**numbers)
+    return rival_rows(estimate, ranking, set(tried), posed, ahead, p)
+
+
+def test_rivals_are_the_first_of_the_ranking_elsewhere(blank: Geometry) -> None:
+    at_origin = by_pairs(blank, seen_at(0.0, [0, 1]))
+    assert at_origin is not None
+    assert at_origin.members == (0, 1)
+    # 0 stands there; 1 was tried; 6 is of another parent frame, 7 has no pose
+    ranking = [6, 7, 0, 1, 4, 2, 3, 5]
+    assert corridor_rivals(at_origin, ranking, [0, 1]) == [4, 2]
+    assert corridor_rivals(at_origin, ranking, [0, 1], rivals=9) == [4, 2, 3, 5]
+    assert corridor_rivals(at_origin, ranking, [0, 1, 4], rivals=9) == [2, 3, 5]
+    # one rank behind the last that votes
+    assert corridor_rivals(at_origin, ranking, [0, 1], rival_ranks=1) == [4]
+    assert corridor_rivals(at_origin, [2, 0, 4, 1, 3], [0, 1], rivals=9, rival_ranks=0) == [2, 4]
+    # frame 0 was not tried, but shows the same; sensors that look all around see 15 m far
+    assert corridor_rivals(at_origin, ranking, [1], rivals=9) == [4, 2, 3, 5]
+    assert corridor_rivals(at_origin, ranking, [0, 1], ahead=False, rivals=9) == [4, 3, 5]
+
+
+def test_rivals_are_asked_of_nothing_that_is_not_found(blank: Geometry) -> None:
+    assert corridor_rivals(None, [0, 1, 2, 3], []) == []
+    unsure = by_pairs(blank, [*seen_at(0.0, [0]), *seen_at(9.0, [1])])
+    assert unsure is not None
+    assert unsure.status == "ambiguous"
+    assert corridor_rivals(unsure, [0, 1, 2, 3], [0, 1]) == []
+    sure = by_pairs(blank, seen_at(0.0, [0, 1]))
+    assert sure is not None
+    assert corridor_rivals(replace(sure, verified_by="prior"), [0, 1, 2, 3], [0, 1]) == []
+
+
+def test_what_was_not_compared_is_ambiguous(blank: Geometry) -> None:
+    sure = by_pairs(blank, seen_at(4.0, [0, 1]))
+    assert sure is not None
+    assert sure.average is not None
+    told = unconfirmed(sure)
+    assert (told.status, told.average, told.strength, told.members) == ("ambiguous", None, None, ())
+    [pose] = told.alternatives
+    np.testing.assert_allclose(pose.T, shifted(4.0), atol=1e-12)
+    assert (pose.weight, pose.support) == (2.0, 2)
+    assert unconfirmed(told) is told

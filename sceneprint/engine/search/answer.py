@@ -32,6 +32,7 @@ from sceneprint.engine.search.verification import (
     nearest_first,
     placed,
     prior_of,
+    rivals,
     validated,
     wanted_of,
 )
@@ -40,7 +41,7 @@ from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.geometry.retrieval.distance import Ints64, pairwise_distances
 from sceneprint.geometry.retrieval.dpp import DiversityParameters, Selection, diversify
 from sceneprint.geometry.validation.validation import ValidationParameters
-from sceneprint.localization import PoseEstimate, PosePrior, QueryFrame
+from sceneprint.localization import PoseEstimate, PosePrior, QueryFrame, unconfirmed
 from sceneprint.matches import PairMatch, searched
 from sceneprint.models import Model
 from sceneprint.store import Store
@@ -86,6 +87,8 @@ class _Attempt:
     tried : what validation made of them
     rows : of the frames that are shown, by number
     matches : those that were tried and are still there
+    rivals : the same of frames beyond `chosen`, which show another place than the one found
+    late : whether the deadline came before the last of these
     """
 
     asked: PreparedQuery
@@ -97,6 +100,8 @@ class _Attempt:
     tried: Validated
     rows: dict[int, FrameRow]
     matches: list[PairMatch]
+    rivals: list[PairMatch] = field(default_factory=list)
+    late: bool = False
 
 
 def answer(
@@ -129,15 +134,63 @@ def answer(
     if asked.geometry is not None:
         attempts = [*before, last]
         poses = [*(one.T for one in earlier), np.eye(4)]
-        estimate = _placed(store, attempts, poses, prior, p, query)
-        if estimate is not None and estimate.status != "found":
-            # guided matches are no votes: what these would say may decide
-            again = [_searched(store, one, query, deadline, p) for one in attempts]
-            if again != attempts:
-                last = again[-1]
-                estimate = _placed(store, again, poses, prior, p, query)
+        estimate, last = _decided(store, attempts, poses, prior, p, query, deadline)
         clock.stage("locate")
     return _answer(store, places, model, last, estimate, query, deadline, clock, len(before))
+
+
+def _decided(
+    store: Store, attempts: list[_Attempt], poses: Sequence[Floats], prior: PosePrior | None,
+    p: ValidationParameters, query: Query, deadline: Deadline,
+) -> tuple[PoseEstimate | None, _Attempt]:  # fmt: skip
+    """Where the last frame was taken, and it with all that was validated to decide that."""
+
+    def decide() -> PoseEstimate | None:
+        return _placed(store, attempts, poses, prior, p, query)
+
+    def search_for_guided() -> PoseEstimate | None:
+        """Guided matches are no votes: what these would say may decide."""
+        again = [_searched(store, one, query, deadline, p) for one in attempts]
+        if again == attempts:
+            return estimate
+        attempts[:] = again
+        return decide()
+
+    estimate = decide()
+    if estimate is not None and estimate.status != "found":
+        estimate = search_for_guided()
+    attempts[-1] = _with_rivals(store, attempts[-1], estimate, query, deadline, p)
+    if attempts[-1].rivals:
+        estimate = decide()
+        if estimate is not None and estimate.status != "found":
+            estimate = search_for_guided()
+    if attempts[-1].late and estimate is not None:
+        estimate = unconfirmed(estimate)
+    return estimate, attempts[-1]
+
+
+def _with_rivals(
+    store: Store, last: _Attempt, estimate: PoseEstimate | None, query: Query, deadline: Deadline,
+    p: ValidationParameters,
+) -> _Attempt:  # fmt: skip
+    """The last frame, with frames validated that look like it elsewhere."""
+    if last.asked.geometry is None:
+        return last
+    more = rivals(
+        store, last.searched, last.tried, estimate, last.asked.geometry, query, deadline, p,
+        last.asked.up,
+    )  # fmt: skip
+    if more is None:
+        return last
+    with store.queried.read() as connection:
+        rows = frames_of(connection, [one.index for one in more.matches])
+    return replace(
+        last,
+        tried=replace(last.tried, geometries=last.tried.geometries | more.geometries),
+        rows=last.rows | rows,
+        rivals=[one for one in more.matches if one.index in rows],
+        late=bool(more.late),
+    )
 
 
 def _placed(
@@ -146,7 +199,7 @@ def _placed(
 ) -> PoseEstimate | None:  # fmt: skip
     """Where the last frame of a query was taken, by those at poses T_query_sensor."""
     frames = [
-        QueryFrame(one.asked.geometry, one.matches, T)
+        QueryFrame(one.asked.geometry, [*one.matches, *one.rivals], T)
         for one, T in zip(attempts, poses, strict=True)
         if one.asked.geometry is not None
     ]
@@ -171,6 +224,7 @@ def _searched(
     if tried.late:
         return attempt
     matches = [one for one in tried.matches if one.index in attempt.rows]
+    tried = replace(tried, geometries=attempt.tried.geometries | tried.geometries)
     return replace(attempt, tried=tried, matches=matches)
 
 
@@ -205,7 +259,11 @@ def _answer(
 ) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
     """What is told of the frame that was asked for."""
     asked, searched, tried, p = last.asked, last.searched, last.tried, model.parameters.validation
-    ranking, matches = searched.ranking, last.matches
+    ranking = searched.ranking
+    # what was rejected elsewhere is no match of anyone's
+    rivals_left = [one for one in last.rivals if one.validation.status != "rejected"]
+    matches = [*last.matches, *rivals_left]
+    chosen = [*last.chosen, *(ranking.indices.tolist().index(one.index) for one in rivals_left)]
     names = {place.row.number: place.row.name for place in places}
     own = query_sensor(_name(asked), asked.kind, list(names.values()))
     found = Candidates(
@@ -214,7 +272,8 @@ def _answer(
     )  # fmt: skip
     explanations = explained = None
     if query.explain:
-        explanations = explain(found, tried, last.among, last.scales)
+        compared = replace(tried, matches=[*tried.matches, *last.rivals])
+        explanations = explain(found, compared, last.among, last.scales)
     if query.explain_frame is not None:
         asking = ExplainedQuery(store, searched, asked, query, found, tried, model, deadline)
         explained = why(asking, query.explain_frame)
@@ -234,7 +293,7 @@ def _answer(
         status=outcome.status,
         reason=outcome.reason,
         cause=outcome.cause,
-        matches=match_records(found, last.chosen, matches),
+        matches=match_records(found, chosen, matches),
         location=location_record(found, estimate) if outcome.status == "found" else None,
         alternatives=alternative_records(found, estimate) if outcome.status == "ambiguous" else [],
         seed=query.seed,
@@ -248,7 +307,7 @@ def _answer(
         kind=asked.kind,
         frames=1 + earlier,
         per_map=_per_map(places, counts) if len(places) > 1 else None,
-        deadline_reached=tried.late,
+        deadline_reached=None if tried.late is None else tried.late or last.late,
         replica_behind_s=behind_s(),
         explanations=explanations,
         explained_frame=explained,

@@ -142,10 +142,11 @@ def _match(
     validation: ToldValidation,
 ) -> ToldMatch:
     row, gain = found.rows[number], None
-    selected = None if found.selection is None else True
+    selected = None
     if found.selection is not None:
-        place = found.selection.indices.tolist().index(position)
-        gain = float(found.selection.gains[place])
+        places = found.selection.indices.tolist()
+        selected = position in places
+        gain = float(found.selection.gains[places.index(position)]) if selected else None
     T = None if tried is None else tried.T_match_query
     in_map: Floats | None = None
     if T is not None and row.pose is not None and validation.status != "rejected":

@@ -26,10 +26,12 @@ from sceneprint.geometry.validation.validation import PairValidation, Validation
 from sceneprint.localization import (
     SAME_SURFACES_M,
     LocalizationParameters,
+    PosedFrame,
     PoseEstimate,
     PosePrior,
     QueryFrame,
     localize,
+    rival_rows,
 )
 from sceneprint.matches import PairMatch, associate
 from sceneprint.store import Store
@@ -100,7 +102,7 @@ def thresholds(
 def validated(
     store: Store, searched: Searched, chosen: Sequence[int], geometry: Geometry | None,
     query: Query, deadline: Deadline, p: ValidationParameters, up: Floats | None = None,
-    known: Mapping[int, PairValidation] | None = None,
+    known: Mapping[int, PairValidation] | None = None, retry: bool = True,
 ) -> Validated:  # fmt: skip
     """Try candidates in the order of R.
 
@@ -115,6 +117,7 @@ def validated(
     up : (3,) in the query's sensor, where it is known
     known : validations of an earlier pass, by number; every other candidate is searched now.
         None: candidates may be guided
+    retry : see `associate`
     """
     if geometry is None:
         return Validated(chosen, [], {}, NOT_ASKED, deadline.reached)
@@ -145,7 +148,7 @@ def validated(
     matches = associate(
         geometry, ranking, chosen, open_geometry, query.k, query.seed,
         *thresholds(query.validation, p), deadline.allows, up=up, up_of=ups.get, pose_of=pose_of,
-        known=known,
+        known=known, retry=retry,
     )  # fmt: skip
     owner = dict(zip(ranking.indices.tolist(), searched.owners.tolist(), strict=True))
     for i, part in enumerate(searched.parts):
@@ -158,6 +161,45 @@ def validated(
         else "enough matches were accepted before it"
     )
     return Validated(chosen, matches, unreadable, untried, late, opened)
+
+
+def rivals(
+    store: Store, searched: Searched, tried: Validated, estimate: PoseEstimate | None,
+    geometry: Geometry, query: Query, deadline: Deadline, p: ValidationParameters,
+    up: Floats | None,
+) -> Validated | None:  # fmt: skip
+    """Validate frames that look like the query and show another place than the one that is found.
+
+    Parameters
+    ----------
+    estimate : of `placed`, with the matches of `tried`
+    store, searched, tried, geometry, query, deadline, p, up : see `validated`
+
+    Returns
+    -------
+    found : see `sceneprint.localization.rival_rows`; None where there are none, and in mode `paper`
+    """
+    if query.validation is not None and query.validation.mode == "paper":
+        return None
+    ranking = searched.ranking.indices.tolist()
+
+    def posed(numbers: Sequence[int]) -> dict[int, PosedFrame]:
+        with store.queried.read() as connection:
+            rows = frames_of(connection, numbers)
+        return {
+            number: PosedFrame(parent_key(row), np.array(row.pose), row.cloud is None)
+            for number, row in rows.items()
+            if row.pose is not None
+        }
+
+    before = {match.index for match in tried.matches}
+    numbers = rival_rows(estimate, ranking, before, posed, looks_ahead(geometry))
+    if not numbers:
+        return None
+    chosen = [ranking.index(number) for number in numbers]
+    return validated(
+        store, searched, chosen, geometry, query, deadline, p, up, known={}, retry=False
+    )  # fmt: skip
 
 
 #: Frames that are looked for about each pose that a candidate suggests, and how far off, metres:

@@ -157,13 +157,7 @@ class MapViews:
         p = self._p
         poses = self.poses if among is None else self.poses[among]
         look_ahead = self._ahead if among is None else self._ahead[among]
-        axes = poses[:, :3, 2]
-        middles = poses[:, :3, 3] + np.where(look_ahead, p.look_ahead, 0.0)[:, None] * axes
-        own = T[:3, 3] + (p.look_ahead if ahead else 0.0) * T[:3, 2]
-        apart = np.linalg.norm(middles - own, axis=1)
-        both = look_ahead & ahead
-        apart += np.where(both, p.look_ahead * (1.0 - axes @ T[:3, 2]), 0.0)
-        apart /= np.where(both, p.reach, p.around_reach)
+        apart = view_separations(poses, look_ahead, T, ahead, p)
         order = np.argsort(apart, kind="stable")[: p.n_views]
         order = order[apart[order] < 1.0]
         near: list[int] = (order if among is None else among[order]).tolist()
@@ -190,6 +184,29 @@ def looks_ahead(geometry: Geometry) -> bool:
     of any kind, and many see all around.
     """
     return isinstance(geometry.surface.camera, Intrinsics)
+
+
+def view_separations(
+    poses: Floats, look_ahead: NDArray[np.bool_], T: Floats, ahead: bool, p: MapParameters
+) -> Floats:
+    """How far the views of sensors lie from that of a sensor at T: (n,), from 1 on too far to share
+    surfaces.
+
+    Parameters
+    ----------
+    poses : (n, 4, 4) T_parent_sensor
+    look_ahead : (n,) whether each looks along z
+    T, ahead : (4, 4) of the one sensor, and whether it does; where both do, directions count
+        beside distance
+    p : see there
+    """
+    axes = poses[:, :3, 2]
+    middles = poses[:, :3, 3] + np.where(look_ahead, p.look_ahead, 0.0)[:, None] * axes
+    own = T[:3, 3] + (p.look_ahead if ahead else 0.0) * T[:3, 2]
+    apart: Floats = np.linalg.norm(middles - own, axis=1)
+    both = look_ahead & ahead
+    apart += np.where(both, p.look_ahead * (1.0 - axes @ T[:3, 2]), 0.0)
+    return apart / np.where(both, p.reach, p.around_reach)
 
 
 def score_pose(

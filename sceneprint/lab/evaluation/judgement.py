@@ -26,6 +26,7 @@ from sceneprint.geometry.retrieval.distance import (
 )
 from sceneprint.geometry.retrieval.dpp import diversify
 from sceneprint.geometry.validation.acceptance import Mode
+from sceneprint.geometry.validation.map_verification import looks_ahead
 from sceneprint.geometry.validation.validation import ValidationParameters, refined_at
 from sceneprint.lab.evaluation.protocol import (
     VIEWS,
@@ -40,10 +41,12 @@ from sceneprint.lab.evaluation.protocol import (
     unwatched,
 )
 from sceneprint.localization import (
+    PosedFrame,
     PoseEstimate,
     PosePrior,
     QueryFrame,
     localize,
+    rival_rows,
     views_of_rows,
 )
 from sceneprint.matches import PairMatch, associate, searched
@@ -83,6 +86,7 @@ class QueryTask:
     selection : those of C, in order
     candidates : all of both, each once
     allowed : rising indices of all database frames that it may find
+    retrieved : database indices of R, in order
     """
 
     number: int
@@ -92,6 +96,7 @@ class QueryTask:
     selection: list[int]
     candidates: tuple[Candidate, ...]
     allowed: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
+    retrieved: Sequence[int] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +247,7 @@ def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -
     )  # neither distance decides here
     query = judging.geometry(task.number)
     validating = partial(
-        associate, query, selected, range(n), open_geometry,
+        associate, query, open_geometry=open_geometry,
         seed=judging.seed, p=judging.p, mode=judging.mode, matching=judging.matching,
     )  # fmt: skip
 
@@ -255,11 +260,25 @@ def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -
             views_of if judging.mode == "full" else None, prior, overlap_p=judging.p.agreement,
         )  # fmt: skip
 
-    matches = validating(pose_of=lambda row: (scenes[row], poses[row]))
+    matches = validating(selected, range(n), pose_of=lambda row: (scenes[row], poses[row]))
     told = located(matches)
     known = searched(matches)
     if known is not None and told is not None and told.status != "found":
-        told = located(validating(known=known))
+        matches = validating(selected, range(n), known=known)
+        told = located(matches)
+
+    def posed(rows: Sequence[int]) -> dict[int, PosedFrame]:
+        return {
+            row: PosedFrame(scenes[row], poses[row], looks_ahead(seen))
+            for row in rows
+            if (seen := open_geometry(row)) is not None
+        }
+
+    tried = {match.index for match in matches}
+    rivals = rival_rows(told, task.retrieved, tried, posed, looks_ahead(query))
+    if rivals and judging.mode == "full":
+        others = Ranking(np.array(rivals), np.zeros(len(rivals), np.int64), np.zeros(len(rivals)))
+        told = located([*matches, *validating(others, range(len(rivals)), retry=False)])
     spent = 1e3 * (time.perf_counter() - start)
     if told is None or told.average is None:
         return JudgedAnswer("not_found" if told is None else told.status, milliseconds=spent)

@@ -1,0 +1,140 @@
+"""Two rooms that are equal, mapped from the same viewpoints: C may hold frames of one alone."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.engine.search import retrieval, verification
+from sceneprint.types import DepthFrame
+from sceneprint_client.api import Answer, Query
+
+#: From one room to its twin, metres.
+APART = 30.0
+
+
+@dataclass
+class Twins:
+    """A map of two equal rooms, with the ids of the frames of each."""
+
+    engine: Engine
+    asked: Any
+    first: list[str]
+    second: list[str]
+
+    def ask(self, **how: Any) -> Answer:
+        """Where the asked frame was taken, of which the map holds the twin alone."""
+        query = Query.model_validate({"keep": False, **how})
+        meta = self.asked.meta.model_copy(update={"pose": None})
+        return self.engine.query_upload("hall", self.asked.data, meta, query)
+
+
+def equal(frame: DepthFrame, rng: np.random.Generator) -> DepthFrame:
+    """The same view in another room: a millimetre of noise, the pose shifted."""
+    depth = frame.depth + (frame.depth > 0) * rng.normal(0.0, 1e-3, frame.depth.shape)
+    T = np.array(frame.pose)
+    T[0, 3] += APART
+    return replace(frame, depth=depth.astype(np.float32), pose=T)
+
+
+@pytest.fixture
+def twins(
+    full: Engine, uploads: Any, make_upload: Callable[..., Any], work_off: Any, ids: Any
+) -> Twins:
+    rng = np.random.default_rng(5)
+    own = ids(full)
+    for one in uploads[6:]:
+        shown = replace(one.frame, pose=one.pose)
+        copy = make_upload(equal(shown, rng), one.room)
+        full.add_frame("hall", copy.data, copy.meta)
+    work_off(full)
+    every = ids(full)
+    full.delete_frame("hall", own[8])
+    return Twins(full, uploads[8], own[6:], [one for one in every if one not in own])
+
+
+#: So many candidates are all but one of the twin room.
+FEW = 3
+
+
+def accepted(answer: Answer) -> list[str]:
+    return [m.frame_id for m in answer.matches if m.validation.status == "accepted"]
+
+
+def blind_to_rivals(*_: Any) -> list[int]:
+    return []
+
+
+def test_an_equal_room_that_fills_the_selection_makes_the_answer_ambiguous(
+    twins: Twins, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer = twins.ask(candidates=FEW)
+    chosen = [m for m in answer.matches if m.selected]
+    assert {m.frame_id for m in chosen if m.validation.status == "accepted"} <= set(twins.second)
+    assert (answer.status, answer.location) == ("ambiguous", None)
+    # beyond the selection, the own room's frames that look most like the query
+    beyond = [m for m in answer.matches if not m.selected]
+    assert [(m.rank, m.diversity_gain, m.frame_id in twins.first) for m in beyond] == [
+        (4, None, True), (3, None, True)
+    ]  # fmt: skip
+    assert set(accepted(answer)) & set(twins.first) == {m.frame_id for m in beyond}
+    assert answer.counts.selected == FEW
+    assert answer.counts.validated == FEW + len(beyond)
+    places = [one.pose.matrix[0][3] - twins.asked.pose[0, 3] for one in answer.alternatives[:2]]
+    assert sorted(places) == pytest.approx([0.0, APART], abs=0.05)
+    # without them the selection alone would be believed: 30 m off
+    monkeypatch.setattr(verification, "rival_rows", blind_to_rivals)
+    believed = twins.ask(candidates=FEW)
+    assert believed.status == "found"
+    assert believed.location is not None
+    off = believed.location.pose.matrix[0][3] - twins.asked.pose[0, 3]
+    assert off == pytest.approx(APART, abs=0.05)
+
+
+def test_a_prior_tells_equal_rooms_apart(twins: Twins) -> None:
+    pose = {"matrix": twins.asked.pose.tolist(), "parent_frame": twins.asked.room}
+    answer = twins.ask(candidates=FEW, prior={"pose": pose})
+    assert answer.location is not None
+    assert (answer.status, answer.location.verified_by) == ("found", "prior")
+    assert answer.location.pose.matrix[0][3] == pytest.approx(twins.asked.pose[0, 3], abs=0.05)
+
+
+def test_a_lone_room_is_found_as_before(twins: Twins) -> None:
+    for frame_id in twins.second:
+        twins.engine.delete_frame("hall", frame_id)
+    answer = twins.ask(explain=True)
+    assert answer.status == "found"
+    assert all(m.selected for m in answer.matches)  # nothing lies elsewhere in this parent frame
+
+
+def test_explanations_tell_of_frames_elsewhere_that_were_compared(twins: Twins) -> None:
+    answer = twins.ask(candidates=FEW, explain=True)
+    told = {one.frame_id: (one.stage, one.outcome) for one in answer.explanations or ()}
+    for match in answer.matches:
+        if not match.selected:
+            assert told[match.frame_id] == ("validate", "accepted")
+
+
+def test_what_the_deadline_leaves_uncompared_is_not_found(
+    twins: Twins, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The selection is validated in time, the frames elsewhere are not."""
+    passed, look, clock = [0.0], verification.rival_rows, time.perf_counter
+
+    def late(*given: Any) -> list[int]:
+        passed[0] = 3600.0
+        return look(*given)
+
+    monkeypatch.setattr(verification, "rival_rows", late)
+    monkeypatch.setattr(retrieval.time, "perf_counter", lambda: clock() + passed[0])
+    answer = twins.ask(candidates=FEW, deadline_ms=60_000)
+    assert (answer.status, answer.deadline_reached) == ("ambiguous", True)
+    assert "the deadline passed before frames of another place" in answer.reason
+    [pose] = answer.alternatives
+    assert pose.pose.matrix[0][3] - twins.asked.pose[0, 3] == pytest.approx(APART, abs=0.05)
