@@ -139,7 +139,7 @@ def ask_site(
         )
         rows = np.arange(len(database))
         task = QueryTask(
-            query.number, scene, query.pose, [], one.selection, among, rows, one.ranking
+            query.number, scene, query.pose, [], one.selection, among, rows, one.retrieved
         )  # fmt: skip
         believed = None if prior is None else prior_about(query.pose, site.name, *prior, rng)
         told.append(Told(site.name, kind, number, able[number], answer_of(judge, task, believed)))

@@ -21,6 +21,7 @@ from sceneprint.geometry.pose.average import PoseAverage, average_poses
 from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.registration.covariance import error_of, place_covariance, transported
 from sceneprint.geometry.registration.overlap import OverlapParameters
+from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.validation.acceptance import Strength
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
@@ -68,7 +69,7 @@ class LocalizationParameters:
     prior_share: float = 0.9  #: least score of that pose, beside the best anywhere
     most_noise: float = 0.2  #: violations of the map's own that are believed
     rivals: int = 2  #: frames elsewhere that are compared before a pose is found, at most
-    rival_ranks: int = 10  #: ranks behind the last match for the pose that they may have in R
+    rival_distance: float = 1.2  #: times that of the farthest match for the pose, at most
     map: MapParameters = field(default_factory=MapParameters)
 
 
@@ -324,22 +325,22 @@ class PosedFrame:
 
 def rival_rows(
     estimate: PoseEstimate | None,
-    ranking: Sequence[int],
+    ranking: Ranking,
     tried: Collection[int],
     posed: Callable[[Sequence[int]], Mapping[int, PosedFrame]],
     query_ahead: bool,
     p: LocalizationParameters | None = None,
 ) -> list[int]:
-    """The first of R that show another place than the one that is found.
+    """Frames that look like the query, but show another place than the one that is found.
 
     Where two rooms are equal and were mapped from the same viewpoints, each signature is there
     twice, and C keeps one of the two: all of C may be of the wrong room. So no pose is found
-    before frames elsewhere, which look like the query as those do that vote, were validated too.
+    before frames elsewhere whose signatures are as near as those that vote were validated too.
 
     Parameters
     ----------
     estimate : of `localize`
-    ranking : rows of R, nearest first
+    ranking : R
     tried : rows that were validated
     posed : describes those of some rows that have a pose
     query_ahead : whether the query's sensor looks along z
@@ -347,14 +348,17 @@ def rival_rows(
 
     Returns
     -------
-    rows : `p.rivals` at most; none where nothing is found, or where the prior decided
+    rows : the first of R, `p.rivals` at most; none where nothing is found, or the prior decided
     """
     p = p or LocalizationParameters()
     if estimate is None or estimate.average is None or estimate.verified_by == "prior":
         return []
-    voters = estimate.members or tried
-    last = max((rank for rank, row in enumerate(ranking) if row in voters), default=-1)
-    untried = [row for row in ranking[: last + 1 + p.rival_ranks] if row not in tried]
+    order = ranking.indices.tolist()
+    voting = [i for i, row in enumerate(order) if row in (estimate.members or tried)]
+    if not voting:
+        return []
+    near = ranking.distances <= p.rival_distance * ranking.distances[voting[-1]]
+    untried = [order[i] for i in np.flatnonzero(near) if order[i] not in tried]
     known = {n: one for n, one in posed(untried).items() if one.parent == estimate.parent}
     rows = [row for row in untried if row in known]
     if not rows:

@@ -14,6 +14,7 @@ import pytest
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.registration.overlap import OverlapParameters
+from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
     MapViews,
@@ -118,10 +119,10 @@ def test_the_pose_of_a_match_leads_to_that_of_the_query(blank: Geometry) -> None
 @pytest.mark.parametrize(
     ("here", "there", "status", "alternatives"),
     [
-        (2, 1, "found", 0),  # twice the weight
+        (2, 1, "found", 1),  # twice the weight
         (3, 2, "ambiguous", 2),
         (1, 1, "ambiguous", 2),
-        (5, 2, "found", 0),
+        (5, 2, "found", 1),
     ],
 )
 def test_a_pose_is_found_where_it_outweighs_every_other(
@@ -645,7 +646,8 @@ def test_the_map_confirms_what_two_views_suggest_or_one_votes_for(
 ) -> None:
     found = judged([suggested_at(0.0, row, status) for row in rows], [WHOLE] * 8)
     assert (found.status == "found") is confirmed
-    assert (found.alternatives == ()) is confirmed
+    assert (found.average is not None) is confirmed
+    assert len(found.alternatives) == 1
     if not confirmed:
         strict = replace(BY_HAND, map_confirms=False)
         told = judged([suggested_at(0.0, row) for row in rows], [WHOLE] * 8, p=strict)
@@ -873,14 +875,15 @@ CORRIDOR = {row: shifted(5.0 * row) for row in range(8)}
 
 
 def corridor_rivals(
-    estimate: PoseEstimate | None, ranking: Sequence[int], tried: Sequence[int], *,
-    ahead: bool = True, **numbers: Any,
+    estimate: PoseEstimate | None, nearest: Sequence[int], tried: Sequence[int], *,
+    ahead: bool = True, distances: Sequence[int] = (1,) * 8, **numbers: Any,
 ) -> list[int]:  # fmt: skip
     def posed(rows: Sequence[int]) -> dict[int, PosedFrame]:
         parents = {**dict.fromkeys(CORRIDOR, ""), 6: "another floor"}
         return {row: PosedFrame(parents[row], CORRIDOR[row], ahead) for row in rows if row != 7}
 
-    p = LocalizationParameters(**numbers)
+    p, n = LocalizationParameters(**numbers), len(nearest)
+    ranking = Ranking(np.array(nearest), np.array(distances[:n]), np.zeros(n))
     return rival_rows(estimate, ranking, set(tried), posed, ahead, p)
 
 
@@ -893,12 +896,20 @@ def test_rivals_are_the_first_of_the_ranking_elsewhere(blank: Geometry) -> None:
     assert corridor_rivals(at_origin, ranking, [0, 1]) == [4, 2]
     assert corridor_rivals(at_origin, ranking, [0, 1], rivals=9) == [4, 2, 3, 5]
     assert corridor_rivals(at_origin, ranking, [0, 1, 4], rivals=9) == [2, 3, 5]
-    # one rank behind the last that votes
-    assert corridor_rivals(at_origin, ranking, [0, 1], rival_ranks=1) == [4]
-    assert corridor_rivals(at_origin, [2, 0, 4, 1, 3], [0, 1], rivals=9, rival_ranks=0) == [2, 4]
     # frame 0 was not tried, but shows the same; sensors that look all around see 15 m far
     assert corridor_rivals(at_origin, ranking, [1], rivals=9) == [4, 2, 3, 5]
     assert corridor_rivals(at_origin, ranking, [0, 1], ahead=False, rivals=9) == [4, 3, 5]
+
+
+def test_rivals_are_about_as_near_as_the_farthest_vote(blank: Geometry) -> None:
+    at_origin = by_pairs(blank, seen_at(0.0, [0, 1]))
+    nearest, distances = [0, 4, 1, 2, 3], (10, 11, 100, 120, 121)
+    assert corridor_rivals(at_origin, nearest, [0, 1], distances=distances, rivals=9) == [4, 2]
+    told = corridor_rivals(at_origin, nearest, [0, 1], distances=distances, rival_distance=1.0)
+    assert told == [4]
+    # the farthest that was tried did not vote; one that votes was not ranked
+    nearest, distances = [1, 2, 3, 5], (100, 119, 121, 130)
+    assert corridor_rivals(at_origin, nearest, [1, 5], distances=distances, rivals=9) == [2]
 
 
 def test_rivals_are_asked_of_nothing_that_is_not_found(blank: Geometry) -> None:

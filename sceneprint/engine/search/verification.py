@@ -181,7 +181,6 @@ def rivals(
     """
     if query.validation is not None and query.validation.mode == "paper":
         return None
-    ranking = searched.ranking.indices.tolist()
 
     def posed(numbers: Sequence[int]) -> dict[int, PosedFrame]:
         with store.queried.read() as connection:
@@ -193,10 +192,10 @@ def rivals(
         }
 
     before = {match.index for match in tried.matches}
-    numbers = rival_rows(estimate, ranking, before, posed, looks_ahead(geometry))
+    numbers = rival_rows(estimate, searched.ranking, before, posed, looks_ahead(geometry))
     if not numbers:
         return None
-    chosen = [ranking.index(number) for number in numbers]
+    chosen = np.flatnonzero(np.isin(searched.ranking.indices, numbers)).tolist()
     return validated(
         store, searched, chosen, geometry, query, deadline, p, up, known={}, retry=False
     )  # fmt: skip

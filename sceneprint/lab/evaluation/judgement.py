@@ -86,7 +86,7 @@ class QueryTask:
     selection : those of C, in order
     candidates : all of both, each once
     allowed : rising indices of all database frames that it may find
-    retrieved : database indices of R, in order
+    retrieved : R; without it no frames elsewhere are compared before a pose is found
     """
 
     number: int
@@ -96,7 +96,7 @@ class QueryTask:
     selection: list[int]
     candidates: tuple[Candidate, ...]
     allowed: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
-    retrieved: Sequence[int] = ()
+    retrieved: Ranking | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,9 +274,11 @@ def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -
             if (seen := open_geometry(row)) is not None
         }
 
-    tried = {match.index for match in matches}
-    rivals = rival_rows(told, task.retrieved, tried, posed, looks_ahead(query))
-    if rivals and judging.mode == "full":
+    rivals: list[int] = []
+    if task.retrieved is not None and judging.mode == "full":
+        tried = {match.index for match in matches}
+        rivals = rival_rows(told, task.retrieved, tried, posed, looks_ahead(query))
+    if rivals:
         others = Ranking(np.array(rivals), np.zeros(len(rivals), np.int64), np.zeros(len(rivals)))
         told = located([*matches, *validating(others, range(len(rivals)), retry=False)])
     spent = 1e3 * (time.perf_counter() - start)
@@ -355,6 +357,11 @@ class Ranked:
     distances: Ints64
     selection: list[int]
     milliseconds: dict[str, float]
+
+    @property
+    def retrieved(self) -> Ranking:
+        """R as `rival_rows` takes it; similarities take no part."""
+        return Ranking(np.array(self.ranking, np.intp), self.distances, np.zeros(len(self.ranking)))
 
 
 def rank(

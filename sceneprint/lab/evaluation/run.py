@@ -351,7 +351,7 @@ def _task(
     )
     return QueryTask(
         query.number, query.scene, query.pose, ranking, ranked.selection, candidates,
-        np.flatnonzero(allowed), ranked.ranking,
+        np.flatnonzero(allowed), ranked.retrieved,
     )  # fmt: skip
 
 
