@@ -908,8 +908,10 @@ def test_rivals_are_about_as_near_as_the_farthest_vote(blank: Geometry) -> None:
     told = corridor_rivals(at_origin, nearest, [0, 1], distances=distances, rival_distance=1.0)
     assert told == [4]
     # the farthest that was tried did not vote; one that votes was not ranked
-    nearest, distances = [1, 2, 3, 5], (100, 119, 121, 130)
-    assert corridor_rivals(at_origin, nearest, [1, 5], distances=distances, rivals=9) == [2]
+    without = corridor_rivals(
+        at_origin, [1, 2, 3, 5], [1, 5], distances=(100, 119, 121, 130), rivals=9
+    )
+    assert without == [2]
 
 
 def test_rivals_are_asked_of_nothing_that_is_not_found(blank: Geometry) -> None:

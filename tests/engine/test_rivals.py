@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.engine.search import retrieval, verification
+from sceneprint.localization import rival_rows
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import Answer, Query
 
+#: What looks for frames of another place.
+RIVAL_ROWS = "sceneprint.engine.search.verification.rival_rows"
+CLOCK = "sceneprint.engine.search.retrieval.time.perf_counter"
 #: From one room to its twin, metres.
 APART = 30.0
 
@@ -89,7 +92,7 @@ def test_an_equal_room_that_fills_the_selection_makes_the_answer_ambiguous(
     places = [one.pose.matrix[0][3] - twins.asked.pose[0, 3] for one in answer.alternatives[:2]]
     assert sorted(places) == pytest.approx([0.0, APART], abs=0.05)
     # without them the selection alone would be believed: 30 m off
-    monkeypatch.setattr(verification, "rival_rows", blind_to_rivals)
+    monkeypatch.setattr(RIVAL_ROWS, blind_to_rivals)
     believed = twins.ask(candidates=FEW)
     assert believed.status == "found"
     assert believed.location is not None
@@ -125,14 +128,16 @@ def test_what_the_deadline_leaves_uncompared_is_not_found(
     twins: Twins, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The selection is validated in time, the frames elsewhere are not."""
-    passed, look, clock = [0.0], verification.rival_rows, time.perf_counter
+    passed, look, clock = [0.0], rival_rows, time.perf_counter
 
     def late(*given: Any) -> list[int]:
         passed[0] = 3600.0
         return look(*given)
 
-    monkeypatch.setattr(verification, "rival_rows", late)
-    monkeypatch.setattr(retrieval.time, "perf_counter", lambda: clock() + passed[0])
+    monkeypatch.setattr(RIVAL_ROWS, late)
+    monkeypatch.setattr(
+        "sceneprint.engine.search.retrieval.time.perf_counter", lambda: clock() + passed[0]
+    )
     answer = twins.ask(candidates=FEW, deadline_ms=60_000)
     assert (answer.status, answer.deadline_reached) == ("ambiguous", True)
     assert "the deadline passed before frames of another place" in answer.reason
