@@ -133,6 +133,9 @@ export class Plan {
     this.#later();
   }
 
+  /** Draw marks again: what they show has changed. */
+  redraw() { this.#later(); }
+
   /** @returns {View} */
   get view() {
     const [width, height] = this.#size, scale = this.#scale, [u0, v0] = this.#centre;

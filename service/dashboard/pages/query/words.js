@@ -25,6 +25,7 @@ export function keyOf(one) {
 /** The likeliest causes of `not_found`. */
 const CAUSES = {
   no_frames: "Nothing to compare",
+  deadline: "Too little time",
   too_little_in_view: "Too little in view",
   one_plane: "Too few planes in view",
   gravity: "Tilted against gravity",
@@ -137,7 +138,7 @@ function reasons(matches) {
     const text = validation.reason.replace(/-?\d+(\.\d+)?( ?%| m| deg)/g, "…$2");
     tally.set(text, (tally.get(text) ?? 0) + 1);
   }
-  return [...tally].sort((a, b) => b[1] - a[1]).slice(0, 3).map(([text, n]) => `${n} ×: ${text}`);
+  return [...tally].sort((a, b) => b[1] - a[1]).slice(0, 3).map(([text, n]) => `${count(n)} ${n === 1 ? "candidate" : "candidates"}: ${text}`);
 }
 
 /** Standard deviations of the worst axes of a covariance in the order of ROS. */
