@@ -3,6 +3,7 @@
 import { at, get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { frameLabel, shortId } from "../lib/format.js";
+import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { empty } from "../lib/states.js";
 import { overlayParts } from "./parts.js";
@@ -40,11 +41,11 @@ export async function render(root, context) {
 /** What stands in place of the page where what it shows is not kept; null for other faults. */
 function missing(error, id) {
   if (error.status === 404 && error.type?.endsWith("unknown-query")) {
-    return empty({ title: "This answer has expired", text: error.detail,
+    return empty({ title: "This answer has expired", text: coded(error.detail),
       actions: h("a", { class: "button primary", href: "#/" }, "To the maps") });
   }
   if (error.status === 404 || (error.status === 409 && error.type?.endsWith("not-indexed"))) {
-    return empty({ title: "There is nothing to overlay", text: error.detail,
+    return empty({ title: "There is nothing to overlay", text: coded(error.detail),
       actions: h("a", { class: "button primary", href: link("queries", id) }, "To the answer") });
   }
   return null;

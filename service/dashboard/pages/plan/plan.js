@@ -5,7 +5,7 @@ import { metres } from "../lib/format.js";
 import { nice } from "../paths/shapes.js";
 
 const NEARER = 1.25, STEP = 0.12; // of a key
-const EDGE_PX = 28; // between what is shown and the edge
+const EDGE_PX = 28, FOOT_PX = 48; // between what is shown and the edge, and the scale bar below
 const LEAST_M = 0.5; // of what is fitted: a plan of one place shows its surroundings
 const CLOSEST = 20_000; // pixels of a metre
 const STILL_PX = 4; // a click may move so far
@@ -101,9 +101,10 @@ export class Plan {
   fit() {
     const [us, vs] = [0, 1].map((k) => this.#whole.map((one) => one[k]));
     const [low, high] = [[least(us), least(vs)], [most(us), most(vs)]];
+    const [width, height] = this.#size, room = [width - 2 * EDGE_PX, height - EDGE_PX - FOOT_PX];
+    this.#scale = Math.min(...room.map((x, k) => Math.max(x, 40) / Math.max(high[k] - low[k], LEAST_M)), CLOSEST);
     this.#centre = low.map((x, k) => (x + high[k]) / 2);
-    const room = this.#size.map((x) => Math.max(x - 2 * EDGE_PX, 40));
-    this.#scale = Math.min(...room.map((x, k) => x / Math.max(high[k] - low[k], LEAST_M)), CLOSEST);
+    this.#centre[1] -= (FOOT_PX - EDGE_PX) / 2 / this.#scale;
     this.#isFitted = true;
     this.#later();
   }

@@ -2,6 +2,7 @@
 // on a plan of the map.
 import { h, put, svg } from "../lib/dom.js";
 import { count, degrees, metres } from "../lib/format.js";
+import { coded } from "../lib/prose.js";
 import { axesFor, ellipseOf, flat, nameOf, uprightOf } from "../plan/axes.js";
 import { drawBackdrop } from "../plan/backdrop.js";
 import { Plan } from "../plan/plan.js";
@@ -32,7 +33,7 @@ export function posePlan(answer, { backdrops, choice, signal }) {
   }, (error) => {
     if (error.name === "AbortError") return;
     if (error.status === 401) throw error;
-    put(body, h("p", { class: "muted" }, `The plan could not be loaded: ${error.message}`));
+    put(body, h("p", { class: "muted" }, coded(`The plan could not be loaded: ${error.message}`)));
   });
   return Object.assign(element, { ready });
 }
