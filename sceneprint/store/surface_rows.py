@@ -25,6 +25,7 @@ from sqlalchemy import (
     update,
 )
 
+from sceneprint.geometry.surface.cell_fusion import FACTOR, TilePlace
 from sceneprint.store.deletion import doom
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import (
@@ -43,8 +44,6 @@ from sceneprint.store.tables import (
 )
 from sceneprint_client.api import FrameState
 
-#: Column, row and floor of a tile.
-TilePlace = tuple[int, int, int]
 #: Scale of a tile that is to be given out again.
 NO_SCALE = -1
 #: Columns of a frame that its share of a surface depends on.
@@ -138,6 +137,14 @@ def maps_to_look_at(connection: Connection) -> list[tuple[MapRow, SurfaceRow | N
         surface = None if own["map_number"] is None else SurfaceRow(**own)
         found.append((map_row(of_map), surface))  # type: ignore[arg-type]
     return found
+
+
+def count_unfinished(connection: Connection, surface: SurfaceRow) -> int:
+    """How many tiles are to be made anew, or given out again."""
+    c = surface_tiles.c
+    lacking = c.rebuilt_to.is_not(None) | ((c.level == 0) & (c.scale != surface.scale))
+    asked = select(func.count()).where(c.map_number == surface.map_number, lacking)
+    return int(connection.execute(asked).scalar_one())
 
 
 # Frames: those that are fused, that are to be, and that are no more.
@@ -355,6 +362,27 @@ def tile_of_digest(connection: Connection, map_number: int, digest: str) -> Tile
     )
     row = connection.execute(asked.limit(1)).mappings().first()
     return None if row is None else TileRow(**row)
+
+
+def tile_of_number(connection: Connection, number: int) -> TileRow | None:
+    """A tile by its number; None where it was removed."""
+    asked = select(surface_tiles).where(surface_tiles.c.number == number)
+    row = connection.execute(asked).mappings().first()
+    return None if row is None else TileRow(**row)
+
+
+def spoil_tile(connection: Connection, tile: TileRow) -> None:
+    """Have a tile made again whose bytes are lost: from its frames, or from finer tiles."""
+    own = surface_tiles.c.number == tile.number
+    if tile.level == 0:
+        lost = {"rebuilt_to": 0, "blob": None, "draft": None, "scale": NO_SCALE}
+        connection.execute(update(surface_tiles).where(own).values(**lost))
+    else:
+        connection.execute(delete(surface_tiles).where(own))
+        forget_scale(connection, tile.map_number, tile.parent, tile.place, FACTOR**tile.level)
+    of_map = surfaces.c.map_number == tile.map_number
+    counted = update(surfaces).where(of_map).values(pose_edits=surfaces.c.pose_edits + 1)
+    connection.execute(counted)
 
 
 def list_tiles(

@@ -6,14 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.engine.maps.surface_job import surface_points
 from sceneprint.geometry.pose.rigid import moved
+from sceneprint.store.frame_queries import numbers_of_runs, stops_of
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import geometry_blobs
-from sceneprint.store.frame_queries import numbers_of_runs, stops_of
 from sceneprint_client.api import JobState
 from sceneprint_client.surface_tiles import SurfaceCells, decode_tile
 

@@ -356,7 +356,10 @@ def begin_job(connection: Connection, row: MapRow, surface: SurfaceRow) -> tuple
         return True, []
     if surface.is_current(row):
         return False, []
-    if surface.model_id == row.model_id and not stored.count_left(connection, surface):
+    is_done = not (
+        stored.count_left(connection, surface) or stored.count_unfinished(connection, surface)
+    )
+    if surface.model_id == row.model_id and is_done:
         stored.write_surface(
             connection, row.number, revision=row.revision, edits=surface.pose_edits
         )

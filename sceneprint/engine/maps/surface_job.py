@@ -327,7 +327,11 @@ class SurfaceHandler:
         with self._store.database.read() as connection:
             row = _living_map(connection, row)
             now = stored.find_surface(connection, row.number)
-            if now is None or stored.count_left(connection, surface):
+            if (
+                now is None
+                or stored.count_left(connection, surface)
+                or stored.count_unfinished(connection, surface)
+            ):
                 return SliceResult(False, progress | {"total": None})
         result: dict[str, Any] = {}
 
