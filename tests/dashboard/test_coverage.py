@@ -139,8 +139,21 @@ def test_two_results_are_compared(
     for one in (before, after):
         until(lambda one=one: station.client.get(f"{path}/{one}").json()["state"] == "succeeded")
     changes = station.client.get(f"{path}/{after}/changes", params={"since": before}).json()
+    surface = "/v1/maps/four-sides/surface"
+    station.client.post(surface)
+    until(lambda: station.client.get(surface).json()["state"] == "ready")
+    (fused,) = station.client.get(surface).json()["parents"]
     page.goto(f"{station.home}#/maps/four-sides/coverage?result={after}")
     settle(page)
+    # the surface lies under the cells, to scale
+    drawn = page.evaluate("""([u, v]) => { const { view } = document.querySelector(".plan").plan;
+        const { width, style } = document.querySelector(".plan-under canvas");
+        const { a, e, f } = new DOMMatrix(style.transform);
+        return [e - view.x(u), f - view.y(v), a * width / view.scale]; }""",
+        [fused["plan"]["left"], fused["plan"]["top"]],
+    )  # fmt: skip
+    wide = fused["plan"]["width"] * fused["plan"]["m_per_pixel"]
+    assert drawn == pytest.approx([0, 0, wide], abs=0.05)
     page.locator("#cover-since").select_option(before)
     settle(page)
     trends = page.locator(".cover-cell").evaluate_all("all => all.map(one => one.dataset.trend)")

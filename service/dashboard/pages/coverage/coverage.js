@@ -6,8 +6,9 @@ import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { confirm, empty, toast } from "../lib/states.js";
 import { flat, nameOf } from "../plan/axes.js";
+import { cornersOf, laySurface, surfaceOf, unseen } from "../plan/backdrop.js";
 import { Plan } from "../plan/plan.js";
-import { beginCoverage, cancelCoverage, followCoverage, goesOn } from "./begin.js";
+import { beginCoverage, cancelCoverage, followCoverage, goesOn } from "./measurement.js";
 import { OUTCOMES, outcomeMark, TRENDS } from "./outcomes.js";
 import { areaCard, cellsTable, changesCard, countsCard, worstCard } from "./panels.js";
 import { cellAt, drawCells, drawFrames, hit, keyOf } from "./sheet.js";
@@ -20,10 +21,10 @@ const FOREVER_S = 1e9;
 /** The page: #/maps/NAME/coverage?result=&since=&parent=&cell=&frame= */
 export async function render(root, { params: { map }, search, signal, go, title, actions }) {
   const path = at("maps", map, "coverage");
-  const [told, sessions, about] = await Promise.all([
-    get(path, { params: { limit: 100 }, signal }), get(at("maps", map, "sessions"), { params: { limit: 1000 }, signal }), get(at("maps", map), { signal })]);
+  const [told, sessions, about, surface] = await Promise.all([
+    get(path, { params: { limit: 100 }, signal }), get(at("maps", map, "sessions"), { params: { limit: 1000 }, signal }), get(at("maps", map), { signal }), surfaceOf(map, signal)]);
   title(`Coverage of ${about.title ?? map}`);
-  const page = new Page(root, { map, search, signal, go, all: told.items,
+  const page = new Page(root, { map, search, signal, go, all: told.items, surface,
     sessions: [...new Set(sessions.items.map((one) => one.session).filter(Boolean))], indexed: about.frames.indexed ?? 0 });
   actions(may("write", map) && page.indexed > 0 && h("button", { class: "button primary", type: "button", id: "cover-begin", onClick: () => page.begin() }, "Measure coverage…"));
   await page.show();
@@ -45,11 +46,13 @@ class Page {
   drawn = [];
   #turn = 0;
 
-  constructor(root, { map, search, signal, go, all, sessions, indexed }) {
+  constructor(root, { map, search, signal, go, all, surface, sessions, indexed }) {
     this.map = map;
     this.signal = signal;
     this.go = go;
     this.all = all; // coverage jobs, the newest first
+    this.surface = surface;
+    this.laid = ""; // the parent frame whose surface is under the plan
     this.sessions = sessions;
     this.indexed = indexed;
     this.area = h("div", {});
@@ -139,11 +142,14 @@ class Page {
     this.axes = { x: planned.x_axis, y: planned.y_axis };
     this.drawn = this.frames.filter((one) => one.position && one.parent_frame === planned.parent_frame)
       .map((one) => ({ ...one, at: this.#flat(one.position) }));
+    this.#links(); // beneath the numbers of cells
     drawCells(this.plan, changed ? changed.cells : planned.cells, wide, this.seen.cell);
     this.plan.label(`Plan of ${planned.parent_frame}: ${OUTCOMES.map(({ name, text }) => `${result[name]} ${text.toLowerCase()}`).join(", ")}`);
-    put(this.plan.about, `${planned.parent_frame}${right && top ? ` · ${right} to the right, ${top} up` : ""}`);
-    this.plan.bounds(planned.cells.flatMap(({ column, row }) => [[column * wide, row * wide], [(column + 1) * wide, (row + 1) * wide]]));
-    this.#links();
+    put(this.plan.about, `${planned.parent_frame}${right && top ? ` · ${right} → ${top} ↑` : ""}`);
+    const corners = /** @type {import("../plan/plan.js").Place[]} */ (planned.cells.flatMap(({ column, row }) => [[column * wide, row * wide], [(column + 1) * wide, (row + 1) * wide]]));
+    const fused = this.surface.parents.find((one) => one.parent_frame === planned.parent_frame) ?? null;
+    this.plan.bounds([...corners, ...cornersOf(fused, corners)]);
+    this.#lay(planned.parent_frame, fused);
     const several = this.shown.plans.length > 1 && h("label", { class: "cover-field" }, h("span", { class: "muted" }, "Parent frame"),
       h("select", { id: "cover-parent", onChange: (event) => this.#look({ parent: event.target.value, cell: null, frame: null }) },
         this.shown.plans.map((one) => h("option", { value: one.parent_frame, selected: one === planned }, one.parent_frame))));
@@ -152,6 +158,14 @@ class Page {
         ? TRENDS.map(({ name, text, sign }) => h("li", {}, h("span", { class: "cover-sign", dataset: { trend: name }, "aria-hidden": "true" }, sign), text))
         : OUTCOMES.map(({ name, text }) => h("li", {}, outcomeMark(name), text))),
       h("p", { class: "muted cover-note" }, `Cells of ${metres(wide)}; the number is how many frames of the map were taken there. Click a cell or a frame. Drag to move.${whence}`));
+  }
+
+  /** The surface under the cells, where it is known. */
+  #lay(parent, fused) {
+    if (this.laid === parent) return;
+    this.laid = parent;
+    this.plan.picture(null);
+    if (fused) laySurface(this.plan, this.axes, this.map, fused, this.signal).catch(unseen);
   }
 
   #flat(place) { return flat(this.axes, [place.x, place.y, place.z]); }
@@ -165,9 +179,9 @@ class Page {
       h("label", { class: "cover-field" }, h("span", { class: "muted" }, "Result"),
         h("select", { id: "cover-result", onChange: (event) => this.#look({ result: event.target.value, since: null, cell: null, frame: null }) },
           this.results.map((one) => h("option", { value: one.coverage_id, selected: one.coverage_id === id }, name(one))))),
-      h("label", { class: "cover-field" }, h("span", { class: "muted" }, "Compare with"),
-        h("select", { id: "cover-since", disabled: earlier.length === 0, onChange: (event) => this.#look({ since: event.target.value || null }) },
-          h("option", { value: "" }, earlier.length ? "nothing" : "no earlier result with these options"),
+      earlier.length > 0 && h("label", { class: "cover-field" }, h("span", { class: "muted" }, "Compare with"),
+        h("select", { id: "cover-since", onChange: (event) => this.#look({ since: event.target.value || null }) },
+          h("option", { value: "" }, "nothing"),
           earlier.map((one) => h("option", { value: one.coverage_id, selected: one.coverage_id === this.seen.since }, name(one))))),
       h("span", { class: "muted cover-when" }, "measured ", time(this.shown.finished_at)),
       h("div", { class: "toolbar", role: "group", "aria-label": "Download" },

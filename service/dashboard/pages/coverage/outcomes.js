@@ -4,10 +4,10 @@ import { svg } from "../lib/dom.js";
 
 /** Outcomes of frames, in the order in which they are listed. */
 export const OUTCOMES = [
-  { name: "found", text: "Found", kind: "good", next: null },
-  { name: "wrong", text: "Wrong place", kind: "bad", next: "Look at once: a wrong pose of the map, drift between sessions, or another place that looks the same." },
-  { name: "ambiguous", text: "Ambiguous", kind: "warn", next: "Other places look the same. Map what differs (doors, corners), or let robots send `gravity` and a `prior`." },
-  { name: "not_found", text: "Not found", kind: "bad", next: "Map this area again, from the directions in which robots drive." },
+  { name: "found", text: "Found", next: null },
+  { name: "wrong", text: "Wrong place", next: "Look at once: a wrong pose of the map, drift between sessions, or another place that looks the same." },
+  { name: "ambiguous", text: "Ambiguous", next: "Other places look the same. Map what differs (doors, corners), or let robots send `gravity` and a `prior`." },
+  { name: "not_found", text: "Not found", next: "Map this area again, from the directions in which robots drive." },
 ];
 /** How a cell compares with an earlier result. */
 export const TRENDS = [

@@ -66,11 +66,11 @@ export function areaCard({ map, cell, key, wide, frames, chosen, onchoose, onove
 const rankOf = ({ outcome }) => ["found", "ambiguous", "not_found", "wrong"].indexOf(outcome);
 
 function frameItem(map, one, chosen, onchoose, onoverlay) {
-  const { text, kind } = outcomeOf(one.outcome), id = one.frame_id;
+  const { text } = outcomeOf(one.outcome), id = one.frame_id;
   const off = one.error_m !== null && one.outcome !== "not_found" ? ` Off by ${metres(one.error_m)}, ${degrees(one.error_deg)}.` : "";
   const toFrame = (frame) => h("a", { class: "mono", href: link("maps", map, "frames", frame), title: frame }, shortId(frame));
   return h("li", { dataset: { frame: id, chosen: chosen === id } },
-    h("div", { class: "cover-head" }, h("span", {}, h("span", { class: "badge", dataset: { kind } }, text), " ", toFrame(id),
+    h("div", { class: "cover-head" }, h("span", {}, outcomeMark(one.outcome), h("strong", {}, text), " ", toFrame(id),
       one.session !== null && h("span", { class: "muted cover-session" }, ` ${one.session}`)),
     one.look_alikes.length > 0 && h("button", { class: "button quiet", type: "button", "aria-pressed": chosen === id, onClick: () => onchoose(id) }, "Show links")),
     h("p", { class: "cover-reason" }, coded(sentence(one.reason)), off),

@@ -4,7 +4,7 @@ import { h, put, svg } from "../lib/dom.js";
 import { count, degrees, metres } from "../lib/format.js";
 import { coded } from "../lib/prose.js";
 import { axesFor, ellipseOf, flat, nameOf, uprightOf } from "../plan/axes.js";
-import { drawBackdrop } from "../plan/backdrop.js";
+import { cornersOf, drawBackdrop } from "../plan/backdrop.js";
 import { Plan } from "../plan/plan.js";
 import { inverseRigid, multiply, ofRows } from "../viewer/matrix.js";
 import { alternativesList, letterOf } from "./alternatives.js";
@@ -57,12 +57,12 @@ function draw(body, answer, backdrop, choice, signal) {
     const near = spots.frames.filter((one) => apart(one) <= REACH_PX).sort((a, b) => apart(a) - apart(b))[0];
     if (near) choice.toggle(near.key);
   } });
-  if (backdrop) drawBackdrop(plan, backdrop);
+  if (backdrop) drawBackdrop(plan, backdrop, signal);
   marks(plan, answer, axes, spots, choice);
   const [right, top] = [nameOf(axes.x), nameOf(axes.y)];
-  put(plan.about, `${parent}${right && top ? ` · ${right} to the right, ${top} up` : ""}`);
+  put(plan.about, `${parent}${right && top ? ` · ${right} → ${top} ↑` : ""}`);
   const all = [...(backdrop?.runs ?? []).flatMap((one) => one.places), ...spots.frames.map((one) => one.at), ...spots.poses.map((one) => one.at)];
-  plan.bounds(all);
+  plan.bounds([...all, ...cornersOf(backdrop?.surface ?? null, all)]);
   put(body, plan.element, legend(answer, axes, spots, backdrop),
     backdrop && backdrop.left > 0 && h("p", { class: "muted query-plan-note" }, `The newest ${count(backdrop.runs.length)} of ${count(backdrop.runs.length + backdrop.left)} runs are drawn.`));
 }
@@ -132,7 +132,8 @@ function legend(answer, axes, { frames, poses }, backdrop) {
     !location && poses.length > 0 && item(svg("g", { class: "query-spot-letter" }, svg("circle", { r: 8 })), poses.length === 1 ? "Possible pose" : "Possible poses", status === "ambiguous" && "none is the answer"),
     voting > 0 && item(svg("path", { d: SMALL, class: "query-spot-match" }), voting === 1 ? "Match, with its vote" : `${count(voting)} matches, with their votes`),
     out > 0 && item(svg("path", { d: SMALL, class: "query-spot-out" }), out === 1 ? "Candidate, not accepted" : `${count(out)} candidates, not accepted`),
-    backdrop && item(svg("path", { d: "M-8 0h0M0 0h0M8 0h0", class: "plan-frames" }), "Frames of the map"));
+    backdrop && backdrop.runs.length > 0 && item(svg("path", { d: "M-8 0h0M0 0h0M8 0h0", class: "plan-frames" }), "Frames of the map"),
+    backdrop?.surface && item(svg("path", { d: "M-8 -6h16v12h-16z", class: "plan-surface" }), "Surfaces seen"));
 }
 
 /** @param {Spot} spot @param {import("../plan/axes.js").Axes} axes */
