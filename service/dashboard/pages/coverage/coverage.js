@@ -25,11 +25,13 @@ export async function render(root, { params: { map }, search, signal, go, title,
     get(path, { params: { limit: 100 }, signal }), get(at("maps", map, "sessions"), { params: { limit: 1000 }, signal }), get(at("maps", map), { signal }), surfaceOf(map, signal)]);
   title(`Coverage of ${about.title ?? map}`);
   const page = new Page(root, { map, search, signal, go, all: told.items, surface,
-    sessions: [...new Set(sessions.items.map((one) => one.session).filter(Boolean))], indexed: about.frames.indexed ?? 0 });
+    names: { sessions: distinct(sessions.items, "session"), robots: distinct(sessions.items, "robot") }, indexed: about.frames.indexed ?? 0 });
   actions(may("write", map) && page.indexed > 0 && h("button", { class: "button primary", type: "button", id: "cover-begin", onClick: () => page.begin() }, "Measure coverage…"));
   await page.show();
   for (const one of told.items.filter(goesOn)) page.follow(one.coverage_id);
 }
+
+const distinct = (items, key) => [...new Set(items.map((one) => one[key]).filter((one) => one !== null))].sort();
 
 class Page {
   /** @type {any} the result that is shown, with its plans */
@@ -46,14 +48,14 @@ class Page {
   drawn = [];
   #turn = 0;
 
-  constructor(root, { map, search, signal, go, all, surface, sessions, indexed }) {
+  constructor(root, { map, search, signal, go, all, surface, names, indexed }) {
     this.map = map;
     this.signal = signal;
     this.go = go;
     this.all = all; // coverage jobs, the newest first
     this.surface = surface;
     this.laid = ""; // the parent frame whose surface is under the plan
-    this.sessions = sessions;
+    this.names = names;
     this.indexed = indexed;
     this.area = h("div", {});
     this.path = at("maps", map, "coverage");
@@ -271,7 +273,7 @@ class Page {
   }
 
   begin() {
-    beginCoverage(this.map, this.sessions, (begun) => {
+    beginCoverage(this.map, this.names, (begun) => {
       this.all.unshift(begun);
       if (this.results.length === 0) put(this.body, this.#nothing());
       this.#progress();

@@ -13,14 +13,15 @@ export const goesOn = (one) => !OVER.has(one.state);
 /**
  * Ask what to measure, and begin it.
  * @param {string} map
- * @param {string[]} sessions names that can be chosen
+ * @param {{sessions: string[], robots: string[]}} names that can be chosen
  * @param {(begun: Object<string, any>) => void} onbegun
  */
-export function beginCoverage(map, sessions, onbegun) {
+export function beginCoverage(map, { sessions, robots }, onbegun) {
   const number = (name, value, more) => h("input", { type: "number", id: `cover-${name}`, name, value, ...more });
   const field = (name, text, input, hint) => h("div", { class: "field" }, h("label", { for: `cover-${name}` }, text), input,
     hint && h("small", { class: "muted" }, hint));
-  const session = h("select", { id: "cover-session" }, h("option", { value: "" }, "All sessions"), sessions.map((one) => h("option", { value: one }, one)));
+  const listed = (name, all, names) => h("select", { id: `cover-${name}` }, h("option", { value: "" }, all), names.map((one) => h("option", { value: one }, one)));
+  const session = listed("session", "All sessions", sessions), robot = listed("robot", "All robots", robots);
   const every = number("every", 1, { min: 1, step: 1 }), most = number("most", 1000, { min: 1, max: 5000, step: 1 });
   const without = h("select", { id: "cover-without", onChange: () => { within.disabled = without.value !== "near"; } },
     h("option", { value: "near" }, "frames of its session taken just before and after"),
@@ -34,6 +35,7 @@ export function beginCoverage(map, sessions, onbegun) {
   const dialog = sheet({ title: "Measure coverage", buttons: button, children: [
     h("p", { class: "muted" }, "Queries frames of the map against the rest of it. Uploads and queries go first; it takes about 0.1 s per frame."),
     field("session", "Query frames of", session),
+    robots.length > 1 && field("robot", "and of", robot),
     h("div", { class: "cover-pair" }, field("every", "Every n-th frame", every), field("most", "At most", most)),
     field("without", "A frame must not find", without, "A robot that comes back on another day has none of these. Decides what the result means."),
     field("not_within_s", "Just before and after: seconds", within),
@@ -49,7 +51,7 @@ export function beginCoverage(map, sessions, onbegun) {
     put(wrong);
     const value = (input) => (Number.isFinite(input.valueAsNumber) ? input.valueAsNumber : undefined);
     const left = without.value === "session" ? { other_sessions: true } : { not_within_s: without.value === "itself" ? 0 : value(within) };
-    const json = { session: session.value || undefined, every: value(every), most: value(most), ...left,
+    const json = { session: session.value || undefined, robot: robot.value || undefined, every: value(every), most: value(most), ...left,
       tolerance_m: value(off), tolerance_deg: value(turned), cell_m: value(wide) };
     try {
       const { data } = await send("POST", at("maps", map, "coverage"), { json });

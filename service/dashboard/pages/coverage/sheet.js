@@ -24,9 +24,12 @@ export function drawCells(plan, cells, wide, chosen) {
   plan.ground("cells", cells.map(rect));
   const one = cells.find((cell) => keyOf(cell) === chosen);
   plan.ground("chosen", one && svg("rect", { class: "cover-chosen", x: one.column * wide, y: one.row * wide, width: wide, height: wide }));
-  plan.mark("counts", ({ x, y, scale }) => wide * scale >= COUNTS_PX && cells.map((cell) => svg("text", {
-    class: "plan-text cover-count", x: x(cell.column * wide) + 4, y: y((cell.row + 1) * wide) + 13,
-  }, cell.trend ? TRENDS.find(({ name }) => name === cell.trend)?.sign : cell.frames)));
+  plan.mark("counts", ({ x, y, scale, width, height }) => wide * scale >= COUNTS_PX && cells.flatMap((cell) => {
+    const left = x(cell.column * wide), top = y((cell.row + 1) * wide), size = wide * scale;
+    if (left > width || top > height || left + size < 0 || top + size < 0) return []; // of thousands few are seen
+    const text = cell.trend ? TRENDS.find(({ name }) => name === cell.trend)?.sign : cell.frames;
+    return [svg("text", { class: "plan-text cover-count", x: left + 4, y: top + 13 }, text)];
+  }));
 }
 
 /**

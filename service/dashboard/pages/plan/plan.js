@@ -41,7 +41,7 @@ export class Plan {
     this.world = svg("g", { class: "plan-world" });
     this.over = svg("g", { class: "plan-over" });
     this.svg = svg("svg", {
-      class: "plan-sheet", tabindex: "0", role: "application", "aria-roledescription": "plan", "aria-label": `${label}. ${KEYS}`,
+      class: "plan-sheet", id: "plan-sheet", tabindex: "0", role: "application", "aria-roledescription": "plan", "aria-label": `${label}. ${KEYS}`,
     }, this.world, this.over);
     this.under = h("div", { class: "plan-under" });
     this.bar = h("span", { class: "plan-bar" });
@@ -137,7 +137,7 @@ export class Plan {
   /** Draw marks again: what they show has changed. */
   redraw() { this.#later(); }
 
-  /** @returns {View} */
+  /** @returns {View} what is seen, in pixels of the element */
   get view() {
     const [width, height] = this.#size, scale = this.#scale, [u0, v0] = this.#centre;
     return { width, height, scale, x: (u) => width / 2 + (u - u0) * scale, y: (v) => height / 2 - (v - v0) * scale };
