@@ -62,7 +62,7 @@ LEVELS, VOXELS = 3, 2.5
 #: Parent frames that are told of: those of most frames.
 MOST_PARENTS = 20
 #: Frames looked up at once; frames taken out in one slice.
-_FRAMES, _TAKEN_OUT = 64, 500
+_FRAMES, _TAKEN_OUT = 256, 500
 #: What a slice holds at most: tiles that are changed, and cells of frames or tiles.
 _TILES, _CELLS = 96, 1_500_000
 
