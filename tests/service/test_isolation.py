@@ -200,7 +200,10 @@ def there(walled, small_shots, until) -> dict[str, There]:
                 "boss", "POST", f"/v1/maps/{name}/frames", headers={"Prefer": "wait=60"},
                 **shot.form(
                     session=session, captured_at=f"2026-11-16T09:30:0{number}Z",
-                    pose={"parent_frame": name, "matrix": shot.pose},
+                    pose={
+                        "parent_frame": name, "translation": {"x": number, "y": 0, "z": 0},
+                        "rotation": {"w": 1, "x": 0, "y": 0, "z": 0},
+                    },
                 ),
             ).json()
             for number, shot in enumerate(pair)
