@@ -63,10 +63,11 @@ def lost(station: Any, four_sides: dict[str, Any], until: Callable[..., Any]) ->
     path = f"/v1/maps/four-sides/coverage/{begun['coverage_id']}"
     until(lambda: station.client.get(path).json()["state"] == "succeeded")
     station.make_map("named")
-    meta["name"] = "dock-entrance-0042.png"
-    station.client.post(
+    meta |= {"name": "dock-entrance-0042.png", "session": 5 * "a-long-name-of-a-session"}
+    added = station.client.post(
         "/v1/maps/named/frames", files=form["files"], data={"meta": json.dumps(meta)}
     )
+    assert added.status_code == 202, added.text
     told: dict[str, Any] = answer
     return told
 
@@ -142,3 +143,20 @@ def test_the_first_frame_is_five_tabs_away(station: Any, page: Page, settle: Set
     page.set_viewport_size({"width": 390, "height": 844})
     columns = "() => getComputedStyle(document.getElementById('frames')).gridTemplateColumns"
     assert len(page.evaluate(columns).split()) == 2
+
+
+def test_a_long_name_of_a_session_stretches_nothing(
+    station: Any, page: Page, settle: Settle, lost: dict[str, Any], until: Callable[..., Any]
+) -> None:
+    del lost  # its fixture has named a session
+    until(lambda: station.client.get("/v1/maps/named").json()["frames"].get("indexed") == 1)
+    page.set_viewport_size({"width": 390, "height": 844})
+    for address in ("", "/query", "/coverage", "/sessions"):
+        page.goto(f"{station.home}#/maps/named{address}")
+        settle(page)
+        assert page.evaluate("() => document.documentElement.scrollWidth") <= 390
+    page.goto(f"{station.home}#/maps/named/query")
+    settle(page)
+    tile = page.locator(".query-picker-grid .query-pick").bounding_box()
+    assert tile is not None
+    assert tile["width"] < 358

@@ -54,6 +54,7 @@ class Page {
     this.go = go;
     this.all = all; // coverage jobs, the newest first
     this.surface = surface;
+    this.isTabled = false; // whether the table of cells is unfolded
     this.laid = ""; // the parent frame whose surface is under the plan
     this.names = names;
     this.indexed = indexed;
@@ -121,7 +122,8 @@ class Page {
   get planned() { return this.shown.plans.find((one) => one.parent_frame === this.seen.parent) ?? this.shown.plans[0] ?? null; }
 
   #draw() {
-    const { result } = this.shown, planned = this.planned, focused = document.activeElement?.id;
+    const { result } = this.shown, planned = this.planned;
+    const isInside = this.body.contains(document.activeElement), focused = document.activeElement?.id;
     const cells = planned?.cells ?? [], wide = result.cell_m;
     const choose = (cell) => this.#choose({ cell, frame: null });
     const side = [countsCard(result), this.changes && changesCard(this.changes),
@@ -129,11 +131,18 @@ class Page {
     this.area = h("div", { id: "cover-area-place" });
     put(this.body, this.#toolbar(), h("div", { class: "cover" },
       h("div", { class: "cover-main" }, planned ? this.#sheet(planned) : h("p", { class: "card muted" }, "The queried frames have no poses, so there is no plan. Send a pose with frames to see where they were taken."),
-        planned && h("details", { class: "card" }, h("summary", {}, "Cells as a table"), cellsTable(cells, wide, choose))),
+        planned && this.#table(cells, wide, choose)),
       h("div", { class: "cover-side" }, this.area, side)));
     this.#area();
     this.#address();
-    if (focused) document.getElementById(focused)?.focus({ preventScroll: true });
+    // where that was is drawn anew: the keyboard goes on from there, or from the plan
+    if (isInside) (document.getElementById(focused ?? "") ?? this.plan.svg).focus({ preventScroll: true });
+  }
+
+  #table(cells, wide, choose) {
+    const fold = h("details", { class: "card", open: this.isTabled, onToggle: () => { this.isTabled = fold.open; } },
+      h("summary", {}, "Cells as a table"), cellsTable(cells, wide, choose));
+    return fold;
   }
 
   #sheet(planned) {

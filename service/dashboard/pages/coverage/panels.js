@@ -72,7 +72,7 @@ function frameItem(map, one, chosen, onchoose, onoverlay) {
   return h("li", { dataset: { frame: id, chosen: chosen === id } },
     h("div", { class: "cover-head" }, h("span", {}, outcomeMark(one.outcome), h("strong", {}, text), " ", toFrame(id),
       one.session !== null && h("span", { class: "muted cover-session" }, ` ${one.session}`)),
-    one.look_alikes.length > 0 && h("button", { class: "button quiet", type: "button", "aria-pressed": chosen === id, onClick: () => onchoose(id) }, "Show links")),
+    one.look_alikes.length > 0 && h("button", { class: "button quiet", type: "button", id: `links-${id}`, "aria-pressed": chosen === id, onClick: () => onchoose(id) }, "Show links")),
     h("p", { class: "cover-reason" }, coded(sentence(one.reason)), off),
     one.look_alikes.length > 0 && h("ul", { class: "cover-alike", "aria-label": "Look-alikes" }, one.look_alikes.map((other) => h("li", {},
       "Looks like ", toFrame(other), " ", h("button", { class: "button", type: "button", dataset: { overlay: other }, onClick: () => onoverlay(one, other) }, "Overlay")))),
@@ -93,7 +93,7 @@ export function changesCard({ trends, result_before: a, result_after: b }) {
 /** All cells as a table. @param {Object<string, any>[]} cells @param {number} wide @param {(cell: string) => void} onchoose */
 export function cellsTable(cells, wide, onchoose) {
   const rows = cells.toSorted((a, b) => b.row - a.row || a.column - b.column).slice(0, 500).map((cell) => h("tr", {},
-    h("th", { scope: "row" }, h("button", { class: "button quiet", type: "button", onClick: () => onchoose(keyOf(cell)) }, placeOfCell(cell, wide))),
+    h("th", { scope: "row" }, h("button", { class: "button quiet", type: "button", id: `row-${keyOf(cell)}`, onClick: () => onchoose(keyOf(cell)) }, placeOfCell(cell, wide))),
     h("td", { class: "number" }, count(cell.frames)), OUTCOMES.map(({ name }) => h("td", { class: "number" }, count(cell[name])))));
   return h("div", { class: "cover-scroll", tabindex: "0", role: "region", "aria-label": "Cells of the plan" }, h("table", { class: "table" },
     h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Middle"), h("th", { scope: "col", class: "number" }, "Frames"),

@@ -77,7 +77,8 @@ function spotsOf(answer, axes, backdrop, parent) {
   const isCloud = answer.kind === "cloud";
   const own = [answer.location, ...answer.alternatives].filter((one) => one?.pose.parent_frame === parent);
   const known = new Map((backdrop?.runs ?? []).flatMap((run) => run.ids.map((id, i) => [id, run.poses[i]])));
-  const frames = answer.matches.flatMap((match) => {
+  const map = mapOf(answer); // parent frames of two maps may have one name
+  const frames = answer.matches.filter((match) => match.map === map).flatMap((match) => {
     const votes = match.pose_in_map?.parent_frame === parent && match.transform && ["accepted", "ambiguous"].includes(match.validation.status);
     // T_parent_match = T_parent_query T_query_match
     const pose = votes ? multiply(ofRows(match.pose_in_map.matrix), inverseRigid(ofRows(match.transform.matrix))) : known.get(match.frame_id);
