@@ -234,6 +234,9 @@ def test_the_plan_and_the_overlay_are_on_the_first_screen(station, page, ask, se
     assert axes == pytest.approx(
         np.sqrt(np.linalg.eigvalsh(covariance) * -2 * np.log(0.05)), rel=1e-3
     )
+    truth = np.array(station.frames[0].meta["pose"]["matrix"])
+    ring = page.locator(".plan .query-spot-taken").evaluate_all(SPOTS)
+    assert ring == [pytest.approx(at(view, *truth[:2, 3]), abs=0.2)]
     voting = [one for one in answer["matches"] if one["validation"]["status"] == "accepted"]
     assert page.locator(".plan .query-vote-line").count() == len(voting)
     # each match stands where its frame was taken

@@ -61,7 +61,7 @@ function draw(body, answer, backdrop, choice, signal) {
   marks(plan, answer, axes, spots, choice);
   const [right, top] = [nameOf(axes.x), nameOf(axes.y)];
   put(plan.about, `${parent}${right && top ? ` · ${right} → ${top} ↑` : ""}`);
-  const all = [...(backdrop?.runs ?? []).flatMap((one) => one.places), ...spots.frames.map((one) => one.at), ...spots.poses.map((one) => one.at)];
+  const all = [...(backdrop?.runs ?? []).flatMap((one) => one.places), ...spots.frames.map((one) => one.at), ...spots.poses.map((one) => one.at), ...(spots.taken ? [spots.taken.at] : [])];
   plan.bounds([...all, ...cornersOf(backdrop?.surface ?? null, all)]);
   put(body, plan.element, legend(answer, axes, spots, backdrop),
     backdrop && backdrop.left > 0 && h("p", { class: "muted query-plan-note" }, `The newest ${count(backdrop.runs.length)} of ${count(backdrop.runs.length + backdrop.left)} runs are drawn.`));
@@ -86,7 +86,8 @@ function spotsOf(answer, axes, backdrop, parent) {
     const voted = votes ? flat(axes, match.pose_in_map.matrix.slice(0, 3).map((row) => row[3])) : null;
     return [{ key: keyOf(match), votes: Boolean(votes), voted, ...spotOf(pose, axes, isCloud) }];
   });
-  return { frames, poses: own.map((one) => spotOf(ofRows(one.pose.matrix), axes, isCloud)) };
+  const taken = answer.frame?.map === map ? known.get(answer.frame.frame_id) : undefined; // by a stored frame's own pose
+  return { frames, taken: taken ? spotOf(taken, axes, isCloud) : null, poses: own.map((one) => spotOf(ofRows(one.pose.matrix), axes, isCloud)) };
 }
 
 /** @param {number[]} m a pose, 16 column-major @param {import("../plan/axes.js").Axes} axes @param {boolean} isCloud @returns {Spot} */
@@ -97,7 +98,7 @@ function spotOf(m, axes, isCloud) {
 
 const turned = (x, y, heading) => `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${(90 - (heading * 180) / Math.PI).toFixed(1)})`;
 
-function marks(plan, answer, axes, { frames, poses }, choice) {
+function marks(plan, answer, axes, { frames, poses, taken }, choice) {
   /** @type {string | null} */
   let looked = null;
   const { location } = answer, isFound = location !== null && poses.length > 0;
@@ -113,6 +114,7 @@ function marks(plan, answer, axes, { frames, poses }, choice) {
     svg("path", { class: "query-vote-line", d: `M${x(one.at[0])} ${y(one.at[1])}L${x(one.voted[0])} ${y(one.voted[1])}` })));
   plan.mark("matches", ({ x, y }) => frames.map((one) => arrow(one, x(one.at[0]), y(one.at[1]), SMALL, {
     class: one.votes ? "query-spot-match" : "query-spot-out", "data-key": one.key, "data-marked": looked === one.key ? "true" : null })));
+  plan.mark("taken", ({ x, y }) => taken && svg("circle", { class: "query-spot-taken", cx: x(taken.at[0]), cy: y(taken.at[1]), r: 13 }));
   plan.mark("answer", ({ x, y }) => poses.map((one, i) => {
     const [px, py] = [x(one.at[0]), y(one.at[1])];
     if (isFound) return arrow(one, px, py, ARROW, { class: "query-spot-found" });
@@ -123,7 +125,7 @@ function marks(plan, answer, axes, { frames, poses }, choice) {
   choice.hear((key) => { looked = key; plan.redraw(); });
 }
 
-function legend(answer, axes, { frames, poses }, backdrop) {
+function legend(answer, axes, { frames, poses, taken }, backdrop) {
   const item = (shape, text, more) => h("li", {}, svg("svg", { viewBox: "-10 -10 20 20", "aria-hidden": "true" }, shape), h("span", {}, text, more && h("span", { class: "muted" }, ` ${more}`)));
   const { location, status } = answer, voting = frames.filter((one) => one.votes).length, out = frames.length - voting;
   const sure = location?.uncertainty ? ellipseOf(axes, location.uncertainty.covariance) : null;
@@ -131,6 +133,7 @@ function legend(answer, axes, { frames, poses }, backdrop) {
     location && poses.length > 0 && item(svg("path", { d: ARROW, class: "query-spot-found" }), "Pose found", headingOf(poses[0], axes)),
     sure && item(svg("ellipse", { rx: 9, ry: 5, class: "query-ellipse" }), "95 %", `± ${metres(sure.long)} × ${metres(sure.short)}`),
     !location && poses.length > 0 && item(svg("g", { class: "query-spot-letter" }, svg("circle", { r: 8 })), poses.length === 1 ? "Possible pose" : "Possible poses", status === "ambiguous" && "none is the answer"),
+    taken && item(svg("circle", { r: 8, class: "query-spot-taken" }), "Where the queried frame was taken"),
     voting > 0 && item(svg("path", { d: SMALL, class: "query-spot-match" }), voting === 1 ? "Match, with its vote" : `${count(voting)} matches, with their votes`),
     out > 0 && item(svg("path", { d: SMALL, class: "query-spot-out" }), out === 1 ? "Candidate, not accepted" : `${count(out)} candidates, not accepted`),
     backdrop && backdrop.runs.length > 0 && item(svg("path", { d: "M-8 0h0M0 0h0M8 0h0", class: "plan-frames" }), "Frames of the map"),
