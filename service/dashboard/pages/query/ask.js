@@ -113,7 +113,7 @@ class Page {
   take(source) {
     this.source = source;
     this.rest = {};
-    this.why = null;
+    this.why = this.seen.match = null;
     this.answer = null;
     this.chooser.tell(source);
     put(this.result);
