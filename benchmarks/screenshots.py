@@ -240,7 +240,7 @@ def _unsure(sides: str, absent: str) -> Iterator[View]:
     several = View("answer-ambiguous", f"#/queries/{sides}")
     plan = View("map-view-ambiguous", f"#/maps/{SIDES}/paths?query={sides}", tall=True)
     none = View("answer-not-found", f"#/queries/{absent}")
-    lost = View("coverage", f"#/maps/{SIDES}/coverage?cell=3,0", tall=True)
+    lost = View("coverage", f"#/maps/{SIDES}/coverage?cell=6,-4", tall=True)
     for one in (several, plan, none, lost):
         yield one
         yield replace(one, name=f"{one.name}-phone", size=PHONE)
