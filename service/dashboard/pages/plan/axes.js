@@ -1,6 +1,6 @@
 // A parent frame seen from above: which way is up, and where a point of it lies on the plan.
-// As the service has it (sceneprint/engine/maps/coverage_plan.py), so that pictures of both agree.
-import { dot } from "../viewer/matrix.js";
+// As the service has it (sceneprint/engine/maps/plan_axes.py), so that pictures of both agree.
+import { cross, dot } from "../viewer/matrix.js";
 
 /** Half an axis of the ellipse that holds 95 % of a normal error in a plane, in deviations. */
 const SIGMAS = Math.sqrt(5.9915);
@@ -16,7 +16,7 @@ export function axesFor(up) {
   const along = Math.abs(up[0]) > 0.9 ? [0, 1, 0] : [1, 0, 0];
   const share = dot(along, up), level = along.map((v, k) => v - share * up[k]);
   const size = Math.hypot(...level), x = level.map((v) => v / size);
-  return { x, y: [up[1] * x[2] - up[2] * x[1], up[2] * x[0] - up[0] * x[2], up[0] * x[1] - up[1] * x[0]] };
+  return { x, y: cross(up, x) };
 }
 
 /**

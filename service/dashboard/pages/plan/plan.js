@@ -170,7 +170,7 @@ export class Plan {
     }
     const length = nice(BAR_PX / 2 / scale);
     this.bar.style.setProperty("width", `${length * scale}px`);
-    put(this.length, metres(length).replace(/(\.\d*?)0+ /, "$1 ").replace(". ", " "));
+    put(this.length, length < 0.1 ? metres(length) : `${Number(length.toPrecision(3))} m`);
   }
 
   #hands(signal, onpick) {

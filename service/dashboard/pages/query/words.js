@@ -25,7 +25,6 @@ export function keyOf(one) {
 /** The likeliest causes of `not_found`. */
 const CAUSES = {
   no_frames: "Nothing to compare",
-  deadline: "Too little time",
   too_little_in_view: "Too little in view",
   one_plane: "Too few planes in view",
   gravity: "Tilted against gravity",
