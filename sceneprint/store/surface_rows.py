@@ -279,8 +279,8 @@ def taken_range(connection: Connection, surface: SurfaceRow) -> tuple[float, flo
     at = frames.c.captured_at
     asked = _posed(surface.map_number, surface.model_id)
     asked = asked.with_only_columns(func.min(at), func.max(at))
-    first, last = connection.execute(asked).one()
-    return None if first is None else (first, last)
+    row = connection.execute(asked).one()
+    return None if row[0] is None else (row[0], row[1])
 
 
 def fused_range(connection: Connection, map_number: int) -> tuple[float | None, float | None]:

@@ -410,6 +410,8 @@ def remove_block(store: Store, row: MapRow) -> bool:
 
 #: Seconds between two looks at all maps; seconds after which frames are fused although more come.
 LOOK_S, LONGEST_S = 5.0, 60.0
+#: In place of when a map was first seen: it was looked at, and waits for what comes next.
+_DONE = math.inf
 #: Maps that get their rows in one look.
 _ROWS_AT_ONCE = 100
 
@@ -457,22 +459,30 @@ class SurfaceUpkeep:
     ) -> None:
         """Begin a job where frames came and no more come, or have come for long."""
         at = row.revision, surface.pose_edits
-        since = time.monotonic() if seen is None else seen[1]
+        changed = seen is None or seen[0] != at
+        since = time.monotonic() if seen is None or (changed and seen[1] == _DONE) else seen[1]
         self._seen[row.number] = at, since
-        if seen is None or (seen[0] != at and time.monotonic() - since < LONGEST_S):
+        if since == _DONE or (changed and time.monotonic() - since < LONGEST_S):
             return
+        self._seen[row.number] = at, _DONE
+        with self._store.database.read() as connection:  # most often there is nothing: no lock
+            if not self._is_due(connection, row, surface):
+                return
         with self._store.database.write() as connection:
             row = map_of(connection, row.number)
             now = stored.find_surface(connection, row.number)
-            if now is None or not now.wanted or self._is_hopeless(connection, row, now):
-                return
-            if not self._auto and not stored.frames_to_remove(connection, now, 1):
+            if now is None or not now.wanted:
                 return
             begun, blobs = begin_job(connection, row, now)
         collect_deleted_blobs(self._store, blobs)
         if begun:
-            self._seen.pop(row.number, None)
             self._bell.ring()
+
+    def _is_due(self, connection: Connection, row: MapRow, surface: SurfaceRow) -> bool:
+        """Whether a job is to be begun unasked."""
+        if self._is_hopeless(connection, row, surface):
+            return False
+        return self._auto or bool(stored.frames_to_remove(connection, surface, 1))
 
     def _is_hopeless(self, connection: Connection, row: MapRow, surface: SurfaceRow) -> bool:
         """Whether the last job failed with the same frames: somebody must look at it first."""
