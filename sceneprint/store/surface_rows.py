@@ -379,6 +379,7 @@ def tile_of_number(connection: Connection, number: int) -> TileRow | None:
 def spoil_tile(connection: Connection, tile: TileRow) -> None:
     """Have a tile made again whose bytes are lost: from its frames, or from finer tiles."""
     own = surface_tiles.c.number == tile.number
+    doom(connection, [blob for blob in (tile.blob, tile.draft) if blob])
     if tile.level == 0:
         lost = {"rebuilt_to": 0, "blob": None, "draft": None, "scale": NO_SCALE}
         connection.execute(update(surface_tiles).where(own).values(**lost))

@@ -40,6 +40,7 @@ from sceneprint.store.opaque_ids import invalid_cursor
 from sceneprint.store.surface_rows import LevelTotals, SightingFrame, SurfaceRow, TileRow
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.store.wakeup import Wakeup
+from sceneprint.types import Floats
 from sceneprint_client.api import JobState, Page, Vector
 from sceneprint_client.api.surface import (
     PLAN_WIDTH,
@@ -51,7 +52,7 @@ from sceneprint_client.api.surface import (
     SurfaceState,
     SurfaceTile,
 )
-from sceneprint_client.surface_tiles import CELL, SIDE
+from sceneprint_client.surface_tiles import CELL, SIDE, cell_points
 
 log = logging.getLogger(__name__)
 
@@ -323,16 +324,13 @@ class MapSurfaces:
                      high, name)  # fmt: skip
         return Output(tag, make)
 
-    def _points(self, surface: SurfaceRow, tile: TileRow) -> np.ndarray[Any, Any]:
+    def _points(self, surface: SurfaceRow, tile: TileRow) -> Floats:
         """(N, 3) of a tile, metres; none of one that is lost or was replaced meanwhile."""
-        tile_m = surface.cell_m * FACTOR**tile.level * SIDE
-        with suppress(DamagedBlob):
+        try:
             cells = tile_cells(self._store, tile, scale_of(surface))
-            found: np.ndarray[Any, Any] = (
-                np.array(tile.place) + (cells["at"] + 0.5) / 256.0
-            ) * tile_m
-            return found
-        return np.zeros((0, 3))
+        except DamagedBlob:
+            return np.zeros((0, 3))
+        return cell_points(cells, tile.place, surface.cell_m * FACTOR**tile.level * SIDE)
 
     def _saw(self, frame: SightingFrame, spot: Sequence[float], within: float) -> bool:
         try:
