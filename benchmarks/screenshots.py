@@ -133,6 +133,11 @@ def views(client: httpx.Client, made: list[Shot]) -> list[View]:
     found = client.post(f"/v1/maps/{MAP}/associations", json=both).raise_for_status().json()
     for job in (snapshot, found["association_id"]):
         _done(client, job)
+    for name in (MAP, SIDES):
+        for begun in ("surface", "coverage"):
+            asked = {"not_within_s": 0} if begun == "coverage" else {}
+            told = client.post(f"/v1/maps/{name}/{begun}", json=asked).raise_for_status().json()
+            _done(client, told.get("coverage_id") or told["job_id"])
     ids = [str(one["frame_id"]) for one in _listed(client, MAP)]
     asked = {"frame_id": ids[3], "k": 4, "explain": True, "explain_frame": ids[-1]}
     answer = client.post(f"/v1/maps/{MAP}/queries", json=asked).raise_for_status().json()
@@ -235,7 +240,8 @@ def _unsure(sides: str, absent: str) -> Iterator[View]:
     several = View("answer-ambiguous", f"#/queries/{sides}")
     plan = View("map-view-ambiguous", f"#/maps/{SIDES}/paths?query={sides}", tall=True)
     none = View("answer-not-found", f"#/queries/{absent}")
-    for one in (several, plan, none):
+    lost = View("coverage", f"#/maps/{SIDES}/coverage?cell=6,-4", tall=True)
+    for one in (several, plan, none, lost):
         yield one
         yield replace(one, name=f"{one.name}-phone", size=PHONE)
 

@@ -311,7 +311,7 @@ def settle() -> Settle:
 
 @pytest.fixture(scope="session")
 def axe() -> Callable[[Page], list[str]]:
-    """What axe finds serious or critical on a page, in the light theme and in the dark one."""
+    """What axe finds on a page, in the light theme and in the dark one."""
     judge = Axe()
 
     def look(page: Page) -> list[str]:
@@ -319,9 +319,8 @@ def axe() -> Callable[[Page], list[str]]:
         for theme in ("light", "dark"):
             page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
             for one in judge.run(page).response["violations"]:
-                if one["impact"] in ("serious", "critical"):
-                    where = [node["html"][:200] for node in one["nodes"][:5]]
-                    found.append(f"{theme}: {one['id']}: {one['help']}: {where}")
+                where = [node["html"][:200] for node in one["nodes"][:5]]
+                found.append(f"{theme}: {one['id']}: {one['help']}: {where}")
         return found
 
     return look

@@ -260,7 +260,7 @@ def test_a_camera_that_is_not_known_is_as_wide_as_what_was_seen(
     settle(page)
     drawn = page.evaluate(
         """async () => {
-          const { lens } = await import(`${location.pathname}/overlay/page.js`);
+          const { lens } = await import(`${location.pathname}/overlay/parts.js`);
           const { frustum } = await import(`${location.pathname}/viewer/shapes.js`);
           return [...frustum(lens(null, {origin: [-1, -0.5, 1], extent: [3, 1, 1]}, "depth"), 2)];
         }"""

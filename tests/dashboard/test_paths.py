@@ -309,3 +309,28 @@ def test_numbers_behind_the_picture(page: Page, station: Any, settle: Any) -> No
     assert [(name, over) for name, _, over in reached] == [("a", 0), ("b", 1), ("c", 2)]
     a_from_c = np.linalg.inv(turn) @ shift
     np.testing.assert_allclose(np.array(reached[2][1]).reshape(4, 4).T, a_from_c, atol=1e-12)
+
+
+def test_colours_of_runs_stay_when_sessions_come(page: Page, station: Any, settle: Any) -> None:
+    page.goto(f"{station.home}#/")
+    settle(page)
+    script = """async ([url, sessions]) => { const { runsOf } = await import(url);
+        const { runs } = runsOf(sessions);
+        return Object.fromEntries(runs.map((one) => [one.session, one.colour])); }"""
+
+    def colours(*days: int) -> dict[str, int]:
+        sessions = [
+            {"session": f"run {day}", "robot": None, "with_pose": 3, "frames": {"indexed": 3},
+             "parent_frames": ["map"], "first_captured_at": f"2026-11-{day:02d}T09:00:00Z",
+             "last_captured_at": f"2026-11-{day:02d}T10:00:00Z"}
+            for day in sorted(days, key=str)  # as the API lists them, by name
+        ]  # fmt: skip
+        url = f"{station.url}/dashboard/paths/data.js"
+        told: dict[str, int] = page.evaluate(script, [url, sessions])
+        return told
+
+    before = colours(2, 3, 20)
+    after = colours(2, 3, 20, 21, 22, 23, 24, 25)
+    assert {name: after[name] for name in before} == before
+    assert sorted(after.values()) == list(range(8))  # as many as there are colours
+    assert len(colours(*range(1, 20))) == 19

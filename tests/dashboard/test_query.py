@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
+import numpy as np
 import pytest
 
 
@@ -25,14 +27,27 @@ def key(one: dict[str, Any]) -> str:
     return f"{one['map']}/{one['frame_id']}"
 
 
+#: Where circles of a plan stand, in its pixels; and its projection: the origin, and a metre.
+SPOTS = "all => all.map(one => [Number(one.getAttribute('cx')), Number(one.getAttribute('cy'))])"
+VIEW = """() => { const view = document.querySelector(".plan").plan.view;
+    return [view.x(0), view.y(0), view.scale]; }"""
+
+
+def at(view: list[float], u: float, v: float) -> list[float]:
+    """The pixel of a place of the plan, metres to the right and to the top."""
+    return [view[0] + u * view[2], view[1] - v * view[2]]
+
+
 @pytest.fixture
 def ask(station, page, settle):
-    """Open the page that asks with a frame; returns the answer that it shows, as the API has it."""
+    """Open the page that asks with a frame, and unfold why; returns the answer that it shows, as
+    the API has it.
+    """
 
-    def open_it(search: str = "", frame: int = 0) -> dict[str, Any]:
+    def open_it(search: str = "", frame: int = 0, why: str = "&why=open") -> dict[str, Any]:
         page.goto("about:blank")
         address = f"{station.home}#/maps/building/query?frame={station.frames[frame].frame_id}"
-        page.goto(address + search)
+        page.goto(address + why + search)
         settle(page)
         return shown(station, page)
 
@@ -138,7 +153,7 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
     several = four_sides["alternatives"]
     # the cube turned by 90, 180 and 270 degrees; the sensor is 1.8 m from its axis
     assert len(several) >= 4
-    page.goto(f"{station.home}#/queries/{four_sides['query_id']}")
+    page.goto(f"{station.home}#/queries/{four_sides['query_id']}?why=open")
     settle(page)
     verdict = page.locator(".query-verdict")
     said = verdict.inner_text()
@@ -147,7 +162,13 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
     assert "Do not act on any of these poses. Move on and query again" in said
     assert "found" not in said.lower()
     assert "agree" not in said.lower()
-    items = verdict.locator(".alternatives li").evaluate_all(
+    # the plan has a letter at each pose, and is not far below it
+    drawn = page.locator(".plan .query-spot-letter circle").evaluate_all(SPOTS)
+    view = page.evaluate(VIEW)
+    for (x, y), told in zip(drawn, several, strict=True):
+        p = told["pose"]["translation"]
+        assert [x, y] == pytest.approx(at(view, p["x"], p["y"]), abs=0.2)
+    items = page.locator(".alternatives li").evaluate_all(
         """all => all.map(one => ({
             letter: one.querySelector(".alternatives-letter").textContent,
             place: one.querySelector(".alternatives-place").textContent,
@@ -189,6 +210,61 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
     assert axe(page) == []
     page.set_viewport_size({"width": 390, "height": 844})
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_the_plan_and_the_overlay_are_on_the_first_screen(station, page, ask, settle):
+    page.set_viewport_size({"width": 1440, "height": 900})
+    answer = ask(why="")
+    plan, inset = page.locator(".query-plan .plan"), page.locator(".query-inset-canvas")
+    for one in (page.locator(".query-verdict"), plan, inset):
+        box = one.bounding_box()
+        assert box["y"] + box["height"] <= 900
+    assert page.locator(".query-row").count() == 0  # folded, and not drawn before it is asked for
+    # the room's z is up: x and y are those of the plan, and a camera looks along its own z
+    pose = np.array(answer["location"]["pose"]["matrix"])
+    view = page.evaluate(VIEW)
+    arrow = page.locator(".plan .query-spot-found")
+    x, y, turn = map(float, re.findall(r"-?[\d.]+", arrow.get_attribute("transform")))
+    assert [x, y] == pytest.approx(at(view, *pose[:2, 3]), abs=0.2)
+    assert 90 - turn == pytest.approx(np.degrees(np.arctan2(pose[1, 2], pose[0, 2])), abs=0.1)
+    covariance = np.reshape(answer["location"]["uncertainty"]["covariance"], (6, 6))[:2, :2]
+    ellipse = page.locator(".plan .query-ellipse")
+    axes = [float(ellipse.get_attribute(name)) for name in ("ry", "rx")]
+    # chi-squared of two degrees of freedom: 95 % lie within -2 ln 0.05
+    assert axes == pytest.approx(
+        np.sqrt(np.linalg.eigvalsh(covariance) * -2 * np.log(0.05)), rel=1e-3
+    )
+    truth = np.array(station.frames[0].meta["pose"]["matrix"])
+    ring = page.locator(".plan .query-spot-taken").evaluate_all(SPOTS)
+    assert ring == [pytest.approx(at(view, *truth[:2, 3]), abs=0.2)]
+    voting = [one for one in answer["matches"] if one["validation"]["status"] == "accepted"]
+    assert page.locator(".plan .query-vote-line").count() == len(voting)
+    # each match stands where its frame was taken
+    taken = {one.frame_id: one.meta["pose"]["matrix"] for one in station.frames}
+    for one in voting:
+        mark = page.locator(f".plan .query-spot-match[data-key='{key(one)}']")
+        x, y, _ = map(float, re.findall(r"-?[\d.]+", mark.get_attribute("transform")))
+        own = np.array(taken[one["frame_id"]])
+        assert [x, y] == pytest.approx(at(view, *own[:2, 3]), abs=0.15 * view[2])
+    # another match is laid on the query; the address keeps which
+    page.locator("#query-inset-match").select_option(key(voting[1]))
+    settle(page)
+    assert f"match=building%2F{voting[1]['frame_id']}" in page.url
+    link = page.get_by_role("link", name="Overlay in 3-D").get_attribute("href")
+    assert link == f"#/queries/{answer['query_id']}/matches/{voting[1]['frame_id']}?map=building"
+    # with the keyboard the plan is moved and shown whole again
+    page.locator(".plan-sheet").focus()
+    for pressed in ("ArrowLeft", "+"):
+        page.keyboard.press(pressed)
+    page.wait_for_timeout(50)
+    assert page.evaluate(VIEW)[2] == pytest.approx(1.25 * view[2])
+    page.keyboard.press("0")
+    page.wait_for_timeout(50)
+    assert page.evaluate(VIEW) == pytest.approx(view)
+    page.locator(".query-reasons > summary").click()
+    settle(page)
+    assert page.locator(".query-row").count() == 3
+    assert "why=open" in page.url
 
 
 def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
@@ -315,7 +391,7 @@ def test_why_not_is_told_as_the_api_explains_it(station, page, ask, settle):
         head = page.locator(".query-why-head")
         assert head.get_attribute("data-lost") == (told["lost_at"] or "none")
         said = page.locator(".query-why-result").inner_text()
-        assert told["reason"][1:] in said
+        assert told["reason"][1:].replace("`", "") in said  # code is shown as code
         if told["rank"] is not None:
             assert f"{told['rank']} of {told['of']}" in said
             assert f"{told['distance']:,}" in said
@@ -371,7 +447,7 @@ def test_a_file_is_asked_and_looked_at_again(station, page, settle, axe):
         "maps/building/queries", f"queries/{first['query_id']}/again",
     ]  # fmt: skip
 
-    page.goto(f"{station.home}#/queries/{answer['query_id']}")
+    page.goto(f"{station.home}#/queries/{answer['query_id']}?why=open")
     settle(page)
     assert page.locator(".query-asked canvas").get_attribute("data-drawn") == "true"
     assert "with an uploaded depth image" in page.locator(".query-note").first.inner_text()
@@ -425,7 +501,7 @@ def test_an_answer_outlives_frames_of_its_ranking(station, page, settle, until):
     gone = next(one for one in answer["matches"] if one["rank"] == 2)
     station.client.delete(f"{path}/frames/{gone['frame_id']}")
     page.allowed.append("404")  # the picture of the frame that is gone
-    page.goto(f"{station.home}#/queries/{answer['query_id']}")
+    page.goto(f"{station.home}#/queries/{answer['query_id']}?why=open")
     settle(page)
     ranking = tiles(page, "R")
     assert key(gone) not in {one["key"] for one in ranking}

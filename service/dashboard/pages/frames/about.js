@@ -1,6 +1,7 @@
 // All that the API tells of a frame, arranged for people.
 import { h } from "../lib/dom.js";
 import { bytes, count, seconds, time } from "../lib/format.js";
+import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { badge, sentence } from "./badge.js";
 
@@ -22,11 +23,11 @@ export function about(frame, job, { edit }) {
   return [
     card("State", null, list([
       ["State", h("span", {}, badge(frame.state), h("span", { class: "muted" }, ` ${sentence(frame.state)}`))],
-      frame.reason && ["Reason", frame.reason],
+      frame.reason && ["Reason", coded(frame.reason)],
       ["Received", exact(frame.received_at)],
       frame.indexed_at && ["Indexed", exact(frame.indexed_at)],
       ["Job", jobOf(frame, job)],
-      job?.error && job.error !== frame.reason && ["Error", job.error],
+      job?.error && job.error !== frame.reason && ["Error", coded(job.error)],
     ])),
     card("Source", edit && h("button", { class: "button", type: "button", id: "edit", onClick: edit }, "Edit"), list(who)),
     card("Sensor", null, list(frame.kind === "cloud" ? ofCloud(frame) : ofDepth(frame))),

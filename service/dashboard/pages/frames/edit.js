@@ -1,6 +1,7 @@
 // Edit who took a frame: sent with If-Match, so that nobody's edit is overwritten unseen.
 import { at, get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
+import { coded } from "../lib/prose.js";
 import { sheet, toast } from "../lib/states.js";
 
 const NAMES = { robot: "Robot", session: "Session", name: "File name", tags: "Tags" };
@@ -41,7 +42,7 @@ export function editFrame(frame, edited) {
     } catch (error) {
       if (error.status === 401 || !dialog.open) throw error; // told elsewhere
       if (error.status === 412) await meet();
-      else put(said, h("p", { class: "field-error" }, error.message), (error.errors ?? []).map((one) => h("p", { class: "field-error" }, one.field ? `${one.field}: ${one.reason}` : one.reason)));
+      else put(said, h("p", { class: "field-error" }, coded(error.message)), (error.errors ?? []).map((one) => h("p", { class: "field-error" }, coded(one.field ? `${one.field}: ${one.reason}` : one.reason))));
     } finally {
       save.disabled = false;
     }

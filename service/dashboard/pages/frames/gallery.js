@@ -45,7 +45,12 @@ export async function render(root, { params, search, signal, go, title, actions 
     h("option", { value: "" }, "Newest first"), h("option", { value: "asc" }, "Oldest first"));
   let bar = filterBar(wanted, [], turn);
   const clear = h("button", { class: "button quiet", type: "button", onClick: () => turn(Object.fromEntries(FILTERS.map((one) => [one, null]))) }, "Clear filters");
-  put(root, bar, h("div", { class: "gallery-head" }, views, order, clear, over), news, place, under);
+  // the tabs of the page and the filters are many steps of the keyboard before the first frame
+  const past = h("a", { class: "skip", href: "#frames", onClick: (event) => {
+    event.preventDefault(); // its `#frames` would be taken for an address
+    grid.querySelector("a")?.focus();
+  } }, "Skip to the frames");
+  put(root, past, bar, h("div", { class: "gallery-head" }, views, order, clear, over), news, place, under);
 
   /** Another list begins at its first page. */
   function turn(asked) {

@@ -1,6 +1,7 @@
 // The files of a queue as rows: how far each one is, and why it was refused in the API's words.
 import { h, put } from "../lib/dom.js";
 import { bytes, count, seconds, shortId } from "../lib/format.js";
+import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { badge, isPending } from "./badge.js";
 import { viewSwitch } from "./views.js";
@@ -144,12 +145,12 @@ function reasonOf(item) {
     const rest = Math.max(0, (item.until - Date.now()) / 1000);
     return [
       state === "waiting" && h("p", {}, `Again ${rest > 0.5 ? `in ${seconds(rest)}` : "now"}: `),
-      h("p", {}, problem.status ? h("strong", {}, `${problem.title}. `) : null, problem.detail ?? problem.message),
-      (problem.errors ?? []).length > 0 && h("ul", {}, problem.errors.map((one) => h("li", {}, one.field ? `${one.field}: ${one.reason}` : one.reason))),
+      h("p", {}, problem.status ? h("strong", {}, `${problem.title}. `) : null, coded(problem.detail ?? problem.message)),
+      (problem.errors ?? []).length > 0 && h("ul", {}, problem.errors.map((one) => h("li", {}, coded(one.field ? `${one.field}: ${one.reason}` : one.reason)))),
     ];
   }
-  if (item.isThere && !isPending(state)) return h("p", {}, "The map already has this frame.", item.reason && ` ${item.reason}`);
-  return item.reason && h("p", {}, item.reason);
+  if (item.isThere && !isPending(state)) return h("p", {}, "The map already has this frame.", item.reason && coded(` ${item.reason}`));
+  return item.reason && h("p", {}, coded(item.reason));
 }
 
 function importOf(item) {
@@ -160,6 +161,6 @@ function importOf(item) {
   return [
     h("p", {}, `Frames: ${parts.join(", ")}.`),
     faults.length > 0 && h("details", {}, h("summary", {}, `Rejected files${faults.length < refused ? ", the first of them" : ""}`),
-      h("ul", {}, faults.slice(0, STEP).map((one) => h("li", {}, h("strong", {}, one.name), ` ${one.problem.detail}`)))),
+      h("ul", {}, faults.slice(0, STEP).map((one) => h("li", {}, h("strong", {}, one.name), coded(` ${one.problem.detail}`))))),
   ];
 }

@@ -3,6 +3,7 @@ import { at } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { frameLabel, frameTitle, time } from "../lib/format.js";
 import { picture } from "../lib/picture.js";
+import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { badge, isPending, sentence } from "./badge.js";
 
@@ -26,7 +27,7 @@ export function preview(frame, { view = "depth", width = PREVIEW, signal }) {
   }
   return h("div", { class: "frame-picture frame-why", dataset: { state: frame.state } },
     h("strong", {}, isPending(frame.state) ? "No picture yet" : `Not searchable`),
-    h("p", {}, frame.reason ?? sentence(frame.state)));
+    h("p", {}, coded(frame.reason ?? sentence(frame.state))));
 }
 
 /**

@@ -1,6 +1,7 @@
 // A picture of the API on a canvas: an <img> cannot show a key, and the policy forbids blob:.
 import { bytes } from "./api.js";
 import { h } from "./dom.js";
+import { plain } from "./prose.js";
 
 /**
  * A canvas that draws itself when the picture has come; where there is nothing to see it says why.
@@ -27,8 +28,8 @@ async function draw(canvas, path, params, alt, signal) {
   } catch (error) {
     if (error.name === "AbortError") return false;
     const why = error.status === 409 ? "No preview yet" : error.status === 0 ? "No answer" : "Not available";
-    canvas.setAttribute("aria-label", `${alt}. ${why}: ${error.message}`);
-    canvas.title = error.message;
+    canvas.setAttribute("aria-label", `${alt}. ${why}: ${plain(error.message)}`);
+    canvas.title = plain(error.message);
     write(canvas, why);
     if (error.status === 401) throw error;
     return false;

@@ -14,3 +14,6 @@ export function sentence(text) {
 export function coded(text) {
   return text.split("`").map((part, i) => (i % 2 ? h("code", {}, part) : part));
 }
+
+/** The same where no markup can stand, as in titles and labels. @param {string} text */
+export const plain = (text) => text.replaceAll("`", "");

@@ -12,7 +12,7 @@ const THEMES = [
   ["light", "Light", "M12 8a4 4 0 100 8 4 4 0 000-8zM12 2v2M12 20v2M2 12h2M20 12h2M5 5l1.400 1.400M17.600 17.600L19 19M5 19l1.400-1.400M17.600 6.400L19 5"],
   ["dark", "Dark", "M20 14.500A8.500 8.500 0 019.500 4a8.500 8.500 0 1010.500 10.500z"],
 ];
-const TABS = [["frames", "Frames"], ["sessions", "Sessions"], ["query", "Query"], ["queries", "Queries"], ["paths", "Map view"], ["upload", "Upload"]];
+const TABS = [["frames", "Frames"], ["sessions", "Sessions"], ["query", "Query"], ["queries", "Queries"], ["coverage", "Coverage"], ["paths", "Map view"], ["upload", "Upload"]];
 
 /** Say what page this is. @param {string} text */
 export function setTitle(text) {

@@ -1,6 +1,7 @@
 // What a page shows in place of what was asked for, and what asks or tells across pages.
 import { lives } from "./api.js";
 import { h, put, svg } from "./dom.js";
+import { coded } from "./prose.js";
 
 const SHAPES = {
   good: "M5 12.500l4.500 4.500L19 7.500",
@@ -34,9 +35,9 @@ export function empty({ title, text, actions }) {
  */
 export function failed(problem, retry) {
   const known = problem.status !== undefined;
-  const fields = (problem.errors ?? []).map((one) => h("li", {}, one.field ? `${one.field}: ${one.reason}` : one.reason));
+  const fields = (problem.errors ?? []).map((one) => h("li", {}, coded(one.field ? `${one.field}: ${one.reason}` : one.reason)));
   const text = [
-    h("p", {}, known ? problem.detail : `The page failed: ${problem.message}`),
+    h("p", {}, known ? coded(problem.detail ?? problem.message) : `The page failed: ${problem.message}`),
     fields.length > 0 && h("ul", {}, fields),
     problem.instance && h("p", { class: "muted" }, "Request id in the log: ", h("span", { class: "mono" }, problem.instance.split("/").pop())),
   ];
@@ -69,7 +70,7 @@ export function gone(back, signal) {
 export function toast(text, { kind = "good" } = {}) {
   const region = document.getElementById("toasts");
   const close = h("button", { class: "button quiet", type: "button", "aria-label": "Dismiss", onClick: () => one.remove() }, "×");
-  const one = h("div", { class: "toast", dataset: { kind } }, shape(kind), h("span", {}, text), close);
+  const one = h("div", { class: "toast", dataset: { kind } }, shape(kind), h("span", {}, coded(text)), close);
   region.append(one);
   while (region.children.length > 4) region.firstChild?.remove();
   // what went wrong stays until it was seen

@@ -2,6 +2,7 @@
 import { at, get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { bytes, count } from "../lib/format.js";
+import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { confirm, sheet, toast } from "../lib/states.js";
 
@@ -99,7 +100,7 @@ async function form({ title, action, children, save, place }) {
       const own = await place(error);
       const told = own ? [{ field: own, reason: error.detail }] : error.errors;
       const left = told.filter((one) => !tell(dialog, one));
-      if (left.length || !told.length) put(rest, error.detail);
+      if (left.length || !told.length) put(rest, coded(error.detail));
       dialog.querySelector("[aria-invalid]")?.focus();
     } finally {
       button.disabled = false;
@@ -112,7 +113,7 @@ function tell(dialog, { field: name, reason }) {
   const input = dialog.querySelector(`[name="${CSS.escape(name)}"]`);
   const place = dialog.querySelector(`#new-${CSS.escape(name)}-error`);
   if (!place) return false;
-  put(place, reason.includes("match pattern") ? PATTERN : reason);
+  put(place, reason.includes("match pattern") ? PATTERN : coded(reason));
   if (input.type !== "radio") input.setAttribute("aria-invalid", "true");
   return true;
 }

@@ -2,6 +2,7 @@
 import { at, get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, shortId, time } from "../lib/format.js";
+import { coded } from "../lib/prose.js";
 import { go, link } from "../lib/router.js";
 import { actions, progress, span, stateBadge, took, traceback } from "./joblist.js";
 import { poll, renewTimes } from "./poll.js";
@@ -66,7 +67,7 @@ function describe(job, open) {
       job.progress && progress(job.progress),
       h("dl", { class: "facts" }, facts.filter(([, value]) => value).map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))))),
     job.error && h("section", { class: "card", "aria-labelledby": "job-error" }, h("h2", { id: "job-error" }, "Error"),
-      h("p", { class: "job-error" }, job.error), traceback(job, open)),
+      h("p", { class: "job-error" }, coded(job.error)), traceback(job, open)),
     job.result && h("section", { class: "card", "aria-labelledby": "job-result" }, h("h2", { id: "job-result" }, "Result"), result(job.result)),
   ];
 }

@@ -2,6 +2,7 @@
 import { at, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, ms, seconds, shortId, time } from "../lib/format.js";
+import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { confirm, toast } from "../lib/states.js";
@@ -59,7 +60,7 @@ export function jobRow(job, changed) {
       h("span", { class: "job-facts muted" }, facts),
       h("span", { class: "job-actions" }, actions(job, changed))),
     job.progress && !job.finished_at && progress(job.progress),
-    job.error && h("p", { class: "job-error" }, job.error),
+    job.error && h("p", { class: "job-error" }, coded(job.error)),
     traceback(job));
 }
 

@@ -1,6 +1,7 @@
 // Making a key, and showing its secret the one time that it can be shown.
 import { get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
+import { coded } from "../lib/prose.js";
 import { sheet, toast } from "../lib/states.js";
 
 const SCOPES = [["read", "read: view and query"], ["write", "write: also upload and edit frames"], ["admin", "admin: also change the map itself"]];
@@ -44,7 +45,7 @@ export async function newKey(signal, made) {
     } catch (error) {
       if (error.status === undefined) throw error;
       const fields = error.errors.map((one) => `${one.field}: ${one.reason}`);
-      put(why, fields.length ? fields.join(". ") : error.message);
+      put(why, coded(fields.length ? fields.join(". ") : error.message));
     } finally {
       button.disabled = false;
     }

@@ -10,9 +10,8 @@ import { residualCounts } from "../viewer/points.js";
 import { createViewer } from "../viewer/viewer.js";
 import { legend } from "./legend.js";
 import { evidenceCard, framesCard, rivalCard, transformCard, uncertaintyCard, verdictCard } from "./numbers.js";
-import { TRANSFORM } from "./overlay.js";
+import { sensorsOf, TRANSFORM } from "./parts.js";
 import { Scene, tally } from "./scene.js";
-import { isOptical } from "./words.js";
 
 const COLOURS = [["source", "Source"], ["normal", "Normals"], ["residual", "Residual"]];
 const POSES = { before: "Before", aligned: "Aligned", rival: "Rival" };
@@ -54,9 +53,7 @@ export function show(root, { params, search, signal, go, actions }, { answer, de
     class: "button", type: "button", onClick: () => download(),
   }, "Download PLY"));
 
-  const parent = details.transform?.parent_frame;
-  const kind = matched?.kind ?? (parent ? (isOptical(parent) ? "depth" : "cloud") : answer.kind);
-  const up = kind === "cloud" ? "z" : "-y";
+  const { up, cameras } = sensorsOf(details, answer, { asked, matched }, aligned);
   const viewer = createViewer(canvas, {
     label: `Query and match ${shortId(params.frame)}, ${details.validation.status}`, up,
     onlost: (isLost) => { lost.hidden = !isLost; },
@@ -68,7 +65,6 @@ export function show(root, { params, search, signal, go, actions }, { answer, de
     put(rival, rivalCard(details, tallies));
     return;
   }
-  const cameras = { query: lens(asked, aligned.query, answer.kind), match: lens(matched, aligned.match, kind) };
   const scene = new Scene(viewer, details, sets, cameras, shown, () => slid());
   canvas.scene = scene;
   signal.addEventListener("abort", () => { scene.destroy(); viewer.destroy(); }, { once: true });
@@ -176,14 +172,6 @@ function steps(answer, params, map) {
   const to = (one, text, label) => one && h("a", { class: "button", "aria-label": label,
     href: link("queries", answer.query_id, "matches", one.frame_id, { map: one.map }) }, text);
   return i < 0 ? null : [to(tried[i - 1], "← Previous", "Previous match"), to(tried[i + 1], "Next →", "Next match")];
-}
-
-/** A camera to draw: as it is known, else as wide as what was seen; null of a cloud's sensor. */
-export function lens(frame, points, kind) {
-  if (frame?.intrinsics) return frame.intrinsics;
-  if (kind === "cloud") return null;
-  const { origin: [x, y, z], extent: [w, d, deep] } = points, far = z + deep;
-  return { width: w, height: d, fx: far, fy: far, cx: -x - 0.5, cy: -y - 0.5 }; // pixels begin at -0.5
 }
 
 /** Where nothing can be drawn in 3-D: both as pictures. */

@@ -3,6 +3,7 @@
 import { at, get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, metres, degrees } from "../lib/format.js";
+import { coded } from "../lib/prose.js";
 import { sheet, toast } from "../lib/states.js";
 import { EDGES } from "./scene.js";
 
@@ -45,7 +46,7 @@ function told(one, edges) {
   const joins = one.result.joins.map((join) => h("li", {},
     h("span", { class: "badge", dataset: { kind: join.transform === null ? "warn" : join.strength === "strong" ? "good" : "neutral" } }, join.transform === null ? "not joined" : `joined, ${join.strength}`),
     h("span", {}, h("span", { class: "mono" }, `${join.from_parent} → ${join.to_parent}`),
-      h("span", { class: "muted" }, join.transform === null ? ` ${join.reason}` : ` ${join.support} of ${join.votes} edges agree, within ${metres(join.spread_m)}, ${degrees(join.spread_deg)}`))));
+      h("span", { class: "muted" }, join.transform === null ? coded(` ${join.reason}`) : ` ${join.support} of ${join.votes} edges agree, within ${metres(join.spread_m)}, ${degrees(join.spread_deg)}`))));
   return [
     h("ul", { class: "paths-kinds" }, kinds),
     edges && edges.drawn < one.result.edges && h("p", { class: "muted" },
@@ -94,7 +95,7 @@ export function begin(map, runs, onbegun) {
       dialog.close();
       onbegun(data);
     } catch (problem) {
-      put(error, problem.detail ?? problem.message);
+      put(error, coded(problem.detail ?? problem.message));
       button.disabled = false;
     }
   });

@@ -6,13 +6,15 @@ import { ofQuaternion } from "../viewer/matrix.js";
 /** Runs that are told of at most, and drawn in one picture; poses of all of them together. */
 export const MOST_RUNS = 1000, MOST_DRAWN = 40;
 const POSES = 6000, MOST_POSES = 2000;
+/** Colours of runs that paths.css has. */
+const COLOURS = 8;
 /** Edges that are drawn, at most. */
 export const MOST_EDGES = 2000;
 
 /**
- * @typedef {{session: string, robot: string | null, parent: string, number: number, frames: number,
- *   last: string | null}} Run
- *   frames: of the session, with those that have no pose
+ * @typedef {{session: string, robot: string | null, parent: string, number: number, colour: number, frames: number,
+ *   first: string | null, last: string | null}} Run
+ *   number: its place in the list of sessions; colour: of those of paths.css; frames: of the session, with those that have no pose
  * @typedef {Run & {ids: string[], times: number[], poses: number[][], posed: number, leftOut: number,
  *   camera: Object<string, number> | null, isCloud: boolean, stamps: "captured" | "sequence" | "received" | null}} Path
  *   poses: T_parent_sensor, 16 column-major; times: seconds, or places in the session where stamps are `sequence`
@@ -40,13 +42,31 @@ export function runsOf(sessions) {
     } else {
       for (const parent of one.parent_frames) {
         runs.push({
-          session: one.session, robot: one.robot, parent, frames, number: runs.length,
-          last: one.last_captured_at,
+          session: one.session, robot: one.robot, parent, frames, number: runs.length, colour: 0,
+          first: one.first_captured_at, last: one.last_captured_at,
         });
       }
     }
   }
+  colourRuns(runs);
   return { runs, without };
+}
+
+/**
+ * Give each run a colour that stays when other sessions come: by its name, and where that is taken the next; those
+ * that began first choose first. @param {Run[]} runs changed in place
+ */
+function colourRuns(runs) {
+  const taken = new Set(), name = (one) => JSON.stringify([one.session, one.robot, one.parent]);
+  const order = (a, b) => (a.first ?? "~").localeCompare(b.first ?? "~") || name(a).localeCompare(name(b));
+  for (const one of runs.toSorted(order)) {
+    let hash = 0;
+    for (const letter of name(one)) hash = (31 * hash + letter.charCodeAt(0)) % 65521;
+    one.colour = hash % COLOURS;
+    while (taken.has(one.colour)) one.colour = (one.colour + 1) % COLOURS;
+    taken.add(one.colour);
+    if (taken.size === COLOURS) taken.clear();
+  }
 }
 
 /** All sessions, up to MOST_RUNS. @returns {Promise<{items: Object<string, any>[], more: boolean}>} */

@@ -23,7 +23,7 @@ export function legend(paths, hidden, onchange) {
   };
   const rows = paths.map((one, i) => h("li", {}, h("label", { class: "paths-run" },
     boxes[i],
-    h("span", { class: "paths-label", style: { borderColor: `var(${tokenOf(one.number)})` }, "aria-hidden": "true" }, String(i + 1)),
+    h("span", { class: "paths-label", style: { borderColor: `var(${tokenOf(one.colour)})` }, "aria-hidden": "true" }, String(i + 1)),
     h("span", { class: "paths-name" }, nameOf(one), one.robot !== null && one.robot !== one.session && h("span", { class: "muted" }, ` ${one.robot}`)),
     h("span", { class: "number muted" }, poses(one)))));
   return [

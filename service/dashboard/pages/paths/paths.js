@@ -2,6 +2,7 @@
 
 import { h, put } from "../lib/dom.js";
 import { count } from "../lib/format.js";
+import { plain } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { empty } from "../lib/states.js";
@@ -171,7 +172,7 @@ class Page {
         this.#paths.set(key, await pathOf(this.map, run, Math.max(share, 4), this.signal));
       } catch (error) {
         if (error.status !== 422) throw error;
-        return { ...run, why: error.detail };
+        return { ...run, why: plain(error.detail) };
       }
     }
     return this.#paths.get(key);

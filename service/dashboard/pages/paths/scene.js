@@ -12,7 +12,6 @@ import {
 } from "./shapes.js";
 
 const FRUSTUMS = 160, CLOSEST = 16; // at first, and how many times as many when one is near
-const COLOURS = 8;
 /** How edges of each verdict are drawn. */
 export const EDGES = [
   { kind: "consistent", tint: "muted", dash: null },
@@ -23,8 +22,8 @@ export const EDGES = [
 const ASKED = ["query", "ellipsoid", "alternatives", "matches", "matched"];
 const STEEP = Math.PI / 2;
 
-/** Colour of a run: a token of paths.css. @param {number} number */
-export const tokenOf = (number) => `--path-${number % COLOURS}`;
+/** Colour of a run: a token of paths.css. @param {number} colour */
+export const tokenOf = (colour) => `--path-${colour}`;
 
 /**
  * @param {HTMLElement} place where the canvas goes
@@ -244,7 +243,7 @@ class Scene {
   #paint() {
     const style = getComputedStyle(document.documentElement);
     this.#drawn.forEach((one, i) => {
-      const tint = rgb(style.getPropertyValue(tokenOf(one.number)));
+      const tint = rgb(style.getPropertyValue(tokenOf(one.colour)));
       for (const kind of ["path", "frustums"]) this.#viewer.lines(`${kind} ${i}`, { tint });
     });
   }
@@ -252,7 +251,7 @@ class Scene {
   #label() {
     const made = [];
     this.#drawn.forEach((one, i) => {
-      if (one.world.length) made.push({ path: i, at: this.#near(placeOf(one.world[0])), node: h("span", { class: "paths-label", style: { borderColor: `var(${tokenOf(one.number)})` } }, String(i + 1)) });
+      if (one.world.length) made.push({ path: i, at: this.#near(placeOf(one.world[0])), node: h("span", { class: "paths-label", style: { borderColor: `var(${tokenOf(one.colour)})` } }, String(i + 1)) });
     });
     this.#asked?.alternatives.forEach((pose, i) => {
       made.push({ at: this.#near(placeOf(pose)), node: h("span", { class: "paths-label", dataset: { kind: "alternative" } }, letterOf(i)) });

@@ -4,16 +4,17 @@ import { h, put } from "../lib/dom.js";
 import { shortId, time } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { empty, soon } from "../lib/states.js";
+import { backdrops } from "../plan/backdrop.js";
 import { askAgain } from "./asking.js";
 import { pickFrame } from "./picker.js";
 import { recall } from "./recent.js";
 import { again, showAnswer } from "./result.js";
 import { thumbs } from "./thumbs.js";
 
-export const styles = ["query/query.css", "query/alternatives.css"];
+export const styles = ["query/query.css", "query/alternatives.css", "plan/plan.css"];
 
 /** @param {HTMLElement} root @param {Object<string, any>} context see main.js */
-export async function render(root, { params, signal, title, actions }) {
+export async function render(root, { params, search, signal, go, title, actions }) {
   title(`Answer ${shortId(params.query)}`);
   const come = soon(root, "Loading the answer");
   let answer;
@@ -31,11 +32,12 @@ export async function render(root, { params, signal, title, actions }) {
   const other = again(answer, "Query with other options");
   other.className = "button primary";
   actions(other);
-  const pictures = thumbs(signal);
+  const pictures = thumbs(signal), seen = { why: search.has("why"), match: search.get("match") };
   const body = h("div", { class: "query-answer" });
   put(root, h("div", { class: "query-page is-answer" }, asked(question), body));
   await showAnswer(body, answer, {
-    signal, pictures, isOwnPage: true,
+    signal, pictures, backdrops: backdrops(signal), isOwnPage: true, seen,
+    onseen: ({ why, match }) => go(link("queries", params.query, { why: why ? "open" : null, match }), { replace: true, quiet: true }),
     ask: async (frame) => (await askAgain(answer.query_id, { explain_frame: frame, explain: null, keep: false, record: false }, signal)).explained_frame,
     pick: answer.maps.length === 1 ? () => pickFrame(answer.maps[0], { pictures, signal, title: "Why not this frame?" }) : undefined,
   });

@@ -4,6 +4,7 @@ import { h, put } from "../lib/dom.js";
 import { shortId } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { empty, failed, gone, loading, soon } from "../lib/states.js";
+import { backdrops } from "../plan/backdrop.js";
 import { ask } from "./asking.js";
 import { controls } from "./controls.js";
 import { fieldsOf, fromOptions, fromSearch, toOptions, toSearch } from "./options.js";
@@ -14,7 +15,7 @@ import { chooser } from "./source.js";
 import { thumbs } from "./thumbs.js";
 import { verdict } from "./words.js";
 
-export const styles = ["query/query.css", "query/alternatives.css", "frames/source.css"];
+export const styles = ["query/query.css", "query/alternatives.css", "plan/plan.css", "frames/source.css"];
 
 /** Milliseconds after the last change until it is asked: a slider that is dragged asks once. */
 const PAUSE_MS = 250;
@@ -65,6 +66,8 @@ class Page {
     else if (search.get("frame")) this.source = { frame: { map: params.map, frame_id: search.get("frame") } };
     this.lost = question === undefined ? search.get("query") : null;
     this.pictures = thumbs(signal);
+    this.backdrops = backdrops(signal);
+    this.seen = { why: search.has("why"), match: search.get("match") };
     this.panel = controls(fields, this.said, { onchange: () => this.later(), sessions });
     this.result = h("div", { class: "query-result" });
     this.state = h("span", { class: "query-state", role: "status" });
@@ -110,7 +113,7 @@ class Page {
   take(source) {
     this.source = source;
     this.rest = {};
-    this.why = null;
+    this.why = this.seen.match = null;
     this.answer = null;
     this.chooser.tell(source);
     put(this.result);
@@ -147,7 +150,7 @@ class Page {
       remember(answer.query_id, this.follow(answer));
       this.panel.refuse([]);
       const shown = await showAnswer(this.result, answer, {
-        signal: this.signal, turn: signal, pictures: this.pictures, before: this.answer, chosen: this.choice?.chosen ?? null,
+        signal: this.signal, turn: signal, pictures: this.pictures, backdrops: this.backdrops, seen: this.seen, onseen: () => this.follow(answer), before: this.answer, chosen: this.choice?.chosen ?? null,
         ask: async (frame) => {
           const told = await ask(source, this.maps, { ...options, explain: null, explain_frame: frame, keep: false, record: false }, this.signal);
           if (this.source === source) this.why = frame; // another may have been taken meanwhile
@@ -193,7 +196,7 @@ class Page {
     const query = source.query ?? (source.file ? answer?.query_id : undefined);
     const maps = this.maps === "*" || this.maps.join() !== this.map ? { maps: this.maps === "*" ? "*" : this.maps.join() } : {};
     const own = query ? { query } : source.frame ? { frame: source.frame.frame_id } : {};
-    const address = link("maps", this.map, "query", { ...own, ...maps, ...toSearch(this.said) });
+    const address = link("maps", this.map, "query", { ...own, ...maps, ...toSearch(this.said), why: this.seen.why ? "open" : null, match: this.seen.match });
     this.go(address, { replace: true, quiet: true });
     return address;
   }

@@ -1,5 +1,6 @@
 // The controls of a query: a slider and a number for each option, its default told, and reset.
 import { h, put } from "../lib/dom.js";
+import { coded } from "../lib/prose.js";
 import { GROUPS } from "./options.js";
 
 /**
@@ -66,7 +67,7 @@ function row(field, said, onchange, sessions) {
         : [" ", h("span", { class: "query-default" }, `Default ${field.default}${field.unit === "°" ? "°" : field.unit ? ` ${field.unit}` : ""}.`)]);
       put(wrong);
     },
-    refuse(text) { put(wrong, text); },
+    refuse(text) { put(wrong, text && coded(text)); },
   };
 }
 

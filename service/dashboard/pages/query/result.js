@@ -1,14 +1,15 @@
-// An answer as it is shown: the verdict, the rows, the funnel, the heat map, "why not?".
+// An answer as it is shown: the verdict, plan and overlay, and folded below why it is so.
 import { at, get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { degrees, frameLabel, metres, percent, shortId } from "../lib/format.js";
+import { count, degrees, frameLabel, metres, percent, shortId } from "../lib/format.js";
 import { heatmap } from "../lib/heatmap.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { failed, loading } from "../lib/states.js";
-import { alternativesList } from "./alternatives.js";
 import { choice } from "./choice.js";
 import { funnel } from "./funnel.js";
+import { overlayInset } from "./inset.js";
+import { posePlan } from "./poseplan.js";
 import { rows } from "./rows.js";
 import { whyNot } from "./whynot.js";
 import { deviation, differences, keyOf, mapOf, number, verdict } from "./words.js";
@@ -18,24 +19,65 @@ const FIRST = 50;
 const MOST = 200;
 const SHAPES = { found: "✓", ambiguous: "≈", not_found: "✕", unvalidated: "?" };
 
+/** @typedef {{why: boolean, match: string | null}} Seen what of an answer is looked at: whether the reasons are unfolded, and the match that is laid on it. */
+
+const shown = new WeakMap(); // element -> what ends the answer in it: a canvas of 3-D is not left to itself
+
 /**
- * Show an answer in an element.
+ * Show an answer in an element: the verdict, then where that is and what it was matched with, then why.
  * @param {Element} root
  * @param {Object<string, any>} answer
- * @param {{signal: AbortSignal, turn?: AbortSignal, isOwnPage?: boolean, pictures: any, ask: (frame: string) => Promise<any>, chosen?: string | null,
- *   before?: Object<string, any> | null, change?: (said: any) => void, pick?: () => Promise<string | null>}} how
+ * @param {{signal: AbortSignal, turn?: AbortSignal, isOwnPage?: boolean, pictures: any, backdrops: any, ask: (frame: string) => Promise<any>,
+ *   chosen?: string | null, before?: Object<string, any> | null, change?: (said: any) => void, pick?: () => Promise<string | null>,
+ *   seen?: Seen, onseen?: (seen: Seen) => void}} how
  *   turn: aborted when a later answer is to be shown in its place; ask: again, explaining a frame; before: the answer that this one replaces; chosen: the frame that was
- *   marked in it; change, pick: see `whyNot`
+ *   marked in it; change, pick: see `whyNot`; seen: changed in place, and told of by onseen
  * @returns {Promise<{choice: any}>}
  */
-export async function showAnswer(root, answer, { signal, turn = signal, isOwnPage = false, pictures, ask, chosen = null, before = null, change, pick }) {
+export async function showAnswer(root, answer, how) {
+  const { pictures, before = null, chosen = null, isOwnPage = false, seen = { why: false, match: null }, onseen = () => {} } = how;
+  shown.get(root)?.abort();
+  const own = new AbortController();
+  shown.set(root, own);
+  const signal = AbortSignal.any([own.signal, how.signal]);
   const looked = choice();
+  const plan = posePlan(answer, { backdrops: how.backdrops, choice: looked, signal });
+  const inset = overlayInset(answer, { pictures, choice: looked, signal, wanted: seen.match, onshow: (key) => { seen.match = key; onseen(seen); } });
+  const why = reasons(answer, { ...how, seen, onseen, signal }, looked);
+  put(root, lead(answer, before, isOwnPage), h("div", { class: "query-views" }, plan, inset), why);
+  if (chosen !== null) looked.choose(chosen);
+  await why.ready;
+  return { choice: looked };
+}
+
+/** The rows of the paper, the funnel, the heat map and "why not?", folded until somebody wants to know. */
+function reasons(answer, how, looked) {
+  const { counts, explained_frame: explained } = answer;
+  const body = h("div", { class: "query-why-body" });
+  let isFilled = false;
+  const fill = async () => {
+    if (isFilled) return;
+    isFilled = true;
+    await fillReasons(body, answer, how, looked);
+  };
+  const isOpen = how.seen.why || explained !== null;
+  const fold = h("details", { class: "query-reasons", open: isOpen, onToggle: () => {
+    if (fold.open) fill().catch((error) => { if (error.name !== "AbortError") throw error; });
+    if (fold.open === how.seen.why) return;
+    how.seen.why = fold.open;
+    how.onseen(how.seen);
+  } }, h("summary", {}, h("h2", {}, "Why this answer"),
+    h("span", { class: "muted number" }, `${count(counts.compared)} compared, ${count(counts.ranked)} ranked, ${count(counts.selected)} selected, ${count(counts.validated)} validated, ${count(counts.accepted)} accepted`)), body);
+  return Object.assign(fold, { ready: isOpen ? fill() : Promise.resolve() });
+}
+
+async function fillReasons(root, answer, { signal, turn = signal, pictures, before = null, ask, change, pick }, looked) {
   // the rows wait for it only where nothing else tells the ranking
   const alike = answer.explanations === null && answer.counts.ranked > 0 ? await similarities(answer, FIRST, turn).catch(passed) : null;
   const ranked = answer.explanations === null ? fromSimilarities(answer, alike) : { ranking: answer.explanations, told: true };
   const steps = funnel(answer);
   const map = h("section", { class: "card query-heat", "aria-label": "Similarity of the ranking" });
-  put(root, lead(answer, before, isOwnPage),
+  put(root,
     answer.explanations === null && h("p", { class: "muted query-note" },
       "This query ran without explanations. Query again to see the distances of frames that were not selected, and why. ",
       again(answer)),
@@ -43,8 +85,6 @@ export async function showAnswer(root, answer, { signal, turn = signal, isOwnPag
     whyNot(answer, { ask, choice: looked, funnel: steps, change, pick }),
     h("div", { class: "query-below" }, steps, map));
   heat(map, answer, { alike, ranked }, looked, signal, turn);
-  if (chosen !== null) looked.choose(chosen);
-  return { choice: looked };
 }
 
 /** To where it is asked again with other options. */
@@ -62,11 +102,11 @@ function lead(answer, before, isOwnPage) {
       h("p", {}, h("strong", {}, `${title}. `), cause && h("span", { class: "badge", dataset: { kind } }, cause), cause && " ", coded(text)),
       next && h("p", { class: "query-next" }, coded(next)),
       details.length > 0 && h("ul", { class: "query-verdict-details" }, details.map((one) => h("li", {}, coded(one)))),
-      several.length > 0 && alternativesList(several),
       changed !== null && h("p", { class: "query-changed" }, h("span", { class: "muted" }, "Compared with the previous answer: "),
         changed.length ? changed.join("; ") : "nothing changed"),
       pose && poseOf(pose, answer.kind)),
     h("div", { class: "query-verdict-links" },
+      (answer.status === "ambiguous" || answer.status === "not_found") && h("a", { class: "button", href: link("maps", mapOf(answer), "coverage") }, "Coverage of the map"),
       (pose || several.length > 0) && h("a", { class: "button", href: link("maps", mapOf(answer), "paths", { query: answer.query_id }) }, "On the map"),
       !isOwnPage && h("a", { class: "button", href: link("queries", answer.query_id), title: "Can be shared for one hour" }, `Answer ${shortId(answer.query_id)}`)));
 }

@@ -1,7 +1,7 @@
 // The rows R, DR and VDR one under the other, the query at their left, as in the paper's figure.
 import { h, put } from "../lib/dom.js";
 import { count, frameLabel, frameTitle, percent, shortId } from "../lib/format.js";
-import { coded } from "../lib/prose.js";
+import { coded, plain } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { voteOf } from "./alternatives.js";
 import { figures, keyOf, number, statusOf } from "./words.js";
@@ -145,8 +145,8 @@ function mark(lines, tiles, reasons, key, chosen) {
     const reason = reasons.get(key)?.reason ?? (one.name === "R" ? "it is not ranked" : "it is not among these");
     one.trace.dataset.lost = String(isLoss);
     const text = fate !== undefined ? `${shortId(key.slice(key.indexOf("/") + 1))}: ${fate}` : isLoss ? `Lost here: ${reason}` : "";
-    put(one.trace, text);
-    one.trace.title = text;
+    put(one.trace, coded(text));
+    one.trace.title = plain(text);
     const tile = fate !== undefined && chosen === key && tiles.find((each) => each.key === key && one.list.contains(each.element))?.element;
     // by hand: scrollIntoView would move the page under the pointer
     if (tile) one.list.scrollLeft = Math.max(0, tile.offsetLeft - (one.list.clientWidth - tile.clientWidth) / 2);

@@ -2,6 +2,7 @@
 // answer: each picture is fetched and decoded once, and only when its tile comes into view.
 import { at, bytes } from "../lib/api.js";
 import { h } from "../lib/dom.js";
+import { plain } from "../lib/prose.js";
 
 const WIDTH = 192;
 const MOST = 400;
@@ -59,8 +60,8 @@ async function draw(element, coming, alt) {
   } catch (error) {
     if (error.name === "AbortError") return;
     const why = error.status === 404 ? "deleted" : error.status === 409 ? "no preview" : "not available";
-    element.setAttribute("aria-label", `${alt}: ${why}. ${error.message}`);
-    element.title = error.message;
+    element.setAttribute("aria-label", `${alt}: ${why}. ${plain(error.message)}`);
+    element.title = plain(error.message);
     element.dataset.drawn = why;
     write(element, why);
   }

@@ -1,7 +1,7 @@
 // "Why not this frame?": asks again with `explain_frame`, and says where the frame was lost.
 import { h, put } from "../lib/dom.js";
 import { count, frameLabel, frameTitle, percent, shortId } from "../lib/format.js";
-import { sentence } from "../lib/prose.js";
+import { coded, sentence } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { failed, loading } from "../lib/states.js";
 import { figures } from "./words.js";
@@ -98,7 +98,7 @@ function explained(told, answer, change) {
       h("span", { class: "badge", dataset: { kind } }, title),
       h("a", { class: "mono", href: link("maps", told.map, "frames", told.frame_id), title: frameTitle(told) }, frameLabel(told)),
       h("span", { class: "muted" }, `of map ${told.map}`)),
-    h("p", {}, sentence(told.reason).startsWith(text.replace(/\.$/, "")) ? null : `${text} `, sentence(told.reason)),
+    h("p", {}, sentence(told.reason).startsWith(text.replace(/\.$/, "")) ? null : `${text} `, coded(sentence(told.reason))),
     change && offer && h("button", { type: "button", class: "button", onclick: () => change(said) }, offer),
     h("dl", { class: "query-facts" }, facts.map(([term, value]) => h("div", {}, h("dt", {}, term), h("dd", { class: "number" }, value)))),
   ];

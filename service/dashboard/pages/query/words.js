@@ -137,7 +137,7 @@ function reasons(matches) {
     const text = validation.reason.replace(/-?\d+(\.\d+)?( ?%| m| deg)/g, "…$2");
     tally.set(text, (tally.get(text) ?? 0) + 1);
   }
-  return [...tally].sort((a, b) => b[1] - a[1]).slice(0, 3).map(([text, n]) => `${n} ×: ${text}`);
+  return [...tally].sort((a, b) => b[1] - a[1]).slice(0, 3).map(([text, n]) => `${count(n)} ${n === 1 ? "candidate" : "candidates"}: ${text}`);
 }
 
 /** Standard deviations of the worst axes of a covariance in the order of ROS. */

@@ -2,6 +2,7 @@
 import { at, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count } from "../lib/format.js";
+import { coded } from "../lib/prose.js";
 import { confirm, sheet, toast } from "../lib/states.js";
 
 /**
@@ -103,7 +104,7 @@ function form(one, all, { title, label, value, action, hint = "", save }) {
       dialog.close();
     } catch (error) {
       if (error.status === undefined || error.status === 401 || !dialog.open) { dialog.close(); throw error; }
-      put(why, error.errors?.length ? error.errors.map((part) => part.reason).join(". ") : error.message);
+      put(why, coded(error.errors?.length ? error.errors.map((part) => part.reason).join(". ") : error.message));
       input.setAttribute("aria-invalid", "true");
       input.focus();
     } finally {

@@ -1,0 +1,93 @@
+// Coverage is begun by a dialog, and followed until it is over.
+import { at, get, send } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { coded } from "../lib/prose.js";
+import { sheet } from "../lib/states.js";
+
+const POLL_MS = 700;
+const OVER = new Set(["succeeded", "failed", "dead", "cancelled"]);
+
+/** Whether it goes on. @param {Object<string, any>} one a coverage job */
+export const goesOn = (one) => !OVER.has(one.state);
+
+/**
+ * Ask what to measure, and begin it.
+ * @param {string} map
+ * @param {{sessions: string[], robots: string[]}} names that can be chosen
+ * @param {(begun: Object<string, any>) => void} onbegun
+ */
+export function beginCoverage(map, { sessions, robots }, onbegun) {
+  const number = (name, value, more) => h("input", { type: "number", id: `cover-${name}`, name, value, ...more });
+  const field = (name, text, input, hint) => h("div", { class: "field" }, h("label", { for: `cover-${name}` }, text), input,
+    hint && h("small", { class: "muted" }, hint));
+  const listed = (name, all, names) => h("select", { id: `cover-${name}` }, h("option", { value: "" }, all), names.map((one) => h("option", { value: one }, one)));
+  const session = listed("session", "All sessions", sessions), robot = listed("robot", "All robots", robots);
+  const every = number("every", 1, { min: 1, step: 1 }), most = number("most", 1000, { min: 1, max: 5000, step: 1 });
+  const without = h("select", { id: "cover-without", onChange: () => { within.disabled = without.value !== "near"; } },
+    h("option", { value: "near" }, "frames of its session taken just before and after"),
+    h("option", { value: "session" }, "its whole session"),
+    h("option", { value: "itself" }, "only the frame itself"));
+  const within = number("not_within_s", 10, { min: 0, step: "any" });
+  const off = number("tolerance_m", 0.5, { min: 0.01, max: 100, step: "any" }), turned = number("tolerance_deg", 15, { min: 0.1, max: 180, step: "any" });
+  const wide = number("cell_m", "", { min: 0.1, max: 1000, step: "any", placeholder: "auto" });
+  const wrong = h("p", { class: "field-error", role: "alert" });
+  const button = h("button", { class: "button primary" }, "Start");
+  const dialog = sheet({ title: "Measure coverage", buttons: button, children: [
+    h("p", { class: "muted" }, "Queries frames of the map against the rest of it. Uploads and queries go first; it takes about 0.1 s per frame."),
+    field("session", "Query frames of", session),
+    robots.length > 1 && field("robot", "and of", robot),
+    h("div", { class: "cover-pair" }, field("every", "Every n-th frame", every), field("most", "At most", most)),
+    field("without", "A frame must not find", without, "A robot that comes back on another day has none of these. Decides what the result means."),
+    field("not_within_s", "Just before and after: seconds", within),
+    h("details", {}, h("summary", {}, "Tolerance and cells"),
+      h("div", { class: "cover-pair" }, field("tolerance_m", "Right within, m", off), field("tolerance_deg", "and within, °", turned)),
+      field("cell_m", "Cell width, m", wide, "Two results are compared only if their cells are equally wide.")),
+    wrong,
+  ] });
+  dialog.querySelector("form").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    if (button.disabled) return;
+    button.disabled = true;
+    put(wrong);
+    const value = (input) => (Number.isFinite(input.valueAsNumber) ? input.valueAsNumber : undefined);
+    const left = without.value === "session" ? { other_sessions: true } : { not_within_s: without.value === "itself" ? 0 : value(within) };
+    const json = { session: session.value || undefined, robot: robot.value || undefined, every: value(every), most: value(most), ...left,
+      tolerance_m: value(off), tolerance_deg: value(turned), cell_m: value(wide) };
+    try {
+      const { data } = await send("POST", at("maps", map, "coverage"), { json });
+      dialog.close();
+      onbegun(data);
+    } catch (error) {
+      if (error.status === undefined || error.status === 401 || !dialog.open) { dialog.close(); throw error; }
+      const told = error.errors?.length ? error.errors.map((one) => `${one.field}: ${one.reason}`).join(". ") : error.detail;
+      put(wrong, coded(told));
+      button.disabled = false;
+    }
+  });
+}
+
+/**
+ * Follow a coverage job until it is over.
+ * @param {string} map @param {string} id
+ * @param {(now: Object<string, any> | null) => void} onchange null: somebody deleted it
+ * @param {AbortSignal} signal
+ */
+export async function followCoverage(map, id, onchange, signal) {
+  for (;;) {
+    await new Promise((resolve) => { setTimeout(resolve, POLL_MS); });
+    if (signal.aborted) return;
+    if (document.hidden) continue;
+    try {
+      const now = await get(at("maps", map, "coverage", id), { signal });
+      onchange(now);
+      if (!goesOn(now)) return;
+    } catch (error) {
+      if (error.name === "AbortError") return;
+      if (error.status === 404) { onchange(null); return; }
+      if (error.status !== 0 && error.status !== 503) throw error; // a service that restarts does not end it
+    }
+  }
+}
+
+/** @param {string} id of the job */
+export const cancelCoverage = (id) => send("POST", `${at("jobs", id)}/cancel`);

@@ -1,0 +1,189 @@
+"""The page of coverage beside the API: a job begun on it, its plan, what a cell holds, changes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Page, expect
+
+Settle = Callable[[Page], None]
+PATIENCE_MS = 60_000
+OUTCOMES = ("found", "wrong", "ambiguous", "not_found")
+CELLS = """all => all.map(one => ({cell: one.dataset.cell, outcome: one.dataset.outcome,
+    x: Number(one.getAttribute("x")), y: Number(one.getAttribute("y")),
+    width: Number(one.getAttribute("width"))}))"""
+
+
+def key(cell: dict[str, Any]) -> str:
+    return f"{cell['column']},{cell['row']}"
+
+
+def click_at(page: Page, place: Any) -> None:
+    """Click on a place of the plan, metres to the right and to the top."""
+    project = """([u, v]) => { const { view } = document.querySelector(".plan").plan;
+        return [view.x(u), view.y(v)]; }"""
+    x, y = page.evaluate(project, [float(one) for one in place])
+    page.locator(".plan-sheet").click(position={"x": x, "y": y})
+
+
+@pytest.fixture
+def measured(
+    station: Any, four_sides: dict[str, Any], page: Page, settle: Settle
+) -> dict[str, Any]:
+    """The result of a job that was begun on the page, which shows it."""
+    del four_sides  # its map is measured
+    path = "/v1/maps/four-sides/coverage"
+    known = {one["coverage_id"] for one in station.client.get(path).json()["items"]}
+    page.goto(f"{station.home}#/maps/four-sides/coverage")
+    settle(page)
+    if not known:
+        expect(page.get_by_role("heading", name="Coverage has not been measured")).to_be_visible()
+    page.locator("#cover-begin").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("A frame must not find").select_option("only the frame itself")
+    dialog.get_by_text("Tolerance and cells").click()
+    dialog.get_by_label("Cell width, m").fill("0.5")
+    dialog.get_by_role("button", name="Start").click()
+    expect(page.get_by_text("Coverage was measured.")).to_be_visible(timeout=PATIENCE_MS)
+    settle(page)
+    (one,) = (
+        one for one in station.client.get(path).json()["items"] if one["coverage_id"] not in known
+    )
+    assert (one["asked"]["not_within_s"], one["asked"]["cell_m"]) == (0, 0.5)
+    told: dict[str, Any] = station.client.get(f"{path}/{one['coverage_id']}").json()
+    frames = station.client.get(f"{path}/{one['coverage_id']}/frames").json()["items"]
+    return {**told, "frames": frames}
+
+
+def test_a_result_is_begun_shown_and_explained(
+    station: Any, page: Page, settle: Settle, measured: dict[str, Any],
+    axe: Callable[[Page], list[str]],
+) -> None:  # fmt: skip
+    result, (plan,) = measured["result"], measured["plans"]
+    assert result["ambiguous"] > 0  # its four sides look the same
+    for name in OUTCOMES:
+        count = page.locator(f".cover-counts [data-outcome={name}] strong")
+        expect(count).to_have_text(str(result[name]))
+    drawn = page.locator(".cover-cell").evaluate_all(CELLS)
+    cells = {key(one): one for one in plan["cells"]}
+    assert {one["cell"] for one in drawn} == set(cells)
+    for one in drawn:
+        cell = cells[one["cell"]]
+        assert [one["x"], one["y"]] == pytest.approx([cell["column"] * 0.5, cell["row"] * 0.5])
+        assert one["width"] == 0.5
+        counts = {name: cell[name] for name in OUTCOMES}
+        if not sum(counts.values()):
+            assert one["outcome"] == "none"
+        else:
+            worst = max(("not_found", "ambiguous", "found"), key=lambda name: counts[name])
+            assert one["outcome"] == ("wrong" if counts["wrong"] else worst)
+    # the cell of a frame that is mistaken: what stands in it, and what each looks like
+    frame = next(one for one in measured["frames"] if one["look_alikes"])
+    axes = np.array([plan["x_axis"], plan["y_axis"]])
+    places = {
+        one["frame_id"]: axes @ [one["position"][axis] for axis in "xyz"]
+        for one in measured["frames"]
+    }
+    cell_of = {name: tuple(np.floor(at / 0.5).astype(int).tolist()) for name, at in places.items()}
+    chosen = cell_of[frame["frame_id"]]
+    click_at(page, places[frame["frame_id"]])
+    settle(page)
+    assert f"cell={chosen[0]}%2C{chosen[1]}&frame={frame['frame_id']}" in page.url
+    inside = {name for name, cell in cell_of.items() if cell == chosen}
+    listed = page.locator(".cover-frames > li").evaluate_all(
+        "all => all.map(one => one.dataset.frame)"
+    )
+    assert set(listed) == inside
+    own = page.locator(f".cover-frames [data-frame='{frame['frame_id']}']")
+    alike = own.locator("[data-overlay]").evaluate_all("all => all.map(one => one.dataset.overlay)")
+    assert alike == frame["look_alikes"]
+    assert frame["reason"][1:] in own.inner_text()
+    assert page.locator(".cover-link").count() == len(frame["look_alikes"])
+    assert axe(page) == []
+    page.reload()
+    settle(page)
+    assert page.locator(".cover-link").count() == len(frame["look_alikes"])
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    # the picture and the numbers are those of the API
+    path = f"/v1/maps/four-sides/coverage/{measured['coverage_id']}"
+    for name, sent in (("PNG", f"{path}/plan.png"), ("JSON", path)):
+        with page.expect_download() as waited:
+            page.get_by_role("button", name=name).click()
+        assert Path(waited.value.path()).read_bytes() == station.client.get(sent).content
+    # laid on what it is mistaken for
+    own.locator("[data-overlay]").first.click()
+    page.locator(".overlay-page").wait_for()
+    settle(page)
+    assert f"/matches/{frame['look_alikes'][0]}" in page.url
+    asked = station.client.get(
+        page.url.partition("#/")[2].partition("/matches")[0].join(("/v1/", ""))
+    )
+    assert asked.json()["frame"] == {"map": "four-sides", "frame_id": frame["frame_id"]}
+
+
+def test_two_results_are_compared(
+    station: Any, four_sides: dict[str, Any], page: Page, settle: Settle, until: Callable[..., Any]
+) -> None:
+    del four_sides  # its map is measured twice, by three of its frames
+    path = "/v1/maps/four-sides/coverage"
+    before, after = (
+        station.client.post(path, json={"not_within_s": 0, "every": 4}).json()["coverage_id"]
+        for _ in range(2)
+    )
+    for one in (before, after):
+        until(lambda one=one: station.client.get(f"{path}/{one}").json()["state"] == "succeeded")
+    changes = station.client.get(f"{path}/{after}/changes", params={"since": before}).json()
+    surface = "/v1/maps/four-sides/surface"
+    station.client.post(surface)
+    until(lambda: station.client.get(surface).json()["state"] == "ready")
+    (fused,) = station.client.get(surface).json()["parents"]
+    page.goto(f"{station.home}#/maps/four-sides/coverage?result={after}")
+    settle(page)
+    # the surface lies under the cells, to scale
+    drawn = page.evaluate("""([u, v]) => { const { view } = document.querySelector(".plan").plan;
+        const { width, style } = document.querySelector(".plan-under canvas");
+        const { a, e, f } = new DOMMatrix(style.transform);
+        return [e - view.x(u), f - view.y(v), a * width / view.scale]; }""",
+        [fused["plan"]["left"], fused["plan"]["top"]],
+    )  # fmt: skip
+    wide = fused["plan"]["width"] * fused["plan"]["m_per_pixel"]
+    assert drawn == pytest.approx([0, 0, wide], abs=0.05)
+    page.locator("#cover-since").select_option(before)
+    settle(page)
+    trends = page.locator(".cover-cell").evaluate_all("all => all.map(one => one.dataset.trend)")
+    assert Counter(trends) == {name: n for name, n in changes["trends"].items() if n}
+    for name, n in changes["trends"].items():
+        expect(page.locator(f".cover-counts [data-trend={name}] strong")).to_have_text(str(n))
+    assert f"since={before}" in page.url
+    page.get_by_role("button", name="Delete").click()
+    page.get_by_role("button", name="Delete result").click()
+    expect(page.get_by_text("The result was deleted.")).to_be_visible()
+    settle(page)
+    assert station.client.get(f"{path}/{after}").status_code == 404
+    expect(page.locator("#cover-result")).not_to_have_value(after)
+
+
+def test_cells_are_ranked_by_what_robots_lose(station: Any, page: Page, settle: Settle) -> None:
+    """Worked out by hand: shares found less shares wrong are -1, 0, 0, 0.5 and 1."""
+    page.goto(f"{station.home}#/")
+    settle(page)
+
+    def cell(column: int, **counts: int) -> dict[str, int]:
+        return {"column": column, "row": 0, "frames": 9, **dict.fromkeys(OUTCOMES, 0), **counts}
+
+    cells = [
+        cell(0, found=1, not_found=1), cell(1, found=3), cell(2, not_found=1), cell(3, ambiguous=2),
+        cell(4, wrong=1), cell(5),
+    ]  # fmt: skip
+    script = """async ([url, cells]) => { const m = await import(url);
+        return [m.worstCells(cells).map((one) => one.column), cells.map(m.outcomeIn)]; }"""
+    url = f"{station.url}/dashboard/coverage/outcomes.js"
+    worst, outcomes = page.evaluate(script, [url, cells])
+    assert worst == [4, 3, 2, 0]
+    assert outcomes == ["not_found", "found", "not_found", "ambiguous", "wrong", None]
