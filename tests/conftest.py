@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import secrets
 import shutil
@@ -21,6 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 from sqlalchemy import Connection, NullPool, create_engine
+from xdist.scheduler import LoadFileScheduling
 
 from benchmarks.fleet.postgres import NoServer, Server
 from benchmarks.fleet.s3 import ObjectServer
@@ -42,7 +44,10 @@ from sceneprint.store import open_database
 from sceneprint.store.tables import metadata
 from sceneprint.types import DepthFrame
 
-#: Files that are begun first: no process is left alone with one of them in the end.
+#: Folders whose files share what is dear to begin, such as a service with its workers: all of one
+#: run in one process, one after another. The longest are first, and are begun first.
+TOGETHER = ("dashboard", "service", "client", "cli_service", "scenes", "ros2")
+#: Files that are begun next: no process is left alone with one of them in the end.
 LONG = (
     "test_container.py", "test_on_postgres.py", "test_deployment.py", "test_fleet.py",
     "test_failover.py", "test_fleets.py", "test_isolation.py", "test_bench_rows.py",
@@ -63,6 +68,7 @@ Once = Callable[[str, Callable[[Path], object]], Path]
 
 def pytest_configure(config: pytest.Config) -> None:
     """Begin the server that the whole run is on, where it is; see tests/on_postgres."""
+    gc.disable()  # what is collected and imported stays, and would be looked through again and again
     config.addinivalue_line("markers", "sqlite_only(reason): of nothing that PostgreSQL does")
     config.addinivalue_line("markers", "thorough: takes long, and runs with `make test-thorough`")
     if ON_POSTGRES and "PYTEST_XDIST_WORKER" not in os.environ:
@@ -77,10 +83,41 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["SCENEPRINT_TEST_SERVER"] = server.url("")
 
 
+def unit_of(nodeid: str) -> str:
+    """The folder or the file whose tests run in one process."""
+    file = nodeid.partition("::")[0]
+    folder = "/".join(file.split("/")[:2])
+    return folder if folder.partition("/")[2] in TOGETHER else file
+
+
+class UnitScheduling(LoadFileScheduling):
+    """Hands out whole files, and whole folders of TOGETHER."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return unit_of(nodeid)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> UnitScheduling | None:
+    """With `--dist loadfile`, keep folders together that share a service."""
+    return UnitScheduling(config, log) if config.getoption("dist") == "loadfile" else None
+
+
+def pytest_collection_finish() -> None:
+    """Let the collector look at what tests make, and at nothing older."""
+    gc.freeze()
+    gc.enable()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put long files first."""
-    places = {name: place for place, name in enumerate(LONG)}
-    items.sort(key=lambda item: places.get(item.path.name, len(LONG)))
+    """Put long folders and files first."""
+    names = (*(f"tests/{name}" for name in TOGETHER), *LONG)
+    places = {name: place for place, name in enumerate(names)}
+
+    def place(item: pytest.Item) -> int:
+        unit = unit_of(item.nodeid)
+        return places.get(unit, places.get(item.path.name, len(places)))
+
+    items.sort(key=place)
     for item in items:
         if item.get_closest_marker("thorough") is not None:
             item.add_marker(pytest.mark.timeout(THOROUGH_S))

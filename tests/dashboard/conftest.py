@@ -1,7 +1,7 @@
-"""A real service with real workers, and a real Chromium that looks at it.
+"""A real service with real workers, and a real Chromium that looks at it: one of each for all files.
 
-Playwright's loop runs in this process as long as `browser` lasts, so that is of a file and has
-ended before tests of others begin loops of their own; the service is one for all files.
+Playwright's loop runs in this process as long as the browser does. It ends with the last test of
+this folder, before tests of others begin loops of their own.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -156,13 +156,25 @@ def chromium() -> str:
     return found
 
 
-@pytest.fixture(scope="module")
-def browser(chromium: str) -> Iterator[Browser]:
-    """One for each file: as long as it is there no other test may run an event loop."""
-    with sync_playwright() as playwright:
-        one = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield one
-        one.close()
+_running = ExitStack()
+_browsers: list[Browser] = []
+
+
+@pytest.fixture
+def browser(chromium: str) -> Browser:
+    """One for all tests of this folder."""
+    if not _browsers:
+        playwright = _running.enter_context(sync_playwright())
+        _browsers.append(playwright.chromium.launch(executable_path=chromium, args=FLAGS))
+        _running.callback(lambda: _browsers.pop().close())
+    return _browsers[0]
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """End the browser where the next test is none of this folder."""
+    if nextitem is None or nextitem.path.parent != item.path.parent:
+        _running.close()
 
 
 @pytest.fixture(scope="session")
