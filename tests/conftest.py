@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache
 from importlib import util
@@ -68,7 +68,7 @@ Once = Callable[[str, Callable[[Path], object]], Path]
 
 def pytest_configure(config: pytest.Config) -> None:
     """Begin the server that the whole run is on, where it is; see tests/on_postgres."""
-    gc.disable()  # what is collected and imported stays, and would be looked through again and again
+    gc.disable()  # what is imported stays, and would be looked through again and again
     config.addinivalue_line("markers", "sqlite_only(reason): of nothing that PostgreSQL does")
     config.addinivalue_line("markers", "thorough: takes long, and runs with `make test-thorough`")
     if ON_POSTGRES and "PYTEST_XDIST_WORKER" not in os.environ:
@@ -100,6 +100,24 @@ class UnitScheduling(LoadFileScheduling):
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> UnitScheduling | None:
     """With `--dist loadfile`, keep folders together that share a service."""
     return UnitScheduling(config, log) if config.getoption("dist") == "loadfile" else None
+
+
+_folder = ExitStack()
+
+
+@pytest.fixture(scope="session")
+def folder_stack() -> ExitStack:
+    """What is entered here ends with the last test of the folder, or of a file that is in no
+    folder of TOGETHER: services would run on beside the tests of others, and take their time.
+    """
+    return _folder
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """End what lasts as long as a folder."""
+    if nextitem is None or unit_of(nextitem.nodeid) != unit_of(item.nodeid):
+        _folder.close()
 
 
 def pytest_collection_finish() -> None:
