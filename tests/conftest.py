@@ -36,7 +36,7 @@ from sceneprint.geometry.signature.pair_features import Projection
 from sceneprint.geometry.signature.pair_table import TableLayout
 from sceneprint.geometry.signature.segmentation import HierarchyParameters, SegmentationParameters
 from sceneprint.geometry.signature.whitening import Whitening
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import KINECT, SynthRoom, synthesise_room
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer
 from sceneprint.settings import Settings
@@ -390,9 +390,32 @@ def small_signer(small_model: Model) -> Signer:
 
 
 @pytest.fixture(scope="session")
-def room_frames() -> tuple[DepthFrame, ...]:
+def room_views(once: Once) -> Callable[..., SynthRoom]:
+    """As `synthesise_room` with noise; each is rendered once for all processes of the run."""
+
+    def views(seed: int, index: int, n: int, *, along_path: bool = False) -> SynthRoom:
+        def make(folder: Path) -> None:
+            folder.mkdir()
+            frames = synthesise_room(seed, index, n, along_path=along_path).frames
+            np.save(folder / "depth.npy", [frame.depth for frame in frames])
+            np.save(folder / "poses.npy", np.array([frame.pose for frame in frames]))
+
+        kind = "path" if along_path else "room"
+        folder, name = once(f"{kind}-{seed}-{index}-{n}", make), f"room-{index:03d}"
+        both = np.load(folder / "depth.npy"), np.load(folder / "poses.npy")
+        frames = (
+            DepthFrame(depth, KINECT, f"{name}/frame-{k:06d}", pose)
+            for k, (depth, pose) in enumerate(zip(*both, strict=True))
+        )
+        return SynthRoom(name, seed, index, tuple(frames))
+
+    return views
+
+
+@pytest.fixture(scope="session")
+def room_frames(room_views: Callable[..., SynthRoom]) -> tuple[DepthFrame, ...]:
     """Three views of each of two synthetic rooms."""
-    rooms = [synthesise_room(21, i, 3) for i in range(2)]
+    rooms = [room_views(21, i, 3) for i in range(2)]
     return tuple(
         replace(frame, name=f"{room.name}-{i}")
         for room in rooms
