@@ -216,6 +216,7 @@ def test_what_a_key_may_not_read_is_not_there(walled, shots):
     form = shots[0].form()
     form["data"] |= {"maps": "*", "stages": "retrieve"}
     every = walled.ask("asking", "POST", "/v1/queries", **form)
+    assert walled.ask("boss", "DELETE", "/v1/keys/asking").status_code == 204
     assert (every.status_code, every.json()["maps"]) == (200, ["ask-a"])
 
 
