@@ -59,7 +59,8 @@ kernels: $(STAMP)
 test: $(STAMP)
 	@$(MAKE) --no-print-directory -j2 lint pytest
 
-# Files stay whole, as their fixtures are dear, and in the order of tests/conftest.py.
+# Files stay whole, as their fixtures are dear, and so do folders that share a service; their order
+# is that of tests/conftest.py.
 pytest: kernels
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 

@@ -52,8 +52,8 @@ def shots(rooms: Sequence[int], views: int, step: int = 1) -> list[Shot]:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "frame.png"
         for room, number in enumerate(rooms):
-            made = synthesise_room(SEED, number, views * step, along_path=True).frames
-            for view, frame in enumerate(made[::step]):
+            made = synthesise_room(SEED, number, views * step, along_path=True, step=step).frames
+            for view, frame in enumerate(made):
                 write_depth_png(path, frame.depth, 1000.0)
                 lens, who = frame.intrinsics, "bob" if view % 2 else "ann"
                 if frame.pose is None:

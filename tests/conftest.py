@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import secrets
 import shutil
@@ -10,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache
 from importlib import util
@@ -21,6 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 from sqlalchemy import Connection, NullPool, create_engine
+from xdist.scheduler import LoadFileScheduling
 
 from benchmarks.fleet.postgres import NoServer, Server
 from benchmarks.fleet.s3 import ObjectServer
@@ -34,7 +36,7 @@ from sceneprint.geometry.signature.pair_features import Projection
 from sceneprint.geometry.signature.pair_table import TableLayout
 from sceneprint.geometry.signature.segmentation import HierarchyParameters, SegmentationParameters
 from sceneprint.geometry.signature.whitening import Whitening
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import KINECT, SynthRoom, synthesise_room
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer
 from sceneprint.settings import Settings
@@ -42,7 +44,10 @@ from sceneprint.store import open_database
 from sceneprint.store.tables import metadata
 from sceneprint.types import DepthFrame
 
-#: Files that are begun first: no process is left alone with one of them in the end.
+#: Folders whose files share what is dear to begin, such as a service with its workers: all of one
+#: run in one process, one after another. The longest are first, and are begun first.
+TOGETHER = ("dashboard", "service", "client", "cli_service", "scenes", "ros2")
+#: Files that are begun next: no process is left alone with one of them in the end.
 LONG = (
     "test_container.py", "test_on_postgres.py", "test_deployment.py", "test_fleet.py",
     "test_failover.py", "test_fleets.py", "test_isolation.py", "test_bench_rows.py",
@@ -65,6 +70,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Begin the server that the whole run is on, where it is; see tests/on_postgres."""
     # of processes that tests begin, too: a job that nobody asked for would be counted
     os.environ.setdefault("SCENEPRINT_SURFACES", "asked")
+    gc.disable()  # what is imported stays, and would be looked through again and again
     config.addinivalue_line("markers", "sqlite_only(reason): of nothing that PostgreSQL does")
     config.addinivalue_line("markers", "thorough: takes long, and runs with `make test-thorough`")
     if ON_POSTGRES and "PYTEST_XDIST_WORKER" not in os.environ:
@@ -79,10 +85,59 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["SCENEPRINT_TEST_SERVER"] = server.url("")
 
 
+def unit_of(nodeid: str) -> str:
+    """The folder or the file whose tests run in one process."""
+    file = nodeid.partition("::")[0]
+    folder = "/".join(file.split("/")[:2])
+    return folder if folder.partition("/")[2] in TOGETHER else file
+
+
+class UnitScheduling(LoadFileScheduling):
+    """Hands out whole files, and whole folders of TOGETHER."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return unit_of(nodeid)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> UnitScheduling | None:
+    """With `--dist loadfile`, keep folders together that share a service."""
+    return UnitScheduling(config, log) if config.getoption("dist") == "loadfile" else None
+
+
+_folder = ExitStack()
+
+
+@pytest.fixture(scope="session")
+def folder_stack() -> ExitStack:
+    """What is entered here ends with the last test of the folder, or of a file that is in no
+    folder of TOGETHER: services would run on beside the tests of others, and take their time.
+    """
+    return _folder
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """End what lasts as long as a folder."""
+    if nextitem is None or unit_of(nextitem.nodeid) != unit_of(item.nodeid):
+        _folder.close()
+
+
+def pytest_collection_finish() -> None:
+    """Let the collector look at what tests make, and at nothing older."""
+    gc.freeze()
+    gc.enable()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put long files first."""
-    places = {name: place for place, name in enumerate(LONG)}
-    items.sort(key=lambda item: places.get(item.path.name, len(LONG)))
+    """Put long folders and files first."""
+    names = (*(f"tests/{name}" for name in TOGETHER), *LONG)
+    places = {name: place for place, name in enumerate(names)}
+
+    def place(item: pytest.Item) -> int:
+        unit = unit_of(item.nodeid)
+        return places.get(unit, places.get(item.path.name, len(places)))
+
+    items.sort(key=place)
     for item in items:
         if item.get_closest_marker("thorough") is not None:
             item.add_marker(pytest.mark.timeout(THOROUGH_S))
@@ -337,9 +392,32 @@ def small_signer(small_model: Model) -> Signer:
 
 
 @pytest.fixture(scope="session")
-def room_frames() -> tuple[DepthFrame, ...]:
+def room_views(once: Once) -> Callable[..., SynthRoom]:
+    """As `synthesise_room` with noise; each is rendered once for all processes of the run."""
+
+    def views(seed: int, index: int, n: int, *, along_path: bool = False) -> SynthRoom:
+        def make(folder: Path) -> None:
+            folder.mkdir()
+            frames = synthesise_room(seed, index, n, along_path=along_path).frames
+            np.save(folder / "depth.npy", [frame.depth for frame in frames])
+            np.save(folder / "poses.npy", np.array([frame.pose for frame in frames]))
+
+        kind = "path" if along_path else "room"
+        folder, name = once(f"{kind}-{seed}-{index}-{n}", make), f"room-{index:03d}"
+        both = np.load(folder / "depth.npy"), np.load(folder / "poses.npy")
+        frames = (
+            DepthFrame(depth, KINECT, f"{name}/frame-{k:06d}", pose)
+            for k, (depth, pose) in enumerate(zip(*both, strict=True))
+        )
+        return SynthRoom(name, seed, index, tuple(frames))
+
+    return views
+
+
+@pytest.fixture(scope="session")
+def room_frames(room_views: Callable[..., SynthRoom]) -> tuple[DepthFrame, ...]:
     """Three views of each of two synthetic rooms."""
-    rooms = [synthesise_room(21, i, 3) for i in range(2)]
+    rooms = [room_views(21, i, 3) for i in range(2)]
     return tuple(
         replace(frame, name=f"{room.name}-{i}")
         for room in rooms

@@ -56,7 +56,7 @@ def run_process(*arguments: object, expect: int = 0) -> Said:
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("synth") / "rooms"
-    done = run("synth", out, "--rooms", 2, "--views", 2, "--seed", 5)
+    done = run("synth", out, "--rooms", 2, "--views", 2, "--seed", 5, "--jobs", 1)
     assert "2 rooms of 2 views" in done.stdout
     return out
 
@@ -90,7 +90,7 @@ def test_synth_writes_the_layout(rooms: Path, tmp_path: Path) -> None:
             "seq-01/frame-000001.pose.txt",
         )
     ]
-    run("synth", tmp_path / "again", "--rooms", 2, "--views", 2, "--seed", 5, "--jobs", 1)
+    run("synth", tmp_path / "again", "--rooms", 2, "--views", 2, "--seed", 5, "--jobs", 2)
     assert tree_hash(tmp_path / "again") == tree_hash(rooms)
     pose = np.loadtxt(rooms / "room-000/seq-01/frame-000001.pose.txt")
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6)

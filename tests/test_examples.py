@@ -49,6 +49,7 @@ def test_the_robot_maps_a_room_and_finds_itself(tmp_path: Path) -> None:
     assert (tmp_path / "robot" / "sceneprint.db").is_file()
 
 
+@pytest.mark.thorough  # tests/client/test_tracker.py carries a robot off as well
 def test_a_robot_tracks_itself_and_notices_that_it_was_carried() -> None:
     ran = subprocess.run(
         [sys.executable, ROOT / "examples" / "tracked_drive.py"],

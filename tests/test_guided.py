@@ -23,7 +23,7 @@ Room = tuple[list[Geometry], list[Floats]]
 def walk() -> Room:
     """Six frames along a path through a room, more than 10 cm apart; the third asks the others."""
     signer = open_signer("depth")
-    frames = synthesise_room(21, 0, 36, along_path=True).frames[::6]
+    frames = synthesise_room(21, 0, 36, along_path=True, step=6).frames
     frames = (frames[2], *frames[:2], *frames[3:])
     poses = [frame.pose for frame in frames if frame.pose is not None]
     return [prepare(frame, signer)[1] for frame in frames], poses

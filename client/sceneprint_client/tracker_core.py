@@ -14,6 +14,7 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -366,8 +367,10 @@ class TrackerCore:
         p = self.parameters
         return step <= p.gate_m + 2 * drift_m and turn <= math.radians(p.gate_deg) + 2 * drift_rad
 
-    def _weight(self, places: Iterable[int], *, found: bool) -> float:
-        """Of votes that agree: views from one place count once."""
+    def _weight(
+        self, places: Iterable[int], apart: Callable[[_Mark, _Mark], bool], *, found: bool
+    ) -> float:
+        """Of votes that agree: views from one place, that are not `apart`, count once."""
         votes = [self._votes[place] for place in places]
         weighed = sorted(
             ((self._aged(one), one) for one in votes if one.found or not found),
@@ -376,7 +379,7 @@ class TrackerCore:
         counted: list[_Mark] = []
         total = 0.0
         for weight, one in weighed:
-            if all(self._apart(one.mark, other) for other in counted):
+            if all(apart(one.mark, other) for other in counted):
                 counted.append(one.mark)
                 total += weight
         return total
@@ -395,8 +398,9 @@ class TrackerCore:
         if not own:
             waits = "several places are possible; " if self._disputed() else ""
             return "ambiguous" if waits else "lost", waits + observation.reason
-        totals = [self._weight(vote.friends, found=False) for vote in self._votes]
-        founds = [self._weight(vote.friends, found=True) for vote in self._votes]
+        apart = cache(self._apart)  # each vote asks it of the same places
+        totals = [self._weight(vote.friends, apart, found=False) for vote in self._votes]
+        founds = [self._weight(vote.friends, apart, found=True) for vote in self._votes]
         best = max(own, key=lambda place: (founds[place], totals[place], -place))
         others = [i for i in range(len(totals)) if i not in self._votes[best].friends]
         rival = max((totals[i] for i in others), default=0.0)

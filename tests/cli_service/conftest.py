@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,10 +31,9 @@ def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def service_url(data_folder: Path) -> Iterator[str]:
+def service_url(data_folder: Path, folder_stack: ExitStack) -> str:
     """One service with one worker for all tests; each uses maps of its own."""
-    with serving(data_folder, 1) as url:
-        yield url
+    return folder_stack.enter_context(serving(data_folder, 1))
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -31,9 +32,13 @@ UPLOAD_BYTES = 2 << 20
 
 
 @pytest.fixture(scope="session")
-def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def service_url(tmp_path_factory: pytest.TempPathFactory, folder_stack: ExitStack) -> str:
     """One service with one worker for all tests; each uses maps of its own."""
-    data = tmp_path_factory.mktemp("service")
+    return folder_stack.enter_context(_serving(tmp_path_factory.mktemp("service")))
+
+
+@contextmanager
+def _serving(data: Path) -> Iterator[str]:
     with (data / "log").open("wb") as log:
         arguments = ["serve", "--port", "0", "--data", str(data), "--workers", "1"]
         process = subprocess.Popen(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -14,7 +14,7 @@ import pytest
 from sceneprint.cli import main
 from sceneprint.errors import InvalidRequest, UnknownJob, UnknownMap
 from sceneprint.formats.dataset import write_depth_png
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 
@@ -30,10 +30,12 @@ class Sent:
 
 
 @pytest.fixture(scope="module")
-def sent(tmp_path_factory: pytest.TempPathFactory) -> list[Sent]:
+def sent(
+    tmp_path_factory: pytest.TempPathFactory, room_views: Callable[..., SynthRoom]
+) -> list[Sent]:
     """Six frames along a path, one to each of two runs in turn."""
     path, found = tmp_path_factory.mktemp("sent") / "depth.png", []
-    for i, frame in enumerate(synthesise_room(21, 0, 6, along_path=True).frames):
+    for i, frame in enumerate(room_views(21, 0, 6, along_path=True).frames):
         write_depth_png(path, frame.depth, 1000.0)
         k = frame.intrinsics
         assert frame.pose is not None

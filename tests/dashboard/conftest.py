@@ -1,7 +1,7 @@
-"""A real service with real workers, and a real Chromium that looks at it.
+"""A real service with real workers, and a real Chromium that looks at it, for all files here.
 
-Playwright's loop runs in this process as long as `browser` lasts, so that is of a file and has
-ended before tests of others begin loops of their own; the service is one for all files.
+Playwright's loop runs in this process as long as `browser` lasts, so that is of the folder and has
+ended before tests of others begin loops of their own.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -156,47 +156,47 @@ def chromium() -> str:
     return found
 
 
-@pytest.fixture(scope="module")
-def browser(chromium: str) -> Iterator[Browser]:
-    """One for each file: as long as it is there no other test may run an event loop."""
-    with sync_playwright() as playwright:
-        one = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield one
-        one.close()
+@pytest.fixture(scope="session")
+def browser(chromium: str, folder_stack: ExitStack) -> Browser:
+    """One for all tests of this folder: as long as it is there no others may run an event loop."""
+    playwright = folder_stack.enter_context(sync_playwright())
+    one = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+    folder_stack.callback(one.close)
+    return one
 
 
 @pytest.fixture(scope="session")
-def station(chromium: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Station]:
+def station(
+    chromium: str, tmp_path_factory: pytest.TempPathFactory, folder_stack: ExitStack
+) -> Station:
     """A service with two workers, and a map `building` of two rooms, all of it indexed.
 
     Tests leave `building` as it is; what they change they make. The frames of a room have the
     parent frame ROOM, and are of two runs, ROOM/ann (even ones) and ROOM/bob (odd ones).
     """
     del chromium  # asked for first: without a browser nothing needs to be made
-    with running(tmp_path_factory.mktemp("station"), 2) as found:
-        found.client.post(
-            "/v1/maps", json={"name": "building", "title": "Two rooms", "model": "depth"}
-        )
-        metas, files = [], []
-        for meta, png in _shots(tmp_path_factory.mktemp("shots")):
-            metas.append(meta)
-            files.append(("frame", (f"{len(files)}.png", png, "image/png")))
-        sent = found.client.post(
-            "/v1/maps/building/frames/batch", data={"metas": json.dumps(metas)}, files=files
-        )
-        assert sent.status_code == 200, sent.text
-        found.frames = [
-            Sent(item["frame"]["frame_id"], file[1][1], meta)
-            for item, file, meta in zip(sent.json()["items"], files, metas, strict=True)
-        ]
-        states: dict[str, int] = {}
+    found = folder_stack.enter_context(running(tmp_path_factory.mktemp("station"), 2))
+    found.client.post("/v1/maps", json={"name": "building", "title": "Two rooms", "model": "depth"})
+    metas, files = [], []
+    for meta, png in _shots(tmp_path_factory.mktemp("shots")):
+        metas.append(meta)
+        files.append(("frame", (f"{len(files)}.png", png, "image/png")))
+    sent = found.client.post(
+        "/v1/maps/building/frames/batch", data={"metas": json.dumps(metas)}, files=files
+    )
+    assert sent.status_code == 200, sent.text
+    found.frames = [
+        Sent(item["frame"]["frame_id"], file[1][1], meta)
+        for item, file, meta in zip(sent.json()["items"], files, metas, strict=True)
+    ]
+    states: dict[str, int] = {}
 
-        def signed() -> bool:
-            states.update(found.client.get("/v1/maps/building").json()["frames"])
-            return states.get("indexed") == len(files)
+    def signed() -> bool:
+        states.update(found.client.get("/v1/maps/building").json()["frames"])
+        return states.get("indexed") == len(files)
 
-        until(signed, 4 * PATIENCE_S)  # a machine of many engineers signs slowly
-        yield found
+    until(signed, 4 * PATIENCE_S)  # a machine of many engineers signs slowly
+    return found
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ from sceneprint.engine import Engine
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.formats.dataset import decode_frame, write_depth_png
 from sceneprint.geometry.signature.whitening import Whitening
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint.models import Model
 from sceneprint.pipeline import Signature, Signer, open_signer, prepare
 from sceneprint.settings import Settings
@@ -54,9 +54,11 @@ def make_upload(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Uploa
 
 
 @pytest.fixture(scope="session")
-def uploads(make_upload: Callable[..., Upload]) -> tuple[Upload, ...]:
+def uploads(
+    make_upload: Callable[..., Upload], room_views: Callable[..., SynthRoom]
+) -> tuple[Upload, ...]:
     """Six views along a path in each of two rooms."""
-    rooms = [synthesise_room(21, i, 6, along_path=True) for i in range(2)]
+    rooms = [room_views(21, i, 6, along_path=True) for i in range(2)]
     return tuple(make_upload(frame, room.name) for room in rooms for frame in room.frames)
 
 

@@ -1,16 +1,29 @@
-"""Outcomes as data, from which figures are worked out by hand."""
+"""Rooms to evaluate; and outcomes as data, from which figures are worked out by hand."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from sceneprint.cli import main
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.lab.evaluation.protocol import Error, QueryOutcome, ValidatedPair
+
+
+@pytest.fixture(scope="session")
+def building(once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
+    """Two rooms of twelve views along a path. Only to be read."""
+
+    def make(folder: Path) -> None:
+        of = ("--rooms", "2", "--views", "12", "--seed", "9", "--path", "--jobs", "1")
+        assert main(["synth", str(folder), *of]) == 0
+
+    return once("evaluated", make)
 
 
 def error(cm: float, degrees: float = 0.0) -> Error:

@@ -22,15 +22,6 @@ RETRIEVAL = {"top1_overlap_50", "top5_overlap_50", "top1_overlap_30", "mean_over
 
 
 @pytest.fixture(scope="module")
-def building(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two rooms of twelve views along a path."""
-    out = tmp_path_factory.mktemp("evaluate") / "rooms"
-    arguments = ["synth", out, "--rooms", 2, "--views", 12, "--seed", 9, "--path", "--jobs", 1]
-    assert main([str(a) for a in arguments]) == 0
-    return out
-
-
-@pytest.fixture(scope="module")
 def model_file(small_model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "small.safetensors"
     save_model(small_model, path)

@@ -22,15 +22,6 @@ from sceneprint.types import Floats
 
 
 @pytest.fixture(scope="module")
-def building(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two rooms of ten views along a path."""
-    out = tmp_path_factory.mktemp("pairs") / "rooms"
-    arguments = ["synth", out, "--rooms", 2, "--views", 10, "--seed", 9, "--path", "--jobs", 1]
-    assert main([str(a) for a in arguments]) == 0
-    return out
-
-
-@pytest.fixture(scope="module")
 def asked(
     building: Path, small_model: Model, tmp_path_factory: pytest.TempPathFactory
 ) -> list[str]:

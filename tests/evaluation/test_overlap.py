@@ -82,7 +82,7 @@ def plain_shares(a: DepthFrame, b: DepthFrame) -> tuple[float, float]:
 def test_against_the_plain_loop(room_frames: tuple[DepthFrame, ...]) -> None:
     from sceneprint.lab.synth import synthesise_room
 
-    frames = [*room_frames[:3], *synthesise_room(3, 0, 25, along_path=True).frames[::12]]
+    frames = [*room_frames[:3], *synthesise_room(3, 0, 25, along_path=True, step=12).frames]
     views = [view_of(frame) for frame in frames]
     found = overlaps(views, views)
     for i, a in enumerate(frames):

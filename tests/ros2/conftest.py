@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -38,17 +39,19 @@ def room(building: Path) -> tuple[Any, ...]:
 
 
 @pytest.fixture(scope="session")
-def service_url(room: tuple[Any, ...], tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def service_url(
+    room: tuple[Any, ...], tmp_path_factory: pytest.TempPathFactory, folder_stack: ExitStack
+) -> str:
     """A service with a map `room`."""
-    with serving(tmp_path_factory.mktemp("service"), 1) as url:
-        with Client(url) as client:
-            client.create_map("room", model="depth")
-            added = [
-                client.upload("room", one, meta_of(one, session="s", parent_frame="site"))
-                for one in room[::2]
-            ]
-            client.wait([one.job_id for one in added])
-        yield url
+    url = folder_stack.enter_context(serving(tmp_path_factory.mktemp("service"), 1))
+    with Client(url) as client:
+        client.create_map("room", model="depth")
+        added = [
+            client.upload("room", one, meta_of(one, session="s", parent_frame="site"))
+            for one in room[::2]
+        ]
+        client.wait([one.job_id for one in added])
+    return url
 
 
 @pytest.fixture(scope="session")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from rerun.chunk import McapReader, RrdReader
 
 from sceneprint.cli import main
 from sceneprint.cli.demo import serving
@@ -58,12 +58,16 @@ def _rows(reader: Any, index: str, time: str) -> Iterator[Logged]:
 
 def rrd_rows(path: Path) -> list[Logged]:
     """All of an .rrd file, in the order in which it was logged, but for what Rerun adds."""
+    from rerun.chunk import RrdReader  # half a second
+
     rows = _rows(RrdReader(path), "frame", "time")
     return [one for one in rows if not one.path.startswith("/__")]
 
 
 def mcap_rows(path: Path) -> list[Logged]:
     """All messages of an MCAP file as Rerun understands them: a reader that is not Foxglove's."""
+    from rerun.chunk import McapReader
+
     rows = _rows(McapReader(path), "no index", "message_log_time")
     return [one for one in rows if not one.path.startswith("/__")]
 
@@ -85,9 +89,8 @@ class ListWriter:
 
 
 @pytest.fixture(scope="session")
-def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with serving(tmp_path_factory.mktemp("service"), 1) as url:
-        yield url
+def service_url(tmp_path_factory: pytest.TempPathFactory, folder_stack: ExitStack) -> str:
+    return folder_stack.enter_context(serving(tmp_path_factory.mktemp("service"), 1))
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -133,14 +133,13 @@ def promised(document: dict[str, Any], answer: httpx.Response) -> None:
 
 
 @pytest.fixture(scope="session")
-def begin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Server]]:
-    """Start `sceneprint serve` or another command; settings are given as for Settings."""
-    begun = []
+def starter(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Server]:
+    """See `begin`; with `stack`, the server ends when that does."""
     document: dict[str, Any] = {}  # of the first: they all have the same, and it takes a while
 
     def start(
-        *arguments: str, folder: Path | None = None, command: tuple[str, ...] | None = None,
-        wait: bool = True, **settings: object,
+        stack: ExitStack, *arguments: str, folder: Path | None = None,
+        command: tuple[str, ...] | None = None, wait: bool = True, **settings: object,
     ) -> Server:  # fmt: skip
         folder = folder or tmp_path_factory.mktemp("server")
         errors = tmp_path_factory.mktemp("errors") / "stderr"
@@ -154,7 +153,7 @@ def begin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Se
                 text=True, start_new_session=True,
             )  # fmt: skip
         server = Server(process, folder, errors)
-        begun.append(server)
+        stack.callback(server.kill)
         if wait:
             assert process.stdout is not None
             line = process.stdout.readline()
@@ -166,15 +165,20 @@ def begin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Se
             server.client.event_hooks = {"response": [lambda answer: promised(document, answer)]}
         return server
 
-    yield start
-    for server in begun:
-        server.kill()
+    return start
+
+
+@pytest.fixture(scope="module")
+def begin(starter: Callable[..., Server]) -> Iterator[Callable[..., Server]]:
+    """Start `sceneprint serve` or another command; settings are given as for Settings."""
+    with ExitStack() as stack:
+        yield partial(starter, stack)
 
 
 @pytest.fixture(scope="session")
-def served(begin: Callable[..., Server]) -> Server:
+def served(starter: Callable[..., Server], folder_stack: ExitStack) -> Server:
     """One server for all tests that leave it as it was but for maps of their own."""
-    return begin(cors_origins=FLEET)
+    return starter(folder_stack, cors_origins=FLEET)
 
 
 @dataclass(frozen=True)
@@ -272,23 +276,26 @@ class Walled:
         return self.server.client.request(method, path, headers=headers, **request)
 
 
-@pytest.fixture(scope="session")
+def _walled(
+    begin: Callable[..., Server], keys: dict[str, dict[str, Scope]], *arguments: str,
+    **settings: object,
+) -> Walled:  # fmt: skip
+    server = begin("--host", "0.0.0.0", *arguments, **settings)
+    # the address that is printed is that of every interface; asked from here it is this one
+    server.client.base_url = server.url = server.url.replace("0.0.0.0", "127.0.0.1")
+    with Engine(Settings(data_dir=server.folder, database_url=None)) as engine:
+        made = {name: engine.create_key(name, grants) for name, grants in keys.items()}
+    return Walled(server, {name: key.secret for name, key in made.items()})
+
+
+@pytest.fixture(scope="module")
 def wall(begin: Callable[..., Server]) -> Callable[..., Walled]:
     """Begin a server that asks for keys; what each may do is given by its name."""
-
-    def start(keys: dict[str, dict[str, Scope]], *arguments: str, **settings: object) -> Walled:
-        server = begin("--host", "0.0.0.0", *arguments, **settings)
-        # the address that is printed is that of every interface; asked from here it is this one
-        server.client.base_url = server.url = server.url.replace("0.0.0.0", "127.0.0.1")
-        with Engine(Settings(data_dir=server.folder, database_url=None)) as engine:
-            made = {name: engine.create_key(name, grants) for name, grants in keys.items()}
-        return Walled(server, {name: key.secret for name, key in made.items()})
-
-    return start
+    return partial(_walled, begin)
 
 
 @pytest.fixture(scope="session")
-def walled(wall: Callable[..., Walled]) -> Walled:
+def walled(starter: Callable[..., Server], folder_stack: ExitStack) -> Walled:
     """One server that asks for keys, for all tests that leave it as it was but for maps of their
     own; `alpha` and `bravo` are those of test_isolation.
     """
@@ -296,7 +303,8 @@ def walled(wall: Callable[..., Walled]) -> Walled:
         "boss": {"*": "admin"}, "watcher": {"*": "read"}, "keeper": {"bravo": "admin"},
         "admin": {"alpha": "admin"}, "writer": {"alpha": "write"}, "reader": {"alpha": "read"},
     }  # fmt: skip
-    return wall(keys, requests_per_s=0, failed_keys_per_minute=0)
+    begin = partial(starter, folder_stack)
+    return _walled(begin, keys, requests_per_s=0, failed_keys_per_minute=0)
 
 
 @dataclass

@@ -193,10 +193,11 @@ def test_what_cannot_be_asked_is_refused(served, maps, shots, refused, make_map)
             415, "unsupported-type")  # fmt: skip
 
 
-def test_what_a_key_may_not_read_is_not_there(wall, shots):
-    held = wall({"robot": {"ask-a": "read"}, "boss": {"*": "admin"}}, "--workers", "0")
+def test_what_a_key_may_not_read_is_not_there(walled, shots):
+    new = {"name": "asking", "grants": {"ask-a": "read"}}
+    walled.secrets["asking"] = walled.ask("boss", "POST", "/v1/keys", json=new).json()["secret"]
     for name in ("ask-a", "secret"):
-        made = held.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
+        made = walled.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
         assert made.status_code == 201
     there = []
     for hidden in ("secret", "nowhere"):
@@ -208,13 +209,14 @@ def test_what_a_key_may_not_read_is_not_there(wall, shots):
             (f"/v1/maps/{hidden}/localize", {"frame_id": "x"}),
             ("/v1/similarity", {"frame_a": frame, "frame_b": mine}),
         ]
-        answers = [held.ask("robot", "POST", path, json=body) for path, body in asked]
+        answers = [walled.ask("asking", "POST", path, json=body) for path, body in asked]
         assert {one.status_code for one in answers} == {404}
         there.append([one.json()["detail"].replace(hidden, "MAP") for one in answers])
     assert there[0] == there[1]
     form = shots[0].form()
     form["data"] |= {"maps": "*", "stages": "retrieve"}
-    every = held.ask("robot", "POST", "/v1/queries", **form)
+    every = walled.ask("asking", "POST", "/v1/queries", **form)
+    assert walled.ask("boss", "DELETE", "/v1/keys/asking").status_code == 204
     assert (every.status_code, every.json()["maps"]) == (200, ["ask-a"])
 
 

@@ -14,7 +14,7 @@ import pytest
 def test_names_are_sent_in_every_way_and_searched(
     served: Any, make_map: Callable[..., str], small_shots: list[Any]
 ) -> None:
-    path, ask = make_map(served, "named"), served.client
+    path, ask = make_map(served, "frame-names"), served.client
     one, two, three, four = small_shots[:4]
     sent = ask.post(f"{path}/frames", **one.form(session="s", name="depth/2.png", sequence=2))
     assert sent.status_code == 202, sent.text

@@ -11,13 +11,17 @@ from datetime import datetime
 
 import pytest
 
+from sceneprint.cli import main
+
 
 @pytest.fixture(scope="module")
 def signing(rows):
     return lambda server: bool(rows(server.folder, "SELECT 1 FROM jobs WHERE state = 'running'"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.thorough)]
+)
 def test_told_to_stop_it_finishes_the_frame_in_hand(
     begin, make_map, shots, until, number, rows, signing
 ):
@@ -132,16 +136,19 @@ def test_a_file_that_is_no_database_is_refused_in_one_line(begin, tmp_path):
     assert (tmp_path / "sceneprint.db").read_bytes() == b"not a database " * 1000
 
 
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (("--port", "99999"), "The setting port is 99999"),
-        (("--workers", "257"), "The setting workers is 257"),
-        (("--host", "no.such.host.invalid"), "no.such.host.invalid:0 is not available"),
-    ],
-)
-def test_what_cannot_be_set_is_refused_in_one_line(begin, arguments, text):
-    assert text in refusal(begin, *arguments)
+@pytest.mark.parametrize("setting", ["port", "workers"])
+def test_what_cannot_be_set_is_refused_in_one_line(tmp_path, capsys, setting):
+    assert main(["serve", "--data", str(tmp_path / "new"), f"--{setting}", "99999"]) == 2
+    said = capsys.readouterr()
+    (line,) = said.err.splitlines()
+    assert line.startswith(f"sceneprint serve: The setting {setting} is 99999: ")
+    assert said.out == ""
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_host_that_is_none_is_refused_in_one_line(begin):
+    line = refusal(begin, "--host", "no.such.host.invalid")
+    assert "no.such.host.invalid:0 is not available" in line
 
 
 def test_a_port_that_is_taken_is_refused_in_one_line(begin, served, tmp_path):

@@ -209,6 +209,7 @@ def test_what_happens_in_other_maps_moves_nothing_that_is_told(both):
         assert a == c
 
 
+@pytest.mark.thorough
 def test_it_is_all_there(both):
     """Else the test above would prove nothing."""
     text = "".join(both[0])

@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from sceneprint.store import Store, open_store
+from sceneprint.store import open_store
 from sceneprint.store.opaque_ids import START
 
 
-def opened(folder: Path) -> Store:
-    return open_store(f"sqlite:///{folder / 'sceneprint.db'}", folder / "blobs")
+@pytest.fixture
+def opened() -> Iterator[Callable[[Path], object]]:
+    """The seals of a new or a known store; all are closed at the end."""
+    with ExitStack() as stack:
+
+        def opened(folder: Path) -> object:
+            store = open_store(f"sqlite:///{folder / 'sceneprint.db'}", folder / "blobs")
+            stack.callback(store.database.close)
+            return store.seals
+
+        yield opened
 
 
-def test_a_seal_is_read_by_its_store_in_every_process(tmp_path):
+def test_a_seal_is_read_by_its_store_in_every_process(opened, tmp_path):
     (tmp_path / "other").mkdir()
-    mine, again = opened(tmp_path).seals, opened(tmp_path).seals
-    other = opened(tmp_path / "other").seals
+    mine, again, other = opened(tmp_path), opened(tmp_path), opened(tmp_path / "other")
     for number in (1, 2, 255, 256, 2**31, 2**63 - 1):
         seal = mine.seal("event", number)
         assert again.seal("event", number) == seal
@@ -31,8 +41,8 @@ def test_a_seal_is_read_by_its_store_in_every_process(tmp_path):
     assert mine.open("event", START) == 0
 
 
-def test_what_was_not_given_out_is_none(tmp_path):
-    seals = opened(tmp_path).seals
+def test_what_was_not_given_out_is_none(opened, tmp_path):
+    seals = opened(tmp_path)
     seal = seals.seal("frame", 7)
     for place in range(48):  # whichever digit is another
         altered = f"{seal[:place]}{'0' if seal[place] != '0' else '1'}{seal[place + 1 :]}"
@@ -42,9 +52,9 @@ def test_what_was_not_given_out_is_none(tmp_path):
 
 
 @pytest.mark.parametrize("part", [slice(16), slice(16, 32), slice(32, 48)])
-def test_neighbours_have_nothing_in_common(tmp_path, part):
+def test_neighbours_have_nothing_in_common(opened, tmp_path, part):
     """Half of 64 bits differ, six deviations of the mean of 500 allowed: else gaps would show."""
-    seals = opened(tmp_path).seals
+    seals = opened(tmp_path)
     found = [int(seals.seal("event", number)[part], 16) for number in range(1, 502)]
     differing = [(a ^ b).bit_count() for a, b in pairwise(found)]
     assert abs(sum(differing) / 500 - 32) < 6 * 4 / 500**0.5

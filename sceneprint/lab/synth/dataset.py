@@ -55,6 +55,7 @@ def synthesise_room(
     views: int,
     *,
     along_path: bool = False,
+    step: int = 1,
     noise: KinectNoise | None = KINECT_V1,
     intrinsics: Intrinsics = KINECT,
 ) -> SynthRoom:
@@ -68,6 +69,7 @@ def synthesise_room(
     seed, index : the room is number `index` of the collection `seed`
     views : how many frames
     along_path : whether the frames follow one hand-held path; else they are independent
+    step : along a path, take only each `step`-th view
     noise : the sensor; None gives ideal depth
     intrinsics : the camera
 
@@ -84,7 +86,7 @@ def synthesise_room(
         return [(take(room, T, intrinsics, rng, sensor), T) for T in poses]
 
     if along_path:
-        taken = shots(trajectory(room, views, rng))
+        taken = shots(trajectory(room, views, rng)[::step])
     else:
         taken, least = [], LEAST_VALID
         while len(taken) < views:

@@ -12,8 +12,6 @@ from sceneprint.engine import Engine
 from sceneprint.maintenance.fsck.findings import Finding
 
 HALL = 12
-#: Flips of each kind.
-TIMES = 12
 INDEX = ("keys", "faiss", "json")
 
 
@@ -58,12 +56,13 @@ def named(finding: Finding) -> str | None:
 
 
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
+@pytest.mark.parametrize("times", [4, pytest.param(12, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("kind", [*INDEX, "table", "artifact", "upload", "signature"])
-def test_a_flipped_byte_is_named_and_nothing_else_is(house: Any, kind: str) -> None:
+def test_a_flipped_byte_is_named_and_nothing_else_is(house: Any, kind: str, times: int) -> None:
     rng = np.random.default_rng(7)
     assert house.look() == []
     before = house.files()
-    for _ in range(TIMES):
+    for _ in range(times):
         path, at, what = place_of(house, kind, rng)
         bit = int(rng.integers(8))
         flip(path, at, bit)
