@@ -1,0 +1,312 @@
+// The surface of a map in the picture: what the API has of it, and which tiles are fetched and drawn.
+
+import { at, bytes, get } from "../lib/api.js";
+import { tintOf } from "../paths/scene.js";
+import { reachAlong } from "../paths/shapes.js";
+import { cellUnder, placeIn, STRIDE } from "../viewer/cells.js";
+import { VIEW } from "../viewer/camera.js";
+import { colourOf } from "../viewer/colours.js";
+import { around, movedBox } from "../viewer/layers.js";
+import { dot, inverseRigid, transformed } from "../viewer/matrix.js";
+import { cover, Pyramid, refine } from "./detail.js";
+
+/** Cells that are drawn at once: what takes 50 ms without a graphics card. */
+const BUDGET = 60_000;
+/** CSS pixels of a cell that is fine enough. */
+const FINE_PX = 2.5;
+const AT_ONCE = 6;
+/** Tiles of a level that are listed: of a larger map the next coarser level is drawn. */
+const MOST_LISTED = 20_000, PAGE = 1000;
+/** Cells that stay in memory when they are not drawn. */
+const KEPT = 500_000;
+const PAUSE_MS = 120;
+/** Shares of the cells that are lower and higher than the colours of heights reach. */
+const OUTER = 0.01;
+
+export class Surface {
+  /** @type {any} as the API tells it; null before `load` */
+  record = null;
+  /** @type {Map<string, Pyramid>} by parent frame */
+  #pyramids = new Map();
+  /** @type {Map<string, any>} array buffers by digest, the longest unused first */
+  #bytes = new Map();
+  /** @type {Map<string, any>} what is drawn, by parent frame: its axes in those of the picture */
+  #shown = new Map();
+  /** @type {Set<string>} digests that are on their way */
+  #coming = new Set();
+  #listing = new Set();
+  /** @type {any[]} drawn now, see viewer/cells.js */
+  #tiles = [];
+  #drawn = "";
+  /** @type {Timer} */
+  #timer = null;
+  /** @type {number[] | null} heights that colours reach from and to; null before they are known */
+  range = null;
+  #most = 255;
+  /** @type {number[] | null} heights that are drawn */
+  cut = null;
+  colour = "height";
+  /** @type {(number | null)[]} numbers of runs by session */
+  numbers = [];
+  /** @type {Set<string>} digests that are gone, until the API tells others */
+  #gone = new Set();
+
+  /**
+   * @param {{map: string, signal: AbortSignal, scene: import("../paths/scene.js").Scene,
+   *   onready: () => void}} what onready: the heights are known
+   */
+  constructor({ map, signal, scene, onready }) {
+    this.map = map;
+    this.signal = signal;
+    this.scene = scene;
+    this.onready = onready;
+    signal.addEventListener("abort", () => clearTimeout(this.#timer), { once: true });
+  }
+
+  /** Ask what there is. @returns {Promise<any>} the record */
+  async load() {
+    const before = this.record?.updated_at;
+    this.record = await get(at("maps", this.map, "surface"), { signal: this.signal });
+    if (this.record.updated_at !== before) {
+      this.#gone.clear();
+      this.#pyramids = new Map(this.record.parents.map((one) => [one.parent_frame, new Pyramid(one.parent_frame, one.levels)]));
+      if (this.#shown.size) await this.show(this.#shown);
+    }
+    return this.record;
+  }
+
+  /** What the API tells of a parent frame; undefined of one without a surface. @param {string} parent */
+  parent(parent) {
+    return this.record?.parents.find((one) => one.parent_frame === parent);
+  }
+
+  /** Middle of a parent frame's surface. @param {string} parent @returns {number[] | null} */
+  middle(parent) {
+    const told = this.parent(parent);
+    return told ? ["x", "y", "z"].map((k) => (told.low[k] + told.high[k]) / 2) : null;
+  }
+
+  /**
+   * Draw the surfaces of parent frames.
+   * @param {Map<string, number[]>} parents each with the matrix that brings it into the picture's frame
+   */
+  async show(parents) {
+    this.#shown = parents;
+    this.#drawn = "";
+    this.range = null;
+    const here = this.#here();
+    if (!here.length || !this.scene.viewer?.available) {
+      this.scene.viewer?.remove("surface");
+      this.#tiles = [];
+      return;
+    }
+    this.scene.viewer.cells("surface", { tiles: [], extent: this.#extent(), ...this.#look() });
+    await Promise.all(here.map((one) => this.#list(one, one.levels.length - 1)));
+    this.update();
+  }
+
+  #here() {
+    return [...this.#shown.keys()].map((name) => this.#pyramids.get(name)).filter((one) => one !== undefined);
+  }
+
+  async #list(pyramid, place) {
+    const key = `${pyramid.parent} ${place}`;
+    if (pyramid.knows(place) || this.#listing.has(key) || pyramid.levels[place].tiles > MOST_LISTED) return;
+    this.#listing.add(key);
+    try {
+      const found = [];
+      let cursor = null;
+      do {
+        const params = { parent: pyramid.parent, level: pyramid.levels[place].level, cursor, limit: PAGE };
+        const page = await get(at("maps", this.map, "surface", "tiles"), { params, signal: this.signal });
+        found.push(...page.items);
+        cursor = page.next_cursor;
+      } while (cursor !== null);
+      pyramid.list(place, found);
+    } finally {
+      this.#listing.delete(key);
+    }
+  }
+
+  /** What should be drawn may have changed: soon. */
+  later() {
+    this.#timer ??= setTimeout(() => { this.#timer = null; this.update(); }, PAUSE_MS);
+  }
+
+  /** Choose tiles for what is looked at, fetch what is missing, and draw what is there. */
+  update() {
+    const here = this.#here(), { viewer } = this.scene;
+    if (this.signal.aborted || !here.length || !viewer?.available) return;
+    const size = this.#sizes(viewer), wanted = [], drawn = [];
+    for (const pyramid of here) {
+      const parts = (piece) => pyramid.parts(piece);
+      const { refined, coarse } = refine(pyramid.roots, { parts, size, budget: BUDGET / here.length, least: FINE_PX });
+      for (const level of coarse) this.#list(pyramid, level - 1).then(() => this.later());
+      const found = cover(pyramid.roots, { refined, parts, there: (piece) => this.#bytes.has(piece.digest) });
+      wanted.push(...found.missing);
+      drawn.push(...found.drawn);
+    }
+    if (this.range === null && here.every((one) => one.roots.length && one.roots.every((piece) => this.#bytes.has(piece.digest)))) this.#measure(here);
+    this.#draw(drawn);
+    this.#fetch(wanted);
+  }
+
+  /** How large a cell of a piece is on the screen: 0 out of view. @returns {(piece: any) => number} */
+  #sizes(viewer) {
+    const { clip, orbit, canvas } = viewer, focal = canvas.clientHeight / 2 / Math.tan(VIEW / 2);
+    const eye = orbit.eye();
+    return (piece) => {
+      const matrix = this.#matrix(piece), { span } = piece;
+      const corners = Array.from({ length: 8 }, (_, i) => transformed(matrix, [0, 1, 2].map((k) => ((i >> k) & 1 ? span : 0))));
+      const seen = corners.map((p) => transformed(clip, p));
+      const outside = [0, 1].some((k) => seen.every((p) => p[k] > p[3]) || seen.every((p) => p[k] < -p[3]));
+      if (outside || this.#isCut(corners)) return 0;
+      const middle = [0, 1, 2].map((k) => (corners[0][k] + corners[7][k]) / 2);
+      const away = orbit.flat ? orbit.distance : Math.hypot(...middle.map((x, k) => x - eye[k])) - 0.87 * span;
+      return (piece.cell * focal) / Math.max(away, span / 4);
+    };
+  }
+
+  #isCut(corners) {
+    if (!this.cut) return false;
+    const up = this.scene.axes.above, base = dot(up, this.scene.origin);
+    const heights = corners.map((p) => dot(up, p) + base);
+    return Math.min(...heights) > this.cut[1] || Math.max(...heights) < this.cut[0];
+  }
+
+  // where its corner is, less the origin in numbers of 64 bits: those that are drawn have 32
+  #matrix({ parent, column, row, floor, span }) {
+    const matrix = this.#shown.get(parent), corner = [column, row, floor].map((x) => x * span);
+    return this.scene.moveOrigin([...matrix.slice(0, 12), ...transformed(matrix, corner)]);
+  }
+
+  #draw(pieces) {
+    const names = pieces.map((one) => `${one.parent} ${one.level} ${one.column} ${one.row} ${one.floor} ${one.digest}`);
+    const all = names.join("\n");
+    if (all === this.#drawn) return;
+    this.#drawn = all;
+    this.#tiles = pieces.map((piece, i) => ({
+      name: names[i], data: this.#bytes.get(piece.digest), span: piece.span, cell: piece.cell,
+      matrix: this.#matrix(piece), piece,
+    }));
+    this.scene.viewer.cells("surface", { tiles: this.#tiles, extent: this.#extent(), ...this.#look() });
+  }
+
+  /** How cells are drawn, for the viewer. */
+  #look() {
+    const base = dot(this.scene.axes.above, this.scene.origin), shift = (pair) => pair && pair.map((x) => x - base);
+    const { taken_from: from, taken_step_s: step, first_taken: first, last_taken: last } = this.record;
+    const code = (iso) => (from && step ? (Date.parse(iso) - Date.parse(from)) / 1000 / step : 0);
+    return {
+      colour: this.colour, palette: this.palette(), most: this.#most, cut: shift(this.cut),
+      heights: shift(this.range ?? reachAlong(/** @type {any} */ (this.#extent()), this.scene.axes.above).map((x) => x + base)),
+      ages: first ? [code(first), code(last)] : [0, 1],
+    };
+  }
+
+  /** Draw cells in other colours, or other heights of them. @param {{colour?: string, cut?: number[] | null}} how */
+  paint({ colour = this.colour, cut = this.cut }) {
+    this.colour = colour;
+    this.cut = cut;
+    if (this.scene.viewer?.has("surface")) this.scene.viewer.cells("surface", this.#look());
+  }
+
+  /** Runs of the map, whose colours their sessions have. @param {Object<string, any>[]} runs */
+  colours(runs) {
+    const numbers = new Map();
+    for (const one of runs) if (!numbers.has(one.session)) numbers.set(one.session, one.number);
+    this.numbers = this.record.sessions.map((name) => numbers.get(name) ?? null);
+    this.paint({});
+  }
+
+  /** Colours of sessions, as the theme has them. */
+  palette() {
+    return Uint8Array.from(this.numbers.flatMap((one) => (one === null ? colourOf("muted") : tintOf(one))));
+  }
+
+  #extent() {
+    const boxes = [...this.#shown].map(([name, matrix]) => [this.parent(name), matrix]).filter(([told]) => told)
+      .map(([{ low, high }, matrix]) => movedBox({ low: [low.x, low.y, low.z], high: [high.x, high.y, high.z] }, this.scene.moveOrigin(matrix)));
+    return around(boxes);
+  }
+
+  // heights and counts that colours reach to, by the coarsest cells
+  #measure(here) {
+    const heights = [], base = dot(this.scene.axes.above, this.scene.origin);
+    const seen = [];
+    for (const piece of here.flatMap((one) => one.roots)) {
+      const data = this.#bytes.get(piece.digest), matrix = this.#matrix(piece), tile = { data, span: piece.span };
+      const codes = new Uint8Array(data);
+      for (let i = 0; i * STRIDE < data.byteLength; i += 1) {
+        heights.push(dot(this.scene.axes.above, transformed(matrix, placeIn(/** @type {any} */ (tile), i))) + base);
+        seen.push(codes[i * STRIDE + 3]);
+      }
+    }
+    const least = (values, share) => values[Math.min(Math.floor(share * values.length), values.length - 1)];
+    heights.sort((a, b) => a - b);
+    seen.sort((a, b) => a - b);
+    this.range = [least(heights, OUTER), least(heights, 1 - OUTER)];
+    this.#most = Math.max(least(seen, 1 - OUTER), 17);
+    this.scene.lay(this.#extent(), this.range[0]);
+    this.#drawn = "";
+    this.onready();
+  }
+
+  /** Frames that saw the cell that was seen by most, for the legend. */
+  get mostSeen() { return Math.round(2 ** (this.#most / 16) - 1); }
+
+  #fetch(wanted) {
+    for (const piece of wanted) {
+      if (this.#coming.size >= AT_ONCE) return;
+      if (!this.#coming.has(piece.digest) && !this.#gone.has(piece.digest)) this.#one(piece);
+    }
+  }
+
+  async #one({ digest }) {
+    this.#coming.add(digest);
+    try {
+      this.#bytes.set(digest, await bytes(at("maps", this.map, "surface", "tiles", digest), { signal: this.signal }));
+      this.#forget();
+    } catch (error) {
+      if (error.name === "AbortError") return;
+      if (error.status !== 404) throw error;
+      this.#gone.add(digest); // it was replaced meanwhile
+      await this.load();
+    } finally {
+      this.#coming.delete(digest);
+    }
+    this.update();
+  }
+
+  #forget() {
+    const drawn = new Set(this.#tiles.map((one) => one.piece.digest));
+    let cells = [...this.#bytes.values()].reduce((sum, one) => sum + one.byteLength / STRIDE, 0);
+    for (const [digest, data] of this.#bytes) {
+      if (cells <= KEPT) return;
+      if (drawn.has(digest) || this.#isRoot(digest)) continue;
+      this.#bytes.delete(digest);
+      cells -= data.byteLength / STRIDE;
+    }
+  }
+
+  #isRoot(digest) {
+    return this.#here().some((one) => one.roots.some((piece) => piece.digest === digest));
+  }
+
+  /**
+   * The spot that is drawn at a place of the canvas.
+   * @param {number} x @param {number} y CSS pixels @param {number} near CSS pixels from there at most
+   * @returns {{parent: string, at: number[], world: number[], cell: number} | null} at: in its parent
+   *   frame; world: in that of the picture; cell: metres
+   */
+  spot(x, y, near) {
+    const up = this.scene.axes.above, base = dot(up, this.scene.origin), { cut } = this;
+    const allowed = (p) => !cut || (dot(up, p) + base >= cut[0] && dot(up, p) + base <= cut[1]);
+    const found = cellUnder(this.#tiles, this.scene.projector(), { x, y, near, allowed });
+    if (!found) return null;
+    const tile = /** @type {any} */ (found.tile);
+    const world = transformed(tile.matrix, placeIn(tile, found.cell)).slice(0, 3).map((v, k) => v + this.scene.origin[k]);
+    const { parent } = tile.piece;
+    return { parent, world, at: transformed(inverseRigid(this.#shown.get(parent)), world).slice(0, 3), cell: tile.cell };
+  }
+}
