@@ -125,7 +125,7 @@ export class Runs {
     this.scene.show(this.#drawn);
     this.card.paths(this.#drawn);
     this.#ask();
-    if (!early) this.scene.look("keep");
+    if (!early || this.scene.viewer.isFitted) this.scene.look("keep");
     this.#runs(wanted, shown, found);
     await this.#association();
     this.onchange();

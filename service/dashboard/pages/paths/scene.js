@@ -102,7 +102,7 @@ export class Scene {
     this.#axes = { above, ahead, right };
     if (this.#viewer === null) {
       this.#viewer = createViewer(this.canvas, { label, up, antialias: false, onview: () => { this.#moved(); this.onview(); } });
-      this.canvas.viewer = this.#viewer; // whoever debugs finds it there
+      Object.assign(this.canvas, { viewer: this.#viewer, scene: this }); // whoever debugs finds them there
     } else {
       Object.assign(this.#viewer.orbit, { above, ahead, right });
       this.#viewer.label = label;

@@ -16,7 +16,8 @@ const MOST = 2000, PAGE = 500;
 const LATEST = 500;
 /** Failures that are marked, and robots that are told. */
 const MOST_MARKS = 60, MOST_ROBOTS = 50;
-const TRAIL = 40;
+/** Of one robot: failures that are told, and poses of the way it came. */
+const MOST_FAILURES = 3, TRAIL = 40;
 const PERIODS = [["", "Latest queries"], ["1", "Last hour"], ["24", "Last 24 hours"], ["168", "Last 7 days"]];
 const HOUR_MS = 3_600_000;
 /** How long a replay takes at most, and how fast and slow its steps are. */
@@ -27,7 +28,8 @@ const TOGETHER_MS = 200;
  * Where robots were when the last of some records came.
  * @param {Object<string, any>[]} records in the order of time
  * @returns {{name: string, last: any, found: any, trail: any[], lost: any[]}[]} those heard of last first;
- *   found: the last record with a pose; trail: those before it; lost: records without one since it
+ *   found: the last record with a pose; trail: those before it; lost: failures, each with the record `near`
+ *   of where the robot had been found last; null: nowhere
  */
 export function robotsOf(records) {
   /** @type {Map<string, any>} */
@@ -173,13 +175,15 @@ export class Robots {
   #row({ name, last, found, lost }) {
     const [kind, word] = STATUSES[last.status] ?? ["neutral", last.status];
     const pose = found && this.#pose(found);
-    const failures = lost.slice(-5).reverse();
+    const failures = lost.slice(-MOST_FAILURES).reverse();
     return h("li", { dataset: { robot: name } },
       h("div", { class: "paths-row" }, h("strong", { class: "paths-name" }, name), h("span", { class: "badge", dataset: { kind } }, word)),
       h("span", { class: "muted" }, time(last.at), found && found !== last && [", found ", time(found.at)]),
       h("span", { class: "muted number" }, where(found)),
-      failures.map(({ record }) => h("a", { class: "place-failure", href: linkOf(record, this.map) }, `${STATUSES[record.status][1]}, `, time(record.at), ": ", coded(sentence(record.reason)))),
-      lost.length > failures.length && h("a", { href: link("maps", this.map, "queries", { robot: last.robot, status: "lost" }) }, `All ${count(lost.length)} failures since it was found`),
+      LOST.includes(last.status) && h("p", {}, coded(sentence(last.reason))),
+      failures.length > 0 && h("ul", { class: "place-failures", "aria-label": `Failures of ${name}` }, failures.map(({ record }) =>
+        h("li", {}, h("a", { href: linkOf(record, this.map), title: record.reason }, STATUSES[record.status][1], ", ", time(record.at))))),
+      lost.length > failures.length && h("a", { href: link("maps", this.map, "queries", { robot: last.robot, status: "lost" }) }, `All its ${count(lost.length)} failures`),
       h("div", { class: "toolbar" },
         pose && h("button", { class: "button quiet", type: "button", "aria-label": `Go to ${name}`, onClick: () => this.scene.approach(pose) }, "Go to it"),
         h("a", { class: "button quiet", href: linkOf(last, this.map), "aria-label": `Last query of ${name}` }, "Last query")));

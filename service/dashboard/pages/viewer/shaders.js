@@ -79,8 +79,12 @@ void main() {
   gl_Position = clip * world;
   gl_PointSize = clamp(size / max(gl_Position.w, 1e-6), pixels.x, pixels.y);
   if (height < cut.x || height > cut.y) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-  if (mode == 0) colour = ramped((height - heights.x) / max(heights.y - heights.x, 1e-6));
-  else if (mode == 1) colour = last.x == 65535u ? unknown : texelFetch(palette, ivec2(int(last.x & 255u), int(last.x >> 8)), 0).rgb;
+  float share = clamp((height - heights.x) / max(heights.y - heights.x, 1e-6), 0.0, 1.0);
+  if (mode == 0) colour = ramped(share);
+  else if (mode == 1) { // what is lower is darker: one colour alone has no shape
+    colour = last.x == 65535u ? unknown : texelFetch(palette, ivec2(int(last.x & 255u), int(last.x >> 8)), 0).rgb;
+    colour *= 0.6 + 0.4 * share;
+  }
   else if (mode == 2) colour = ramped((float(place.w) - 16.0) / max(most - 16.0, 1.0));
   else colour = last.y == 65535u ? unknown : ramped((float(last.y) - ages.x) / max(ages.y - ages.x, 1.0));
 }`;

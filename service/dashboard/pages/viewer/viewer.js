@@ -192,6 +192,11 @@ export class Viewer {
     return [((x / w + 1) / 2) * clientWidth, ((1 - y / w) / 2) * clientHeight, w];
   }
 
+  /** Whether nobody has looked elsewhere since `fit`. */
+  get isFitted() {
+    return this.#fitted !== null;
+  }
+
   /** World to clip coordinates; 16, column-major. */
   get clip() {
     return this.#clip();
