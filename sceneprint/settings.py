@@ -111,6 +111,9 @@ class Settings(BaseSettings):
     history_days: float = Field(default=30.0, ge=0, le=36_500)
     #: Newest records of queries of each map that are kept, some 600 bytes each.
     history_queries: int = Field(default=100_000, ge=1, le=100_000_000)
+    #: Who begins the fused surface of a map: workers, as frames come, or whoever asks for it.
+    #: Deleted frames are always taken out of one that there is.
+    surfaces: Literal["auto", "asked"] = "auto"
     #: Seconds after which no byte of a deleted frame is left in the caches of this node.
     purge_s: float = Field(default=3600.0, ge=1, le=31_536_000)
 

@@ -52,6 +52,7 @@ from service.routes import (
     reconstructions,
     results,
     sessions,
+    surface,
 )
 
 # The OpenAPI document: FastAPI's, and the records that only bodies of our own reading use.
@@ -104,7 +105,7 @@ ROUTERS = (
     maps.router, frames.router, frame_data.router, frame_data.points_router, maps.edits_router,
     sessions.router, frames.imports_router, queries.router, results.history_router,
     results.router,
-    queries.similarity_router, sessions.associations_router, coverage.router,
+    queries.similarity_router, sessions.associations_router, coverage.router, surface.router,
     reconstructions.router, jobs.router,
     jobs.events_router, admin.operations_router, admin.snapshots_router, admin.keys_router,
 )  # fmt: skip

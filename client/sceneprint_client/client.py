@@ -18,6 +18,7 @@ from sceneprint_client.errors import MissingDependency
 from sceneprint_client.http import ServiceConnection
 from sceneprint_client.map_contents import MapMethods
 from sceneprint_client.queries import QueryMethods
+from sceneprint_client.surfaces import SurfaceMethods
 from sceneprint_client.uploads import UploadMethods
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class Status(ApiRecord):
     )
 
 
-class Client(MapMethods, UploadMethods, QueryMethods, AdminMethods):
+class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMethods):
     """Maps, frames and queries of a service; safe to share between threads.
 
     Brief faults of the network and of a busy service are waited out; uploading twice is safe,

@@ -25,6 +25,7 @@ from sceneprint_client.api import (
 )
 from sceneprint_client.api.base import checked
 from sceneprint_client.errors import (
+    NotFound,
     SceneprintError,
     UnknownFrame,
     UnknownJob,
@@ -130,6 +131,16 @@ def association_path(map_name: str, association_id: str) -> str:
 def coverage_path(map_name: str, coverage_id: str) -> str:
     """Path of a coverage job; UnknownMap or UnknownJob as `map_path`."""
     return f"{map_path(map_name)}/coverage/{_part(coverage_id, 'coverage', UnknownJob)}"
+
+
+def surface_path(map_name: str) -> str:
+    """Path of the surface of a map; UnknownMap as `map_path`."""
+    return f"{map_path(map_name)}/surface"
+
+
+def surface_tile_path(map_name: str, digest: str) -> str:
+    """Path of a tile; UnknownMap as `map_path`, NotFound where no tile can have that digest."""
+    return f"{surface_path(map_name)}/tiles/{_part(digest, 'tile', NotFound)}"
 
 
 def _part(name: str, what: str, error: type[SceneprintError]) -> str:

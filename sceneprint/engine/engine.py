@@ -21,7 +21,9 @@ from sceneprint.engine.maps import map_lifecycle, reencoding
 from sceneprint.engine.maps.coverage_job import COVERAGE, CoverageHandler
 from sceneprint.engine.maps.map_coverage import CoverageJobs
 from sceneprint.engine.maps.map_frames import FrameFiles, list_frames
+from sceneprint.engine.maps.map_surface import MapSurfaces, SurfaceUpkeep
 from sceneprint.engine.maps.reencoding import Reencodings
+from sceneprint.engine.maps.surface_job import SURFACE, SurfaceHandler
 from sceneprint.engine.reconstruction import ReconstructionJobs
 from sceneprint.engine.results.query_history import QueryHistory
 from sceneprint.engine.results.rerun import Rerun
@@ -117,6 +119,11 @@ class Engine:
         self.coverage = CoverageJobs(self.store, self.tasks)
         measuring = CoverageHandler(self.store, self.signers, self.queries)
         self.tasks.register(COVERAGE, measuring)
+        self.surfaces = MapSurfaces(self.store, self.bell)
+        self.tasks.register(SURFACE, SurfaceHandler(self.store, self.signers))
+        self._surface_upkeep = SurfaceUpkeep(
+            self.store, self.bell, auto=settings.surfaces == "auto"
+        )
         self.audit = Audit(self.store)
         self.outputs = FrameFiles(self.store, self.signers)
         self.points = PointClouds(self.store, self.inspection.pairs, self.kept)
@@ -357,6 +364,7 @@ class Engine:
         self.operations.tidy()
         self.history.tidy()
         self.imports.tidy()
+        self._surface_upkeep.run()
         if self.purging.run() is not None:
             with self.store.database.read() as connection:
                 self._readers.purge(connection)

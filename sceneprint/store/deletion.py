@@ -45,6 +45,10 @@ from sceneprint.store.tables import (
     maps,
     query_records,
     signatures,
+    surface_frames,
+    surface_tiles,
+    surface_touches,
+    surfaces,
 )
 from sceneprint_client.api import FrameState
 
@@ -122,10 +126,18 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
         select(frames.c.blob).where(frames.c.map_number == row.number),
         select(signatures.c.geometry).where(signatures.c.frame_number.in_(own)),
         select(job_files.c.blob).where(job_files.c.job_number.in_(of_map)),
+        *(
+            select(column).where(surface_tiles.c.map_number == row.number, column.is_not(None))
+            for column in (surface_tiles.c.blob, surface_tiles.c.draft)
+        ),
     )
     referred = sorted({blob for one in asked for blob in connection.execute(one).scalars()})
     doom_found(connection, *asked)
     connection.execute(delete(signatures).where(signatures.c.frame_number.in_(own)))
+    tiles = select(surface_tiles.c.number).where(surface_tiles.c.map_number == row.number)
+    connection.execute(delete(surface_touches).where(surface_touches.c.tile_number.in_(tiles)))
+    for of_surface in (surface_tiles, surface_frames, surfaces):
+        connection.execute(delete(of_surface).where(of_surface.c.map_number == row.number))
     for made in (job_items, job_files):
         connection.execute(delete(made).where(made.c.job_number.in_(of_map)))
     connection.execute(delete(jobs).where(jobs.c.map_number == row.number))

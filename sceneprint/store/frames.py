@@ -13,6 +13,7 @@ from sceneprint.store.deletion import delete_frames
 from sceneprint.store.events import record_event
 from sceneprint.store.maps import ROOMLESS, count_on, find_map
 from sceneprint.store.queue import now
+from sceneprint.store.surface_rows import FUSED_COLUMNS, note_edit
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
@@ -23,6 +24,7 @@ from sceneprint.store.tables import (
     maps,
     rows_among,
     signatures,
+    surface_tiles,
 )
 from sceneprint_client.api import FrameState
 
@@ -164,12 +166,16 @@ def delete_frame(connection: Connection, row: MapRow, frame: FrameRow) -> list[s
 
 
 def refers_to(connection: Connection, blob: str) -> bool:
-    """Whether a frame that is kept, a signature or a job refers to a blob."""
+    """Whether a frame that is kept, a signature, a job or a tile refers to a blob."""
     kept = frames.c.state.not_in(ROOMLESS)
     of_frame = select(frames.c.number).where(frames.c.blob == blob, kept)
     of_artifact = select(signatures.c.frame_number).where(signatures.c.geometry == blob)
     of_job = select(job_files.c.job_number).where(job_files.c.blob == blob)
-    return any(connection.execute(one.limit(1)).first() for one in (of_frame, of_artifact, of_job))
+    c = surface_tiles.c
+    of_tile = select(c.number).where(c.blob == blob)
+    of_draft = select(c.number).where(c.draft == blob)
+    every = (of_frame, of_artifact, of_job, of_tile, of_draft)
+    return any(connection.execute(one.limit(1)).first() for one in every)
 
 
 def count_states(connection: Connection, map_number: int | None = None) -> dict[str, int]:
@@ -265,6 +271,8 @@ def write_frame(
     if "tags" in changed:
         connection.execute(delete(frame_tags).where(frame_tags.c.frame_number == frame.number))
         _write_tags(connection, frame.number, changed["tags"])
+    if FUSED_COLUMNS & set(changed):
+        note_edit(connection, frame.number, row.number)
     record_event(connection, "frame.edited", row.name, frame.id, fields=sorted(changed))
     return frame_of(connection, frame.number)
 

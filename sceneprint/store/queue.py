@@ -140,6 +140,12 @@ def find_job(connection: Connection, job_id: str) -> JobRow:
     return job_row(row)
 
 
+def job_of_number(connection: Connection, number: int) -> JobRow | None:
+    """The job of a number; None where it was removed."""
+    row = connection.execute(select(jobs).where(jobs.c.number == number)).mappings().first()
+    return None if row is None else job_row(row)
+
+
 def unknown_job(job_id: str) -> UnknownJob:
     """What is said of a job that is not there, or not for whoever asks: the same words."""
     return UnknownJob(

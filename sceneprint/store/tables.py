@@ -338,6 +338,84 @@ query_records = Table(
     sqlite_autoincrement=True,
 )
 
+#: The fused surface of a map: where its making stands.
+surfaces = Table(
+    "surfaces",
+    metadata,
+    Column("map_number", WHOLE, ForeignKey("maps.number"), primary_key=True),
+    Column("model_id", _string(64), nullable=False),  # whose artifacts are fused
+    Column("cell_m", Float, nullable=False),  # of the finest level
+    Column("wanted", Boolean, nullable=False),  # false: it was deleted, and nobody asked again
+    Column("job_number", WHOLE),  # of its latest job, which may have been removed since
+    # revision and edits of the map up to which nothing is left to do
+    Column("revision", WHOLE, nullable=False),
+    Column("edits", WHOLE, nullable=False),
+    Column("pose_edits", WHOLE, nullable=False),  # counts edits of what is fused
+    # of times in the tiles that are given out; `scale` counts how often it was changed
+    Column("scale", WHOLE, nullable=False),
+    Column("taken_from", Float),
+    Column("taken_step_s", Float, nullable=False),
+    Column("first_taken", Float),
+    Column("last_taken", Float),
+    Column("sessions", JSON, nullable=False),
+    Column("parents", JSON, nullable=False),  # those of most frames: name, frames, up, axes
+    Column("updated_at", Float),
+)
+
+#: Tiles of surfaces.
+surface_tiles = Table(
+    "surface_tiles",
+    metadata,
+    Column("number", WHOLE, primary_key=True),
+    Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
+    Column("parent", _string(128), nullable=False),
+    Column("level", WHOLE, nullable=False),
+    Column("tile_x", WHOLE, nullable=False),
+    Column("tile_y", WHOLE, nullable=False),
+    Column("tile_z", WHOLE, nullable=False),
+    Column("cells", WHOLE, nullable=False),
+    Column("blob", _string(64)),  # sums of the finest level, cells of the others; null: none yet
+    Column("digest", _string(64), nullable=False),  # of the cells, as the outside knows them
+    Column("scale", WHOLE, nullable=False),  # by which its times are told
+    # of a tile that is made anew: the last frame in `draft`, 0 at first; null: it is up to date
+    Column("rebuilt_to", WHOLE),
+    Column("draft", _string(64)),
+    Column("low_x", Float, nullable=False),  # box of its cells, metres
+    Column("low_y", Float, nullable=False),
+    Column("low_z", Float, nullable=False),
+    Column("high_x", Float, nullable=False),
+    Column("high_y", Float, nullable=False),
+    Column("high_z", Float, nullable=False),
+    UniqueConstraint(
+        "map_number", "parent", "level", "tile_x", "tile_y", "tile_z", name="uq_surface_tiles_place"
+    ),
+    Index(None, "blob"),
+    Index(None, "draft"),
+    Index(None, "map_number", "digest"),
+    Index(None, "map_number", "rebuilt_to"),
+    sqlite_autoincrement=True,
+)
+
+#: Frames that are fused.
+surface_frames = Table(
+    "surface_frames",
+    metadata,
+    Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
+    Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
+    Column("parent", _string(128), nullable=False),
+    Column("changed", Boolean, nullable=False),  # edited since: to be taken out, and fused anew
+    Index(None, "map_number", "parent", "changed"),
+)
+
+#: Which tiles of the finest level they are fused into.
+surface_touches = Table(
+    "surface_touches",
+    metadata,
+    Column("tile_number", WHOLE, ForeignKey("surface_tiles.number"), primary_key=True),
+    Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
+    Index(None, "frame_number"),
+)
+
 #: Blobs of what was deleted, until somebody has seen that they are removed.
 doomed = Table(
     "doomed",

@@ -10,15 +10,13 @@ import pytest
 from sceneprint.engine.maps.coverage_picture import cell_outcome, coverage_picture
 from sceneprint.engine.maps.coverage_plan import (
     MOST_CELLS,
-    PlanAxes,
     QueriedPosition,
     cell_width,
     coverage_plans,
     localisability,
-    plan_axes,
     plan_changes,
-    upright,
 )
+from sceneprint.engine.maps.plan_axes import PlanAxes, plan_axes, upright
 from sceneprint_client.api.coverage import (
     CoverageCell,
     CoverageOutcome,

@@ -28,7 +28,7 @@ from sceneprint.store.tables import MapRow, metadata
 TABLES = [
     "audit", "doomed", "events", "former_maps", "frame_tags", "frames", "idempotency", "job_files",
     "job_items", "jobs", "keys", "maps", "models", "query_records", "samples", "secrets",
-    "signatures",
+    "signatures", "surface_frames", "surface_tiles", "surface_touches", "surfaces",
 ]  # fmt: skip
 
 

@@ -15,6 +15,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
+from sqlalchemy import Connection
+
 from sceneprint.engine.jobs.lifecycle import LEFT_S, failure_texts, renewed
 from sceneprint.engine.serializers import job_record
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
@@ -91,6 +93,8 @@ class SliceResult:
     result : in short, at the end
     drop : names of files of the job that are of no use any more
     event : kind of the event that tells of the end, such as association.found; its data is `result`
+    write : what else the commit stores; returns blobs that may be of no use any more
+    blobs : that `write` comes to refer to; they are there
     """
 
     over: bool
@@ -100,6 +104,8 @@ class SliceResult:
     result: dict[str, Any] | None = None
     drop: Collection[str] = ()
     event: str | None = None
+    write: Callable[[Connection], Collection[str]] | None = None
+    blobs: Collection[str] = ()
 
 
 #: Does a slice of a job until the time of `time.monotonic` that is given; may be done again.
@@ -229,7 +235,8 @@ class Tasks:
         try:
             gone = self._stored(task, outcome)
         except Exception:  # nothing came to refer to them
-            collect_deleted_blobs(self._store, [one.blob for one in outcome.files])
+            made = [*(one.blob for one in outcome.files), *outcome.blobs]
+            collect_deleted_blobs(self._store, made)
             raise
         collect_deleted_blobs(self._store, gone)
         if not outcome.over:
@@ -253,12 +260,14 @@ class Tasks:
             else:
                 queue.go_on(connection, task.job, outcome.progress)
             self._check(outcome.files)
+            self._check_blobs(outcome.blobs)
             # after the job: it may be gone, and nothing can be of one that is
             queue.append_items(connection, job.number, outcome.items)
             before = queue.files_of(connection, job.number)
             queue.add_files(connection, job.number, outcome.files)
             gone = queue.remove_parts(connection, job.number, items=False, files=outcome.drop)
-            return gone + [before[one.name].blob for one in outcome.files if one.name in before]
+            gone += [before[one.name].blob for one in outcome.files if one.name in before]
+            return gone if outcome.write is None else [*gone, *outcome.write(connection)]
 
     def _check(self, files: Collection[queue.JobFile]) -> None:
         """See that files are there, in the transaction that comes to refer to them."""
@@ -267,6 +276,11 @@ class Tasks:
                 raise Swept(
                     f"A deletion elsewhere swept the same {one.name} before its job was stored."
                 )
+
+    def _check_blobs(self, blobs: Collection[str]) -> None:
+        for blob in blobs:
+            if not self._store.blobs.holds(blob):
+                raise Swept("A deletion elsewhere swept the same bytes before they were stored.")
 
     def _fail(self, task: LongJob, reason: str) -> JobState | None:
         try:

@@ -19,16 +19,10 @@ import numpy as np
 from sqlalchemy import Connection
 
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
-from sceneprint.engine.maps.coverage_plan import (
-    PlanAxes,
-    QueriedPosition,
-    coverage_plans,
-    plan_axes,
-    upright,
-)
+from sceneprint.engine.maps.coverage_plan import QueriedPosition, coverage_plans
+from sceneprint.engine.maps.plan_axes import parent_axes
 from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
-from sceneprint.engine.search.up_vectors import parent_up
 from sceneprint.engine.serializers import model_label
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import (
@@ -283,10 +277,6 @@ def _look_alikes(answer: Answer, poses: Sequence[Transform]) -> list[str]:
 # All items together: plans.
 
 
-#: Frames that the vertical is learnt from, about.
-_UP_FRAMES = 200
-
-
 def plans_of(
     connection: Connection, row: MapRow, items: Sequence[dict[str, Any]], cell_m: float | None
 ) -> tuple[list[CoveragePlan], float]:
@@ -301,18 +291,7 @@ def plans_of(
         for name in names
     }
     axes = {
-        name: _axes(connection, row, [item["frame"] for item in by_parent[name]]) for name in names
+        name: parent_axes(connection, row, [item["frame"] for item in by_parent[name]])
+        for name in names
     }
     return coverage_plans(queried, positions_of_map(connection, row.number), axes, cell_m)
-
-
-def _axes(connection: Connection, row: MapRow, numbers: Sequence[int]) -> PlanAxes:
-    """How to see from above the parent frame that the poses of some frames lead to."""
-    numbers = numbers[:: max(len(numbers) // _UP_FRAMES, 1)]
-    if (up := parent_up(connection, numbers)) is not None:
-        return PlanAxes(plan_axes(up), "frames" if row.up is None else "map")
-    stops = [stop for stop in stops_of(connection, numbers).values() if stop.pose is not None]
-    if not stops:  # all were deleted meanwhile
-        return PlanAxes(np.eye(3)[:2], "cameras")
-    poses = np.array([stop.pose for stop in stops])
-    return PlanAxes(plan_axes(upright(poses, [stop.is_cloud for stop in stops])), "cameras")

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sceneprint.engine.maps.plan_axes import PlanAxes
 from sceneprint.types import Floats
 from sceneprint_client.api.coverage import (
     COVERAGE_OUTCOMES,
@@ -22,7 +23,6 @@ from sceneprint_client.api.coverage import (
     CoverageOutcome,
     CoveragePlan,
     PlanChanges,
-    UpSource,
 )
 
 #: Cells along the longer side of a plan, about.
@@ -40,56 +40,11 @@ Place = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class PlanAxes:
-    """How a parent frame is seen from above.
-
-    Parameters
-    ----------
-    axes : (2, 3) unit vectors to the right and to the top of the plan, in the parent frame
-    up_from : whence up is known
-    """
-
-    axes: Floats
-    up_from: UpSource
-
-
-@dataclass(frozen=True, eq=False)
 class QueriedPosition:
     """Where a queried frame was taken, (3,) in its parent frame, and what became of it."""
 
     at: Floats
     outcome: CoverageOutcome
-
-
-def plan_axes(up: Floats) -> Floats:
-    """(2, 3) axes of a plan seen from above: the first along the parent's x axis, or its y axis
-    where that is nearly vertical.
-
-    Parameters
-    ----------
-    up : (3,) unit vector
-    """
-    along = np.eye(3)[int(abs(up[0]) > 0.9)]
-    right = along - (along @ up) * up
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(up, right)])
-
-
-def upright(poses: Floats, clouds: Sequence[bool]) -> Floats:
-    """The axis (3,) of a parent frame, or its opposite, nearest to the sensors' own up.
-
-    Robots hold sensors upright: -y of a camera, z of a scanner.
-
-    Parameters
-    ----------
-    poses : (n, 4, 4) T_parent_sensor
-    clouds : (n,) of point clouds
-    """
-    own = np.where(np.array(clouds)[:, None], poses[:, :3, 2], -poses[:, :3, 1])
-    mean = own.mean(axis=0)
-    axis = int(np.argmax(np.abs(mean)))
-    up: Floats = np.eye(3)[axis] * (1.0 if mean[axis] >= 0 else -1.0)
-    return up
 
 
 def cell_width(extent_m: float) -> float:

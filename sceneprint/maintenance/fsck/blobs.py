@@ -30,9 +30,11 @@ from sceneprint.models.table_cache import is_sound_table
 from sceneprint.store.blobs.folder import PART, BlobEntry, Condition
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import refers_to
+from sceneprint.store.maps import map_of
 from sceneprint.store.queue import cancel_jobs, enqueue, remove_parts
 from sceneprint.store.reencoding_rows import REENCODE
-from sceneprint.store.tables import frames, job_files, jobs, maps, signatures
+from sceneprint.store.surface_rows import spoil_tile, tile_of_number
+from sceneprint.store.tables import frames, job_files, jobs, maps, signatures, surface_tiles
 from sceneprint_client.api import FrameState, JobState
 
 _BEING_SIGNED = (FrameState.RECEIVED, FrameState.SIGNING)
@@ -345,6 +347,54 @@ def _repair_product(folder: Folder, job_number: int, name: str, blob: str) -> st
         moved = quarantine_blob(folder, blob) if condition == "damaged" else ""
         remove_parts(connection, job_number, items=False, files=[name])
     return f"{moved}the job has it no more"
+
+
+# Tiles of surfaces: workers make them anew from the frames.
+
+
+def check_surfaces(folder: Folder) -> Iterator[Finding]:
+    """Tiles of surfaces, each against its hash."""
+    c = surface_tiles.c
+    with folder.store.database.read() as connection:
+        asked = select(c.number).join(maps, maps.c.number == c.map_number)
+        if folder.map_name is not None:
+            asked = asked.where(maps.c.name == folder.map_name)
+        numbers = list(connection.execute(asked.order_by(c.number)).scalars())
+    for done, number in enumerate(numbers):
+        folder.progress("surfaces", done, len(numbers))
+        with folder.store.database.read() as connection:
+            tile = tile_of_number(connection, number)
+        for blob in () if tile is None else (tile.blob, tile.draft):
+            if tile is None or blob is None:
+                continue
+            folder.counts["blobs"] += 1
+            condition = folder.store.blobs.condition(blob, quick=folder.quick)
+            if condition == "sound":
+                continue
+            with folder.store.database.read() as connection:
+                now = tile_of_number(connection, number)
+                if now is None or blob not in (now.blob, now.draft):
+                    continue
+                name = map_of(connection, tile.map_number).name
+            move = "move it to the quarantine, and " if condition == "damaged" else ""
+            yield Finding(
+                f"{condition}-tile", f"tile {tile.place} of level {tile.level} of map {name}",
+                "damage", "that part of the surface cannot be shown",
+                f"{move}have it made again from the frames",
+                map=name, path=folder.store.blobs.place(blob),
+                repair=partial(_repair_tile, folder, number, blob),
+            )  # fmt: skip
+
+
+def _repair_tile(folder: Folder, number: int, blob: str) -> str:
+    with folder.store.database.write() as connection:
+        tile = tile_of_number(connection, number)
+        condition = folder.store.blobs.condition(blob)
+        if tile is None or blob not in (tile.blob, tile.draft) or condition == "sound":
+            return GONE
+        moved = quarantine_blob(folder, blob) if condition == "damaged" else ""
+        spoil_tile(connection, tile)
+    return f"{moved}a worker makes it again"
 
 
 # Signatures whose bytes are not those that were stored.

@@ -327,6 +327,12 @@ _USES = (
     " UNION ALL SELECT geometry, frame_number, 'geometry' FROM signatures"
 )
 _USES_OF_JOBS = "SELECT blob AS digest, job_number AS number, 'job' AS role FROM job_files"
+#: And of surfaces: (digest, number of the map, surface).
+_USES_OF_SURFACES = " UNION ALL ".join(
+    f"SELECT {column} AS digest, map_number AS number, 'surface' AS role FROM surface_tiles"
+    f" WHERE {column} IS NOT NULL"
+    for column in ("blob", "draft")
+)
 
 
 @dataclass(frozen=True)
@@ -519,7 +525,12 @@ def referred(connection: sqlite3.Connection) -> Iterator[str]:
 
 
 def _every(connection: sqlite3.Connection) -> str:
-    return f"{_USES} UNION ALL {_USES_OF_JOBS}" if _has_job_files(connection) else _USES
+    parts = [_USES]
+    if _has_table(connection, "job_files"):
+        parts.append(_USES_OF_JOBS)
+    if _has_table(connection, "surface_tiles"):
+        parts.append(_USES_OF_SURFACES)
+    return " UNION ALL ".join(parts)
 
 
 def count_referred(connection: sqlite3.Connection) -> int:
@@ -537,9 +548,21 @@ def uses(connection: sqlite3.Connection, digest: str) -> tuple[BlobUse, ...]:
         " ORDER BY frames.number",
         (digest,),
     )
-    of_frames = [BlobUse(map=name, frame=frame, role=role) for name, frame, role in rows]
-    if not _has_job_files(connection):
-        return tuple(of_frames)
+    found = [BlobUse(map=name, frame=frame, role=role) for name, frame, role in rows]
+    if _has_table(connection, "job_files"):
+        found += _uses_of_jobs(connection, digest)
+    if _has_table(connection, "surface_tiles"):
+        rows = connection.execute(
+            f"SELECT DISTINCT maps.name FROM ({_USES_OF_SURFACES}) AS used"
+            " JOIN maps ON maps.number = used.number WHERE CAST(digest AS TEXT) = ?"
+            " ORDER BY maps.name",
+            (digest,),
+        )
+        found += [BlobUse(map=name, role="surface") for (name,) in rows]
+    return tuple(found)
+
+
+def _uses_of_jobs(connection: sqlite3.Connection, digest: str) -> list[BlobUse]:
     rows = connection.execute(
         "SELECT maps.name, jobs.id FROM"
         f" ({_USES_OF_JOBS}) AS used JOIN jobs ON jobs.number = used.number"
@@ -547,13 +570,13 @@ def uses(connection: sqlite3.Connection, digest: str) -> tuple[BlobUse, ...]:
         " ORDER BY jobs.number",
         (digest,),
     )
-    return (*of_frames, *(BlobUse(map=name, job=job, role="job") for name, job in rows))
+    return [BlobUse(map=name, job=job, role="job") for name, job in rows]
 
 
-def _has_job_files(connection: sqlite3.Connection) -> bool:
-    """Whether the database is of a version that lets jobs refer to blobs."""
-    asked = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name = 'job_files'"
-    return bool(connection.execute(asked).fetchone()[0])
+def _has_table(connection: sqlite3.Connection, name: str) -> bool:
+    """Whether the database is of a version that has a table."""
+    asked = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name = ?"
+    return bool(connection.execute(asked, (name,)).fetchone()[0])
 
 
 def _connect(path: Path, how: str) -> sqlite3.Connection:

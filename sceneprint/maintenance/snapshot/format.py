@@ -201,7 +201,7 @@ class BlobUse(_Record):
     map: str
     frame: str | None = None
     job: str | None = None
-    role: Literal["upload", "geometry", "job"]
+    role: Literal["upload", "geometry", "job", "surface"]
 
 
 class LostBlob(_Record):

@@ -1,0 +1,604 @@
+"""Surfaces of maps: begun, told, read by tile, looked into, drawn and removed."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection
+
+from sceneprint.engine.maps.map_frames import Output
+from sceneprint.engine.maps.surface_job import (
+    PRIORITY,
+    SURFACE,
+    scale_of,
+    surface_points,
+    tile_cells,
+)
+from sceneprint.engine.maps.surface_picture import PlanFrame, plan_frame, surface_picture
+from sceneprint.engine.serializers import tag_of, when
+from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
+from sceneprint.errors import (
+    DamagedBlob,
+    InvalidRequest,
+    NotFound,
+    SceneprintError,
+    UnreadableGeometry,
+)
+from sceneprint.formats.artifact import read_geometry
+from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.surface.cell_fusion import FACTOR, TilePlace
+from sceneprint.store import Store, queue
+from sceneprint.store import surface_rows as stored
+from sceneprint.store.maps import find_map, map_of
+from sceneprint.store.opaque_ids import invalid_cursor
+from sceneprint.store.surface_rows import LevelTotals, SightingFrame, SurfaceRow, TileRow
+from sceneprint.store.tables import JobRow, MapRow
+from sceneprint.store.wakeup import Wakeup
+from sceneprint_client.api import JobState, Page, Vector
+from sceneprint_client.api.surface import (
+    PLAN_WIDTH,
+    MapSurface,
+    SurfaceLevel,
+    SurfaceParent,
+    SurfacePlan,
+    SurfaceSighting,
+    SurfaceState,
+    SurfaceTile,
+)
+from sceneprint_client.surface_tiles import CELL, SIDE
+
+log = logging.getLogger(__name__)
+
+#: Cells that a plan is drawn of, at most: of more, those of a coarser level.
+_DRAWN_CELLS = 1_500_000
+#: Around a spot, in cells: how near a frame must have seen something, by default and at most.
+_NEAR, _NEAREST = 2.0, float(SIDE)
+#: Artifacts that one page of sightings opens, and those that are looked up at once.
+_OPENED, _AT_ONCE = 150, 25
+#: Largest coordinate that is asked for, metres.
+FARTHEST_M = 1e9
+#: Seconds for which one call removes tiles.
+_CALL_S = 10.0
+
+
+class MapSurfaces:
+    """The surfaces of all maps."""
+
+    def __init__(self, store: Store, bell: Wakeup) -> None:
+        self._store, self._bell = store, bell
+
+    def get(self, map_name: str) -> MapSurface:
+        """The surface of a map as it is now; UnknownMap where there is none."""
+        with self._store.database.read() as connection:
+            row, surface = stored.living_surface(connection, map_name)
+            return _surface_record(connection, row, surface)
+
+    def begin(self, map_name: str) -> tuple[MapSurface, bool]:
+        """Have the surface of a map built, or brought up to date.
+
+        Returns
+        -------
+        surface : as it is now
+        begun : whether a job is at it; else there is nothing to do
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : it has no frames to build it of.
+        """
+        with self._store.database.write() as connection:
+            row = find_map(connection, map_name)
+            surface = stored.find_surface(connection, row.number)
+            if surface is None:
+                surface = stored.add_surface(connection, row)
+            elif not surface.wanted:
+                stored.write_surface(connection, row.number, wanted=True, model_id="")
+                surface = stored.find_surface(connection, row.number) or surface
+            begun, blobs = begin_job(connection, row, surface)
+            told = _surface_record(connection, row, stored.find_surface(connection, row.number))
+            if not begun and not told.frames:
+                raise InvalidRequest(
+                    f"Map {row.name!r} has no indexed frame with a pose, so there is no surface. "
+                    "Send `pose` with uploads, or edit frames with PATCH."
+                )
+        collect_deleted_blobs(self._store, blobs)
+        if begun:
+            self._bell.ring()
+        return told, begun
+
+    def remove(self, map_name: str) -> None:
+        """Remove the surface of a map; workers do not build it again until somebody asks for it.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        """
+        with self._store.database.write() as connection:
+            row = find_map(connection, map_name)
+            surface = stored.find_surface(connection, row.number)
+            if surface is None:
+                surface = stored.add_surface(connection, row)
+            job = _job_of(connection, surface)
+            blobs = [] if job is None else queue.remove_job(connection, job)
+            stored.write_surface(connection, row.number, wanted=False, job_number=None)
+        collect_deleted_blobs(self._store, blobs)
+        until = time.monotonic() + _CALL_S
+        while not remove_block(self._store, row) and time.monotonic() < until:
+            pass
+
+    def tiles(
+        self, map_name: str, parent: str | None = None, level: int = 0,
+        cursor: str | None = None, limit: int = 1000,
+    ) -> Page[SurfaceTile]:  # fmt: skip
+        """Tiles of a parent frame and level, by column, row and floor.
+
+        Parameters
+        ----------
+        map_name : of the map
+        parent : default: the parent frame of most frames
+        level : 0 for the finest
+        cursor, limit : of the page
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : a cursor that was not given out.
+        """
+        beyond = _place_of(cursor)
+        with self._store.database.read() as connection:
+            row, surface = stored.living_surface(connection, map_name)
+            name = _parent_name(surface, parent)
+            found: list[TileRow] = []
+            if surface is not None and name is not None:
+                found = stored.list_tiles(connection, row.number, name, level, beyond, limit + 1)
+        more = "~".join(map(str, found[limit - 1].place)) if len(found) > limit else None
+        items = [
+            SurfaceTile(
+                column=one.tile_x, row=one.tile_y, floor=one.tile_z, cells=one.cells,
+                bytes=one.cells * CELL.itemsize, digest=one.digest,
+            )
+            for one in found[:limit]
+        ]  # fmt: skip
+        return Page[SurfaceTile](items=items, next_cursor=more)
+
+    def tile(self, map_name: str, digest: str) -> Output[bytes]:
+        """The cells of a tile.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        NotFound : the map has no such tile now.
+        """
+        with self._store.database.read() as connection:
+            row, surface = stored.living_surface(connection, map_name)
+            found = None
+            if surface is not None:
+                found = stored.tile_of_digest(connection, row.number, digest)
+        if surface is None or found is None:
+            raise NotFound(
+                f"Map {row.name!r} has no tile {digest!r:.80}: it changed, or was removed. List "
+                f"tiles with GET /v1/maps/{row.name}/surface/tiles."
+            )
+        scale = scale_of(surface)
+        return Output(digest, lambda: tile_cells(self._store, found, scale).tobytes())
+
+    def sightings(
+        self, map_name: str, spot: Sequence[float], radius: float | None = None,
+        parent: str | None = None, cursor: str | None = None, limit: int = 20,
+    ) -> Page[SurfaceSighting]:  # fmt: skip
+        """Frames that saw a spot, from the nearest viewpoint on.
+
+        A page may hold fewer than `limit` before the last, as each call opens so many artifacts.
+
+        Parameters
+        ----------
+        map_name : of the map
+        spot : x, y, z in the parent frame, metres
+        radius : a frame saw the spot if it saw a point so near, metres; default: two cells
+        parent : default: the parent frame of most frames
+        cursor, limit : of the page
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : a cursor that was not given out, or a radius of more than 64 cells.
+        """
+        beyond = self._store.seals.moment("frame", cursor)
+        with self._store.database.read() as connection:
+            _, surface = stored.living_surface(connection, map_name)
+        name = _parent_name(surface, parent)
+        if surface is None or name is None or not surface.cell_m:
+            return Page[SurfaceSighting](items=[])
+        within = _NEAR * surface.cell_m if radius is None else radius
+        if not 0 < within <= _NEAREST * surface.cell_m:
+            raise InvalidRequest(
+                f"The radius is {within:g} m. Give one above 0 and up to "
+                f"{_NEAREST * surface.cell_m:g} m.",
+                (("radius", "out of its range"),),
+            )
+        places = _tiles_around(spot, within, surface.cell_m * SIDE)
+        seen: list[SightingFrame] = []
+        opened = 0
+        while len(seen) < limit and opened < _OPENED:
+            with self._store.database.read() as connection:
+                some = stored.frames_seeing(
+                    connection, surface, name, places, spot, beyond, _AT_ONCE
+                )
+            for one in some:
+                beyond = one.square, one.number
+                opened += 1
+                if self._saw(one, spot, within):
+                    seen.append(one)
+                if len(seen) == limit:
+                    break
+            if len(some) < _AT_ONCE and len(seen) < limit:
+                beyond = None
+                break
+        more = None if beyond is None else self._moment(beyond)
+        items = [_sighting(one, name, math.sqrt(one.square)) for one in seen]
+        return Page[SurfaceSighting](items=items, next_cursor=more)
+
+    def frames_in(
+        self, map_name: str, low: Sequence[float], high: Sequence[float],
+        parent: str | None = None, cursor: str | None = None, limit: int = 20,
+    ) -> Page[SurfaceSighting]:  # fmt: skip
+        """Frames taken in a box, the nearest to its middle first; see `sightings`.
+
+        Parameters
+        ----------
+        map_name, parent, cursor, limit : see `sightings`
+        low, high : x, y, z of two of its corners, metres
+        """
+        beyond = self._store.seals.moment("frame", cursor)
+        ends = np.sort([low, high], axis=0).tolist()
+        with self._store.database.read() as connection:
+            _, surface = stored.living_surface(connection, map_name)
+            name = _parent_name(surface, parent)
+            if surface is None or name is None:
+                return Page[SurfaceSighting](items=[])
+            found = stored.frames_taken_in(
+                connection, surface, name, ends[0], ends[1], beyond, limit + 1
+            )
+        last = found[limit - 1] if len(found) > limit else None
+        more = None if last is None else self._moment((last.square, last.number))
+        items = [_sighting(one, name, None) for one in found[:limit]]
+        return Page[SurfaceSighting](items=items, next_cursor=more)
+
+    def picture(
+        self, map_name: str, parent: str | None = None, width: int = PLAN_WIDTH,
+        low: float | None = None, high: float | None = None,
+    ) -> Output[bytes]:  # fmt: skip
+        """A surface seen from above as a PNG, transparent where nothing is.
+
+        Parameters
+        ----------
+        map_name : of the map
+        parent : default: the parent frame of most frames
+        width : of the longer side, pixels
+        low, high : only what lies between these heights, metres along up
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        NotFound : there is no surface in that parent frame.
+        """
+        with self._store.database.read() as connection:
+            row, surface = stored.living_surface(connection, map_name)
+            name = _parent_name(surface, parent)
+            told = None
+            if surface is not None:
+                told = next((one for one in surface.parents if one["parent_frame"] == name), None)
+            totals = [
+                one for one in stored.level_totals(connection, row.number) if one.parent == name
+            ]
+        if surface is None or told is None or not totals:
+            raise NotFound(
+                f"Map {row.name!r} has no surface in that parent frame. Begin it with "
+                f"POST /v1/maps/{row.name}/surface, and see GET /v1/maps/{row.name}/surface for "
+                "its parent frames."
+            )
+        axes = np.array(told["axes"])
+        plan = plan_frame(axes, totals[0].low, totals[0].high, surface.cell_m, width)
+        level = _drawn_level(surface, totals, plan)
+
+        def make() -> bytes:
+            with self._store.database.read() as connection:
+                tiles = stored.list_tiles(connection, row.number, totals[0].parent, level)
+            points = (self._points(surface, one) for one in tiles)
+            return surface_picture(plan, axes, points, surface.cell_m * FACTOR**level, (low, high))
+
+        tag = tag_of("surface-plan", row.number, surface.updated_at, told["axes"], width, low,
+                     high, name)  # fmt: skip
+        return Output(tag, make)
+
+    def _points(self, surface: SurfaceRow, tile: TileRow) -> np.ndarray[Any, Any]:
+        """(N, 3) of a tile, metres; none of one that is lost or was replaced meanwhile."""
+        tile_m = surface.cell_m * FACTOR**tile.level * SIDE
+        with suppress(DamagedBlob):
+            cells = tile_cells(self._store, tile, scale_of(surface))
+            found: np.ndarray[Any, Any] = (
+                np.array(tile.place) + (cells["at"] + 0.5) / 256.0
+            ) * tile_m
+            return found
+        return np.zeros((0, 3))
+
+    def _saw(self, frame: SightingFrame, spot: Sequence[float], within: float) -> bool:
+        try:
+            geometry = read_geometry(self._store.blobs.get(frame.geometry))
+        except (DamagedBlob, UnreadableGeometry):
+            return False
+        apart = moved(np.array(frame.pose), surface_points(geometry)) - np.array(spot)
+        return bool(((apart * apart).sum(axis=1) <= within * within).any())
+
+    def _moment(self, last: tuple[float, int]) -> str | None:
+        return self._store.seals.next_moment("frame", [last, last], 1)
+
+
+# Jobs: begun by whoever asks, and by workers as frames come.
+
+
+def begin_job(connection: Connection, row: MapRow, surface: SurfaceRow) -> tuple[bool, list[str]]:
+    """Queue a job where one is needed and none is pending; an earlier one is removed.
+
+    Returns
+    -------
+    begun : whether a job is pending now
+    blobs : of the earlier job: sweep them when this is committed
+    """
+    job = _job_of(connection, surface)
+    if job is not None and not job.state.over:
+        return True, []
+    if surface.is_current(row):
+        return False, []
+    is_done = not (
+        stored.count_left(connection, surface) or stored.count_unfinished(connection, surface)
+    )
+    if surface.model_id == row.model_id and is_done:
+        stored.write_surface(
+            connection, row.number, revision=row.revision, edits=surface.pose_edits
+        )
+        return False, []
+    if surface.model_id != row.model_id and not stored.count_posed(connection, row):
+        fused = stored.count_fused(connection, row.number)
+        if not fused:
+            stored.write_surface(
+                connection, row.number, model_id=row.model_id, cell_m=0.0,
+                revision=row.revision, edits=surface.pose_edits,
+            )  # fmt: skip
+            return False, []
+    blobs = [] if job is None else queue.remove_job(connection, job)
+    data = {"revision": row.revision, "edits": surface.pose_edits}
+    new = queue.enqueue(connection, SURFACE, None, PRIORITY, map_number=row.number, data=data)
+    stored.write_surface(connection, row.number, job_number=new.number)
+    return True, blobs
+
+
+def remove_block(store: Store, row: MapRow) -> bool:
+    """Remove some of a surface that was deleted; whether nothing is left of it."""
+    with store.database.write() as connection:
+        surface = stored.find_surface(connection, row.number)
+        if surface is None or surface.wanted:
+            return True
+        blobs, over = stored.remove_some(connection, row.number)
+        if over:
+            stored.write_surface(
+                connection, row.number, model_id="", parents=[], sessions=[], updated_at=None
+            )
+    collect_deleted_blobs(store, blobs)
+    return over
+
+
+#: Seconds between two looks at all maps; seconds after which frames are fused although more come.
+LOOK_S, LONGEST_S = 5.0, 60.0
+#: Maps that get their rows in one look.
+_ROWS_AT_ONCE = 100
+
+
+class SurfaceUpkeep:
+    """Begins jobs for surfaces that lack frames; any number of processes may.
+
+    Parameters
+    ----------
+    store, bell : of the engine
+    auto : whether frames that came are fused unasked; deleted ones are always taken out
+    """
+
+    def __init__(self, store: Store, bell: Wakeup, *, auto: bool) -> None:
+        self._store, self._bell, self._auto = store, bell, auto
+        self._next = 0.0
+        # of maps that may lack something: their revision and edits, and when they were first seen
+        self._seen: dict[int, tuple[tuple[int, int], float]] = {}
+
+    def run(self) -> None:
+        """One look, where it is time; what goes wrong is logged and tried again."""
+        if time.monotonic() < self._next:
+            return
+        self._next = time.monotonic() + LOOK_S
+        try:
+            with self._store.database.read() as connection:
+                found = stored.maps_to_look_at(connection)
+            if self._auto:
+                self._add_rows([row for row, surface in found if surface is None])
+            seen = self._seen
+            self._seen = {}
+            for row, surface in found:
+                if surface is None:
+                    continue
+                if not surface.wanted:
+                    if surface.model_id:
+                        remove_block(self._store, row)
+                    continue
+                self._look(row, surface, seen.get(row.number))
+        except SceneprintError as error:
+            log.warning("surfaces not looked at", extra={"error": str(error)})
+
+    def _look(
+        self, row: MapRow, surface: SurfaceRow, seen: tuple[tuple[int, int], float] | None
+    ) -> None:
+        """Begin a job where frames came and no more come, or have come for long."""
+        at = row.revision, surface.pose_edits
+        since = time.monotonic() if seen is None else seen[1]
+        self._seen[row.number] = at, since
+        if seen is None or (seen[0] != at and time.monotonic() - since < LONGEST_S):
+            return
+        with self._store.database.write() as connection:
+            row = map_of(connection, row.number)
+            now = stored.find_surface(connection, row.number)
+            if now is None or not now.wanted or self._is_hopeless(connection, row, now):
+                return
+            if not self._auto and not stored.frames_to_remove(connection, now, 1):
+                return
+            begun, blobs = begin_job(connection, row, now)
+        collect_deleted_blobs(self._store, blobs)
+        if begun:
+            self._seen.pop(row.number, None)
+            self._bell.ring()
+
+    def _is_hopeless(self, connection: Connection, row: MapRow, surface: SurfaceRow) -> bool:
+        """Whether the last job failed with the same frames: somebody must look at it first."""
+        job = _job_of(connection, surface)
+        if job is None or not job.state.over or job.state == JobState.SUCCEEDED:
+            return False
+        return job.data == {"revision": row.revision, "edits": surface.pose_edits}
+
+    def _add_rows(self, rows: Sequence[MapRow]) -> None:
+        if not rows:
+            return
+        with self._store.database.write() as connection:
+            for row in rows[:_ROWS_AT_ONCE]:
+                with suppress(SceneprintError):
+                    if (
+                        stored.find_surface(connection, map_of(connection, row.number).number)
+                        is None
+                    ):
+                        stored.add_surface(connection, row)
+
+
+# Records.
+
+
+def _job_of(connection: Connection, surface: SurfaceRow) -> JobRow | None:
+    if surface.job_number is None:
+        return None
+    return queue.job_of_number(connection, surface.job_number)
+
+
+def _surface_record(connection: Connection, row: MapRow, surface: SurfaceRow | None) -> MapSurface:
+    """A surface as JSON."""
+    if surface is None:
+        return MapSurface(
+            map=row.name, state="none", job_id=None, error=None, frames=0,
+            frames_left=stored.count_posed(connection, row), updated_at=None, sessions=[],
+            first_taken=None, last_taken=None, taken_from=None, taken_step_s=1.0, parents=[],
+        )  # fmt: skip
+    job = _job_of(connection, surface)
+    is_building = job is not None and not job.state.over
+    frames = sum(stored.count_fused(connection, row.number).values())
+    left = 0
+    if is_building and job is not None and job.progress and job.progress.get("total"):
+        left = job.progress["total"] - job.progress.get("done", 0)
+    elif not surface.is_current(row):
+        of_model = surface.model_id == row.model_id
+        left = (
+            stored.count_left(connection, surface)
+            if of_model
+            else stored.count_posed(connection, row)
+        )
+    state: SurfaceState = "stale" if left else "ready"
+    if is_building:
+        state = "building"
+    elif not frames:
+        state = "none"
+    totals = stored.level_totals(connection, row.number)
+    failed = job is not None and job.state.over and job.state != JobState.SUCCEEDED
+    return MapSurface(
+        map=row.name, state=state, job_id=None if job is None else job.id,
+        error=job.error if job is not None and failed else None,
+        frames=frames, frames_left=left, updated_at=when(surface.updated_at),
+        sessions=surface.sessions, first_taken=when(surface.first_taken),
+        last_taken=when(surface.last_taken), taken_from=when(surface.taken_from),
+        taken_step_s=surface.taken_step_s,
+        parents=[
+            _parent_record(surface, told, own)
+            for told in surface.parents
+            if (own := [one for one in totals if one.parent == told["parent_frame"]])
+        ],
+    )  # fmt: skip
+
+
+def _parent_record(
+    surface: SurfaceRow, told: dict[str, Any], totals: Sequence[LevelTotals]
+) -> SurfaceParent:
+    finest = totals[0]
+    plan = plan_frame(np.array(told["axes"]), finest.low, finest.high, surface.cell_m, PLAN_WIDTH)
+    return SurfaceParent(
+        parent_frame=told["parent_frame"], frames=told["frames"], up=_vector(told["up"]),
+        up_from=told["up_from"], x_axis=told["axes"][0], y_axis=told["axes"][1],
+        low=_vector(finest.low), high=_vector(finest.high),
+        levels=[
+            SurfaceLevel(
+                level=one.level, cell_m=surface.cell_m * FACTOR**one.level,
+                tile_m=surface.cell_m * FACTOR**one.level * SIDE, tiles=one.tiles,
+                cells=one.cells, bytes=one.cells * CELL.itemsize,
+            )
+            for one in totals
+        ],
+        plan=SurfacePlan(
+            m_per_pixel=plan.m_per_pixel, width=plan.width, height=plan.height, left=plan.left,
+            top=plan.top,
+        ),
+    )  # fmt: skip
+
+
+def _sighting(frame: SightingFrame, parent: str, distance: float | None) -> SurfaceSighting:
+    return SurfaceSighting(
+        frame_id=frame.id, name=frame.name, kind="cloud" if frame.is_cloud else "depth",
+        robot=frame.robot, session=frame.session, captured_at=when(frame.captured_at),
+        parent_frame=parent, position=_vector([frame.pose[i][3] for i in range(3)]),
+        distance_m=distance,
+    )  # fmt: skip
+
+
+def _vector(at: Sequence[float]) -> Vector:
+    return Vector(**dict(zip("xyz", at, strict=True)))
+
+
+def _parent_name(surface: SurfaceRow | None, parent: str | None) -> str | None:
+    """The parent frame that was asked for, or that of most frames."""
+    if parent is not None or surface is None:
+        return parent
+    return surface.parents[0]["parent_frame"] if surface.parents else None
+
+
+def _place_of(cursor: str | None) -> TilePlace | None:
+    if cursor is None:
+        return None
+    try:
+        x, y, z = (int(part) for part in cursor.split("~"))
+    except ValueError:
+        raise invalid_cursor(cursor) from None
+    if max(abs(x), abs(y), abs(z)) >= 2**62:
+        raise invalid_cursor(cursor)
+    return x, y, z
+
+
+def _tiles_around(spot: Sequence[float], within: float, tile_m: float) -> list[TilePlace]:
+    """Places of the tiles that a ball may touch."""
+    low = [math.floor((at - within) / tile_m) for at in spot]
+    high = [math.floor((at + within) / tile_m) for at in spot]
+    x, y, z = (range(a, b + 1) for a, b in zip(low, high, strict=True))
+    return [(i, j, k) for i in x for j in y for k in z]
+
+
+def _drawn_level(surface: SurfaceRow, totals: Sequence[LevelTotals], plan: PlanFrame) -> int:
+    """The coarsest level that is as fine as the pixels; a coarser one of very many cells."""
+    fine = [one for one in totals if surface.cell_m * FACTOR**one.level <= plan.m_per_pixel]
+    first = fine[-1].level if fine else 0
+    few = [one.level for one in totals if one.level >= first and one.cells <= _DRAWN_CELLS]
+    return few[0] if few else totals[-1].level
