@@ -92,8 +92,9 @@ class Place {
     this.surface = surface;
     this.flat = search.get("view") !== "3d";
     surface.colour = COLOURS.some(([name]) => name === search.get("colour")) ? search.get("colour") : "height";
-    const heights = ["low", "high"].map((name) => (search.has(name) ? Number(search.get(name)) : NaN));
-    surface.cut = heights.some(Number.isFinite) ? [Number.isFinite(heights[0]) ? heights[0] : -1e9, Number.isFinite(heights[1]) ? heights[1] : 1e9] : null;
+    const [low, high] = ["low", "high"].map((name) => (search.get(name) ? Number(search.get(name)) : NaN));
+    surface.isChosen = Number.isFinite(low) || Number.isFinite(high) || search.get("heights") === "all";
+    surface.cut = Number.isFinite(low) || Number.isFinite(high) ? [Number.isFinite(low) ? low : -1e9, Number.isFinite(high) ? high : 1e9] : null;
     const names = surface.record.parents.map((one) => one.parent_frame);
     const onchange = () => this.address();
     this.runs = new Runs({ ...told, names, onchange, onreveal: () => this.spot.close(), onframe: (...frame) => this.#frame(...frame) });
@@ -249,6 +250,7 @@ class Place {
       this.runs.add(this.surface.record.parents.map((one) => one.parent_frame));
       await this.runs.draw();
     }
+    if (this.scene.viewer?.isFitted) this.scene.look("keep"); // it may have grown
     this.#colours();
     this.#state();
   }
@@ -267,11 +269,11 @@ class Place {
 
   /** The address says what is shown, so that it survives a reload. */
   address() {
-    const { colour, cut } = this.surface;
-    const height = (value) => (value === undefined || Math.abs(value) >= 1e8 ? null : value.toFixed(2));
+    const { colour, cut, isChosen } = this.surface;
+    const height = (value) => (!isChosen || value === undefined || Math.abs(value) >= 1e8 ? null : value.toFixed(2));
     const search = {
       ...this.runs.search, view: this.flat ? null : "3d", colour: colour === "height" ? null : colour,
-      low: height(cut?.[0]), high: height(cut?.[1]),
+      low: height(cut?.[0]), high: height(cut?.[1]), heights: isChosen && cut === null ? "all" : null,
       at: this.robots.at, since: this.robots.since, until: this.robots.until,
     };
     this.go(link("maps", this.map, "place", search), { replace: true, quiet: true });

@@ -21,11 +21,12 @@ export function shades(surface, onchange) {
   const ends = [range("place-low", "Lowest height drawn", () => cut(0)), range("place-high", "Highest height drawn", () => cut(1))];
   const told = h("span", { class: "number muted" });
   const facts = h("p", { class: "muted" });
+  const ceiling = h("p", { class: "muted" });
   const element = h("section", { class: "card paths-section", "aria-labelledby": "place-surface", hidden: true },
     h("h2", { id: "place-surface" }, "Surface"),
     h("label", { class: "field" }, h("span", {}, "Colour by"), select), legend,
     h("div", { class: "field", role: "group", "aria-label": "Heights drawn" }, h("span", { class: "paths-row" }, "Heights", told), h("span", { class: "place-cut" }, ends)),
-    facts);
+    ceiling, facts);
 
   // a step of a slider to metres: a little beyond what the colours reach, so that all is drawn at the ends
   const metresAt = (step) => { const [low, high] = surface.range ?? [0, 1], more = (high - low) * 0.05; return low - more + ((high - low + 2 * more) * step) / STEPS; };
@@ -36,14 +37,16 @@ export function shades(surface, onchange) {
     if (values[0] > values[1]) values[moved] = values[1 - moved];
     ends[moved].value = String(values[moved]);
     const all = values[0] === 0 && values[1] === STEPS;
+    surface.isChosen = true;
     surface.paint({ cut: all ? null : [values[0] === 0 ? -1e9 : metresAt(values[0]), values[1] === STEPS ? 1e9 : metresAt(values[1])] });
     surface.later();
+    put(ceiling);
     tell();
     onchange();
   }
 
   function tell() {
-    const text = ends.map((one) => `${metresAt(Number(one.value)).toFixed(2)} m`);
+    const text = ends.map((one) => `${metresAt(Number(one.value)).toFixed(1)} m`);
     put(told, surface.cut === null ? "all" : text.join(" to "));
     ends.forEach((one, i) => one.setAttribute("aria-valuetext", text[i]));
   }
@@ -61,6 +64,7 @@ export function shades(surface, onchange) {
     const [low, high] = surface.cut ?? [-1e9, 1e9];
     [low, high].forEach((height, i) => { ends[i].value = String(Math.min(Math.max(stepAt(height), 0), STEPS)); });
     tell();
+    put(ceiling, !surface.isChosen && surface.cut !== null && "The upper part is not drawn: it covers the rest.");
     put(facts, `${count(record.frames)} ${record.frames === 1 ? "frame" : "frames"}, updated `, time(record.updated_at));
   }
 

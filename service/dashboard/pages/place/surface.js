@@ -10,18 +10,20 @@ import { around, movedBox } from "../viewer/layers.js";
 import { dot, inverseRigid, transformed } from "../viewer/matrix.js";
 import { cover, Pyramid, refine } from "./detail.js";
 
-/** Cells that are drawn at once: what takes 50 ms without a graphics card. */
-const BUDGET = 60_000;
+/** Cells that are drawn at once: what takes 50 ms without a graphics card, and with one. */
+const BUDGET = 60_000, FAST_BUDGET = 400_000;
 /** CSS pixels of a cell that is fine enough. */
 const FINE_PX = 2.5;
 const AT_ONCE = 6;
 /** Tiles of a level that are listed: of a larger map the next coarser level is drawn. */
 const MOST_LISTED = 20_000, PAGE = 1000;
-/** Cells that stay in memory when they are not drawn. */
-const KEPT = 500_000;
+/** Cells that stay in memory, drawn or not. */
+const KEPT = 1_000_000;
 const PAUSE_MS = 120;
 /** Shares of the cells that are lower and higher than the colours of heights reach. */
 const OUTER = 0.01;
+/** A ceiling: above this share of the heights, over so many of the columns. */
+const CEILING = 0.7, COVERED = 0.65;
 
 export class Surface {
   /** @type {any} as the API tells it; null before `load` */
@@ -43,6 +45,10 @@ export class Surface {
   /** @type {number[] | null} heights that colours reach from and to; null before they are known */
   range = null;
   #most = 255;
+  /** @type {number | null} */
+  #budget = null;
+  /** Whether somebody chose which heights are drawn: else what a ceiling hides is. */
+  isChosen = false;
   /** @type {number[] | null} heights that are drawn */
   cut = null;
   colour = "height";
@@ -138,9 +144,10 @@ export class Surface {
     const here = this.#here(), { viewer } = this.scene;
     if (this.signal.aborted || !here.length || !viewer?.available) return;
     const size = this.#sizes(viewer), wanted = [], drawn = [];
+    const budget = (this.#budget ??= viewer.isFast ? FAST_BUDGET : BUDGET) / here.length;
     for (const pyramid of here) {
       const parts = (piece) => pyramid.parts(piece);
-      const { refined, coarse } = refine(pyramid.roots, { parts, size, budget: BUDGET / here.length, least: FINE_PX });
+      const { refined, coarse } = refine(pyramid.roots, { parts, size, budget, least: FINE_PX });
       for (const level of coarse) this.#list(pyramid, level - 1).then(() => this.later());
       const found = cover(pyramid.roots, { refined, parts, there: (piece) => this.#bytes.has(piece.digest) });
       wanted.push(...found.missing);
@@ -232,14 +239,16 @@ export class Surface {
 
   // heights and counts that colours reach to, by the coarsest cells
   #measure(here) {
-    const heights = [], base = dot(this.scene.axes.above, this.scene.origin);
-    const seen = [];
+    const { above, right, ahead } = this.scene.axes, base = dot(above, this.scene.origin);
+    const heights = [], seen = [], columns = new Map();
     for (const piece of here.flatMap((one) => one.roots)) {
-      const data = this.#bytes.get(piece.digest), matrix = this.#matrix(piece), tile = { data, span: piece.span };
-      const codes = new Uint8Array(data);
+      const data = this.#bytes.get(piece.digest), matrix = this.#matrix(piece), codes = new Uint8Array(data);
       for (let i = 0; i * STRIDE < data.byteLength; i += 1) {
-        heights.push(dot(this.scene.axes.above, transformed(matrix, placeIn(/** @type {any} */ (tile), i))) + base);
+        const p = transformed(matrix, placeIn({ data, span: piece.span }, i)), height = dot(above, p) + base;
+        heights.push(height);
         seen.push(codes[i * STRIDE + 3]);
+        const key = [right, ahead].map((axis) => Math.floor(dot(axis, p) / piece.cell)).join(" ");
+        columns.set(key, [...(columns.get(key) ?? []), height]);
       }
     }
     const least = (values, share) => values[Math.min(Math.floor(share * values.length), values.length - 1)];
@@ -247,6 +256,7 @@ export class Surface {
     seen.sort((a, b) => a - b);
     this.range = [least(heights, OUTER), least(heights, 1 - OUTER)];
     this.#most = Math.max(least(seen, 1 - OUTER), 17);
+    if (!this.isChosen) this.cut = ceiling([...columns.values()], this.range);
     this.scene.lay(this.#extent(), this.range[0]);
     this.#drawn = "";
     this.onready();
@@ -309,4 +319,15 @@ export class Surface {
     const { parent } = tile.piece;
     return { parent, world, at: transformed(inverseRigid(this.#shown.get(parent)), world).slice(0, 3), cell: tile.cell };
   }
+}
+
+/**
+ * Heights to draw so that a ceiling does not hide what is under it; null: there is none.
+ * @param {number[][]} columns heights of the cells of each column of the plan
+ * @param {number[]} range the lowest and the highest @returns {number[] | null}
+ */
+export function ceiling(columns, [low, high]) {
+  const top = low + CEILING * (high - low);
+  const covered = columns.filter((one) => one.some((x) => x > top) && one.some((x) => x <= top));
+  return covered.length > COVERED * columns.length ? [-1e9, top] : null;
 }

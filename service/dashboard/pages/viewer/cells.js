@@ -94,7 +94,7 @@ export class CellsLayer extends Layer {
   }
 }
 
-/** Where a cell is, metres from the corner of its tile. @param {Tile} tile @param {number} i */
+/** Where a cell is, metres from the corner of its tile. @param {{data: ArrayBuffer, span: number}} tile @param {number} i */
 export function placeIn({ data, span }, i) {
   const bytes = new Uint8Array(data, i * STRIDE, 3);
   return [0, 1, 2].map((k) => ((bytes[k] + 0.5) / 256) * span);

@@ -192,6 +192,13 @@ export class Viewer {
     return [((x / w + 1) / 2) * clientWidth, ((1 - y / w) / 2) * clientHeight, w];
   }
 
+  /** Whether a graphics card draws, as far as the browser tells. */
+  get isFast() {
+    const known = this.#gl?.getExtension("WEBGL_debug_renderer_info");
+    const name = known ? this.#gl.getParameter(known.UNMASKED_RENDERER_WEBGL) : "";
+    return Boolean(name) && !/swiftshader|llvmpipe|software|basic render/i.test(name);
+  }
+
   /** Whether nobody has looked elsewhere since `fit`. */
   get isFitted() {
     return this.#fitted !== null;
