@@ -14,6 +14,7 @@ import { leftOut } from "../paths/legend.js";
 import { Runs } from "../paths/runs.js";
 import { createScene } from "../paths/scene.js";
 import { dot } from "../viewer/matrix.js";
+import { crosses } from "../viewer/shapes.js";
 import { Robots } from "./robots.js";
 import { COLOURS, shades } from "./shades.js";
 import { sightings } from "./spot.js";
@@ -100,7 +101,7 @@ class Place {
     this.runs = new Runs({ ...told, names, onchange, onreveal: () => this.spot.close(), onframe: (...frame) => this.#frame(...frame) });
     this.robots = new Robots({ map, signal, search, scene, runs: this.runs, onchange });
     this.shades = shades(surface, onchange);
-    this.spot = sightings({ map, signal, onclose: () => this.scene.mark("spot", []) });
+    this.spot = sightings({ map, signal, onclose: () => this.#unmark() });
     this.tools = new Tools({
       stage, scene, surface, onframe: (one) => this.runs.choose(one), onspot: (spot) => this.#spot(spot),
       onbox: (corners) => this.#boxed(corners), onplan: () => this.#turn(true),
@@ -187,9 +188,15 @@ class Place {
     if (!flat) this.tools.choose(null);
   }
 
+  #unmark() {
+    this.scene.viewer?.remove("spot");
+    this.scene.mark("spot", []);
+  }
+
   async #spot({ parent, at: place, world, cell }) {
-    this.scene.mark("spot", [{ at: world, node: h("span", { class: "paths-label", dataset: { kind: "selected" } }, "Spot") }]);
     this.runs.choose(null);
+    this.scene.viewer.lines("spot", { positions: crosses([this.scene.near(world)], 6 * cell), tint: "ink", width: 2, onTop: true });
+    this.scene.mark("spot", [{ at: world, node: h("span", { class: "paths-label", dataset: { kind: "selected" } }, "Spot") }]);
     const text = place.map((v) => v.toFixed(2)).join(", ");
     await this.spot.show({
       title: `Frames that saw ${text}`, none: "No frame saw this spot from where it is visible now.",
@@ -207,6 +214,7 @@ class Place {
       return along >= 0 && along <= 1;
     });
     this.runs.choose(null);
+    this.#unmark();
     await this.spot.show({
       title: "Frames taken in the box", none: "No frame was taken in this box.", inside,
       params: { parent: this.runs.parent, box: [...low, ...high].map((v) => v.toFixed(3)).join(",") },

@@ -159,11 +159,12 @@ export async function keepPicture(stage, scene, caption, name) {
     const { left, top, width, height } = one.getBoundingClientRect(), look = getComputedStyle(one);
     pen.fillStyle = look.backgroundColor;
     pen.strokeStyle = look.borderBottomColor;
-    pen.lineWidth = parseFloat(look.borderBottomWidth) || 0;
+    const edge = parseFloat(look.borderBottomWidth) || 0;
     pen.beginPath();
     pen.roundRect(left - corner.left, top - corner.top, width, height, parseFloat(look.borderTopLeftRadius) || 0);
     pen.fill();
-    if (pen.lineWidth > 0) pen.stroke();
+    pen.lineWidth = edge || 1;
+    if (edge > 0) pen.stroke();
     const text = one.childElementCount === 0 ? one.textContent : one.lastElementChild?.childElementCount === 0 ? one.lastElementChild.textContent : "";
     pen.fillStyle = look.color;
     pen.font = `${look.fontWeight} ${look.fontSize} system-ui, sans-serif`;

@@ -146,6 +146,11 @@ export class Viewer {
     return this.#layers.has(id);
   }
 
+  /** A layer as it is drawn, for tests; see layers.js. @param {string} id */
+  layer(id) {
+    return this.#layers.get(id);
+  }
+
   remove(id) {
     this.#layers.get(id)?.free(this.#gl);
     if (this.#layers.delete(id)) this.redraw();
