@@ -208,7 +208,7 @@ def test_it_is_measured_and_frames_are_boxed(
     with page.expect_download() as kept:
         page.get_by_role("button", name="Save picture").click()
     assert kept.value.suggested_filename.startswith("building-place-")
-    picture = Image.open(io.BytesIO(open(kept.value.path(), "rb").read())).convert("RGB")
+    picture = Image.open(io.BytesIO(kept.value.path().read_bytes())).convert("RGB")
     assert picture.size == (round(corner["width"]), round(corner["height"]))
     x, y, _ = page.evaluate(PROJECT, [CANVAS, one.tolist()])
     ground = picture.getpixel((picture.width - 3, 3))
