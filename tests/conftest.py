@@ -63,6 +63,8 @@ Once = Callable[[str, Callable[[Path], object]], Path]
 
 def pytest_configure(config: pytest.Config) -> None:
     """Begin the server that the whole run is on, where it is; see tests/on_postgres."""
+    # of processes that tests begin, too: a job that nobody asked for would be counted
+    os.environ.setdefault("SCENEPRINT_SURFACES", "asked")
     config.addinivalue_line("markers", "sqlite_only(reason): of nothing that PostgreSQL does")
     config.addinivalue_line("markers", "thorough: takes long, and runs with `make test-thorough`")
     if ON_POSTGRES and "PYTEST_XDIST_WORKER" not in os.environ:

@@ -14,6 +14,7 @@ from sceneprint.store import reencoding_rows
 from sceneprint.store.maps import next_revision
 from sceneprint.store.postgres import vectors
 from sceneprint.store.queue import PENDING
+from sceneprint.store.surface_rows import mark_edited, note_edit
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
@@ -64,6 +65,7 @@ def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) 
     """Store a signature and let queries find the frame; returns the map's revision."""
     # a map that goes back to a model may still have what that model once made of the frame
     _write_signature(connection, frame, made)
+    mark_edited(connection, frame.number)  # it may have been indexed before
     revision = next_revision(connection, frame.map_number)
     connection.execute(
         update(frames)
@@ -87,11 +89,14 @@ def replace_signature(connection: Connection, frame: FrameRow, made: StoredSigna
     known = connection.execute(select(signatures.c.vector, signatures.c.checksum).where(own))
     before = known.first()
     _write_signature(connection, frame, made)
+    searched = select(maps.c.model_id).where(maps.c.number == frame.map_number)
+    is_searched = connection.execute(searched).scalar_one() == made.model_id
+    if is_searched:  # its artifact may have been lost
+        note_edit(connection, frame.number, frame.map_number)
     # a checksum that does not fit made readers pass the frame over, whatever its bytes
     if before is not None and tuple(before) == (made.vector, crc32(made.vector)):
         return False
-    searched = select(maps.c.model_id).where(maps.c.number == frame.map_number)
-    if connection.execute(searched).scalar_one() == made.model_id:
+    if is_searched:
         revision = next_revision(connection, frame.map_number)
         connection.execute(
             update(frames).where(frames.c.number == frame.number).values(revision=revision)

@@ -110,11 +110,16 @@ def write_surface(connection: Connection, map_number: int, **values: object) -> 
 
 def note_edit(connection: Connection, frame_number: int, map_number: int) -> None:
     """Let the surface learn that a frame was edited, in the transaction that does so."""
-    own = surface_frames.c.frame_number == frame_number
-    connection.execute(update(surface_frames).where(own).values(changed=True))
+    mark_edited(connection, frame_number)
     of_map = surfaces.c.map_number == map_number
     counted = update(surfaces).where(of_map).values(pose_edits=surfaces.c.pose_edits + 1)
     connection.execute(counted)
+
+
+def mark_edited(connection: Connection, frame_number: int) -> None:
+    """As `note_edit`, of a frame that takes a revision of its map with it."""
+    own = surface_frames.c.frame_number == frame_number
+    connection.execute(update(surface_frames).where(own).values(changed=True))
 
 
 def maps_to_look_at(connection: Connection) -> list[tuple[MapRow, SurfaceRow | None]]:
@@ -396,7 +401,7 @@ def list_tiles(
         c.map_number == map_number, c.parent == parent, c.level == level, c.blob.is_not(None)
     )
     if beyond is not None:
-        asked = asked.where(tuple_(*place) > beyond)
+        asked = asked.where(tuple_(*place) > tuple_(*beyond))
     found = connection.execute(asked.order_by(*place).limit(limit)).mappings()
     return [TileRow(**row) for row in found]
 

@@ -114,7 +114,7 @@ def list_surface_frames(
         Query(max_length=400, description="x0,y0,z0,x1,y1,z1 of a box that frames were taken in."),
     ] = None,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
-    limit: Annotated[int, Query(ge=1, le=200)] = 20,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 20,
 ) -> Page[SurfaceSighting]:
     """Frames that saw a spot, from the nearest viewpoint on; or frames that were taken in a box.
 

@@ -74,6 +74,7 @@ GIVEN: dict[str, Any] = {
     "association_id": ID, "coverage_id": ID, "since": ID, "snapshot_id": ID, "session": "s",
     "changes": {"title": "x"},
     "model": "depth", "grants": {"*": "read"}, "query": ID, "job_ids": [ID],
+    "digest": ID,
     "a": ("hall", ID), "b": ("hall", ID),
 }  # fmt: skip
 #: Answered without a key, or of no service.

@@ -2,65 +2,125 @@
 
 from __future__ import annotations
 
+import io
+import shutil
+import time
 from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
+from PIL import Image
+from sqlalchemy import func, select
 
 from sceneprint.engine import Engine
+from sceneprint.engine.maps import map_surface, surface_job
+from sceneprint.engine.maps.map_surface import SurfaceUpkeep
 from sceneprint.engine.maps.surface_job import surface_points
+from sceneprint.errors import DamagedBlob, InvalidRequest, NotFound
 from sceneprint.geometry.pose.rigid import moved
+from sceneprint.settings import Settings
 from sceneprint.store.frame_queries import numbers_of_runs, stops_of
+from sceneprint.store.frames import find_frame, refers_to, write_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import geometry_blobs
+from sceneprint.store.tables import (
+    jobs,
+    surface_frames,
+    surface_tiles,
+    surface_touches,
+    surfaces,
+)
+from sceneprint.types import Floats
 from sceneprint_client.api import JobState
 from sceneprint_client.surface_tiles import SurfaceCells, decode_tile
 
 WorkOff = Callable[[Engine], list[JobState | None]]
+BEGIN = datetime(2026, 1, 1, tzinfo=UTC).timestamp()
 
 
-def cells_of(engine: Engine, level: int = 0, name: str = "hall") -> dict[str, SurfaceCells]:
-    """All cells of a level by parent frame, in one order."""
-    found = {}
-    for parent in engine.surfaces.get(name).parents:
-        tile_m = parent.levels[level].tile_m
-        parts = [
-            decode_tile(engine.surfaces.tile(name, tile.digest).make(), tile, tile_m)
-            for tile in engine.surfaces.tiles(name, parent.parent_frame, level).items
-        ]
-        points = np.concatenate([one.points for one in parts])
-        order = np.lexsort(np.floor(points / (tile_m / 64) + 1e-9).T)
-        found[parent.parent_frame] = SurfaceCells(
-            points[order],
-            *(np.concatenate([getattr(one, what) for one in parts])[order]
-              for what in ("seen", "sessions", "taken")),
-        )  # fmt: skip
-    return found
+@pytest.fixture(scope="session")
+def surfaced_folder(
+    tmp_path_factory: pytest.TempPathFactory, signed_folder: Path, work_off: WorkOff
+) -> Path:
+    """A data folder whose map `hall` has twelve frames in two rooms, ten seconds apart, in
+    sessions a, b and none; and the surface of them.
+    """
+    folder = tmp_path_factory.mktemp("surfaced") / "data"
+    shutil.copytree(signed_folder, folder)
+    with Engine(Settings(data_dir=folder)) as engine:
+        for i, frame in enumerate(engine.list_frames("hall").items):
+            session = ("a", "b", None)[i % 3]
+            edit(engine, frame.frame_id, session=session, captured_at=BEGIN + 10.0 * i)
+        build(engine, work_off)
+    return folder
 
 
-def oracle(engine: Engine, cell_m: float, name: str = "hall") -> dict[str, dict[Any, Any]]:
-    """Cells of each parent frame, one point after the other: means of each frame, by cell."""
-    found: dict[str, dict[Any, Any]] = {}
+@pytest.fixture
+def engine(surfaced_folder: Path, tmp_path: Path, make_engine: Callable[..., Engine]) -> Engine:
+    shutil.copytree(surfaced_folder, tmp_path / "data")
+    return make_engine()
+
+
+def edit(engine: Engine, frame_id: str, **values: Any) -> None:
+    with engine.store.database.write() as connection:
+        row = find_map(connection, "hall")
+        write_frame(connection, row, find_frame(connection, row, frame_id), values)
+
+
+def build(engine: Engine, work_off: WorkOff) -> None:
+    told, begun = engine.surfaces.begin("hall")
+    assert (told.state, begun) == ("building", True)
+    assert work_off(engine)[-1] is JobState.SUCCEEDED
+
+
+def tiles_of(engine: Engine) -> dict[Any, bytes]:
+    """All tiles by parent frame, level and place."""
+    return {
+        (parent.parent_frame, level.level, tile.column, tile.row, tile.floor): engine.surfaces.tile(
+            "hall", tile.digest
+        ).make()
+        for parent in engine.surfaces.get("hall").parents
+        for level in parent.levels
+        for tile in engine.surfaces.tiles("hall", parent.parent_frame, level.level).items
+    }
+
+
+def cells_of(engine: Engine, parent: str, level: int = 0) -> tuple[SurfaceCells, float]:
+    """All cells of a level, and their width."""
+    told = next(p for p in engine.surfaces.get("hall").parents if p.parent_frame == parent)
+    own = told.levels[level]
+    parts = [
+        decode_tile(engine.surfaces.tile("hall", tile.digest).make(), tile, own.tile_m)
+        for tile in engine.surfaces.tiles("hall", parent, level).items
+    ]
+    assert sum(len(one.points) for one in parts) == own.cells
+    names = ("points", "seen", "sessions", "taken")
+    columns = (np.concatenate([getattr(one, name) for one in parts]) for name in names)
+    return SurfaceCells(*columns), own.cell_m
+
+
+def oracle(engine: Engine, cell_m: float) -> dict[str, dict[Any, list[Any]]]:
+    """What each frame saw of each cell: its mean, its session and its time, by parent frame."""
+    found: dict[str, dict[Any, list[Any]]] = {}
     with engine.store.database.read() as connection:
-        row = find_map(connection, name)
+        row = find_map(connection, "hall")
         numbers = numbers_of_runs(connection, row.number, None, None)
-        stops, blobs = (
-            stops_of(connection, numbers),
-            geometry_blobs(connection, numbers, row.model_id),
-        )
+        stops = stops_of(connection, numbers)
+        blobs = geometry_blobs(connection, numbers, row.model_id)
     for number in sorted(stops):
         stop = stops[number]
         if stop.pose is None or stop.parent is None:
             continue
-        points = moved(
-            np.array(stop.pose), surface_points(engine.store.geometries.read(blobs[number]))
-        )
-        own: dict[Any, list[Any]] = {}
-        for point in points:
+        geometry = engine.store.geometries.read(blobs[number])
+        own: dict[Any, list[Floats]] = {}
+        for point in moved(np.array(stop.pose), surface_points(geometry)):
             own.setdefault(tuple(np.floor(point / cell_m).astype(int).tolist()), []).append(point)
+        cells = found.setdefault(stop.parent, {})
         for key, some in own.items():
-            means = found.setdefault(stop.parent, {}).setdefault(key, [])
-            means.append(np.mean(some, axis=0))
+            cells.setdefault(key, []).append((np.mean(some, axis=0), stop))
     return found
 
 
@@ -68,25 +128,372 @@ def check(engine: Engine) -> None:
     """The surface is that of the frames that the map has now."""
     told = engine.surfaces.get("hall")
     assert (told.state, told.frames_left, told.error) == ("ready", 0, None)
-    cell_m = told.parents[0].levels[0].cell_m
-    expected, cells = oracle(engine, cell_m), cells_of(engine)
-    assert cells.keys() == expected.keys()
-    for parent, found in cells.items():
+    expected = oracle(engine, told.parents[0].levels[0].cell_m)
+    assert {parent.parent_frame for parent in told.parents} == set(expected)
+    start = 0.0 if told.taken_from is None else told.taken_from.timestamp()
+    for parent, seen in expected.items():
+        found, cell_m = cells_of(engine, parent)
         keys = [tuple(one) for one in np.floor(found.points / cell_m + 1e-9).astype(int).tolist()]
         assert len(keys) == len(set(keys))
-        assert set(keys) == set(expected[parent])
-        views = np.array([len(expected[parent][key]) for key in keys])
-        np.testing.assert_allclose(found.seen, views, rtol=0.03)
-        means = np.array([np.mean(expected[parent][key], axis=0) for key in keys])
-        # a quarter of a cell, and what each frame's mean is rounded by
+        assert set(keys) == set(seen)
+        np.testing.assert_allclose(found.seen, [len(seen[key]) for key in keys], rtol=0.03)
+        means = np.array([np.mean([mean for mean, _ in seen[key]], axis=0) for key in keys])
+        # an eighth of a cell, and what each frame's mean is rounded by
         np.testing.assert_allclose(found.points, means, atol=cell_m * (1 / 8 + 1 / 100))
+        for place, key in enumerate(keys):
+            last = max((stop for _, stop in seen[key]), key=lambda one: one.captured_at or 0.0)
+            session = found.sessions[place]
+            assert last.session == (None if session < 0 else told.sessions[session])
+            if last.captured_at is not None:
+                assert found.taken[place] == (last.captured_at - start) // told.taken_step_s
 
 
-def test_a_surface_is_that_of_its_frames(full: Engine, work_off: WorkOff) -> None:
-    assert full.surfaces.get("hall").state == "none"
-    told, begun = full.surfaces.begin("hall")
-    assert (told.state, begun) == ("building", True)
-    assert work_off(full)[-1] is JobState.SUCCEEDED
-    check(full)
-    told, begun = full.surfaces.begin("hall")
+def test_a_surface_is_that_of_its_frames(engine: Engine) -> None:
+    check(engine)
+    told, begun = engine.surfaces.begin("hall")
     assert (told.state, begun, told.frames) == ("ready", False, 12)
+    assert sorted(told.sessions) == ["a", "b"]
+    assert told.first_taken is not None
+    assert told.last_taken is not None
+    assert (told.last_taken - told.first_taken).total_seconds() == 110.0
+    for parent in told.parents:
+        assert parent.frames == 6
+        assert [level.cell_m for level in parent.levels] == [0.05, 0.2, 0.8]
+        assert [level.tile_m for level in parent.levels] == [3.2, 12.8, 51.2]
+        found, _ = cells_of(engine, parent.parent_frame)
+        low, high = ([getattr(end, axis) for axis in "xyz"] for end in (parent.low, parent.high))
+        assert (found.points > low).all()
+        assert (found.points < high).all()
+        np.testing.assert_allclose(found.points.min(axis=0), low, atol=0.0125)
+        np.testing.assert_allclose(found.points.max(axis=0), high, atol=0.0125)
+
+
+def test_coarser_levels_are_those_of_the_finest(engine: Engine) -> None:
+    parent = engine.surfaces.get("hall").parents[0].parent_frame
+    fine, _ = cells_of(engine, parent)
+    for level in (1, 2):
+        found, cell_m = cells_of(engine, parent, level)
+        assert cell_m == pytest.approx(0.05 * 4**level)
+        within: dict[Any, list[int]] = {}
+        for i, key in enumerate(np.floor(fine.points / cell_m).astype(int).tolist()):
+            within.setdefault(tuple(key), []).append(i)
+        keys = [tuple(one) for one in np.floor(found.points / cell_m + 1e-9).astype(int).tolist()]
+        assert set(keys) == set(within)
+        most = [fine.seen[within[key]].max() for key in keys]
+        np.testing.assert_array_equal(found.seen, most)
+        last = [fine.taken[within[key]].max() for key in keys]
+        np.testing.assert_array_equal(found.taken, last)
+
+
+def test_frames_that_go_and_move_take_their_share_along(engine: Engine, work_off: WorkOff) -> None:
+    frames = engine.list_frames("hall").items
+    engine.delete_frame("hall", frames[3].frame_id)
+    edit(engine, frames[4].frame_id, pose=None, pose_parent=None)
+    edit(engine, frames[7].frame_id, session="c")
+    T = np.eye(4)
+    T[:3, 3] = 5.0, -0.4, 3.0
+    assert frames[2].pose is not None
+    edit(engine, frames[2].frame_id, pose=(T @ np.array(frames[2].pose.matrix)).tolist())
+    told = engine.surfaces.get("hall")
+    assert (told.state, told.frames, told.frames_left) == ("stale", 12, 4)
+    build(engine, work_off)
+    check(engine)
+    kept = tiles_of(engine)
+    engine.surfaces.remove("hall")
+    build(engine, work_off)
+    again = tiles_of(engine)
+    assert kept.keys() == again.keys()  # no empty tile is left, and as if made at once
+    for place in kept:
+        a, b = (np.frombuffer(one[place], surface_job.CELL) for one in (kept, again))
+        for name in ("at", "seen", "taken"):
+            np.testing.assert_array_equal(a[name], b[name])
+
+
+def test_a_surface_whose_frames_are_all_gone_is_none(engine: Engine, work_off: WorkOff) -> None:
+    with engine.store.database.read() as connection:
+        columns = surface_tiles.c.blob, surface_tiles.c.digest
+        blobs = [row[0] for row in connection.execute(select(*columns))]
+    assert blobs
+    for frame in engine.list_frames("hall").items:
+        engine.delete_frame("hall", frame.frame_id)
+    build(engine, work_off)
+    told = engine.surfaces.get("hall")
+    assert (told.state, told.frames, told.parents) == ("none", 0, [])
+    assert [blob for blob in blobs if engine.store.blobs.holds(blob)] == []
+    with pytest.raises(InvalidRequest, match="has no indexed frame with a pose"):
+        engine.surfaces.begin("hall")
+
+
+def test_slices_that_are_lost_are_done_again(
+    engine: Engine, work_off: WorkOff, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One frame a slice, each of them lost once before its commit: the same tiles as at once."""
+    before = tiles_of(engine)
+    frames = engine.list_frames("hall").items
+    edit(engine, frames[1].frame_id, session="z")
+    edit(engine, frames[1].frame_id, session="b")
+    engine.surfaces.remove("hall")
+    monkeypatch.setattr(surface_job, "SLICE_S", 0.0)
+    engine.surfaces.begin("hall")
+    turns = []
+    while (lost := engine.claim("w")) is not None:
+        engine.put_back(lost)
+        taken = engine.claim("w")
+        assert taken is not None
+        outcome = surface_job.SurfaceHandler(engine.store, engine.signers)(taken, time.monotonic())
+        assert all(engine.store.blobs.holds(blob) for blob in outcome.blobs)
+        turns.append(engine.run(taken))
+    assert turns[-1] is JobState.SUCCEEDED
+    assert len(turns) > 12
+    assert tiles_of(engine) == before
+    edit(engine, frames[6].frame_id, session="z")  # tiles are made anew a frame at a time as well
+    engine.surfaces.begin("hall")
+    assert len(work_off(engine)) > 4
+    check(engine)
+
+
+def test_times_far_off_change_the_scale_and_nothing_else(engine: Engine, work_off: WorkOff) -> None:
+    step = engine.surfaces.get("hall").taken_step_s
+    assert step == 1.0
+    frame = engine.list_frames("hall").items[3]
+    edit(engine, frame.frame_id, captured_at=BEGIN + 3e7)  # a year later
+    build(engine, work_off)
+    told = engine.surfaces.get("hall")
+    assert told.taken_step_s == 2048.0  # a power of two that lets four times a year be told
+    assert told.last_taken is not None
+    assert told.last_taken.timestamp() == BEGIN + 3e7
+    check(engine)
+
+
+def test_a_lost_tile_is_made_again(engine: Engine, work_off: WorkOff) -> None:
+    before = tiles_of(engine)
+    parent = engine.surfaces.get("hall").parents[0].parent_frame
+    for level in (2, 0):
+        tile = engine.surfaces.tiles("hall", parent, level).items[0]
+        with engine.store.database.read() as connection:
+            own = select(surface_tiles.c.blob).where(surface_tiles.c.digest == tile.digest)
+            blob = connection.execute(own).scalar_one()
+        engine.settings.data_dir.joinpath("blobs", blob[:2], blob).unlink()
+        with pytest.raises(DamagedBlob):
+            engine.surfaces.tile("hall", tile.digest).make()
+        with pytest.raises(NotFound, match="has no tile"):
+            engine.surfaces.tile("hall", tile.digest)
+        build(engine, work_off)
+        assert tiles_of(engine) == before
+    check(engine)
+
+
+def test_another_model_begins_anew(engine: Engine, work_off: WorkOff, whitened_model: Any) -> None:
+    with engine.store.database.read() as connection:
+        before = set(connection.execute(select(surface_tiles.c.number)).scalars())
+    before_model = engine.get_map("hall").model
+    engine.reencode("hall", whitened_model)
+    work_off(engine)
+    engine.publish_due()
+    assert engine.get_map("hall").model != before_model
+    assert engine.surfaces.get("hall").state == "stale"
+    build(engine, work_off)
+    check(engine)
+    with engine.store.database.read() as connection:
+        after = set(connection.execute(select(surface_tiles.c.number)).scalars())
+    assert not before & after
+
+
+def test_a_deleted_map_leaves_nothing(engine: Engine) -> None:
+    with engine.store.database.read() as connection:
+        blobs = list(connection.execute(select(surface_tiles.c.blob)).scalars())
+        assert all(refers_to(connection, blob) for blob in blobs)
+    engine.delete_map("hall")
+    with engine.store.database.read() as connection:
+        for table in (surfaces, surface_tiles, surface_frames, surface_touches):
+            asked = select(func.count()).select_from(table)
+            assert connection.execute(asked).scalar_one() == 0
+    assert [blob for blob in blobs if engine.store.blobs.holds(blob)] == []
+
+
+def test_workers_begin_by_themselves_once_frames_have_come(
+    engine: Engine, work_off: WorkOff, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_surface, "LOOK_S", 0.0)
+    by_itself = SurfaceUpkeep(engine.store, engine.bell, auto=True)
+    asked_only = SurfaceUpkeep(engine.store, engine.bell, auto=False)
+
+    def begun() -> bool:
+        return engine.surfaces.get("hall").state == "building"
+
+    by_itself.run(), by_itself.run()
+    assert not begun()  # nothing is left to do
+    edit(engine, engine.list_frames("hall").items[1].frame_id, tags=["x"])
+    by_itself.run(), by_itself.run()
+    assert not begun()  # nor is a tag of the surface
+    engine.surfaces.remove("hall")
+    for _ in range(3):
+        by_itself.run()
+    assert not begun()  # it was deleted
+    build(engine, work_off)
+    frame = engine.list_frames("hall").items[0]
+    edit(engine, frame.frame_id, session="z")
+    by_itself.run()
+    assert not begun()  # more may come
+    edit(engine, frame.frame_id, session="y")
+    by_itself.run()
+    assert not begun()
+    by_itself.run()
+    assert begun()
+    assert work_off(engine)[-1] is JobState.SUCCEEDED
+    with engine.store.database.read() as connection:  # the job before went with it
+        own = select(func.count()).where(jobs.c.kind == surface_job.SURFACE)
+        assert connection.execute(own).scalar_one() == 1
+    edit(engine, frame.frame_id, session=None)
+    engine.delete_frame("hall", engine.list_frames("hall").items[1].frame_id)
+    asked_only.run(), asked_only.run()
+    assert begun()
+    work_off(engine)
+    check(engine)
+
+
+def test_a_surface_that_failed_is_not_begun_again_unasked(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_surface, "LOOK_S", 0.0)
+    edit(engine, engine.list_frames("hall").items[0].frame_id, session="z")
+    engine.surfaces.begin("hall")
+
+    def broken(*_: object) -> None:
+        raise NotFound("It cannot be.")
+
+    monkeypatch.setattr(surface_job.SurfaceHandler, "_take_out", broken)
+    while (taken := engine.claim("w")) is not None:
+        state = engine.run(taken)
+    assert state is JobState.FAILED
+    told = engine.surfaces.get("hall")
+    assert (told.state, told.error) == ("stale", "It cannot be.")
+    upkeep = SurfaceUpkeep(engine.store, engine.bell, auto=True)
+    for _ in range(3):
+        upkeep.run()
+    assert engine.surfaces.get("hall").state == "stale"
+    assert engine.surfaces.begin("hall")[1]
+
+
+def test_a_spot_is_seen_by_the_frames_that_have_a_point_there(engine: Engine) -> None:
+    parent = engine.surfaces.get("hall").parents[0]
+    cells, cell_m = cells_of(engine, parent.parent_frame)
+    spot = cells.points[int(np.argmax(cells.seen))].tolist()
+    with engine.store.database.read() as connection:
+        row = find_map(connection, "hall")
+        numbers = numbers_of_runs(connection, row.number, None, None)
+        stops = stops_of(connection, numbers)
+        blobs = geometry_blobs(connection, numbers, row.model_id)
+    expected = []
+    for number, stop in stops.items():
+        if stop.parent != parent.parent_frame:
+            continue
+        pose = np.array(stop.pose)
+        points = moved(pose, surface_points(engine.store.geometries.read(blobs[number])))
+        if np.linalg.norm(points - spot, axis=1).min() <= 2 * cell_m:
+            expected.append((float(np.linalg.norm(pose[:3, 3] - spot)), stop.id))
+    assert len(expected) > 2
+    found = []
+    cursor = None
+    while True:
+        page = engine.surfaces.sightings("hall", spot, None, parent.parent_frame, cursor, 2)
+        assert len(page.items) <= 2
+        found += page.items
+        cursor = page.next_cursor
+        if cursor is None:
+            break
+    assert [one.frame_id for one in found] == [name for _, name in sorted(expected)]
+    np.testing.assert_allclose(
+        [one.distance_m for one in found], sorted(one for one, _ in expected), rtol=1e-6
+    )
+    nowhere = engine.surfaces.sightings("hall", [1e6, 0.0, 0.0], None, parent.parent_frame)
+    assert (nowhere.items, nowhere.next_cursor) == ([], None)
+    with pytest.raises(InvalidRequest, match=r"The radius is 4 m. Give one above 0 and up to 3.2"):
+        engine.surfaces.sightings("hall", spot, 4.0)
+
+
+def test_frames_in_a_box(engine: Engine) -> None:
+    parent = engine.surfaces.get("hall").parents[1].parent_frame
+    own = [
+        frame for frame in engine.list_frames("hall").items
+        if frame.pose is not None and frame.pose.parent_frame == parent
+    ]  # fmt: skip
+    at = {one.frame_id: np.array(one.pose.matrix)[:3, 3] for one in own if one.pose is not None}
+    first = next(iter(at.values()))
+    half = np.array([0.6, 5.0, 5.0])
+    low, high = first - half, first + half
+    expected = {name for name, one in at.items() if abs(one[0] - first[0]) <= 0.6}
+    assert len(expected) > 0
+    found = engine.surfaces.frames_in("hall", high.tolist(), low.tolist(), parent)
+    assert {one.frame_id for one in found.items} == expected
+    assert {one.distance_m for one in found.items} == {None}
+    one_by_one = engine.surfaces.frames_in("hall", low.tolist(), high.tolist(), parent, None, 1)
+    assert [one.frame_id for one in one_by_one.items] == [found.items[0].frame_id]
+    assert (one_by_one.next_cursor is not None) == (len(expected) > 1)
+
+
+def test_a_plan_shows_what_lies_between_two_heights(engine: Engine) -> None:
+    parent = engine.surfaces.get("hall").parents[0]
+    cells, _ = cells_of(engine, parent.parent_frame)
+    up = np.array([getattr(parent.up, axis) for axis in "xyz"])
+    axes = np.array([parent.x_axis, parent.y_axis])
+    np.testing.assert_allclose(np.cross(axes[0], axes[1]), up, atol=1e-9)
+
+    def picture(**more: Any) -> Floats:
+        data = engine.surfaces.picture("hall", parent.parent_frame, **more).make()
+        return np.asarray(Image.open(io.BytesIO(data)))
+
+    whole = picture()
+    assert whole.shape == (parent.plan.height, parent.plan.width, 4)
+    assert max(whole.shape) == 1024
+    flat = cells.points @ axes.T
+    x = ((flat[:, 0] - parent.plan.left) / parent.plan.m_per_pixel).astype(int)
+    y = ((parent.plan.top - flat[:, 1]) / parent.plan.m_per_pixel).astype(int)
+    assert (whole[y, x, 3] > 0).all()
+    assert 0.05 < (whole[..., 3] == 0).mean() < 0.95
+    small = picture(width=100)
+    assert max(small.shape) == 100
+    heights = cells.points @ up
+    middle = float(np.median(heights))
+    low, high = picture(high=middle), picture(low=middle)
+    for cut, inside in ((low, heights <= middle), (high, heights >= middle)):
+        assert (cut[y[inside], x[inside], 3] > 0).all()
+        assert (cut[..., 3] > 0).sum() < (whole[..., 3] > 0).sum()
+    assert not picture(low=heights.max() + 1)[..., 3].any()
+    with pytest.raises(NotFound, match="has no surface in that parent frame"):
+        engine.surfaces.picture("hall", "nowhere")
+
+
+def test_a_frame_whose_artifact_is_lost_adds_nothing(engine: Engine, work_off: WorkOff) -> None:
+    frame = engine.list_frames("hall").items[5]
+    with engine.store.database.read() as connection:
+        row = find_map(connection, "hall")
+        number = find_frame(connection, row, frame.frame_id).number
+        (blob,) = geometry_blobs(connection, [number], row.model_id).values()
+    engine.settings.data_dir.joinpath("blobs", blob[:2], blob).unlink()
+    edit(engine, frame.frame_id, session="z")
+    build(engine, work_off)
+    told = engine.surfaces.get("hall")
+    assert (told.state, told.frames, told.frames_left) == ("ready", 12, 0)
+    assert "z" not in told.sessions
+
+
+def test_tiles_come_in_pages(engine: Engine) -> None:
+    parent = engine.surfaces.get("hall").parents[0].parent_frame
+    whole = engine.surfaces.tiles("hall", parent).items
+    places = [(one.column, one.row, one.floor) for one in whole]
+    assert places == sorted(places)
+    assert len(places) > 2
+    found, cursor = [], None
+    while True:
+        page = engine.surfaces.tiles("hall", parent, 0, cursor, 2)
+        found += page.items
+        cursor = page.next_cursor
+        if cursor is None:
+            break
+    assert found == whole
+    for bad in ("x", "1~2", "1~2~3~4", "1~2~" + "9" * 30):
+        with pytest.raises(InvalidRequest, match="The cursor"):
+            engine.surfaces.tiles("hall", parent, 0, bad)
+    with pytest.raises(NotFound, match="has no tile"):
+        engine.surfaces.tile("hall", "0" * 32)

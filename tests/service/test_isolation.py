@@ -103,6 +103,13 @@ OF_A_MAP = {
     "GET /v1/maps/{map_name}/coverage/{job_id}/frames": Case(),
     "GET /v1/maps/{map_name}/coverage/{job_id}/changes": Case(query={"since": "{coverage}"}),
     "GET /v1/maps/{map_name}/coverage/{job_id}/plan.png": Case(),
+    "GET /v1/maps/{map_name}/surface": Case(),
+    "POST /v1/maps/{map_name}/surface": Case("write"),
+    "DELETE /v1/maps/{map_name}/surface": Case("write"),
+    "GET /v1/maps/{map_name}/surface/tiles": Case(),
+    "GET /v1/maps/{map_name}/surface/tiles/{digest}": Case(),
+    "GET /v1/maps/{map_name}/surface/frames": Case(query={"at": "0,0,0"}),
+    "GET /v1/maps/{map_name}/surface/plan.png": Case(),
     "GET /v1/jobs": Case(query={"map": "{map}"}),
     "GET /v1/jobs/{job_id}": Case(),
     "POST /v1/jobs/{job_id}/cancel": Case("write"),
@@ -144,6 +151,7 @@ class There:
     association: str
     reconstruction: str
     coverage: str
+    tile: str
     session: str
 
     def of(self, operation: str, what: str) -> str:
@@ -156,6 +164,7 @@ class There:
         return {
             "map_name": self.map, "frame_id": self.frame, "query_id": self.query,
             "job_id": (jobs or [self.job])[0], "key_name": "keeper", "snapshot_id": self.job,
+            "digest": self.tile,
         }[what]  # fmt: skip
 
     def fill(self, text: str) -> str:
@@ -174,11 +183,12 @@ class There:
             self.association,
             self.reconstruction,
             self.coverage,
+            self.tile,
         ]
 
 
 @pytest.fixture(scope="module")
-def there(walled, small_shots) -> dict[str, There]:
+def there(walled, small_shots, until) -> dict[str, There]:
     """Two maps with two frames each, and of each an answer and a job of every kind."""
     found = {}
     for name, pair in ((OWN, small_shots[:2]), (THEIRS, small_shots[1:3])):
@@ -188,7 +198,13 @@ def there(walled, small_shots) -> dict[str, There]:
         sent = [
             walled.ask(
                 "boss", "POST", f"/v1/maps/{name}/frames", headers={"Prefer": "wait=60"},
-                **shot.form(session=session, captured_at=f"2026-11-16T09:30:0{number}Z"),
+                **shot.form(
+                    session=session, captured_at=f"2026-11-16T09:30:0{number}Z",
+                    pose={
+                        "parent_frame": name, "translation": {"x": number, "y": 0, "z": 0},
+                        "rotation": {"w": 1, "x": 0, "y": 0, "z": 0},
+                    },
+                ),
             ).json()
             for number, shot in enumerate(pair)
         ]  # fmt: skip
@@ -203,9 +219,16 @@ def there(walled, small_shots) -> dict[str, There]:
         assert fused.status_code == 202, fused.text
         measured = walled.ask("boss", "POST", f"/v1/maps/{name}/coverage")
         assert measured.status_code == 202, measured.text
+        built = walled.ask("boss", "POST", f"/v1/maps/{name}/surface")
+        assert built.status_code == 202, built.text
+        surface = f"/v1/maps/{name}/surface"
+        until(lambda at=surface: walled.ask("boss", "GET", at).json()["state"] == "ready")
+        tiles = walled.ask("boss", "GET", f"{surface}/tiles").json()["items"]
         jobs = [one.headers["location"].rpartition("/")[2] for one in (begun, fused, measured)]
-        found[name] = There(name, frame, query, sent[0]["job_id"], *jobs, session)
-    found[NONE] = There(NONE, *[NO_ID] * 6, f"run-of-{NONE}")
+        found[name] = There(
+            name, frame, query, sent[0]["job_id"], *jobs, tiles[0]["digest"], session
+        )
+    found[NONE] = There(NONE, *[NO_ID] * 7, f"run-of-{NONE}")
     return found
 
 
@@ -297,6 +320,7 @@ def test_lists_have_nothing_of_another_map(walled, there, operations):
               f"/v1/stats?map={OWN}", f"/v1/jobs?map={OWN}", f"/v1/events?map={OWN}",
               "/v1/jobs?kind=associate", "/v1/jobs?kind=reconstruct", "/readyz", "/openapi.json",
               f"/v1/maps/{OWN}/associations", f"/v1/maps/{OWN}/coverage",
+              f"/v1/maps/{OWN}/surface", f"/v1/maps/{OWN}/surface/tiles",
               f"/v1/maps/{OWN}/sessions"]  # fmt: skip
     for path in listed:
         for key in ("admin", "reader"):
@@ -310,7 +334,7 @@ def test_lists_have_nothing_of_another_map(walled, there, operations):
     assert [one["name"] for one in mine] == [OWN]
     jobs = walled.ask("reader", "GET", "/v1/jobs?limit=1000").json()["items"]
     assert {job["map"] for job in jobs} == {OWN}
-    assert len(jobs) == 5  # two frames, an association, a reconstruction, a coverage
+    assert len(jobs) == 6  # two frames, an association, a reconstruction, a coverage, a surface
     events = walled.ask("reader", "GET", "/v1/events?limit=1000").json()["items"]
     assert {event["map"] for event in events} == {OWN}
 
@@ -464,6 +488,7 @@ def test_what_is_not_noted_is_said(operations):
         "delete_frame", "patch_session", "delete_session_frames", "cancel_job", "retry_job",
         "retry_dead_jobs", "reencode", "cancel_reencoding",
         "begin_association", "delete_association", "begin_coverage", "delete_coverage",
+        "begin_surface", "delete_surface",
         "reconstruct", "delete_reconstruction",
         "add_import", "take_snapshot", "delete_snapshot", "delete_queries",
     }  # fmt: skip

@@ -100,7 +100,12 @@ def live(one: Twin, small_model: Any) -> None:
         assert measured.status_code == 202, measured.text
         one.ids["coverage"] = measured.json()["coverage_id"]
         one.disturb()
+    built = one.ask("boss", "POST", f"{path}/surface")
+    assert built.status_code == 202, built.text
+    one.disturb()
     one.house.work()
+    tiles = one.ask("boss", "GET", f"{path}/surface/tiles").json()["items"]
+    one.ids["digest"] = tiles[0]["digest"]
     fused = one.ask("boss", "POST", f"/v1/queries/{one.ids['query_id']}/reconstruction", json={})
     one.ids["reconstruction"] = fused.json()["job_id"]
     one.disturb()
@@ -114,6 +119,7 @@ def path_of(one: Twin, pattern: str) -> str:
     names = {
         "map_name": "alpha", "frame_id": "frame-1", "query_id": one.ids["query_id"],
         "job_id": one.ids[kinds[0] if kinds else "job_id"], "key_name": "k2", "snapshot_id": "x",
+        "digest": one.ids["digest"],
     }  # fmt: skip
     return re.sub(r"\{(\w+)\}", lambda found: names[found[1]], pattern)
 
@@ -126,6 +132,7 @@ def everything(one: Twin) -> Iterator[str]:
         "/v1/jobs": ["", "?map=alpha", "?state=queued", "?kind=associate"],
         "/v1/events": ["?order=oldest", "?map=alpha&kind=frame.", "?after=0&limit=1000"],
         "/v1/queries/{query_id}/matches/{frame_id}": ["", "?detail=true"],
+        "/v1/maps/{map_name}/surface/frames": ["?at=1,0,2&radius=3", "?box=-9,-9,-9,9,9,9&limit=1"],
         "/v1/maps/{map_name}/coverage/{job_id}/changes": [f"?since={one.ids['coverage']}"],
     }  # fmt: skip
     for pattern, methods in sorted(document["paths"].items()):
@@ -153,6 +160,7 @@ def everything(one: Twin) -> Iterator[str]:
         ("DELETE", "/v1/maps/alpha/frames/frame-3", None),
         ("DELETE", f"/v1/maps/alpha/associations/{one.ids['association']}", None),
         ("DELETE", f"/v1/maps/alpha/coverage/{one.ids['coverage']}", None),
+        ("DELETE", "/v1/maps/alpha/surface", None),
         ("POST", "/v1/maps", {"name": "bravo"}),
         ("GET", "/v1/events", None),
         ("GET", "/v1/maps/alpha", None),
@@ -205,7 +213,8 @@ def test_it_is_all_there(both):
     """Else the test above would prove nothing."""
     text = "".join(both[0])
     # the frames' poses contradict what they show, so that their matches disagree
-    for part in ("frame.indexed", "association.found", "coverage.measured", "cursor=",
+    for part in ("frame.indexed", "association.found", "coverage.measured", "surface.updated",
+                 "cursor=",
                  '"status":"ambiguous"',
                  "end_header",
                  '"frame_id":"frame-3"', "POST /v1/similarity\n200", "VERTEX_SE3"):  # fmt: skip

@@ -174,6 +174,7 @@ class MapSurfaces:
         ------
         UnknownMap : no such map.
         NotFound : the map has no such tile now.
+        DamagedBlob : its bytes are lost, when they are made; a worker makes the tile again.
         """
         with self._store.database.read() as connection:
             row, surface = stored.living_surface(connection, map_name)
@@ -181,12 +182,17 @@ class MapSurfaces:
             if surface is not None:
                 found = stored.tile_of_digest(connection, row.number, digest)
         if surface is None or found is None:
-            raise NotFound(
-                f"Map {row.name!r} has no tile {digest!r:.80}: it changed, or was removed. List "
-                f"tiles with GET /v1/maps/{row.name}/surface/tiles."
-            )
+            raise _unknown_tile(row, digest)
         scale = scale_of(surface)
-        return Output(digest, lambda: tile_cells(self._store, found, scale).tobytes())
+
+        def make() -> bytes:
+            try:
+                return tile_cells(self._store, found, scale).tobytes()
+            except DamagedBlob:
+                self._mend(row, found)
+                raise
+
+        return Output(digest, make)
 
     def sightings(
         self, map_name: str, spot: Sequence[float], radius: float | None = None,
@@ -335,6 +341,14 @@ class MapSurfaces:
             return False
         apart = moved(np.array(frame.pose), surface_points(geometry)) - np.array(spot)
         return bool(((apart * apart).sum(axis=1) <= within * within).any())
+
+    def _mend(self, row: MapRow, tile: TileRow) -> None:
+        """Have a tile made again whose bytes are lost; NotFound where it was replaced meanwhile."""
+        with self._store.database.write() as connection:
+            now = stored.tile_of_number(connection, tile.number)
+            if now is None or now.blob != tile.blob:
+                raise _unknown_tile(row, tile.digest)
+            stored.spoil_tile(connection, now)
 
     def _moment(self, last: tuple[float, int]) -> str | None:
         return self._store.seals.next_moment("frame", [last, last], 1)
@@ -554,6 +568,13 @@ def _parent_record(
             top=plan.top,
         ),
     )  # fmt: skip
+
+
+def _unknown_tile(row: MapRow, digest: str) -> NotFound:
+    return NotFound(
+        f"Map {row.name!r} has no tile {digest!r:.80}: it changed, or was removed. List tiles with "
+        f"GET /v1/maps/{row.name}/surface/tiles."
+    )
 
 
 def _sighting(frame: SightingFrame, parent: str, distance: float | None) -> SurfaceSighting:

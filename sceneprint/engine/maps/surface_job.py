@@ -59,10 +59,10 @@ PRIORITY = REENCODING_PRIORITY - 1
 SLICE_S = 1.5
 #: Levels of a surface, and the width of the finest cells in voxels of the map's model.
 LEVELS, VOXELS = 3, 2.5
-#: Parent frames that are told of: those of most frames.
-MOST_PARENTS = 20
+#: Parent frames that are told of: those of most frames. Sessions that cells tell apart.
+MOST_PARENTS, MOST_SESSIONS = 20, 10_000
 #: Frames looked up at once; frames taken out in one slice.
-_FRAMES, _TAKEN_OUT = 64, 500
+_FRAMES, _TAKEN_OUT = 256, 500
 #: What a slice holds at most: tiles that are changed, and cells of frames or tiles.
 _TILES, _CELLS = 96, 1_500_000
 
@@ -169,12 +169,12 @@ class SurfaceHandler:
             progress |= {"done": 0, "after": 0, "checked": False}
             with self._store.database.read() as connection:
                 progress["total"] = stored.count_left(connection, surface)
+        if not progress["checked"]:  # all of them first: tiles are made anew once
+            return self._take_out(surface, progress)
         with self._store.database.read() as connection:
             rebuilt = stored.tiles_to_rebuild(connection, row.number, _TILES)
         if rebuilt:
             return self._rebuild(surface, progress, rebuilt, until)
-        if not progress["checked"]:
-            return self._take_out(surface, progress)
         with self._store.database.read() as connection:
             rescaled = stored.tiles_of_other_scale(connection, surface, _TILES)
         if rescaled:
@@ -477,8 +477,8 @@ class _Sessions:
         self._index = {name: i for i, name in enumerate(known)}
 
     def index(self, name: str | None) -> int:
-        """The index of a session; NO_SESSION without one, and of more than there are indexes."""
-        if name is None or (name not in self._index and len(self.names) >= NO_SESSION):
+        """The index of a session; NO_SESSION without one, and of those beyond MOST_SESSIONS."""
+        if name is None or (name not in self._index and len(self.names) >= MOST_SESSIONS):
             return NO_SESSION
         if name not in self._index:
             self._index[name] = len(self.names)

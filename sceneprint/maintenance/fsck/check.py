@@ -21,8 +21,8 @@ from sceneprint.maintenance.fsck.blobs import (
     check_artifacts,
     check_files,
     check_products,
-    check_surfaces,
     check_signatures,
+    check_surfaces,
     check_tables,
     check_uploads,
 )

@@ -12,7 +12,9 @@ from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 from sceneprint.settings import Settings
 from sceneprint.store import Store
+from sceneprint.store.maps import find_map
 from sceneprint.store.queue import JobFile, add_files, files_of, find_job
+from sceneprint.store.surface_rows import add_surface, find_surface, tiles_to_rebuild, write_tile
 from sceneprint_client.api import NewMap
 
 
@@ -72,3 +74,49 @@ def test_a_lost_file_of_a_job_is_named_and_forgotten(settings, made, condition):
         assert names(engine.store, job_id) == ["picture.png"]
     kept = [one.read_bytes() for one in settings.data_dir.rglob(f"quarantine/*{blob}*")]
     assert kept == ([b"a mush"] if condition == "damaged" else [])
+
+
+@pytest.fixture
+def tiled(settings: Settings) -> str:
+    """Blob of the one tile of a surface, which is up to date."""
+    with Engine(settings) as engine:
+        engine.create_map(NewMap(name="hall", model="depth"))
+        blob = engine.store.blobs.put(b"cells")
+        with engine.store.database.write() as connection:
+            row = find_map(connection, "hall")
+            add_surface(connection, row)
+            values = {"blob": blob, "digest": "d", "cells": 1, "scale": 0}
+            write_tile(connection, row.number, "room", 0, (0, -1, 2), values)
+    return blob
+
+
+def test_sound_tiles_are_no_finding_and_belong_to_a_snapshot(settings, tiled, tmp_path):
+    assert list(fsck(settings, grace_s=0)) == []
+    take_snapshot(settings, tmp_path / "all.tar")
+    restore_snapshot(tmp_path / "all.tar", tmp_path / "again")
+    with Engine(Settings(data_dir=tmp_path / "again", database_url=None)) as engine:
+        assert engine.store.blobs.get(tiled) == b"cells"
+
+
+@pytest.mark.parametrize("condition", ["damaged", "missing"])
+def test_a_lost_tile_is_named_and_made_again(settings, tiled, condition):
+    path = settings.blob_dir / tiled[:2] / tiled
+    if condition == "missing":
+        path.unlink()
+    else:
+        path.chmod(0o600)
+        path.write_bytes(b"calls")
+    (found,) = fsck(settings, grace_s=0)
+    assert (found.finding.kind, found.finding.map) == (f"{condition}-tile", "hall")
+    assert found.finding.what == "tile (0, -1, 2) of level 0 of map hall"
+    (done,) = fsck(settings, grace_s=0, repair=True)
+    assert done.done is not None
+    assert done.done.endswith("a worker makes it again")
+    assert list(fsck(settings, grace_s=0)) == []
+    with Engine(settings) as engine, engine.store.database.read() as connection:
+        row = find_map(connection, "hall")
+        (tile,) = tiles_to_rebuild(connection, row.number, 10)
+        assert (tile.place, tile.blob, tile.rebuilt_to) == ((0, -1, 2), None, 0)
+        surface = find_surface(connection, row.number)
+        assert surface is not None
+        assert surface.edits < surface.pose_edits  # so that workers look at it

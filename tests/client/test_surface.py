@@ -1,0 +1,180 @@
+"""The surface of a map by client, raw HTTP and command."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+
+from sceneprint.cli import main
+from sceneprint.errors import InvalidRequest, NotFound, UnknownMap
+from sceneprint.formats.dataset import write_depth_png
+from sceneprint.formats.points.ply import read_ply
+from sceneprint.lab.synth import synthesise_room
+from sceneprint_client import Client
+from sceneprint_client.api import FrameMeta, JobState
+from sceneprint_client.api.surface import SurfaceTile
+from sceneprint_client.errors import Refused
+from sceneprint_client.surface_tiles import decode_tile
+
+MAP, PLAIN = "fused", "poseless"
+PATH = f"/v1/maps/{MAP}/surface"
+
+
+@pytest.fixture(scope="module")
+def fused(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
+    """A client of a map with four posed frames and their surface, and of one without poses."""
+    path = tmp_path_factory.mktemp("fused") / "depth.png"
+    with Client(service_url) as client:
+        for name in (MAP, PLAIN):
+            client.create_map(name, model="depth")
+        jobs = []
+        for i, frame in enumerate(synthesise_room(21, 0, 4, along_path=True).frames):
+            write_depth_png(path, frame.depth, 1000.0)
+            k = frame.intrinsics
+            assert frame.pose is not None
+            fields = {
+                "intrinsics": {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy,
+                               "cx": k.cx, "cy": k.cy},
+                "session": "a", "robot": "ann",
+                "captured_at": datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=i),
+            }  # fmt: skip
+            posed = fields | {"pose": {"parent_frame": "room", "matrix": frame.pose.tolist()}}
+            jobs.append(client.upload(MAP, path, FrameMeta.model_validate(posed)).job_id)
+        jobs.append(client.upload(PLAIN, path, FrameMeta.model_validate(fields)).job_id)
+        assert {job.state for job in client.wait(jobs)} == {JobState.SUCCEEDED}
+        before = client.surface(MAP)
+        assert (before.state, before.frames, before.frames_left) == ("none", 0, 4)
+        begun = client.begin_surface(MAP)
+        assert begun.job_id is not None
+        assert [job.state for job in client.wait([begun.job_id])] == [JobState.SUCCEEDED]
+        yield client
+
+
+def test_tiles_and_the_frames_that_saw_them(fused: Client) -> None:
+    told = fused.surface(MAP)
+    assert (told.state, told.frames, told.sessions) == ("ready", 4, ["a"])
+    assert fused.begin_surface(MAP) == told  # there is nothing to do
+    (parent,) = told.parents
+    assert (parent.parent_frame, parent.frames) == ("room", 4)
+    cells = 0
+    for level in parent.levels:
+        tiles = list(fused.surface_tiles(MAP, "room", level.level))
+        assert (len(tiles), sum(one.bytes for one in tiles)) == (level.tiles, level.bytes)
+        for tile in tiles:
+            found = decode_tile(fused.surface_tile(MAP, tile.digest), tile, level.tile_m)
+            assert (np.floor(found.points / level.tile_m)
+                    == [tile.column, tile.row, tile.floor]).all()  # fmt: skip
+            assert set(found.sessions.tolist()) == {0}
+            cells += len(found.points)
+    assert cells == sum(level.cells for level in parent.levels)
+    spot = found.points[0].tolist()  # of the coarsest level: near what was seen
+    seen = list(fused.surface_frames(MAP, spot, radius=1.0))
+    assert seen
+    distances = [one.distance_m for one in seen]
+    assert distances == sorted(distances, key=float)
+    every = [-100.0, -100.0, -100.0, 100.0, 100.0, 100.0]
+    boxed = list(fused.surface_frames(MAP, box=every, parent="room"))
+    assert {one.frame_id for one in boxed} == {one.frame_id for one in fused.frames(MAP)}
+    assert {one.robot for one in boxed} == {"ann"}
+    assert list(fused.surface_frames(MAP, spot, parent="elsewhere")) == []
+
+
+def test_what_a_surface_refuses(fused: Client) -> None:
+    for call in (fused.surface, fused.begin_surface, fused.delete_surface, fused.surface_plan):
+        with pytest.raises(UnknownMap):
+            call("nowhere")
+    with pytest.raises(InvalidRequest, match="has no indexed frame with a pose"):
+        fused.begin_surface(PLAIN)
+    assert (fused.surface(PLAIN).state, fused.surface(PLAIN).frames_left) == ("none", 0)
+    with pytest.raises(NotFound, match=r"There is no tile '\.\./x'"):
+        fused.surface_tile(MAP, "../x")
+    with pytest.raises(NotFound, match="has no tile"):
+        fused.surface_tile(MAP, "0" * 32)
+    with pytest.raises(NotFound, match="has no surface in that parent frame"):
+        fused.surface_plan(MAP, "elsewhere")
+    with pytest.raises(InvalidRequest, match="The width is 5000"):
+        fused.surface_plan(MAP, width=5000)
+    with pytest.raises(InvalidRequest, match="Give either `at` or `box`"):
+        list(fused.surface_frames(MAP))
+    tile = SurfaceTile(column=0, row=0, floor=0, cells=2, bytes=16, digest="x")
+    with pytest.raises(Refused, match="sent 15 bytes, which are not 2 cells"):
+        decode_tile(bytes(15), tile, 1.0)
+
+
+def test_a_tile_is_kept_for_ever_and_a_plan_asked_for_again(
+    fused: Client, service_url: str
+) -> None:
+    tile = next(fused.surface_tiles(MAP))
+    with httpx.Client(base_url=service_url) as http:
+        first = http.get(f"{PATH}/tiles/{tile.digest}")
+        assert first.headers["cache-control"] == "private, max-age=31536000, immutable"
+        assert len(first.content) == tile.bytes
+        plan = http.get(f"{PATH}/plan.png")
+        assert plan.headers["cache-control"] == "private, no-cache"
+        for path, known in ((f"tiles/{tile.digest}", first), ("plan.png", plan)):
+            again = {"If-None-Match": known.headers["etag"]}
+            assert http.get(f"{PATH}/{path}", headers=again).status_code == 304
+        assert http.get(f"{PATH}/plan.png?high=0").headers["etag"] != plan.headers["etag"]
+        for query in ("at=1,2", "at=1,2,nan", "at=1,2,1e300", "at=a,b,c", "box=1,2,3",
+                      "at=1,2,3&box=1,2,3,4,5,6", "at=1,2,3&radius=9", "at=1,2,3&cursor=x",
+                      "box=1,2,3,4,5,6&cursor=x"):  # fmt: skip
+            refused = http.get(f"{PATH}/frames?{query}")
+            assert refused.status_code == 422, query
+            assert refused.json()["type"] == "/problems/invalid-request"
+    image = Image.open(io.BytesIO(plan.content))
+    (parent,) = fused.surface(MAP).parents
+    assert (image.mode, image.size) == ("RGBA", (parent.plan.width, parent.plan.height))
+
+
+def test_the_command_writes_plan_and_points(
+    fused: Client, service_url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan, points = tmp_path / "plan.png", tmp_path / "surface.ply"
+    given = ["--url", service_url]
+    assert main(["surface", MAP, "--out", str(plan), *given]) == 0
+    (parent,) = fused.surface(MAP).parents
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"surface of map {MAP} is ready: 4 frames"
+    assert lines[1].startswith("room: 4 frames, ")
+    finest = parent.levels[0]
+    assert lines[2].startswith(f"  cells of 0.05 m: {finest.cells} in {finest.tiles} tiles, ")
+    assert lines[-1] == f"wrote {plan}"
+    assert plan.read_bytes() == fused.surface_plan(MAP)
+    assert main(["surface", MAP, "--out", str(points), "--level", "1", "--json", *given]) == 0
+    assert json.loads(capsys.readouterr().out)["frames"] == 4
+    assert read_ply(points.read_bytes()).count == parent.levels[1].cells
+    for wrong, message in (
+        (["--out", "plan.jpg"], "end the name with .png"),
+        (["--out", str(points), "--parent-frame", "x"], "has no surface in that parent frame"),
+        (["--delete", "--out", str(plan)], "leaves nothing to write"),
+    ):
+        assert main(["surface", MAP, *wrong, *given]) == 1
+        assert message in capsys.readouterr().err
+
+
+def test_a_deleted_surface_comes_back_when_asked_for(
+    fused: Client, service_url: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = fused.surface(MAP)
+    tile = next(fused.surface_tiles(MAP))
+    assert main(["surface", MAP, "--delete", "--url", service_url]) == 0
+    assert capsys.readouterr().out == f"deleted the surface of map {MAP}\n"
+    told = fused.surface(MAP)
+    assert (told.state, told.frames, told.parents, told.job_id) == ("none", 0, [], None)
+    with pytest.raises(NotFound):
+        fused.surface_tile(MAP, tile.digest)
+    assert list(fused.surface_tiles(MAP)) == []
+    assert main(["surface", MAP, "--no-build", "--url", service_url]) == 0
+    assert capsys.readouterr().out == f"surface of map {MAP} is none: 0 frames, 4 left\n"
+    assert main(["surface", MAP, "--url", service_url]) == 0
+    again = fused.surface(MAP)
+    assert again.parents == before.parents
+    assert next(fused.surface_tiles(MAP)) == tile
