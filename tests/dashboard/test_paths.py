@@ -126,7 +126,7 @@ def test_a_query_is_among_them(
     answer = station.client.post("/v1/maps/building/queries", **sent.form(k=3)).json()
     location = answer["location"]
     assert answer["status"] == "found"
-    page.goto(f"{station.home}#/maps/building/place?query={answer['query_id']}")
+    page.goto(f"{station.home}#/maps/building/place?view=3d&query={answer['query_id']}")
     settle(page)
     expect(page.locator("#paths-parent")).to_have_value("room-0")
     expect(page.locator(".paths-run")).to_have_count(2)
@@ -287,7 +287,9 @@ def test_numbers_behind_the_picture(page: Page, station: Any, settle: Any) -> No
     lines = np.array(grid["positions"]).reshape(-1, 3) + np.array([10, 1, 20])
     assert set(lines[:, 1]) == {2}
     assert (lines.max(0)[[0, 2]] >= [20, 24]).all()
-    reach = run("shapes", "m.reachAlong(given[0], [0.6, 0, -0.8])", {"low": [0, 0, 1], "high": [10, 9, 2]})
+    reach = run(
+        "shapes", "m.reachAlong(given[0], [0.6, 0, -0.8])", {"low": [0, 0, 1], "high": [10, 9, 2]}
+    )
     assert reach == pytest.approx([-1.6, 6 - 0.8])
     # the nearest on the screen; of two about as near, the one in front; nothing far away
     flat = "p => [p[0], p[1], p[2]]"

@@ -1,4 +1,4 @@
-"""The place of a map in a real browser: its surface beside the API's bytes, spots, robots, tools."""
+"""The place of a map in a real browser: its surface beside the API's bytes, spots, robots."""
 
 from __future__ import annotations
 
@@ -97,7 +97,9 @@ def test_a_spot_names_the_frames_that_saw_it(
         built["cells"]
     )  # a small place is drawn in its finest cells
     fetched = [one.path for one in asked if "/surface/tiles/" in one.path]
-    assert len(fetched) == len(set(fetched)) == sum(one["tiles"] for one in built["parent"]["levels"])
+    assert (
+        len(fetched) == len(set(fetched)) == sum(one["tiles"] for one in built["parent"]["levels"])
+    )
 
     spot = highest(built)
     click_at(page, spot)
@@ -136,7 +138,10 @@ def test_what_is_drawn_is_in_the_address_and_reached_by_keys(
     page.locator("#place-high").press("ArrowLeft")
     expect(page.locator(".place-cut").locator("..")).to_contain_text("m to")
     search = parse_qs(page.url.partition("?")[2])
-    assert {name: search[name] for name in ("view", "colour")} == {"view": ["3d"], "colour": ["seen"]}
+    assert {name: search[name] for name in ("view", "colour")} == {
+        "view": ["3d"],
+        "colour": ["seen"],
+    }
     page.reload()
     settle(page)
     expect(page.locator("#place-colour")).to_have_value("seen")
@@ -352,7 +357,13 @@ def test_detail_by_value(page: Page, station: Any, settle: Any) -> None:
     levels = [{"level": 0, "cell_m": 1, "tile_m": 64}, {"level": 1, "cell_m": 4, "tile_m": 256}]
 
     def tile(column: int, row: int, cells: int) -> dict[str, Any]:
-        return {"column": column, "row": row, "floor": 0, "cells": cells, "digest": f"{column} {row}"}
+        return {
+            "column": column,
+            "row": row,
+            "floor": 0,
+            "cells": cells,
+            "digest": f"{column} {row}",
+        }
 
     fine = [tile(0, 0, 100), tile(3, 3, 100), tile(-1, 0, 50), tile(4, 0, 500)]
     coarse = [tile(0, 0, 20), tile(-1, 0, 5), tile(1, 0, 30)]
@@ -365,7 +376,8 @@ def test_detail_by_value(page: Page, station: Any, settle: Any) -> None:
       const cover = m.cover(p.roots, { refined: found.refined, parts,
         there: (one) => one.level === 1 || !given[4].includes(one.digest) });
       const names = (all) => all.map((one) => `${one.level}:${one.digest}`);
-      return [names([...found.refined]), found.cells, [...found.coarse], names(cover.drawn), names(cover.missing)];
+      return [names([...found.refined]), found.cells, [...found.coarse], names(cover.drawn),
+        names(cover.missing)];
     })()"""
     # all but the largest fits: the one at 1 0 would take 500
     assert run("detail", script, levels, fine, coarse, 400, []) == [
@@ -388,7 +400,8 @@ def test_detail_by_value(page: Page, station: Any, settle: Any) -> None:
     ]  # fmt: skip
     told = run("robots", """m.robotsOf(given[0]).map((one) => [one.name, one.last.query_id,
         one.found?.query_id ?? null, one.trail.map((each) => each.query_id),
-        one.lost.map((each) => [each.record.query_id, each.near?.query_id ?? null])])""", records)  # fmt: skip
+        one.lost.map((each) => [each.record.query_id, each.near?.query_id ?? null])])""",
+        records)  # fmt: skip
     assert told == [
         ["spot", 6, 1, [], [[0, None], [3, 1], [6, 1]]],
         ["cart", 5, 5, [2], []],

@@ -163,7 +163,8 @@ def test_cells_lie_where_they_are_projected(stage: Page) -> None:
         """(text) => view.cells("surface", {
           tiles: [{ name: "one", data: bytes(text), span: 2.56, cell: 0.05,
                     matrix: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, -1.28, -1.28, -1.285, 1] }],
-          extent: { low: [-1, -1, -1], high: [1, 1, 1] }, palette: new Uint8Array([10, 20, 30, 200, 0, 100]),
+          extent: { low: [-1, -1, -1], high: [1, 1, 1] },
+          palette: new Uint8Array([10, 20, 30, 200, 0, 100]),
           heights: [-1, 1], most: 48, ages: [0, 600], cut: null,
         })""",
         base64.b64encode(cells.tobytes()).decode(),
