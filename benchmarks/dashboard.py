@@ -64,8 +64,8 @@ class DashboardFigures:
     second in which nothing moved; `place`: seconds until the surface of a map is drawn as fine as
     its first view needs; `place_bytes`: of all that came for it; `cells`: that are drawn;
     `place_drawing`, `place_idle`: as `drawing` and `idle`; `gallery`: seconds until the newest
-    frames of a map of `frames` frames are there with their pictures; `gallery_bytes`: of all that came for it; `faults`: what
-    pages said in the console, and requests to other places.
+    frames of a map of `frames` frames are there with their pictures; `gallery_bytes`: of all that
+    came for it; `faults`: what pages said in the console, and requests to other places.
     """
 
     runs: int

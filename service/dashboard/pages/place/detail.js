@@ -12,6 +12,9 @@
  * @property {number} cell metres of a cell
  */
 
+/** A level of so few cells is drawn without coarser ones before it. */
+const FEW = 30_000;
+
 const keyOf = (column, row, floor) => `${column} ${row} ${floor}`;
 
 /** The tiles of one parent frame, level by level. */
@@ -27,10 +30,13 @@ export class Pyramid {
     this.levels = levels;
     this.#lists = levels.map(() => null);
     this.#within = levels.map(() => null);
+    const first = levels.findIndex((one) => one.cells <= FEW);
+    /** Place in `levels` of the coarsest pieces that are drawn. */
+    this.base = first < 0 ? levels.length - 1 : first;
   }
 
   /** The coarsest pieces; none before they are listed. */
-  get roots() { return this.#lists.at(-1) ?? []; }
+  get roots() { return this.#lists[this.base] ?? []; }
 
   /** Whether a level is listed. @param {number} place in `levels` */
   knows(place) { return this.#lists[place] !== null; }

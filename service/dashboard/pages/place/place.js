@@ -26,6 +26,7 @@ export const styles = ["paths/paths.css", "place/place.css", "query/alternatives
 /** How often a surface that is built is asked for, and one that may be soon. */
 const BUILDING_MS = 1500, WAITING_MS = 6000;
 const TOGETHER_MS = 1500; // frames of a burst are one look
+const CHANGES = new Set(["frame.indexed", "frame.deleted", "frame.edited", "surface.updated"]);
 /** Frames are told from so far below the plan to so far above it, metres. */
 const TALL = 1000;
 
@@ -98,7 +99,7 @@ class Place {
     surface.cut = Number.isFinite(low) || Number.isFinite(high) ? [Number.isFinite(low) ? low : -1e9, Number.isFinite(high) ? high : 1e9] : null;
     const names = surface.record.parents.map((one) => one.parent_frame);
     const onchange = () => this.address();
-    this.runs = new Runs({ ...told, names, onchange, onreveal: () => this.spot.close(), onframe: (...frame) => this.#frame(...frame) });
+    this.runs = new Runs({ ...told, names, onchange: () => { this.robots.draw(); onchange(); }, onreveal: () => this.spot.close(), onframe: (...frame) => this.#frame(...frame) });
     this.robots = new Robots({ map, signal, search, scene, runs: this.runs, onchange });
     this.shades = shades(surface, onchange);
     this.spot = sightings({ map, signal, onclose: () => this.#unmark() });
@@ -137,7 +138,7 @@ class Place {
   // the picture begins with the surface, or where there is none with the poses
   #frame(parent, reached, up, poses) {
     const { surface, scene } = this, told = surface.parent(parent), middle = surface.middle(parent);
-    const label = `The place ${this.map}, in ${parent}`;
+    const label = `The place ${this.map} in ${parent}; Enter lists the frames that saw its middle`;
     if (told && middle) {
       if (poses) return true;
       const own = { above: ["x", "y", "z"].map((k) => told.up[k]), ahead: told.y_axis };
@@ -148,6 +149,8 @@ class Place {
     } else {
       return false;
     }
+    this.spot.close(); // it was of another picture
+    this.tools.choose(null);
     this.#blind(parent);
     this.tools.enable(Boolean(told));
     surface.show(new Map([...reached].map(([name, one]) => [name, one.matrix])));
@@ -247,13 +250,14 @@ class Place {
   }
 
   async #again() {
-    const had = this.surface.record.parents.length;
+    const had = this.surface.record.parents.length, before = JSON.stringify(this.surface.record);
     try {
       await this.surface.load();
     } catch (error) {
       if (error.status !== 0 && error.status !== 503) throw error; // a service that restarts comes back
     }
     if (this.signal.aborted) return;
+    if (JSON.stringify(this.surface.record) === before) { this.#state(); return; } // nothing to draw
     if (had === 0 && this.surface.record.parents.length > 0) {
       this.runs.add(this.surface.record.parents.map((one) => one.parent_frame));
       await this.runs.draw();
@@ -265,10 +269,10 @@ class Place {
 
   #follow() {
     watch({
-      map: this.map, kinds: ["query.answered", "frame."], signal: this.signal,
+      map: this.map, kinds: ["query.answered", "frame.", "surface."], signal: this.signal,
       onevent: ({ kind }) => {
         if (kind === "query.answered") { this.robots.heard(); return; }
-        if (!["frame.indexed", "frame.deleted", "frame.edited"].includes(kind) || this.surface.record.state === "building") return;
+        if (!CHANGES.has(kind) || this.surface.record.state === "building") return;
         clearTimeout(this.#timer);
         this.#timer = setTimeout(() => this.#again(), TOGETHER_MS);
       },

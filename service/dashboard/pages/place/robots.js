@@ -74,6 +74,8 @@ export class Robots {
   live;
   /** @type {any} */
   bar;
+  /** @type {any} */
+  dates;
 
   /**
    * @param {{map: string, signal: AbortSignal, search: URLSearchParams,
@@ -102,8 +104,10 @@ export class Robots {
     this.period = h("select", { id: "place-period", "aria-label": "Period", onChange: () => this.#choose(this.period.value) });
     this.live = h("button", { class: "button", type: "button", hidden: true, onClick: () => { this.stop(); this.#go(this.#records.length); } }, "Latest");
     this.bar = h("div", { class: "place-time", role: "group", "aria-label": "Queries over time" }, this.play, this.slider, this.told, this.live, this.period);
+    const date = (id, text) => h("label", { class: "field" }, h("span", {}, text), h("input", { type: "datetime-local", id, onChange: () => this.#between() }));
+    this.dates = h("details", { class: "place-dates" }, h("summary", {}, "Another period"), date("place-since", "From"), date("place-until", "To"));
     this.section = h("section", { class: "card paths-section", "aria-labelledby": "place-robots" },
-      h("h2", { id: "place-robots" }, "Robots"), this.none, this.list);
+      h("h2", { id: "place-robots" }, "Robots"), this.none, this.list, this.dates);
   }
 
   /** Read the records of the period. */
@@ -252,9 +256,17 @@ export class Robots {
 
   async #choose(hours) {
     if (hours === "chosen") return;
+    await this.#read(hours ? new Date(Date.now() - Number(hours) * HOUR_MS).toISOString() : null, null);
+  }
+
+  async #between() {
+    const [since, until] = [...this.dates.querySelectorAll("input")].map((one) => (one.value ? new Date(one.value).toISOString() : null));
+    await this.#read(since, until);
+  }
+
+  async #read(since, until) {
     this.stop();
-    this.since = hours ? new Date(Date.now() - Number(hours) * HOUR_MS).toISOString() : null;
-    this.until = this.at = null;
+    [this.since, this.until, this.at] = [since, until, null];
     await this.load();
     this.onchange();
   }

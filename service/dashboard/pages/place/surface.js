@@ -22,8 +22,8 @@ const KEPT = 1_000_000;
 const PAUSE_MS = 120;
 /** Shares of the cells that are lower and higher than the colours of heights reach. */
 const OUTER = 0.01;
-/** A ceiling: above this share of the heights, over so many of the columns. */
-const CEILING = 0.7, COVERED = 0.65;
+/** A ceiling: above this share of the heights, over so many of the columns, of so many cells' width. */
+const CEILING = 0.7, COVERED = 0.65, COLUMN = 16;
 
 export class Surface {
   /** @type {any} as the API tells it; null before `load` */
@@ -108,7 +108,7 @@ export class Surface {
       return;
     }
     this.scene.viewer.cells("surface", { tiles: [], extent: this.#extent(), ...this.#look() });
-    await Promise.all(here.map((one) => this.#list(one, one.levels.length - 1)));
+    await Promise.all(here.map((one) => this.#list(one, one.base)));
     this.update();
   }
 
@@ -247,15 +247,16 @@ export class Surface {
   // heights and counts that colours reach to, by the coarsest cells
   #measure(here) {
     const { above, right, ahead } = this.scene.axes, base = dot(above, this.scene.origin);
-    const heights = [], seen = [], columns = new Map();
+    const heights = [], seen = [], columns = new Map(), wide = COLUMN * here[0].levels[0].cell_m;
     for (const piece of here.flatMap((one) => one.roots)) {
       const data = this.#bytes.get(piece.digest), matrix = this.#matrix(piece), codes = new Uint8Array(data);
       for (let i = 0; i * STRIDE < data.byteLength; i += 1) {
         const p = transformed(matrix, placeIn({ data, span: piece.span }, i)), height = dot(above, p) + base;
         heights.push(height);
         seen.push(codes[i * STRIDE + 3]);
-        const key = [right, ahead].map((axis) => Math.floor(dot(axis, p) / piece.cell)).join(" ");
-        columns.set(key, [...(columns.get(key) ?? []), height]);
+        const key = [right, ahead].map((axis) => Math.floor(dot(axis, p) / wide)).join(" ");
+        const [low, high] = columns.get(key) ?? [height, height];
+        columns.set(key, [Math.min(low, height), Math.max(high, height)]);
       }
     }
     const least = (values, share) => values[Math.min(Math.floor(share * values.length), values.length - 1)];
@@ -330,7 +331,7 @@ export class Surface {
 
 /**
  * Heights to draw so that a ceiling does not hide what is under it; null: there is none.
- * @param {number[][]} columns heights of the cells of each column of the plan
+ * @param {number[][]} columns the lowest and the highest cell of each column of the plan
  * @param {number[]} range the lowest and the highest @returns {number[] | null}
  */
 export function ceiling(columns, [low, high]) {
