@@ -368,26 +368,30 @@ def test_detail_by_value(page: Page, station: Any, settle: Any) -> None:
             "digest": f"{column} {row}",
         }
 
-    fine = [tile(0, 0, 100), tile(3, 3, 100), tile(-1, 0, 50), tile(4, 0, 500)]
+    fine = [
+        tile(0, 0, 100), tile(2, 2, 900), tile(3, 3, 100), tile(-1, 0, 50), tile(4, 0, 500)
+    ]  # fmt: skip
     coarse = [tile(0, 0, 20), tile(-1, 0, 5), tile(1, 0, 30)]
     script = """(() => {
       const p = new m.Pyramid("a", given[0]);
       p.list(1, given[2]); if (given[1]) p.list(0, given[1]);
-      const size = (one) => ({ "0 0": 9, "-1 0": 7, "1 0": 8 })[one.digest] ?? 1;
+      const size = (one) => ({ "0 0": 9, "-1 0": 7, "1 0": 8, "2 2": 0 })[one.digest] ?? 1;
       const parts = (one) => p.parts(one);
       const found = m.refine(p.roots, { parts, size, budget: given[3], least: 2 });
       const cover = m.cover(p.roots, { refined: found.refined, parts,
+        isSeen: (one) => size(one) > 0,
         there: (one) => one.level === 1 || !given[4].includes(one.digest) });
       const names = (all) => all.map((one) => `${one.level}:${one.digest}`);
       return [names([...found.refined]), found.cells, [...found.coarse], names(cover.drawn),
         names(cover.missing)];
     })()"""
-    # all but the largest fits: the one at 1 0 would take 500
-    assert run("detail", script, levels, fine, coarse, 400, []) == [
+    # all but the largest fits: the one at 1 0 would take 500. What is not in view is not counted,
+    # and drawn if it is there
+    assert run("detail", script, levels, fine, coarse, 400, ["2 2"]) == [
         ["1:0 0", "1:-1 0"], 280, [], ["0:0 0", "0:3 3", "0:-1 0", "1:1 0"], []
     ]  # fmt: skip
     # one of its parts is on its way: the coarse tile stays until then
-    assert run("detail", script, levels, fine, coarse, 400, ["3 3"])[3:] == [
+    assert run("detail", script, levels, fine, coarse, 400, ["2 2", "3 3"])[3:] == [
         ["1:0 0", "0:-1 0", "1:1 0"], ["0:3 3"]
     ]  # fmt: skip
     # the finer level is not listed yet

@@ -29,8 +29,11 @@ const ASIDE = { azimuth: 0.6, elevation: 0.55 };
 /** Colour of a run: a token of paths.css. @param {number} number */
 export const tokenOf = (number) => `--path-${number % COLOURS}`;
 
-/** The same as the theme has it now: red, green, blue. @param {number} number */
-export const tintOf = (number) => rgb(getComputedStyle(document.documentElement).getPropertyValue(tokenOf(number)));
+/** That of a run. @param {import("./data.js").Run} run */
+export const runToken = (run) => tokenOf(run.number);
+
+/** The same as the theme has it now: red, green, blue. @param {import("./data.js").Run} run */
+export const tintOf = (run) => rgb(getComputedStyle(document.documentElement).getPropertyValue(runToken(run)));
 
 /**
  * @param {HTMLElement} place where the canvas goes
@@ -307,7 +310,7 @@ export class Scene {
 
   #paint() {
     this.#drawn.forEach((one, i) => {
-      const tint = tintOf(one.number);
+      const tint = tintOf(one);
       for (const kind of ["path", "frustums"]) this.#viewer.lines(`${kind} ${i}`, { tint });
     });
   }
@@ -315,7 +318,7 @@ export class Scene {
   #label() {
     const made = [];
     this.#drawn.forEach((one, i) => {
-      if (one.world.length) made.push({ path: i, at: this.near(placeOf(one.world[0])), node: h("span", { class: "paths-label", style: { borderColor: `var(${tokenOf(one.number)})` } }, String(i + 1)) });
+      if (one.world.length) made.push({ path: i, at: this.near(placeOf(one.world[0])), node: h("span", { class: "paths-label", style: { borderColor: `var(${runToken(one)})` } }, String(i + 1)) });
     });
     this.#asked?.alternatives.forEach((pose, i) => {
       made.push({ at: this.near(placeOf(pose)), node: h("span", { class: "paths-label", dataset: { kind: "alternative" } }, letterOf(i)) });

@@ -67,46 +67,59 @@ export class Pyramid {
  * @param {Piece[]} roots
  * @param {{parts: (piece: Piece) => Piece[] | null, size: (piece: Piece) => number, budget: number,
  *   least: number}} how size: pixels of a cell on the screen, 0 of what is not in view; budget: cells
- *   that are drawn, at most, if the roots are no more; least: a cell of fewer pixels is fine enough
- * @returns {{refined: Set<Piece>, cells: number, coarse: Set<number>}} coarse: levels whose pieces should be
- *   drawn in finer ones, if these were listed
+ *   in view that are drawn, at most, if the roots are no more; least: a cell of fewer pixels is fine
+ *   enough
+ * @returns {{refined: Set<Piece>, cells: number, coarse: Set<number>}} cells: in view; coarse: levels whose
+ *   pieces should be drawn in finer ones, if these were listed
  */
 export function refine(roots, { parts, size, budget, least }) {
   const refined = new Set(), coarse = new Set();
-  let cells = roots.reduce((sum, one) => sum + one.cells, 0);
-  const open = roots.map((piece) => ({ piece, pixels: size(piece) }));
+  const seen = (pieces) => pieces.map((piece) => ({ piece, pixels: size(piece) })).filter((one) => one.pixels > 0);
+  const count = (ones) => ones.reduce((sum, one) => sum + one.piece.cells, 0);
+  const open = seen(roots);
+  let cells = count(open);
   while (open.length) {
     let first = 0;
     for (let i = 1; i < open.length; i += 1) if (open[i].pixels > open[first].pixels) first = i;
     const [{ piece, pixels }] = open.splice(first, 1);
     if (pixels <= least) break; // so are all others
-    const finer = parts(piece);
-    if (finer === null) { if (piece.level > 0) coarse.add(piece.level); continue; }
-    const more = finer.reduce((sum, one) => sum + one.cells, 0) - piece.cells;
+    const all = parts(piece);
+    if (all === null) { if (piece.level > 0) coarse.add(piece.level); continue; }
+    const finer = seen(all), more = count(finer) - piece.cells;
     if (cells + more > budget) continue;
     cells += more;
     refined.add(piece);
-    for (const one of finer) open.push({ piece: one, pixels: size(one) });
+    open.push(...finer);
   }
   return { refined, cells, coarse };
 }
 
 /**
- * What can be drawn of it now: a piece stays until all that replaces it is there.
+ * What can be drawn of it now: a piece stays until all in view that replaces it is there.
  * @param {Piece[]} roots
- * @param {{refined: Set<Piece>, parts: (piece: Piece) => Piece[] | null, there: (piece: Piece) => boolean}} what
+ * @param {{refined: Set<Piece>, parts: (piece: Piece) => Piece[] | null, there: (piece: Piece) => boolean,
+ *   isSeen: (piece: Piece) => boolean}} what
  * @returns {{drawn: Piece[], missing: Piece[]}} missing: the coarser ones first
  */
-export function cover(roots, { refined, parts, there }) {
+export function cover(roots, { refined, parts, there, isSeen }) {
   const missing = [];
   const of = (piece) => {
     const own = there(piece);
-    if (!own) missing.push(piece);
-    if (!refined.has(piece)) return own ? [piece] : null;
+    if (!refined.has(piece)) {
+      if (own) return [piece];
+      if (!isSeen(piece)) return [];
+      missing.push(piece);
+      return null;
+    }
+    if (!own) missing.push(piece); // others are drawn before it is
     const all = (parts(piece) ?? []).map(of);
     if (all.every((one) => one !== null)) return all.flat();
     return own ? [piece] : null;
   };
-  const drawn = roots.flatMap((one) => of(one) ?? []);
+  const drawn = roots.flatMap((one) => {
+    const found = of(one);
+    if (!there(one) && !missing.includes(one)) missing.push(one); // all of them: what comes into view is there
+    return found ?? [];
+  });
   return { drawn, missing: missing.sort((a, b) => b.level - a.level) };
 }

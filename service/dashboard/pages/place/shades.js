@@ -2,7 +2,7 @@
 
 import { h, put } from "../lib/dom.js";
 import { count, time } from "../lib/format.js";
-import { tokenOf } from "../paths/scene.js";
+import { runToken } from "../paths/scene.js";
 
 export const COLOURS = [["height", "Height"], ["session", "Session"], ["seen", "Times seen"], ["age", "Last seen"]];
 const MOST_SESSIONS = 12;
@@ -60,7 +60,7 @@ export function shades(surface, onchange) {
     if (surface.colour === "height") put(legend, ramp(...heights.map((x) => `${x.toFixed(1)} m`)));
     if (surface.colour === "seen") put(legend, ramp("1 frame", `${count(surface.mostSeen)} frames`));
     if (surface.colour === "age") put(legend, record.first_taken ? ramp(["seen ", time(record.first_taken)], time(record.last_taken)) : h("p", { class: "muted" }, "No frame says when it was taken: send `captured_at` with frames."));
-    if (surface.colour === "session") put(legend, sessions(record.sessions, surface.numbers));
+    if (surface.colour === "session") put(legend, sessions(record.sessions, surface.runs));
     const [low, high] = surface.cut ?? [-1e9, 1e9];
     [low, high].forEach((height, i) => { ends[i].value = String(Math.min(Math.max(stepAt(height), 0), STEPS)); });
     tell();
@@ -71,13 +71,13 @@ export function shades(surface, onchange) {
   return { element, draw };
 }
 
-function sessions(names, numbers) {
+function sessions(names, runs) {
   if (!names.length) return h("p", { class: "muted" }, "No frame has a session.");
   const shown = names.slice(-MOST_SESSIONS);
   return [
     h("ul", { class: "place-sessions" }, shown.map((name, i) => {
-      const number = numbers[names.length - shown.length + i] ?? null;
-      return h("li", {}, h("span", { class: "place-swatch", style: { background: number === null ? "var(--muted)" : `var(${tokenOf(number)})` } }), h("span", { class: "paths-name" }, name));
+      const run = runs[names.length - shown.length + i] ?? null;
+      return h("li", {}, h("span", { class: "place-swatch", style: { background: run === null ? "var(--muted)" : `var(${runToken(run)})` } }), h("span", { class: "paths-name" }, name));
     })),
     h("p", { class: "muted" }, `A cell has the colour of the session that saw it last.${names.length > shown.length ? ` The last ${count(shown.length)} of ${count(names.length)}.` : ""}`),
   ];

@@ -3,7 +3,7 @@
 import { at, bytes, get } from "../lib/api.js";
 import { tintOf } from "../paths/scene.js";
 import { reachAlong } from "../paths/shapes.js";
-import { cellUnder, placeIn, STRIDE } from "../viewer/cells.js";
+import { cellUnder, cornersOf, isInView, placeIn, STRIDE } from "../viewer/cells.js";
 import { VIEW } from "../viewer/camera.js";
 import { colourOf } from "../viewer/colours.js";
 import { around, movedBox } from "../viewer/layers.js";
@@ -20,6 +20,11 @@ const MOST_LISTED = 20_000, PAGE = 1000;
 /** Cells that stay in memory, drawn or not. */
 const KEPT = 1_000_000;
 const PAUSE_MS = 120;
+/** Where even the coarsest cells are too many, every how many-th is drawn at most; and by what share of
+ * the budget more are not too many. */
+const MOST_THINNED = 31, SLACK = 0.2;
+/** What is so near the edge of the picture comes into view soon. */
+const MARGIN = 1.25;
 /** Shares of the cells that are lower and higher than the colours of heights reach. */
 const OUTER = 0.01;
 /** A ceiling: above this share of the heights, over so many of the columns, of so many cells' width. */
@@ -53,8 +58,8 @@ export class Surface {
   /** @type {number[] | null} heights that are drawn */
   cut = null;
   colour = "height";
-  /** @type {(number | null)[]} numbers of runs by session */
-  numbers = [];
+  /** @type {(import("../paths/data.js").Run | null)[]} a run of each session, whose colour it has */
+  runs = [];
   /** @type {Set<string>} digests that are gone, until the API tells others */
   #gone = new Set();
 
@@ -145,19 +150,20 @@ export class Surface {
     const here = this.#here(), { viewer } = this.scene;
     if (this.signal.aborted || !here.length || !viewer?.available) return;
     const size = this.#sizes(viewer), wanted = [], drawn = [];
-    let isWhole = true;
+    let isWhole = true, cells = 0;
     const budget = (this.#budget ??= viewer.isFast ? FAST_BUDGET : BUDGET) / here.length;
     for (const pyramid of here) {
       const parts = (piece) => pyramid.parts(piece);
-      const { refined, coarse } = refine(pyramid.roots, { parts, size, budget, least: FINE_PX });
+      const { refined, coarse, cells: own } = refine(pyramid.roots, { parts, size, budget, least: FINE_PX });
+      cells += own;
       isWhole &&= coarse.size === 0;
       for (const level of coarse) this.#list(pyramid, level - 1).then(() => this.later());
-      const found = cover(pyramid.roots, { refined, parts, there: (piece) => this.#bytes.has(piece.digest) });
+      const found = cover(pyramid.roots, { refined, parts, there: (piece) => this.#bytes.has(piece.digest), isSeen: (piece) => size(piece) > 0 });
       wanted.push(...found.missing);
       drawn.push(...found.drawn);
     }
     if (this.range === null && here.every((one) => one.roots.length && one.roots.every((piece) => this.#bytes.has(piece.digest)))) this.#measure(here);
-    this.#draw(drawn);
+    this.#draw(drawn, Math.min(Math.ceil(cells / (budget * here.length) - SLACK), MOST_THINNED));
     this.#fetch(wanted);
     if (isWhole && !wanted.length && drawn.length && !this.#isMarked) {
       this.#isMarked = true;
@@ -170,14 +176,11 @@ export class Surface {
     const { clip, orbit, canvas } = viewer, focal = canvas.clientHeight / 2 / Math.tan(VIEW / 2);
     const eye = orbit.eye();
     return (piece) => {
-      const matrix = this.#matrix(piece), { span } = piece;
-      const corners = Array.from({ length: 8 }, (_, i) => transformed(matrix, [0, 1, 2].map((k) => ((i >> k) & 1 ? span : 0))));
-      const seen = corners.map((p) => transformed(clip, p));
-      const outside = [0, 1].some((k) => seen.every((p) => p[k] > p[3]) || seen.every((p) => p[k] < -p[3]));
-      if (outside || this.#isCut(corners)) return 0;
+      const tile = { matrix: this.#matrix(piece), span: piece.span }, corners = cornersOf(tile);
+      if (!isInView(tile, clip, MARGIN) || this.#isCut(corners)) return 0;
       const middle = [0, 1, 2].map((k) => (corners[0][k] + corners[7][k]) / 2);
-      const away = orbit.flat ? orbit.distance : Math.hypot(...middle.map((x, k) => x - eye[k])) - 0.87 * span;
-      return (piece.cell * focal) / Math.max(away, span / 4);
+      const away = orbit.flat ? orbit.distance : Math.hypot(...middle.map((x, k) => x - eye[k])) - 0.87 * piece.span;
+      return (piece.cell * focal) / Math.max(away, piece.span / 4);
     };
   }
 
@@ -194,16 +197,16 @@ export class Surface {
     return this.scene.moveOrigin([...matrix.slice(0, 12), ...transformed(matrix, corner)]);
   }
 
-  #draw(pieces) {
+  #draw(pieces, every) {
     const names = pieces.map((one) => `${one.parent} ${one.level} ${one.column} ${one.row} ${one.floor} ${one.digest}`);
-    const all = names.join("\n");
+    const all = [every, ...names].join("\n");
     if (all === this.#drawn) return;
     this.#drawn = all;
     this.#tiles = pieces.map((piece, i) => ({
       name: names[i], data: this.#bytes.get(piece.digest), span: piece.span, cell: piece.cell,
       matrix: this.#matrix(piece), piece,
     }));
-    this.scene.viewer.cells("surface", { tiles: this.#tiles, extent: this.#extent(), ...this.#look() });
+    this.scene.viewer.cells("surface", { tiles: this.#tiles, every: Math.max(every, 1), extent: this.#extent(), ...this.#look() });
   }
 
   /** How cells are drawn, for the viewer. */
@@ -225,17 +228,16 @@ export class Surface {
     if (this.scene.viewer?.has("surface")) this.scene.viewer.cells("surface", this.#look());
   }
 
-  /** Runs of the map, whose colours their sessions have. @param {Object<string, any>[]} runs */
+  /** Give sessions the colours of their runs. @param {import("../paths/data.js").Run[]} runs of the map */
   colours(runs) {
-    const numbers = new Map();
-    for (const one of runs) if (!numbers.has(one.session)) numbers.set(one.session, one.number);
-    this.numbers = this.record.sessions.map((name) => numbers.get(name) ?? null);
+    const named = new Map(runs.slice().reverse().map((one) => [one.session, one])); // the first of a name
+    this.runs = this.record.sessions.map((name) => named.get(name) ?? null);
     this.paint({});
   }
 
   /** Colours of sessions, as the theme has them. */
   palette() {
-    return Uint8Array.from(this.numbers.flatMap((one) => (one === null ? colourOf("muted") : tintOf(one))));
+    return Uint8Array.from(this.runs.flatMap((one) => (one === null ? colourOf("muted") : tintOf(one))));
   }
 
   #extent() {

@@ -23,7 +23,7 @@ const WIDER = 1.3;
 
 export class CellsLayer extends Layer {
   kind = "cells";
-  /** @type {Map<string, {array: any, buffer: any, count: number}>} */
+  /** @type {Map<string, {array: any, buffer: any, count: number, every: number}>} */
   #held = new Map();
 
   set(told) {
@@ -52,16 +52,17 @@ export class CellsLayer extends Layer {
   }
 
   #buffers(gl, { name, data }) {
-    const known = this.#held.get(name);
-    if (known) return known;
-    const made = { array: gl.createVertexArray(), buffer: gl.createBuffer(), count: Math.floor(data.byteLength / STRIDE) };
+    const known = this.#held.get(name), every = this.every ?? 1, stride = every * STRIDE;
+    if (known?.every === every) return known;
+    if (known) this.#drop(gl, name, known);
+    const made = { array: gl.createVertexArray(), buffer: gl.createBuffer(), count: Math.ceil(Math.floor(data.byteLength / STRIDE) / every), every };
     gl.bindVertexArray(made.array);
     gl.bindBuffer(gl.ARRAY_BUFFER, made.buffer);
     gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
     gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 4, gl.UNSIGNED_BYTE, STRIDE, 0);
+    gl.vertexAttribIPointer(0, 4, gl.UNSIGNED_BYTE, stride, 0);
     gl.enableVertexAttribArray(1);
-    gl.vertexAttribIPointer(1, 2, gl.UNSIGNED_SHORT, STRIDE, 4);
+    gl.vertexAttribIPointer(1, 2, gl.UNSIGNED_SHORT, stride, 4);
     this.#held.set(name, made);
     return made;
   }
@@ -84,15 +85,27 @@ export class CellsLayer extends Layer {
     gl.uniform2fv(at.ages, this.ages);
     gl.bindTexture(gl.TEXTURE_2D, this.made.texture);
     for (const one of this.tiles) {
+      if (!isInView(one, view.clip, 1)) continue;
       const { array, count } = this.#buffers(gl, one);
       gl.uniformMatrix4fv(at.model, false, one.matrix);
       gl.uniform1f(at.span, one.span);
-      gl.uniform1f(at.size, one.cell * WIDER * view.pixelsAtOneMetre);
+      gl.uniform1f(at.size, one.cell * WIDER * Math.sqrt(this.every ?? 1) * view.pixelsAtOneMetre);
       gl.bindVertexArray(array);
       gl.drawArrays(gl.POINTS, 0, count);
     }
   }
 }
+
+/** Whether a tile may be in the picture. @param {{matrix: number[], span: number}} tile @param {ArrayLike<number>} clip
+ * world to clip coordinates @param {number} margin of the picture's width and height: 1 is its edge */
+export function isInView({ matrix, span }, clip, margin) {
+  const seen = cornersOf({ matrix, span }).map((p) => transformed(/** @type {any} */ (clip), p));
+  return ![0, 1].some((k) => seen.every((p) => p[k] > margin * p[3]) || seen.every((p) => p[k] < -margin * p[3]));
+}
+
+/** @param {{matrix: number[], span: number}} tile @returns {number[][]} in the picture's frame */
+export const cornersOf = ({ matrix, span }) =>
+  Array.from({ length: 8 }, (_, i) => transformed(matrix, [0, 1, 2].map((k) => ((i >> k) & 1 ? span : 0))).slice(0, 3));
 
 /** Where a cell is, metres from the corner of its tile. @param {{data: ArrayBuffer, span: number}} tile @param {number} i */
 export function placeIn({ data, span }, i) {
@@ -124,8 +137,8 @@ export function cellUnder(tiles, project, { x, y, near, allowed }) {
 }
 
 /** Whether a tile may be drawn near a place of the canvas. */
-function reaches({ span, matrix }, project, x, y, near) {
-  const corners = Array.from({ length: 8 }, (_, i) => project(transformed(matrix, [0, 1, 2].map((k) => ((i >> k) & 1 ? span : 0)))));
+function reaches(tile, project, x, y, near) {
+  const corners = cornersOf(tile).map(project);
   if (corners.some((one) => one === null)) return true; // it is about the eye
   const within = (k, at) => Math.min(...corners.map((one) => one[k])) - near <= at && at <= Math.max(...corners.map((one) => one[k])) + near;
   return within(0, x) && within(1, y);

@@ -51,6 +51,8 @@ export class Layer {
   // of cells, see cells.js
   /** @type {import("./cells.js").Tile[] | undefined} */
   tiles;
+  /** @type {number | undefined} every how many-th cell is drawn, up to 31 */
+  every;
   /** @type {{low: number[], high: number[]} | undefined} all there is, whether it is drawn or not */
   extent;
   /** @type {Uint8Array | undefined} rgb of each session */

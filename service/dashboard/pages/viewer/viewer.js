@@ -288,15 +288,15 @@ export class Viewer {
       canvas.width = width;
       canvas.height = height;
     }
+    const clip = this.#clip();
     const view = {
-      density, heights: this.#heights(), pixelsAtOneMetre: height / 2 / Math.tan(VIEW / 2),
+      clip, density, heights: this.#heights(), pixelsAtOneMetre: height / 2 / Math.tan(VIEW / 2),
     };
     gl.viewport(0, 0, width, height);
     gl.clearColor(...colourOf(this.background).map((x) => x / 255), 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA); // colours come times alpha
-    const clip = this.#clip();
     const clear = (one) => one.kind === "triangles" && (one.alpha ?? 1) < 1;
     const layers = [...this.#layers.values()].filter((one) => one.visible);
     for (const kind of ["cells", "points", "lines", "triangles"]) {
