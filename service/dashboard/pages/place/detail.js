@@ -28,6 +28,8 @@ export class Pyramid {
   constructor(parent, levels) {
     this.parent = parent;
     this.levels = levels;
+    /** @type {Set<number>} places in `levels` whose tiles are on their way */
+    this.coming = new Set();
     this.#lists = levels.map(() => null);
     this.#within = levels.map(() => null);
     const first = levels.findIndex((one) => one.cells <= FEW);
@@ -99,11 +101,13 @@ export function refine(roots, { parts, size, budget, least }) {
  * @param {Piece[]} roots
  * @param {{refined: Set<Piece>, parts: (piece: Piece) => Piece[] | null, there: (piece: Piece) => boolean,
  *   isSeen: (piece: Piece) => boolean}} what
- * @returns {{drawn: Piece[], missing: Piece[]}} missing: the coarser ones first
+ * @returns {{drawn: Piece[], missing: Piece[], needed: Set<Piece>}} missing: the coarser ones first;
+ *   needed: both, and those that wait for others
  */
 export function cover(roots, { refined, parts, there, isSeen }) {
-  const missing = [];
+  const missing = [], needed = new Set(roots);
   const of = (piece) => {
+    needed.add(piece);
     const own = there(piece);
     if (!refined.has(piece)) {
       if (own) return [piece];
@@ -121,5 +125,5 @@ export function cover(roots, { refined, parts, there, isSeen }) {
     if (!there(one) && !missing.includes(one)) missing.push(one); // all of them: what comes into view is there
     return found ?? [];
   });
-  return { drawn, missing: missing.sort((a, b) => b.level - a.level) };
+  return { drawn, missing: missing.sort((a, b) => b.level - a.level), needed };
 }

@@ -99,7 +99,10 @@ class Place {
     surface.cut = Number.isFinite(low) || Number.isFinite(high) ? [Number.isFinite(low) ? low : -1e9, Number.isFinite(high) ? high : 1e9] : null;
     const names = surface.record.parents.map((one) => one.parent_frame);
     const onchange = () => this.address();
-    this.runs = new Runs({ ...told, names, onchange: () => { this.robots.draw(); onchange(); }, onreveal: () => this.spot.close(), onframe: (...frame) => this.#frame(...frame) });
+    this.runs = new Runs({
+      ...told, names, onchange: () => { this.robots.draw(); onchange(); }, onreveal: () => this.spot.close(),
+      onframe: (...frame) => this.#frame(...frame),
+    });
     this.robots = new Robots({ map, signal, search, scene, runs: this.runs, onchange });
     this.shades = shades(surface, onchange);
     this.spot = sightings({ map, signal, onclose: () => this.#unmark() });
@@ -152,7 +155,7 @@ class Place {
     this.spot.close(); // it was of another picture
     this.tools.choose(null);
     this.#blind(parent);
-    this.tools.enable(Boolean(told));
+    this.tools.offer(Boolean(told));
     surface.show(new Map([...reached].map(([name, one]) => [name, one.matrix])));
     scene.look("keep");
     return true;
@@ -188,7 +191,7 @@ class Place {
       this.scene.look(flat ? "plan" : "space");
       this.address();
     }
-    if (!flat) this.tools.choose(null);
+    if (!flat && this.tools.tool === "box") this.tools.choose(null);
   }
 
   #unmark() {
@@ -202,7 +205,7 @@ class Place {
     this.scene.mark("spot", [{ at: world, node: h("span", { class: "paths-label", dataset: { kind: "selected" } }, "Spot") }]);
     const text = place.map((v) => v.toFixed(2)).join(", ");
     await this.spot.show({
-      title: `Frames that saw ${text}`, none: "No frame saw this spot from where it is visible now.",
+      title: `Frames that saw ${text}`, none: "No frame saw this spot.",
       params: { parent, at: place.map((v) => v.toFixed(4)).join(","), radius: cell },
     });
   }

@@ -46,7 +46,7 @@ export function shades(surface, onchange) {
   }
 
   function tell() {
-    const text = ends.map((one) => `${metresAt(Number(one.value)).toFixed(1)} m`);
+    const text = ends.map((one) => tenths(metresAt(Number(one.value))));
     put(told, surface.cut === null ? "all" : text.join(" to "));
     ends.forEach((one, i) => one.setAttribute("aria-valuetext", text[i]));
   }
@@ -57,7 +57,7 @@ export function shades(surface, onchange) {
     if (!record?.parents.length || heights === null) return;
     element.hidden = false;
     const ramp = (low, high) => [h("span", { class: "place-ramp", "aria-hidden": "true" }), h("span", { class: "paths-row number" }, h("span", {}, low), h("span", {}, high))];
-    if (surface.colour === "height") put(legend, ramp(...heights.map((x) => `${x.toFixed(1)} m`)));
+    if (surface.colour === "height") put(legend, ramp(...heights.map(tenths)));
     if (surface.colour === "seen") put(legend, ramp("1 frame", `${count(surface.mostSeen)} frames`));
     if (surface.colour === "age") put(legend, record.first_taken ? ramp(["seen ", time(record.first_taken)], time(record.last_taken)) : h("p", { class: "muted" }, "No frame says when it was taken: send `captured_at` with frames."));
     if (surface.colour === "session") put(legend, sessions(record.sessions, surface.runs));
@@ -70,6 +70,9 @@ export function shades(surface, onchange) {
 
   return { element, draw };
 }
+
+// a height; no "-0.0"
+const tenths = (x) => `${(Math.round(10 * x) / 10 || 0).toFixed(1)} m`;
 
 function sessions(names, runs) {
   if (!names.length) return h("p", { class: "muted" }, "No frame has a session.");

@@ -17,7 +17,7 @@ const FINE_PX = 2.5;
 const AT_ONCE = 6;
 /** Tiles of a level that are listed: of a larger map the next coarser level is drawn. */
 const MOST_LISTED = 20_000, PAGE = 1000;
-/** Cells that stay in memory, drawn or not. */
+/** Cells that stay in memory, if they are not needed. */
 const KEPT = 1_000_000;
 const PAUSE_MS = 120;
 /** Where even the coarsest cells are too many, every how many-th is drawn at most; and by what share of
@@ -41,7 +41,8 @@ export class Surface {
   #shown = new Map();
   /** @type {Set<string>} digests that are on their way */
   #coming = new Set();
-  #listing = new Set();
+  /** @type {Set<string>} digests that are needed for what is looked at */
+  #needed = new Set();
   /** @type {any[]} drawn now, see viewer/cells.js */
   #tiles = [];
   #drawn = "";
@@ -49,6 +50,7 @@ export class Surface {
   #timer = null;
   /** @type {number[] | null} heights that colours reach from and to; null before they are known */
   range = null;
+  #isMeasured = false;
   #most = 255;
   /** @type {number | null} */
   #budget = null;
@@ -73,17 +75,21 @@ export class Surface {
     this.scene = scene;
     this.onready = onready;
     signal.addEventListener("abort", () => clearTimeout(this.#timer), { once: true });
+    window.addEventListener("sceneprint:theme", () => this.paint({}), { signal });
   }
 
   /** Ask what there is. @returns {Promise<any>} the record */
   async load() {
     const before = this.record?.updated_at;
     this.record = await get(at("maps", this.map, "surface"), { signal: this.signal });
-    if (this.record.updated_at !== before) {
-      this.#gone.clear();
-      this.#pyramids = new Map(this.record.parents.map((one) => [one.parent_frame, new Pyramid(one.parent_frame, one.levels)]));
-      if (this.#shown.size) await this.show(this.#shown);
-    }
+    if (this.record.updated_at === before) return this.record;
+    this.#gone.clear();
+    const pyramids = new Map(this.record.parents.map((one) => [one.parent_frame, new Pyramid(one.parent_frame, one.levels)]));
+    const shown = [...pyramids.values()].filter((one) => this.#shown.has(one.parent));
+    await Promise.all(shown.map((one) => this.#list(one, one.base))); // what is drawn stays until then
+    this.#pyramids = pyramids;
+    this.#isMeasured = false;
+    this.update();
     return this.record;
   }
 
@@ -105,6 +111,7 @@ export class Surface {
   async show(parents) {
     this.#shown = parents;
     this.#drawn = "";
+    this.#isMeasured = false;
     this.range = null;
     const here = this.#here();
     if (!here.length || !this.scene.viewer?.available) {
@@ -122,9 +129,9 @@ export class Surface {
   }
 
   async #list(pyramid, place) {
-    const key = `${pyramid.parent} ${place}`;
-    if (pyramid.knows(place) || this.#listing.has(key) || pyramid.levels[place].tiles > MOST_LISTED) return;
-    this.#listing.add(key);
+    const isMuch = place !== pyramid.base && pyramid.levels[place].tiles > MOST_LISTED;
+    if (pyramid.knows(place) || pyramid.coming.has(place) || isMuch) return;
+    pyramid.coming.add(place);
     try {
       const found = [];
       let cursor = null;
@@ -136,7 +143,7 @@ export class Surface {
       } while (cursor !== null);
       pyramid.list(place, found);
     } finally {
-      this.#listing.delete(key);
+      pyramid.coming.delete(place);
     }
   }
 
@@ -150,6 +157,7 @@ export class Surface {
     const here = this.#here(), { viewer } = this.scene;
     if (this.signal.aborted || !here.length || !viewer?.available) return;
     const size = this.#sizes(viewer), wanted = [], drawn = [];
+    this.#needed = new Set();
     let isWhole = true, cells = 0;
     const budget = (this.#budget ??= viewer.isFast ? FAST_BUDGET : BUDGET) / here.length;
     for (const pyramid of here) {
@@ -159,10 +167,11 @@ export class Surface {
       isWhole &&= coarse.size === 0;
       for (const level of coarse) this.#list(pyramid, level - 1).then(() => this.later());
       const found = cover(pyramid.roots, { refined, parts, there: (piece) => this.#bytes.has(piece.digest), isSeen: (piece) => size(piece) > 0 });
+      for (const piece of found.needed) this.#needed.add(piece.digest);
       wanted.push(...found.missing);
       drawn.push(...found.drawn);
     }
-    if (this.range === null && here.every((one) => one.roots.length && one.roots.every((piece) => this.#bytes.has(piece.digest)))) this.#measure(here);
+    if (!this.#isMeasured && here.every((one) => one.roots.length && one.roots.every((piece) => this.#bytes.has(piece.digest)))) this.#measure(here);
     this.#draw(drawn, Math.min(Math.ceil(cells / (budget * here.length) - SLACK), MOST_THINNED));
     this.#fetch(wanted);
     if (isWhole && !wanted.length && drawn.length && !this.#isMarked) {
@@ -174,13 +183,17 @@ export class Surface {
   /** How large a cell of a piece is on the screen: 0 out of view. @returns {(piece: any) => number} */
   #sizes(viewer) {
     const { clip, orbit, canvas } = viewer, focal = canvas.clientHeight / 2 / Math.tan(VIEW / 2);
-    const eye = orbit.eye();
-    return (piece) => {
+    const eye = orbit.eye(), known = new Map();
+    const size = (piece) => {
       const tile = { matrix: this.#matrix(piece), span: piece.span }, corners = cornersOf(tile);
       if (!isInView(tile, clip, MARGIN) || this.#isCut(corners)) return 0;
       const middle = [0, 1, 2].map((k) => (corners[0][k] + corners[7][k]) / 2);
       const away = orbit.flat ? orbit.distance : Math.hypot(...middle.map((x, k) => x - eye[k])) - 0.87 * piece.span;
       return (piece.cell * focal) / Math.max(away, piece.span / 4);
+    };
+    return (piece) => {
+      if (!known.has(piece)) known.set(piece, size(piece));
+      return known.get(piece);
     };
   }
 
@@ -267,6 +280,7 @@ export class Surface {
     this.range = [least(heights, OUTER), least(heights, 1 - OUTER)];
     this.#most = Math.max(least(seen, 1 - OUTER), 17);
     if (!this.isChosen) this.cut = ceiling([...columns.values()], this.range);
+    this.#isMeasured = true;
     this.scene.lay(this.#extent(), this.range[0]);
     this.#drawn = "";
     this.onready();
@@ -299,18 +313,13 @@ export class Surface {
   }
 
   #forget() {
-    const drawn = new Set(this.#tiles.map((one) => one.piece.digest));
     let cells = [...this.#bytes.values()].reduce((sum, one) => sum + one.byteLength / STRIDE, 0);
     for (const [digest, data] of this.#bytes) {
       if (cells <= KEPT) return;
-      if (drawn.has(digest) || this.#isRoot(digest)) continue;
+      if (this.#needed.has(digest)) continue;
       this.#bytes.delete(digest);
       cells -= data.byteLength / STRIDE;
     }
-  }
-
-  #isRoot(digest) {
-    return this.#here().some((one) => one.roots.some((piece) => piece.digest === digest));
   }
 
   /**

@@ -53,9 +53,9 @@ export class Tools {
       : tool === "box" ? "Drag a box over the plan, or press Enter for all that is in view." : "");
   }
 
-  /** Whether a tool needs a surface that is not there. @param {boolean} is */
-  enable(is) {
-    this.buttons.box.disabled = !is;
+  /** Offer what needs a surface, or not. @param {boolean} isBuilt */
+  offer(isBuilt) {
+    this.buttons.box.disabled = !isBuilt;
   }
 
   #clicks() {
