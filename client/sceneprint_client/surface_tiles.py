@@ -6,6 +6,7 @@ bytes  --decode_tile-->  SurfaceCells
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,21 @@ class SurfaceCells:
     taken: NDArray[np.int32]
 
 
+def cell_points(
+    rows: NDArray[Any], place: tuple[int, int, int], tile_m: float
+) -> NDArray[np.float64]:
+    """(N, 3) where cells lie, metres in the parent frame.
+
+    Parameters
+    ----------
+    rows : of CELL
+    place : column, row and floor of their tile
+    tile_m : width of the tile
+    """
+    points: NDArray[np.float64] = (np.array(place) + (rows["at"] + 0.5) / STEPS) * tile_m
+    return points
+
+
 def decode_tile(data: bytes, tile: SurfaceTile, tile_m: float) -> SurfaceCells:
     """The cells of a tile.
 
@@ -62,10 +78,9 @@ def decode_tile(data: bytes, tile: SurfaceTile, tile_m: float) -> SurfaceCells:
             {},
         )
     rows = np.frombuffer(data, CELL)
-    corner = np.array([tile.column, tile.row, tile.floor])
     sessions, taken = rows["session"].astype(np.int32), rows["taken"].astype(np.int32)
     return SurfaceCells(
-        points=(corner + (rows["at"] + 0.5) / STEPS) * tile_m,
+        points=cell_points(rows, (tile.column, tile.row, tile.floor), tile_m),
         seen=2.0 ** (rows["seen"] / SEEN_STEPS) - 1.0,
         sessions=np.where(sessions == NO_SESSION, -1, sessions),
         taken=np.where(taken == NO_TIME, -1, taken),

@@ -33,6 +33,14 @@ def find_map(connection: Connection, name: str) -> MapRow:
     return map_row(row)
 
 
+def living_map(connection: Connection, of: MapRow) -> MapRow:
+    """A map as it is now; UnknownMap where it was deleted, whether or not another has its name."""
+    row = find_map(connection, of.name)
+    if row.number != of.number:
+        raise unknown_map(of.name)
+    return row
+
+
 def find_maps(connection: Connection, names: Sequence[str]) -> list[MapRow]:
     """The maps of some names, in their order, by one statement; UnknownMap where one is none."""
     if len(names) == 1:

@@ -279,8 +279,8 @@ def taken_range(connection: Connection, surface: SurfaceRow) -> tuple[float, flo
     at = frames.c.captured_at
     asked = _posed(surface.map_number, surface.model_id)
     asked = asked.with_only_columns(func.min(at), func.max(at))
-    first, last = connection.execute(asked).one()
-    return None if first is None else (first, last)
+    row = connection.execute(asked).one()
+    return None if row[0] is None else (row[0], row[1])
 
 
 def fused_range(connection: Connection, map_number: int) -> tuple[float | None, float | None]:
@@ -379,6 +379,7 @@ def tile_of_number(connection: Connection, number: int) -> TileRow | None:
 def spoil_tile(connection: Connection, tile: TileRow) -> None:
     """Have a tile made again whose bytes are lost: from its frames, or from finer tiles."""
     own = surface_tiles.c.number == tile.number
+    doom(connection, [blob for blob in (tile.blob, tile.draft) if blob])
     if tile.level == 0:
         lost = {"rebuilt_to": 0, "blob": None, "draft": None, "scale": NO_SCALE}
         connection.execute(update(surface_tiles).where(own).values(**lost))

@@ -156,7 +156,7 @@ def test_the_command_writes_plan_and_points(
         (["--out", str(points), "--parent-frame", "x"], "has no surface in that parent frame"),
         (["--delete", "--out", str(plan)], "leaves nothing to write"),
     ):
-        assert main(["surface", MAP, *wrong, *given]) == 1
+        assert main(["surface", MAP, *wrong, *given]) == 2
         assert message in capsys.readouterr().err
 
 

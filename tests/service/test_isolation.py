@@ -404,7 +404,7 @@ def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
 def unseen(walled: Any, method: str, path: str, id_: str) -> None:
     """See that an id is to the key as one that nothing has."""
     answers = [
-        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"-----"))
+        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"------"))
         for one in (id_, NO_ID)
     ]
     assert told(*answers[0]) == told(*answers[1])

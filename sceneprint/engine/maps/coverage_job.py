@@ -42,7 +42,7 @@ from sceneprint.store.frame_queries import (
     stops_of,
 )
 from sceneprint.store.frames import count_states, living_frame
-from sceneprint.store.maps import find_map, model_names, unknown_map
+from sceneprint.store.maps import living_map, model_names
 from sceneprint.store.queue import items_of
 from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
 from sceneprint.store.tables import MapRow
@@ -94,14 +94,6 @@ def frames_to_query(connection: Connection, row: MapRow, asked: NewMapCoverage) 
     return [numbers[place] for place in chosen.tolist()]
 
 
-def _living_map(connection: Connection, of: MapRow) -> MapRow:
-    """A map as it is now; UnknownMap where it was deleted, whether or not another has its name."""
-    row = find_map(connection, of.name)
-    if row.number != of.number:
-        raise unknown_map(of.name)
-    return row
-
-
 class CoverageHandler:
     """Does the jobs."""
 
@@ -127,7 +119,7 @@ class CoverageHandler:
 
     def _begin(self, task: LongJob, asked: NewMapCoverage) -> dict[str, Any]:
         with self._store.database.read() as connection:
-            row = _living_map(connection, task.of_map)
+            row = living_map(connection, task.of_map)
             numbers = frames_to_query(connection, row, asked)
         return {
             "done": 0, "total": len(numbers), "skipped": 0, "frames": numbers,
@@ -179,7 +171,7 @@ class CoverageHandler:
     ) -> SliceResult:  # fmt: skip
         """Plans and counts of all frames; the plans are items behind those of the frames."""
         with self._store.database.read() as connection:
-            row = _living_map(connection, task.of_map)
+            row = living_map(connection, task.of_map)
             found = items_of(connection, task.job.number) + items
             plans, cell_m = plans_of(connection, row, found, asked.cell_m)
             states = count_states(connection, row.number)

@@ -40,6 +40,7 @@ from sceneprint.store.opaque_ids import invalid_cursor
 from sceneprint.store.surface_rows import LevelTotals, SightingFrame, SurfaceRow, TileRow
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.store.wakeup import Wakeup
+from sceneprint.types import Floats
 from sceneprint_client.api import JobState, Page, Vector
 from sceneprint_client.api.surface import (
     PLAN_WIDTH,
@@ -51,7 +52,7 @@ from sceneprint_client.api.surface import (
     SurfaceState,
     SurfaceTile,
 )
-from sceneprint_client.surface_tiles import CELL, SIDE
+from sceneprint_client.surface_tiles import CELL, SIDE, cell_points
 
 log = logging.getLogger(__name__)
 
@@ -323,16 +324,13 @@ class MapSurfaces:
                      high, name)  # fmt: skip
         return Output(tag, make)
 
-    def _points(self, surface: SurfaceRow, tile: TileRow) -> np.ndarray[Any, Any]:
+    def _points(self, surface: SurfaceRow, tile: TileRow) -> Floats:
         """(N, 3) of a tile, metres; none of one that is lost or was replaced meanwhile."""
-        tile_m = surface.cell_m * FACTOR**tile.level * SIDE
-        with suppress(DamagedBlob):
+        try:
             cells = tile_cells(self._store, tile, scale_of(surface))
-            found: np.ndarray[Any, Any] = (
-                np.array(tile.place) + (cells["at"] + 0.5) / 256.0
-            ) * tile_m
-            return found
-        return np.zeros((0, 3))
+        except DamagedBlob:
+            return np.zeros((0, 3))
+        return cell_points(cells, tile.place, surface.cell_m * FACTOR**tile.level * SIDE)
 
     def _saw(self, frame: SightingFrame, spot: Sequence[float], within: float) -> bool:
         try:
@@ -410,6 +408,8 @@ def remove_block(store: Store, row: MapRow) -> bool:
 
 #: Seconds between two looks at all maps; seconds after which frames are fused although more come.
 LOOK_S, LONGEST_S = 5.0, 60.0
+#: In place of when a map was first seen: it was looked at, and waits for what comes next.
+_DONE = math.inf
 #: Maps that get their rows in one look.
 _ROWS_AT_ONCE = 100
 
@@ -457,22 +457,30 @@ class SurfaceUpkeep:
     ) -> None:
         """Begin a job where frames came and no more come, or have come for long."""
         at = row.revision, surface.pose_edits
-        since = time.monotonic() if seen is None else seen[1]
+        changed = seen is None or seen[0] != at
+        since = time.monotonic() if seen is None or (changed and seen[1] == _DONE) else seen[1]
         self._seen[row.number] = at, since
-        if seen is None or (seen[0] != at and time.monotonic() - since < LONGEST_S):
+        if since == _DONE or (changed and time.monotonic() - since < LONGEST_S):
             return
+        self._seen[row.number] = at, _DONE
+        with self._store.database.read() as connection:  # most often there is nothing: no lock
+            if not self._is_due(connection, row, surface):
+                return
         with self._store.database.write() as connection:
             row = map_of(connection, row.number)
             now = stored.find_surface(connection, row.number)
-            if now is None or not now.wanted or self._is_hopeless(connection, row, now):
-                return
-            if not self._auto and not stored.frames_to_remove(connection, now, 1):
+            if now is None or not now.wanted:
                 return
             begun, blobs = begin_job(connection, row, now)
         collect_deleted_blobs(self._store, blobs)
         if begun:
-            self._seen.pop(row.number, None)
             self._bell.ring()
+
+    def _is_due(self, connection: Connection, row: MapRow, surface: SurfaceRow) -> bool:
+        """Whether a job is to be begun unasked."""
+        if self._is_hopeless(connection, row, surface):
+            return False
+        return self._auto or bool(stored.frames_to_remove(connection, surface, 1))
 
     def _is_hopeless(self, connection: Connection, row: MapRow, surface: SurfaceRow) -> bool:
         """Whether the last job failed with the same frames: somebody must look at it first."""

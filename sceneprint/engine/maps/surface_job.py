@@ -44,7 +44,7 @@ from sceneprint.geometry.surface.cell_fusion import (
 from sceneprint.store import Store
 from sceneprint.store import surface_rows as stored
 from sceneprint.store.deletion import doom
-from sceneprint.store.maps import find_map, unknown_map
+from sceneprint.store.maps import living_map
 from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
 from sceneprint.store.surface_rows import FusedFrame, SurfaceRow, TileRow
 from sceneprint.store.tables import MapRow
@@ -158,7 +158,7 @@ class SurfaceHandler:
         """A slice: some frames added or taken out, some tiles made anew, or the conclusion."""
         until = min(until, time.monotonic() + SLICE_S)
         with self._store.database.read() as connection:
-            row = _living_map(connection, task.of_map)
+            row = living_map(connection, task.of_map)
             surface = stored.find_surface(connection, row.number)
         if surface is None or not surface.wanted:
             return SliceResult(True, dict(task.progress))
@@ -325,7 +325,7 @@ class SurfaceHandler:
     def _conclude(self, row: MapRow, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
         """The end, where nothing came, went or was edited meanwhile; else once more."""
         with self._store.database.read() as connection:
-            row = _living_map(connection, row)
+            row = living_map(connection, row)
             now = stored.find_surface(connection, row.number)
             if (
                 now is None
@@ -511,14 +511,6 @@ def parent_records(
             }  # fmt: skip
         found.append(told | {"frames": counts[name]})
     return found
-
-
-def _living_map(connection: Connection, of: MapRow) -> MapRow:
-    """A map as it is now; UnknownMap where it was deleted, whether or not another has its name."""
-    row = find_map(connection, of.name)
-    if row.number != of.number:
-        raise unknown_map(of.name)
-    return row
 
 
 def _told(progress: dict[str, Any]) -> dict[str, Any]:

@@ -129,7 +129,7 @@ def fused(parts: Sequence[CellSums]) -> CellSums:
     rows = rows[np.lexsort((rows["number"], rows["taken"], rows["key"]))]
     starts = np.flatnonzero(np.append(True, rows["key"][1:] != rows["key"][:-1]))
     last = np.append(starts[1:], len(rows)) - 1
-    found = rows[last]  # the latest of each cell
+    found: CellSums = rows[last]  # the latest of each cell
     found["views"] = np.add.reduceat(rows["views"].astype(np.int64), starts)
     found["sums"] = np.add.reduceat(rows["sums"], starts)
     return found
@@ -186,7 +186,7 @@ def coarser(parts: Mapping[TilePlace, Cells]) -> Cells:
     found, at, key = found[order], at[order], key[order]
     starts = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
     ends = np.append(starts[1:], len(found))
-    result = found[ends - 1]
+    result: Cells = found[ends - 1]
     result["at"] = np.add.reduceat(at, starts) // (ends - starts)[:, None]
     result["seen"] = np.maximum.reduceat(found["seen"], starts)
     return result
@@ -196,7 +196,8 @@ def without(cells: Cells, place: TilePlace) -> Cells:
     """The cells of a coarser tile that are not of one tile of the level below."""
     corner = np.array(place) % FACTOR
     inside = (cells["at"] // (STEPS // FACTOR) == corner).all(axis=1)
-    return cells[~inside]
+    kept: Cells = cells[~inside]
+    return kept
 
 
 def joined(kept: Cells, added: Cells) -> Cells:
