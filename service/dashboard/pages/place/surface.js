@@ -51,6 +51,8 @@ export class Surface {
   /** @type {number[] | null} heights that colours reach from and to; null before they are known */
   range = null;
   #isMeasured = false;
+  /** Whether other tiles are to come in place of those that are drawn. */
+  #isReplaced = false;
   #most = 255;
   /** @type {number | null} */
   #budget = null;
@@ -86,8 +88,9 @@ export class Surface {
     this.#gone.clear();
     const pyramids = new Map(this.record.parents.map((one) => [one.parent_frame, new Pyramid(one.parent_frame, one.levels)]));
     const shown = [...pyramids.values()].filter((one) => this.#shown.has(one.parent));
-    await Promise.all(shown.map((one) => this.#list(one, one.base))); // what is drawn stays until then
+    await Promise.all(shown.map((one) => this.#list(one, one.base)));
     this.#pyramids = pyramids;
+    this.#isReplaced = this.#tiles.length > 0;
     this.#isMeasured = false;
     this.update();
     return this.record;
@@ -111,7 +114,7 @@ export class Surface {
   async show(parents) {
     this.#shown = parents;
     this.#drawn = "";
-    this.#isMeasured = false;
+    this.#isMeasured = this.#isReplaced = false;
     this.range = null;
     const here = this.#here();
     if (!here.length || !this.scene.viewer?.available) {
@@ -172,7 +175,8 @@ export class Surface {
       drawn.push(...found.drawn);
     }
     if (!this.#isMeasured && here.every((one) => one.roots.length && one.roots.every((piece) => this.#bytes.has(piece.digest)))) this.#measure(here);
-    this.#draw(drawn, Math.min(Math.ceil(cells / (budget * here.length) - SLACK), MOST_THINNED));
+    this.#isReplaced &&= wanted.length > 0; // what is drawn stays until all the others are there
+    if (!this.#isReplaced) this.#draw(drawn, Math.min(Math.ceil(cells / (budget * here.length) - SLACK), MOST_THINNED));
     this.#fetch(wanted);
     if (isWhole && !wanted.length && drawn.length && !this.#isMarked) {
       this.#isMarked = true;
