@@ -58,6 +58,8 @@ export class Robots {
   #player = null;
   /** @type {Timer} */
   #waiting = null;
+  /** @type {string | null | undefined} the period that the list of periods tells */
+  #period;
   /** @type {any} elements of the section */
   list;
   /** @type {any} */
@@ -87,10 +89,11 @@ export class Robots {
     this.scene = scene;
     this.runs = runs;
     this.onchange = onchange;
-    this.since = search.get("since");
-    this.until = search.get("until");
+    const when = (name) => (Number.isFinite(Date.parse(search.get(name) ?? "")) ? search.get(name) : null);
+    this.since = when("since");
+    this.until = when("until");
     /** @type {string | null} the time that is shown; null: the latest */
-    this.at = search.get("at");
+    this.at = when("at");
     this.#build();
     signal.addEventListener("abort", () => { clearTimeout(this.#player); clearTimeout(this.#waiting); }, { once: true });
   }
@@ -98,11 +101,11 @@ export class Robots {
   #build() {
     this.list = h("ul", { class: "place-robots" });
     this.none = h("p", { class: "muted" });
-    this.slider = h("input", { type: "range", id: "place-time", min: 1, max: 1, value: 1, "aria-label": "Time", onInput: () => { this.stop(); this.#go(Number(this.slider.value)); } });
+    this.slider = h("input", { type: "range", id: "place-time", min: 1, max: 1, value: 1, "aria-label": "Time", onInput: () => { this.stop(); this.#go(Number(this.slider.value)); }, onChange: () => this.onchange() });
     this.told = h("span", { class: "number place-when" });
     this.play = h("button", { class: "button", type: "button", id: "place-play", onClick: () => this.#toggle() });
     this.period = h("select", { id: "place-period", "aria-label": "Period", onChange: () => this.#choose(this.period.value) });
-    this.live = h("button", { class: "button", type: "button", hidden: true, onClick: () => { this.stop(); this.#go(this.#records.length); } }, "Latest");
+    this.live = h("button", { class: "button", type: "button", hidden: true, onClick: () => { this.stop(); this.#go(this.#records.length); this.onchange(); this.slider.focus(); } }, "Latest");
     this.bar = h("div", { class: "place-time", role: "group", "aria-label": "Queries over time" }, this.play, this.slider, this.told, this.live, this.period);
     const date = (id, text) => h("label", { class: "field" }, h("span", {}, text), h("input", { type: "datetime-local", id, onChange: () => this.#between() }));
     this.dates = h("details", { class: "place-dates" }, h("summary", {}, "Another period"), date("place-since", "From"), date("place-until", "To"));
@@ -156,7 +159,9 @@ export class Robots {
     this.#controls(shown, all);
     this.none.hidden = robots.length > 0;
     put(this.none, this.since || this.until ? "No queries in this period." : "No robot has queried this map yet: the position of each will show here.");
+    const held = this.list.contains(document.activeElement) ? document.activeElement?.getAttribute("aria-label") : null;
     put(this.list, robots.map((one) => this.#row(one)));
+    if (held) [...this.list.querySelectorAll("[aria-label]")].find((one) => one.getAttribute("aria-label") === held)?.focus();
     this.#marks(robots);
   }
 
@@ -171,8 +176,10 @@ export class Robots {
     put(this.told, text);
     put(this.play, this.#player === null ? "Play" : "Pause");
     this.live.hidden = this.at === null;
-    const chosen = this.since || this.until;
-    put(this.period, [...PERIODS, ...(chosen ? [["chosen", `${this.since ? exact(this.since) : "…"} to ${this.until ? exact(this.until) : "now"}`]] : [])]
+    const chosen = this.since || this.until ? `${this.since ? exact(this.since) : "…"} to ${this.until ? exact(this.until) : "now"}` : null;
+    if (chosen === this.#period) return; // an open list must not close
+    this.#period = chosen;
+    put(this.period, [...PERIODS, ...(chosen ? [["chosen", chosen]] : [])]
       .map(([value, name]) => h("option", { value, selected: value === (chosen ? "chosen" : "") }, name)));
   }
 
@@ -186,7 +193,7 @@ export class Robots {
       h("span", { class: "muted number" }, where(found)),
       LOST.includes(last.status) && h("p", {}, coded(sentence(last.reason))),
       failures.length > 0 && h("ul", { class: "place-failures", "aria-label": `Failures of ${name}` }, failures.map(({ record }) =>
-        h("li", {}, h("a", { href: linkOf(record, this.map), title: record.reason }, STATUSES[record.status][1], ", ", time(record.at))))),
+        h("li", {}, h("a", { href: linkOf(record, this.map) }, STATUSES[record.status][1], ", ", time(record.at))))),
       lost.length > failures.length && h("a", { href: link("maps", this.map, "queries", { robot: last.robot, status: "lost" }) }, `All its ${count(lost.length)} failures`),
       h("div", { class: "toolbar" },
         pose && h("button", { class: "button quiet", type: "button", "aria-label": `Go to ${name}`, onClick: () => this.scene.approach(pose) }, "Go to it"),
@@ -230,17 +237,18 @@ export class Robots {
   #go(shown) {
     this.at = shown >= this.#records.length ? null : this.#records[shown - 1].at;
     this.draw();
-    this.onchange();
   }
 
   #toggle() {
-    if (this.#player !== null) { this.stop(); this.draw(); return; }
+    // a browser bears few changes of an address at a time: it follows at the end
+    const end = () => { this.stop(); this.draw(); this.onchange(); };
+    if (this.#player !== null) { end(); return; }
     const all = this.#records.length, pace = Math.min(Math.max(REPLAY_MS / all, FASTEST_MS), SLOWEST_MS);
     const step = Math.max(Math.ceil((all * FASTEST_MS) / REPLAY_MS), 1);
     let shown = this.#shown >= all ? 1 : this.#shown;
     const turn = () => {
       this.#go(Math.min(shown, all));
-      if (shown >= all || this.signal.aborted) { this.stop(); this.draw(); return; }
+      if (shown >= all || this.signal.aborted) { end(); return; }
       shown += step;
       this.#player = setTimeout(turn, pace);
     };

@@ -17,7 +17,7 @@ export function shades(surface, onchange) {
   const select = h("select", { id: "place-colour", onChange: () => { surface.paint({ colour: select.value }); draw(); onchange(); } },
     COLOURS.map(([value, text]) => h("option", { value, selected: value === surface.colour }, text)));
   const legend = h("div", { class: "place-legend" });
-  const range = (id, label, change) => h("input", { type: "range", id, min: 0, max: STEPS, "aria-label": label, onInput: change });
+  const range = (id, label, change) => h("input", { type: "range", id, min: 0, max: STEPS, "aria-label": label, onInput: change, onChange: onchange });
   const ends = [range("place-low", "Lowest height drawn", () => cut(0)), range("place-high", "Highest height drawn", () => cut(1))];
   const told = h("span", { class: "number muted" });
   const facts = h("p", { class: "muted" });
@@ -42,7 +42,6 @@ export function shades(surface, onchange) {
     surface.later();
     put(ceiling);
     tell();
-    onchange();
   }
 
   function tell() {
