@@ -284,6 +284,7 @@ class Place {
 
   /** The address says what is shown, so that it survives a reload. */
   address() {
+    if (this.signal.aborted) return; // it is another page's by now
     const { colour, cut, isChosen } = this.surface;
     const height = (value) => (!isChosen || value === undefined || Math.abs(value) >= 1e8 ? null : value.toFixed(2));
     const search = {
