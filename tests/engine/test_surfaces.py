@@ -27,6 +27,7 @@ from sceneprint.store.frames import find_frame, refers_to, write_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import (
+    events,
     jobs,
     surface_frames,
     surface_tiles,
@@ -156,6 +157,11 @@ def test_a_surface_is_that_of_its_frames(engine: Engine) -> None:
     assert told.first_taken is not None
     assert told.last_taken is not None
     assert (told.last_taken - told.first_taken).total_seconds() == 110.0
+    with engine.store.database.read() as connection:
+        own = select(events.c.data).where(events.c.kind == "surface.updated")
+        (data,) = connection.execute(own).scalars()
+    tiles = sum(level.tiles for parent in told.parents for level in parent.levels)
+    assert data == {"frames": 12, "tiles": tiles}
     for parent in told.parents:
         assert parent.frames == 6
         assert [level.cell_m for level in parent.levels] == [0.05, 0.2, 0.8]

@@ -333,23 +333,20 @@ class SurfaceHandler:
                 or stored.count_unfinished(connection, surface)
             ):
                 return SliceResult(False, progress | {"total": None})
-        result: dict[str, Any] = {}
-
-        def write(connection: Connection) -> Collection[str]:
             parents = parent_records(connection, row, {})
             totals = stored.level_totals(connection, row.number)
-            times = stored.fused_range(connection, row.number)
-            result.update(
-                frames=sum(stored.count_fused(connection, row.number).values()),
-                tiles=sum(one.tiles for one in totals),
-            )
+            first, last = stored.fused_range(connection, row.number)
+            frames = sum(stored.count_fused(connection, row.number).values())
+
+        def write(connection: Connection) -> Collection[str]:
             stored.write_surface(
                 connection, row.number, revision=row.revision, edits=now.pose_edits,
-                parents=parents, first_taken=times[0], last_taken=times[1],
+                parents=parents, first_taken=first, last_taken=last,
             )  # fmt: skip
             return ()
 
         progress["done"] = progress["total"]
+        result = {"frames": frames, "tiles": sum(one.tiles for one in totals)}
         return SliceResult(True, progress, result=result, event=UPDATED, write=write)
 
     # what they share
