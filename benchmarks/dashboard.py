@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from benchmarks.chromium import chromium, installed, settled, until, watched
-from benchmarks.rooms import Shot, multiply, send, shots, wait
+from benchmarks.rooms import Shot, fuse, multiply, send, shots, wait
 from sceneprint.cli.demo import serving
 
 if TYPE_CHECKING:
@@ -31,8 +31,8 @@ RUNS, FRAMES = 5, 100_000
 SLOW = {"downloadThroughput": 1.25e6, "uploadThroughput": 1.25e6, "latency": 40}
 #: The canvas whose drawing is timed, CSS pixels, and how often it is drawn.
 CANVAS, DRAWN = (900, 600), 20
-_DRAW = """async ([width, height, times]) => {
-  const canvas = document.querySelector("canvas.overlay-canvas"), viewer = canvas.viewer;
+_DRAW = """async ([width, height, times, of]) => {
+  const canvas = document.querySelector(of), viewer = canvas.viewer;
   for (const [name, size] of [["width", width], ["height", height]])
     canvas.style.setProperty(name, `${size}px`, "important");
   const frame = () => new Promise((done) => requestAnimationFrame(done));
@@ -49,6 +49,8 @@ _DRAW = """async ([width, height, times]) => {
   return {taken, idle: viewer.frames - before, size: [canvas.clientWidth, canvas.clientHeight],
     smooth: canvas.getContext("webgl2").getContextAttributes().antialias};
 }"""
+_CELLS = """document.querySelector("canvas.paths-canvas").viewer.layer("surface")
+  .tiles.reduce((sum, one) => sum + one.data.byteLength / 8, 0)"""
 
 
 @dataclass(frozen=True)
@@ -59,9 +61,11 @@ class DashboardFigures:
     `code`: bytes of its HTML, CSS and JavaScript as they are sent; `overlay`: seconds until two
     clouds are drawn; `overlay_bytes`: of all that came for it; `points`: of both clouds;
     `drawing`: milliseconds to draw them once, antialiased; `idle`: how often that was done in a
-    second in which nothing moved; `gallery`: seconds until the newest frames of a map of `frames`
-    frames are there with their pictures; `gallery_bytes`: of all that came for it; `faults`: what
-    pages said in the console, and requests to other places.
+    second in which nothing moved; `place`: seconds until the surface of a map is drawn as fine as
+    its first view needs; `place_bytes`: of all that came for it; `cells`: that are drawn;
+    `place_drawing`, `place_idle`: as `drawing` and `idle`; `gallery`: seconds until the newest
+    frames of a map of `frames` frames are there with their pictures; `gallery_bytes`: of all that
+    came for it; `faults`: what pages said in the console, and requests to other places.
     """
 
     runs: int
@@ -73,6 +77,11 @@ class DashboardFigures:
     points: int
     drawing: float
     idle: int
+    place: float
+    place_bytes: int
+    cells: int
+    place_drawing: float
+    place_idle: int
     frames: int
     gallery: float
     gallery_bytes: int
@@ -107,11 +116,13 @@ def measure(frames: int = FRAMES, runs: int = RUNS) -> DashboardFigures | None:
             _make(client, MAP)
             send(client, MAP, made)
             wait(client, f"/v1/maps/{MAP}", {"indexed"})
+            fuse(client, MAP)
             pages = look(browser, url, _match(client, MAP, made), runs)
+            place = visit(browser, url, MAP, runs)
         multiply(data, MAP, LARGE, frames)
         with serving(data, workers=0) as url:
             gallery, shown = browse(browser, url, LARGE, runs)
-    return _figures(runs, *pages, frames, gallery, shown)
+    return _figures(runs, *pages, place, frames, gallery, shown)
 
 
 def _make(client: httpx.Client, name: str) -> None:
@@ -152,7 +163,7 @@ def look(
         return float(until(page, when))
 
     def draw(page: Page) -> None:
-        drawn.update(page.evaluate(_DRAW, [*CANVAS, DRAWN]))
+        drawn.update(page.evaluate(_DRAW, [*CANVAS, DRAWN, "canvas.overlay-canvas"]))
         drawn["points"] = _points(page)
 
     both = [
@@ -160,6 +171,28 @@ def look(
         for i in range(runs)
     ]
     return first, slow, both, drawn
+
+
+def visit(
+    browser: Browser, url: str, name: str, runs: int
+) -> tuple[list[Load], dict[str, Any]]:  # fmt: skip
+    """Load the place of a map whose surface is built; and draw it again and again."""
+    drawn: dict[str, Any] = {}
+
+    def placed(page: Page) -> float:
+        when = 'performance.getEntriesByName("place")[0]?.startTime ?? null'
+        return float(until(page, when))
+
+    def draw(page: Page) -> None:
+        settled(page)
+        drawn.update(page.evaluate(_DRAW, [*CANVAS, DRAWN, "canvas.paths-canvas"]))
+        drawn["cells"] = page.evaluate(_CELLS)
+
+    address = f"{url}/dashboard#/maps/{name}/place"
+    loads = [
+        _load(browser, address, placed, then=draw if i == runs - 1 else None) for i in range(runs)
+    ]
+    return loads, drawn
 
 
 def browse(browser: Browser, url: str, name: str, runs: int) -> tuple[list[Load], int]:
@@ -238,8 +271,9 @@ def _heard(faults: list[str], message: Any) -> None:
 
 def _figures(
     runs: int, first: list[Load], slow: list[Load], both: list[Load], drawn: dict[str, Any],
-    frames: int, gallery: list[Load], shown: int,
+    place: tuple[list[Load], dict[str, Any]], frames: int, gallery: list[Load], shown: int,
 ) -> DashboardFigures:  # fmt: skip
+    places, surface = place
     if drawn["size"] != list(CANVAS) or not drawn["smooth"]:
         raise AssertionError(f"another canvas was drawn than the one that is asked for: {drawn}")
     if shown == 0:
@@ -254,10 +288,15 @@ def _figures(
         points=drawn["points"],
         drawing=statistics.median(drawn["taken"]),
         idle=drawn["idle"],
+        place=_seconds(places),
+        place_bytes=_size(places),
+        cells=surface["cells"],
+        place_drawing=statistics.median(surface["taken"]),
+        place_idle=surface["idle"],
         frames=frames,
         gallery=_seconds(gallery),
         gallery_bytes=_size(gallery),
-        faults=sum(len(one.faults) for one in (*first, *slow, *both, *gallery)),
+        faults=sum(len(one.faults) for one in (*first, *slow, *both, *places, *gallery)),
     )
 
 
@@ -289,6 +328,10 @@ def table(f: DashboardFigures | None) -> list[str]:
         f"| all that came for it | {f.overlay_bytes / 1000:.0f} kB | 700 kB |",
         f"| drawing it, {width} x {height}, antialiased | {f.drawing:.0f} ms | 150 ms |",
         f"| drawn again in a second without a change | {f.idle} | 0 |",
+        f"| the place, {f.cells:,} cells, drawn | {f.place:.2f} s | 1.5 s |",
+        f"| all that came for it | {f.place_bytes / 1000:.0f} kB | |",
+        f"| drawing it, {width} x {height} | {f.place_drawing:.0f} ms | 50 ms |",
+        f"| drawn again in a second without a change | {f.place_idle} | 0 |",
         f"| first page of {f.frames:,} frames, with its pictures | {f.gallery:.2f} s | |",
         f"| all that came for it | {f.gallery_bytes / 1000:.0f} kB | |",
         f"| requests elsewhere, violations, errors in the console | {f.faults} | 0 |",

@@ -138,6 +138,14 @@ def wait(client: httpx.Client, path: str, states: set[str]) -> None:
         time.sleep(0.1)
 
 
+def fuse(client: httpx.Client, name: str) -> None:
+    """Build the surface of a map, and wait for it."""
+    path = f"/v1/maps/{name}/surface"
+    client.post(path).raise_for_status()
+    while client.get(path).raise_for_status().json()["state"] != "ready":
+        time.sleep(0.1)
+
+
 def multiply(data: Path, source: str, name: str, count: int) -> None:
     """Make a map of many frames that are all like the first of another map, for lists to show.
 

@@ -20,7 +20,7 @@ import httpx
 from tqdm import tqdm
 
 from benchmarks.chromium import PATIENCE_S, chromium, installed, settled, watched
-from benchmarks.rooms import Shot, box, circled, scans, send, shots, wait
+from benchmarks.rooms import Shot, box, circled, fuse, scans, send, shots, wait
 from sceneprint.cli.demo import serving
 
 if TYPE_CHECKING:
@@ -133,11 +133,12 @@ def views(client: httpx.Client, made: list[Shot]) -> list[View]:
     found = client.post(f"/v1/maps/{MAP}/associations", json=both).raise_for_status().json()
     for job in (snapshot, found["association_id"]):
         _done(client, job)
+    for name in (MAP, HALL, SIDES):
+        fuse(client, name)
     for name in (MAP, SIDES):
-        for begun in ("surface", "coverage"):
-            asked = {"not_within_s": 0} if begun == "coverage" else {}
-            told = client.post(f"/v1/maps/{name}/{begun}", json=asked).raise_for_status().json()
-            _done(client, told.get("coverage_id") or told["job_id"])
+        asked = {"not_within_s": 0}
+        told = client.post(f"/v1/maps/{name}/coverage", json=asked).raise_for_status().json()
+        _done(client, told["coverage_id"])
     ids = [str(one["frame_id"]) for one in _listed(client, MAP)]
     asked = {"frame_id": ids[3], "k": 4, "explain": True, "explain_frame": ids[-1]}
     answer = client.post(f"/v1/maps/{MAP}/queries", json=asked).raise_for_status().json()
@@ -196,9 +197,14 @@ def _views(
     rows = View("answer", f"#/queries/{query}", tall=True)
     aligned = View("overlay", overlay, tall=True)
     queries = View("queries", f"#/maps/{MAP}/queries")
-    paths = View("map-view", f"#/maps/{MAP}/paths?query={query}", tall=True)
+    place = View("place", f"#/maps/{MAP}/place?parent=room-{ROOMS[0]}")
+    paths = View("place-query", f"#/maps/{MAP}/place?view=3d&query={query}", tall=True)
     operations = View("operations", "#/operations", tall=True)
-    yield from (maps, frames)
+    yield from (maps, place, replace(place, name="place-phone", size=PHONE, tall=True))
+    yield View("place-3d", f"{place.address}&view=3d&colour=session&association=none")
+    yield View("place-scans", f"#/maps/{HALL}/place")
+    yield View("place-none", "#/maps/empty/place")
+    yield frames
     yield View("frames-normals", f"#/maps/{MAP}?view=normals")
     yield View("frames-patches", f"#/maps/{MAP}?view=patches")
     yield View("frames-scans", f"#/maps/{HALL}")
@@ -226,7 +232,7 @@ def _views(
     yield View("key-too-little", "#/operations?tab=keys", headers=ELSEWHERE, key=key)
     yield View("nowhere", "#/nowhere")
     yield View("gone", f"#/maps/{MAP}", gone=True)
-    for one in (maps, frames, rows, aligned, paths, operations):
+    for one in (maps, place, frames, rows, aligned, paths, operations):
         yield replace(one, name=f"{one.name}-tablet", size=TABLET)
     # the last: the map is empty no more
     sent = [(f"frame-{i:06d}.depth.png", one.data) for i, one in enumerate(made[:6])]
@@ -238,7 +244,7 @@ def _views(
 def _unsure(sides: str, absent: str) -> Iterator[View]:
     """Answers that are not found: one of several poses, and one of none."""
     several = View("answer-ambiguous", f"#/queries/{sides}")
-    plan = View("map-view-ambiguous", f"#/maps/{SIDES}/paths?query={sides}", tall=True)
+    plan = View("place-ambiguous", f"#/maps/{SIDES}/place?query={sides}", tall=True)
     none = View("answer-not-found", f"#/queries/{absent}")
     lost = View("coverage", f"#/maps/{SIDES}/coverage?cell=6,-4", tall=True)
     for one in (several, plan, none, lost):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 import socket
 import subprocess
@@ -115,12 +116,16 @@ class Station:
 
 @contextmanager
 def running(data: Path, workers: int, port: int = 0) -> Iterator[Station]:
-    """`sceneprint serve` on a loopback port; it is gone when this ends."""
+    """`sceneprint serve` on a loopback port; it is gone when this ends.
+
+    Its workers build a surface when somebody asks for it: most tests look at none.
+    """
     with (data / "service.log").open("ab") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "sceneprint", "serve", "--port", str(port),
              "--data", str(data), "--workers", str(workers)],
             stdout=subprocess.PIPE, stderr=log, text=True,
+            env={**os.environ, "SCENEPRINT_SURFACES": "asked"},
         )  # fmt: skip
     assert process.stdout is not None
     try:

@@ -1,4 +1,4 @@
-"""The map view beside the numbers of the API: paths, joins, edges, the query, and who may what."""
+"""Runs in the place beside the numbers of the API: paths, joins, edges, a query, who may what."""
 
 from __future__ import annotations
 
@@ -43,12 +43,14 @@ def apart(station: Any, until: Callable[..., Any]) -> dict[str, Any]:
     until(lambda: station.client.get(path).json()["frames"].get("indexed") == 9)
     ids = [item["frame"]["frame_id"] for item in answer.json()["items"]]
     poses = [np.array(meta["pose"]["matrix"]) if "pose" in meta else None for meta in metas]
-    return {"path": path, "ids": ids, "poses": poses, "url": f"{station.home}#/maps/apart/paths"}
+    return {"path": path, "ids": ids, "poses": poses, "url": f"{station.home}#/maps/apart/place"}
 
 
 def click_at(page: Page, point: Any) -> None:
-    """Click where a point of the picture is drawn."""
-    project = "([css, p]) => document.querySelector(css).viewer.project(p)"
+    """Click where a point of the picture's frame is drawn."""
+    project = """([css, p]) => {
+      const { viewer, scene } = document.querySelector(css);
+      return viewer.project(scene.near(p)); }"""
     x, y, _ = page.evaluate(project, [CANVAS, [float(v) for v in point]])
     page.locator(CANVAS).click(position={"x": x, "y": y})
 
@@ -93,9 +95,8 @@ def test_runs_are_joined_from_here(
     # bob's third frame, by the API's own transform, about the first pose that is drawn
     b_from_a = np.array(join["transform"]["matrix"])
     assert (join["from_parent"], join["to_parent"]) == ("ann/odom", "bob/odom")
-    at = (np.linalg.inv(b_from_a) @ apart["poses"][5])[:3, 3] - apart["poses"][0][:3, 3]
-    assert np.linalg.norm(at - (apart["poses"][5] - apart["poses"][0])[:3, 3]) > 1  # it is moved
-    page.get_by_role("button", name="From above").click()
+    at = (np.linalg.inv(b_from_a) @ apart["poses"][5])[:3, 3]
+    assert np.linalg.norm(at - apart["poses"][5][:3, 3]) > 1  # it is moved
     click_at(page, at)
     frame = page.locator(".paths-told a.mono")
     expect(frame).to_have_attribute("href", f"#/maps/apart/frames/{apart['ids'][5]}")
@@ -125,7 +126,7 @@ def test_a_query_is_among_them(
     answer = station.client.post("/v1/maps/building/queries", **sent.form(k=3)).json()
     location = answer["location"]
     assert answer["status"] == "found"
-    page.goto(f"{station.home}#/maps/building/paths?query={answer['query_id']}")
+    page.goto(f"{station.home}#/maps/building/place?view=3d&query={answer['query_id']}")
     settle(page)
     expect(page.locator("#paths-parent")).to_have_value("room-0")
     expect(page.locator(".paths-run")).to_have_count(2)
@@ -141,28 +142,27 @@ def test_a_query_is_among_them(
     accepted = [m for m in answer["matches"] if m["validation"]["status"] == "accepted"]
     expect(card).to_contain_text(f"{len(accepted)} of {len(accepted)} accepted matches")
     # the label stands where the API says that the query is
-    first = station.client.get(
-        "/v1/maps/building/trajectory", params={"session": "room-0/ann"},
-        headers={"Accept": "application/json"},
-    ).json()["poses"][0][1:4]  # fmt: skip
-    place = [location["pose"]["translation"][axis] - first[i] for i, axis in enumerate("xyz")]
+    place = [location["pose"]["translation"][axis] for axis in "xyz"]
     where = """([css, p]) => {
-      const [x, y] = document.querySelector(css).viewer.project(p);
+      const { viewer, scene } = document.querySelector(css);
+      const [x, y] = viewer.project(scene.near(p));
       const label = document.querySelector('.paths-label[data-kind=query]');
       const [left, top] = label.style.transform.match(/[-0-9.]+(?=px)/g).map(Number);
       return Math.hypot(left - x, top - y);
     }"""
     until(lambda: page.evaluate(where, [CANVAS, place]) < 1)
     # a run that is switched off is not there to be clicked
-    click_at(page, [0, 0, 0])
+    first = np.array(station.frames[0].meta["pose"]["matrix"])[:3, 3]
+    click_at(page, first)
     frame = page.locator(".paths-told a.mono")
     expect(frame).to_have_attribute("title", station.frames[0].frame_id)
     page.get_by_role("button", name="Done").click()
     page.locator(".paths-run input").first.uncheck()
     expect(page.locator(".paths-labels .paths-label").first).to_be_hidden()
-    click_at(page, [0, 0, 0])
+    click_at(page, first)
     page.wait_for_timeout(100)
-    expect(frame).to_have_count(0)
+    titles = frame.evaluate_all("all => all.map((one) => one.title)")
+    assert station.frames[0].frame_id not in titles
     page.locator(".paths-words summary").click()
     expect(page.locator(".paths-words tbody tr")).to_have_count(2)
     assert axe(page) == []
@@ -176,7 +176,7 @@ def test_alternatives_are_drawn_alike_and_none_as_the_answer(
     page: Page, station: Any, four_sides: dict[str, Any], settle: Any, axe: Any, until: Any
 ) -> None:
     several = four_sides["alternatives"]
-    page.goto(f"{station.home}#/maps/four-sides/paths?query={four_sides['query_id']}")
+    page.goto(f"{station.home}#/maps/four-sides/place?query={four_sides['query_id']}")
     settle(page)
     card = page.locator("section", has=page.locator("#paths-asked"))
     expect(card.locator(".badge")).to_have_text("ambiguous")
@@ -190,24 +190,16 @@ def test_alternatives_are_drawn_alike_and_none_as_the_answer(
     labels = page.locator(".paths-labels .paths-label[data-kind=alternative]")
     assert labels.all_inner_texts() == list("ABCDE"[: len(several)])
     expect(page.locator(".paths-label[data-kind=query]")).to_have_count(0)
-    page.get_by_role("button", name="From above").click()
-    first = station.client.get(
-        "/v1/maps/four-sides/trajectory", params={"session": "round"},
-        headers={"Accept": "application/json"},
-    ).json()["poses"][0][1:4]  # fmt: skip
     where = """([css, places]) => {
-      const { viewer } = document.querySelector(css);
+      const { viewer, scene } = document.querySelector(css);
       const labels = [...document.querySelectorAll('.paths-label[data-kind=alternative]')];
       return Math.max(...places.map((p, i) => {
-        const [x, y] = viewer.project(p);
+        const [x, y] = viewer.project(scene.near(p));
         const [left, top] = labels[i].style.transform.match(/[-0-9.]+(?=px)/g).map(Number);
         return Math.hypot(left - x, top - y);
       }));
     }"""
-    places = [
-        [one["pose"]["translation"][axis] - first[i] for i, axis in enumerate("xyz")]
-        for one in several
-    ]
+    places = [[one["pose"]["translation"][axis] for axis in "xyz"] for one in several]
     until(lambda: page.evaluate(where, [CANVAS, places]) < 1)
     assert axe(page) == []
     page.get_by_role("button", name="Hide it").click()
@@ -218,11 +210,11 @@ def test_what_is_not_there_is_told(
     page: Page, open_page: Callable[..., Page], station: Any, settle: Any
 ) -> None:
     station.make_map("pathless")
-    page.goto(f"{station.home}#/maps/pathless/paths")
+    page.goto(f"{station.home}#/maps/pathless/place")
     settle(page)
-    expect(page.get_by_role("heading", name="There is no path to draw")).to_be_visible()
+    expect(page.get_by_role("heading", name="This map is empty")).to_be_visible()
     page.allowed.append("404")  # type: ignore[attr-defined]
-    page.goto(f"{station.home}#/maps/building/paths?query={'0' * 32}")
+    page.goto(f"{station.home}#/maps/building/place?query={'0' * 32}")
     expect(page.get_by_text("Its answer has expired")).to_be_visible()
     expect(page.locator(".paths-run")).to_have_count(2)
 
@@ -230,7 +222,7 @@ def test_what_is_not_there_is_told(
     reader = station.key("paths-reader", {"building": "read"})
     far = open_page(extra_http_headers={"X-Forwarded-For": "192.0.2.7"})
     far.add_init_script(f"sessionStorage.setItem('sceneprint.key', {json.dumps(reader)})")
-    far.goto(f"{station.home}#/maps/building/paths")
+    far.goto(f"{station.home}#/maps/building/place")
     settle(far)
     expect(far.locator(".paths-run")).to_have_count(2)
     expect(far.get_by_text("need a key with write access")).to_be_visible()
@@ -280,14 +272,26 @@ def test_numbers_behind_the_picture(page: Page, station: Any, settle: Any) -> No
     for matrix, is_cloud, up in ((level, False, "z"), (itself, False, "-y"), (itself, True, "z")):
         pose = {"matrix": matrix, "isCloud": is_cloud}
         assert run("shapes", "m.upright([given[0]])", pose) == up
-    grid = run("shapes", "m.grid(given[0], 'z', 0, [10, 20, 1])",
-               {"low": [0, 0, 0], "high": [10, 4, 1]})  # fmt: skip
+    level = {"right": [1, 0, 0], "ahead": [0, 1, 0], "above": [0, 0, 1]}
+    grid = run("shapes", "m.grid(given[0], given[1], 0, [10, 20, 1])",
+               {"low": [0, 0, 0], "high": [10, 4, 1]}, level)  # fmt: skip
     lines = np.array(grid["positions"]).reshape(-1, 3) + np.array([10, 20, 1])
     assert grid["step"] == 1
     assert set(lines[:, 2]) == {0}
     assert (np.abs(lines[:, :2] - np.round(lines[:, :2])) < 1e-5).all()  # at whole metres
     assert (lines.min(0)[:2] <= [10, 20]).all()
     assert (lines.max(0)[:2] >= [20, 24]).all()
+    # the same ground where z is ahead and up is -y: turned, at 2 m below the origin
+    turned = {"right": [1, 0, 0], "ahead": [0, 0, 1], "above": [0, -1, 0]}
+    grid = run("shapes", "m.grid(given[0], given[1], -2, [10, 1, 20])",
+               {"low": [0, 0, 0], "high": [10, 1, 4]}, turned)  # fmt: skip
+    lines = np.array(grid["positions"]).reshape(-1, 3) + np.array([10, 1, 20])
+    assert set(lines[:, 1]) == {2}
+    assert (lines.max(0)[[0, 2]] >= [20, 24]).all()
+    reach = run(
+        "shapes", "m.reachAlong(given[0], [0.6, 0, -0.8])", {"low": [0, 0, 1], "high": [10, 9, 2]}
+    )
+    assert reach == pytest.approx([-1.6, 6 - 0.8])
     # the nearest on the screen; of two about as near, the one in front; nothing far away
     flat = "p => [p[0], p[1], p[2]]"
     points = [[0, 0, 9], [10, 0, 9], [10, 1, 3], [300, 0, 1]]

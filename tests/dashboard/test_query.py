@@ -206,7 +206,7 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
     page.go_back()
     settle(page)
     on_map = verdict.get_by_role("link", name="On the map").get_attribute("href")
-    assert on_map == f"#/maps/four-sides/paths?query={four_sides['query_id']}"
+    assert on_map == f"#/maps/four-sides/place?query={four_sides['query_id']}"
     assert axe(page) == []
     page.set_viewport_size({"width": 390, "height": 844})
     assert page.evaluate("document.documentElement.scrollWidth") <= 390

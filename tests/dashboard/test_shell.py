@@ -161,7 +161,9 @@ def test_a_page_looks_the_same_wherever_one_comes_from(
     for area in ("Operations", "Maps"):  # operations have tiles, too
         page.get_by_role("link", name=area, exact=True).click()
         settle(page)
-    page.locator("main a[href='#/maps/building']").first.click()
+    page.locator("main a[href='#/maps/building/place']").first.click()
+    settle(page)
+    page.get_by_role("link", name="Frames", exact=True).click()
     settle(page)
     assert page.evaluate(look) == alone
 

@@ -125,6 +125,79 @@ def test_the_orbit_by_value(stage: Page) -> None:
     assert abs(ends).max() <= 1  # nor cut off in depth
 
 
+def test_a_plan_by_value(stage: Page) -> None:
+    """Straight down, one scale at every height: metres to pixels by hand."""
+    js: Callable[..., Any] = stage.evaluate
+    js("""() => {
+      const up = new camera.Orbit({ above: [0, 0, 1], ahead: [0, 1, 0] });
+      Object.assign(view.orbit, { above: up.above, ahead: up.ahead, right: up.right });
+      view.look({ target: [1, 2, 0], distance: 4, azimuth: 0, elevation: 0.3, flat: true });
+    }""")
+    scale = FOCAL / 4  # pixels of a metre
+    for point in ((1, 2, 0), (1.5, 2.25, 0), (0.25, 1, 3), (2, 2.5, -40)):
+        x, y, _ = js("(p) => view.project(p)", point)
+        assert x == pytest.approx(WIDTH / 2 + (point[0] - 1) * scale)
+        assert y == pytest.approx(HEIGHT / 2 - (point[1] - 2) * scale)
+    corners = [[x, y, z] for x in (0, 6) for y in (1, 3) for z in (0, 9)]
+    js("(corners) => view.orbit.fit(corners, 4 / 3)", corners)
+    assert js("() => view.orbit.target.slice(0, 2)") == pytest.approx([3, 2])
+    # 6 m fill 93 % of the width
+    assert 2 * math.tan(math.radians(22.5)) * js("() => view.orbit.distance") * (
+        4 / 3
+    ) * 0.93 == pytest.approx(6)
+    clip = js("() => view.orbit.projection(4 / 3, { low: [0, 1, 0], high: [6, 3, 9] })")
+    ends = np.array([[*p, 1] for p in corners]) @ np.array(clip).reshape(4, 4)
+    assert abs(ends[:, :3] / ends[:, 3:]).max() <= 1  # nor cut off in depth
+    assert js("() => canvas.getAttribute('aria-label')").startswith("A test. Arrow keys move")
+    js("() => view.look({ flat: false })")
+    assert js("() => view.orbit.elevation") == pytest.approx(0.3)  # as it was
+
+
+def test_cells_lie_where_they_are_projected(stage: Page) -> None:
+    """Bytes of a tile as the API sends them: places, four colours, and heights that are cut."""
+    cells = np.zeros(3, np.dtype([("at", "u1", 3), ("seen", "u1"), ("last", "<u2", 2)]))
+    cells["at"] = [(64, 128, 128), (191, 64, 128), (128, 200, 128)]
+    cells["seen"] = [16, 32, 48]  # by 1, 3 and 7 frames
+    cells["last"] = [(0, 0), (1, 600), (65535, 65535)]
+    stage.evaluate(
+        """(text) => view.cells("surface", {
+          tiles: [{ name: "one", data: bytes(text), span: 2.56, cell: 0.05,
+                    matrix: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, -1.28, -1.28, -1.285, 1] }],
+          extent: { low: [-1, -1, -1], high: [1, 1, 1] },
+          palette: new Uint8Array([10, 20, 30, 200, 0, 100]),
+          heights: [-1, 1], most: 48, ages: [0, 600], cut: null,
+        })""",
+        base64.b64encode(cells.tobytes()).decode(),
+    )
+    at = (cells["at"] + 0.5) / 256 * 2.56 - [1.28, 1.28, 1.285]
+    ramp = np.array([(0.267, 0.005, 0.329), (0.230, 0.322, 0.546), (0.128, 0.567, 0.551),
+                     (0.369, 0.789, 0.383), (0.993, 0.906, 0.144)])  # fmt: skip
+
+    def ramped(share: float) -> Any:
+        place = min(max(share, 0), 1) * 4
+        k = min(int(place), 3)
+        return 255 * (ramp[k] + (ramp[k + 1] - ramp[k]) * (place - k))
+
+    shares = (1 - at[:, 1]) / 2  # up is -y here
+    grey = np.array([150, 155, 160.0])
+    sessions = [np.array([10, 20, 30.0]), np.array([200, 0, 100.0]), grey]
+    for colour, wanted in (
+        ("height", [ramped(x) for x in shares]),
+        ("session", [c * (0.6 + 0.4 * x) for c, x in zip(sessions, shares, strict=True)]),
+        ("seen", [ramped(0), ramped(0.5), ramped(1)]),
+        ("age", [ramped(0), ramped(1), grey]),
+    ):
+        stage.evaluate("(colour) => view.cells('surface', { colour })", colour)
+        picture = drawn(stage).astype(float)
+        for point, own in zip(at, wanted, strict=True):
+            assert abs(picture[seen_at(point)] - own).max() <= 1.5, (colour, point)
+    # only what is between two heights: the second lies at 0.63 m, the others at -0.01 m and -0.73 m
+    stage.evaluate("() => view.cells('surface', { cut: [-0.5, 0.5] })")
+    picture = drawn(stage)
+    blank = picture[0, 0].tolist()
+    assert [picture[seen_at(point)].tolist() == blank for point in at] == [False, True, True]
+
+
 def test_points_are_read_as_they_were_written(stage: Page) -> None:
     rng = np.random.default_rng(2)
     at = rng.uniform(-3, 5, (50, 3))

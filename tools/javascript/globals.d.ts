@@ -3,8 +3,10 @@
 interface HTMLCanvasElement {
   /** The view that draws here; the tests and benchmarks read it. */
   viewer?: import("../../service/dashboard/pages/viewer/viewer.js").Viewer;
-  /** The overlay that is drawn here; likewise. */
-  scene?: import("../../service/dashboard/pages/overlay/scene.js").Scene;
+  /** The overlay or the place that is drawn here; likewise. */
+  scene?:
+    | import("../../service/dashboard/pages/overlay/scene.js").Scene
+    | import("../../service/dashboard/pages/paths/scene.js").Scene;
   /** Whether the picture was drawn, once that is known. */
   ready?: Promise<boolean>;
 }

@@ -117,8 +117,8 @@ class Match(ApiRecord):
     distance: int = Field(description="L1 distance of the stored signatures.")
     similarity: float = Field(description="1 - distance / that of unrelated frames, 0 to 1.")
     selected: bool | None = Field(
-        description="In the diverse selection C; null without that stage. False: a frame of another "
-        "place, validated as it looks like the query too."
+        description="In the diverse selection C; null without that stage. False: a frame of "
+        "another place, validated as it looks like the query too."
     )
     diversity_gain: float | None = Field(description="1 for the first; near 0 for a duplicate.")
     validation: Validation

@@ -11,11 +11,11 @@ import { rows } from "../operations/poll.js";
 export const styles = ["operations/operations.css", "history/queries.css"];
 
 /** What came of a query: the kind of its badge, and its words. */
-const STATUSES = {
+export const STATUSES = {
   found: ["good", "Found"], ambiguous: ["warn", "Ambiguous"], not_found: ["warn", "Not found"],
   failed: ["bad", "Failed"], unvalidated: ["neutral", "Not validated"],
 };
-const LOST = ["ambiguous", "not_found", "failed"];
+export const LOST = ["ambiguous", "not_found", "failed"];
 const CHOICES = [["", "All outcomes"], ["lost", "Without a pose"], ...Object.entries(STATUSES).map(([name, [, text]]) => [name, text])];
 const PERIODS = [["", "Any time"], ["1", "Last hour"], ["24", "Last 24 hours"], ["168", "Last 7 days"]];
 const HOUR_MS = 3_600_000;

@@ -12,7 +12,7 @@ const THEMES = [
   ["light", "Light", "M12 8a4 4 0 100 8 4 4 0 000-8zM12 2v2M12 20v2M2 12h2M20 12h2M5 5l1.400 1.400M17.600 17.600L19 19M5 19l1.400-1.400M17.600 6.400L19 5"],
   ["dark", "Dark", "M20 14.500A8.500 8.500 0 019.500 4a8.500 8.500 0 1010.500 10.500z"],
 ];
-const TABS = [["frames", "Frames"], ["sessions", "Sessions"], ["query", "Query"], ["queries", "Queries"], ["coverage", "Coverage"], ["paths", "Map view"], ["upload", "Upload"]];
+const TABS = [["place", "Place"], ["frames", "Frames"], ["sessions", "Sessions"], ["query", "Query"], ["queries", "Queries"], ["coverage", "Coverage"], ["upload", "Upload"]];
 
 /** Say what page this is. @param {string} text */
 export function setTitle(text) {
@@ -27,11 +27,11 @@ export function drawHead(route, params) {
   put(document.getElementById("actions"));
   const crumbs = [];
   if (route?.area === "maps" && route.path !== "") crumbs.push(["Maps", "#/"]);
-  if (map && route.path !== "maps/:map") crumbs.push([map, link("maps", map)]);
+  if (map && route.section !== "place") crumbs.push([map, link("maps", map, "place")]);
   if (query && frame) crumbs.push(["Answer", link("queries", query)]);
   if (route?.path === "operations/jobs/:job") crumbs.push(["Operations", "#/operations"]);
   const items = crumbs.map(([text, href]) => h("li", {}, h("a", { href }, text)));
-  if (crumbs.length) items.push(h("li", { "aria-current": "page" }, map && route.path === "maps/:map" ? map : route.title));
+  if (crumbs.length) items.push(h("li", { "aria-current": "page" }, map && route.section === "place" ? map : route.title));
   put(document.getElementById("crumbs"), h("ol", {}, items));
   const tabs = document.getElementById("tabs");
   tabs.hidden = !route?.section;

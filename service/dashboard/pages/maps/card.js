@@ -65,7 +65,7 @@ export function mapCard(map, { signal, changed }) {
 
   function draw() {
     const { name, title, frames, model, reencoding } = card.map;
-    put(parts.heading, h("a", { href: link("maps", name) }, title ?? name));
+    put(parts.heading, h("a", { href: link("maps", name, "place") }, title ?? name));
     put(parts.name, title === null || title === name ? "" : name);
     put(parts.number, count(frames.indexed ?? 0));
     const badges = [

@@ -4,11 +4,13 @@ import { h, put } from "../lib/dom.js";
 import { metres } from "../lib/format.js";
 import { letterOf } from "../query/alternatives.js";
 import { Orbit, VIEW } from "../viewer/camera.js";
+import { around } from "../viewer/layers.js";
+import { dot } from "../viewer/matrix.js";
 import { links } from "../viewer/shapes.js";
 import { createViewer, frustum } from "../viewer/viewer.js";
 import { nearest, projector } from "./pick.js";
 import {
-  AXES, boxAbout, copies, dashes, ellipsoid, grid, hollow, nice, placeOf, polyline, spaced, upright,
+  boxAbout, copies, dashes, ellipsoid, grid, hollow, nice, placeOf, polyline, reachAlong, spaced,
 } from "./shapes.js";
 
 const FRUSTUMS = 160, CLOSEST = 16; // at first, and how many times as many when one is near
@@ -20,16 +22,23 @@ export const EDGES = [
 ];
 /** Layers of a query. */
 const ASKED = ["query", "ellipsoid", "alternatives", "matches", "matched"];
-const STEEP = Math.PI / 2;
+/** Where a picture in 3-D begins. */
+const ASIDE = { azimuth: 0.6, elevation: 0.55 };
 
 /** Colour of a run: a token of paths.css. @param {number} colour */
 export const tokenOf = (colour) => `--path-${colour}`;
 
+/** That of a run. @param {import("./data.js").Run} run */
+export const runToken = (run) => tokenOf(run.colour);
+
+/** The same as the theme has it now: red, green, blue. @param {import("./data.js").Run} run */
+export const tintOf = (run) => rgb(getComputedStyle(document.documentElement).getPropertyValue(runToken(run)));
+
 /**
  * @param {HTMLElement} place where the canvas goes
- * @param {{onpick: (path: number, place: number) => void, signal: AbortSignal}} how
+ * @param {{onview: () => void, signal: AbortSignal}} how onview: it was drawn anew
  */
-export function createScene(place, { onpick, signal }) {
+export function createScene(place, { onview, signal }) {
   const canvas = h("canvas", { class: "paths-canvas" });
   const labels = h("div", { class: "paths-labels", "aria-hidden": "true" });
   const bar = h("span", { class: "paths-bar" });
@@ -37,21 +46,23 @@ export function createScene(place, { onpick, signal }) {
   const ground = h("span", { class: "muted" });
   const scale = h("div", { class: "paths-scale" }, h("span", { class: "paths-ruler" }, bar, scaleText), ground);
   put(place, canvas, labels, scale);
-  return new Scene(canvas, { labels, bar, scaleText, ground }, onpick, signal);
+  return new Scene(canvas, { labels, bar, scaleText, ground }, onview, signal);
 }
 
-class Scene {
+export class Scene {
   #parts;
   /** @type {any} the viewer; null until paths are shown */
   #viewer = null;
-  /** @type {any} "z", "y" or "-y"; null until paths are shown */
-  #up = null;
+  /** @type {{right: number[], ahead: number[], above: number[]}} */
+  #axes = new Orbit("z");
   /** @type {(import("./data.js").Path & {world: number[][]})[]} */
   #drawn = [];
   #origin = [0, 0, 0];
   #hidden = new Set();
-  /** @type {any} about all that is drawn; null about nothing */
+  /** @type {any} about the paths, less the origin; null about none */
   #box = null;
+  /** @type {{box: any, floor: number | null}} of the surface beneath them, as `box` */
+  #under = { box: null, floor: null };
   #size = 0.1;
   #ratio = 0;
   #wide = 1;
@@ -62,45 +73,55 @@ class Scene {
   /** @type {any[]} */
   #labels = [];
 
-  constructor(canvas, parts, onpick, signal) {
+  /** @type {Map<string, {at: number[], node: HTMLElement}[]>} */
+  #marks = new Map();
+
+  constructor(canvas, parts, onview, signal) {
     this.canvas = canvas;
     this.#parts = parts;
-    /** @type {number[] | null} */
-    let down = null;
-    canvas.addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; });
-    canvas.addEventListener("click", (event) => {
-      if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) > 4) return; // turned
-      const found = this.#pick(event.offsetX, event.offsetY);
-      if (found) onpick(found.path, found.place);
-    });
+    this.onview = onview;
     window.addEventListener("sceneprint:theme", () => this.#paint(), { signal });
     signal.addEventListener("abort", () => this.#viewer?.destroy(), { once: true });
   }
 
-  /** The viewer; its up axis is that of the poses that came first. */
+  /** The viewer; null before `begin`. */
   get viewer() { return this.#viewer; }
 
-  /** What is up, where the poses say so. @returns {"z" | "y" | "-y" | null} */
-  get up() { return this.#up; }
+  /** Directions of the picture: two level ones, and up. */
+  get axes() { return this.#axes; }
+
+  /** What is taken off all coordinates, metres. */
+  get origin() { return this.#origin; }
+
+  /**
+   * Begin a picture in another frame, or with another axis up.
+   * @param {{origin: number[], up: import("../viewer/camera.js").Up, label: string, flat: boolean}} what
+   *   origin: a point near all that is drawn; label: what is to be seen; flat: as a plan
+   */
+  begin({ origin, up, label, flat }) {
+    this.#origin = [...origin];
+    const orbit = new Orbit(up), { above, ahead, right } = orbit;
+    this.#axes = { above, ahead, right };
+    if (this.#viewer === null) {
+      this.#viewer = createViewer(this.canvas, { label, up, antialias: false, onview: () => { this.#moved(); this.onview(); } });
+      Object.assign(this.canvas, { viewer: this.#viewer, scene: this }); // whoever debugs finds them there
+    } else {
+      Object.assign(this.#viewer.orbit, { above, ahead, right });
+      this.#viewer.label = label;
+    }
+    this.#under = { box: null, floor: null };
+    this.show([]);
+    for (const name of this.#marks.keys()) this.mark(name, []);
+    this.#viewer.look({ ...(flat ? { azimuth: 0 } : ASIDE), flat });
+  }
 
   /**
    * Draw other paths.
    * @param {(import("./data.js").Path & {world: number[][]})[]} paths world: poses in the frame of
    *   the picture
-   * @param {string} label what is to be seen
-   * @param {"z" | "y" | "-y" | null} up null: as the poses say
    */
-  show(paths, label, up) {
+  show(paths) {
     const all = paths.flatMap((one) => one.world.map(placeOf));
-    this.#origin = all.length ? [...all[0]] : [0, 0, 0];
-    this.#up = up ?? upright(paths.flatMap((one) => one.world.map((matrix) => ({ matrix, isCloud: one.isCloud }))));
-    if (this.#viewer === null) {
-      this.#viewer = createViewer(this.canvas, { label, up: this.#up, onview: () => this.#moved() });
-      this.canvas.viewer = this.#viewer; // whoever debugs finds it there
-    } else {
-      const { above, ahead, right } = new Orbit(this.#up);
-      Object.assign(this.#viewer.orbit, { above, ahead, right });
-    }
     for (let i = 0; i < this.#drawn.length; i += 1) {
       this.#viewer.remove(`path ${i}`);
       this.#viewer.remove(`frustums ${i}`);
@@ -109,17 +130,50 @@ class Scene {
     this.#hidden = new Set();
     this.#selected = this.#asked = null;
     for (const id of ["selected", ...ASKED]) this.#viewer.remove(id);
-    this.#box = boxAbout(all.map((p) => this.#near(p)));
+    this.#box = boxAbout(all.map((p) => this.near(p)));
     const size = this.#box ? Math.hypot(...this.#box.high.map((x, k) => x - this.#box.low[k])) : 1;
     this.#size = Math.max(size, 0.5) * 0.035;
     this.#ground();
     paths.forEach((one, i) => {
-      this.#viewer.lines(`path ${i}`, { positions: polyline(one.world.map((m) => this.#near(placeOf(m)))), width: 2 });
+      this.#viewer.lines(`path ${i}`, { positions: polyline(one.world.map((m) => this.near(placeOf(m)))), width: 2 });
     });
     this.#ratio = 0;
     this.#thin(1);
     this.#paint();
     this.#label();
+  }
+
+  /** The surface that paths are drawn over, less the origin. @param {any} box null: none
+   * @param {number | null} floor its height along the axis that is up; null: not known */
+  lay(box, floor) {
+    this.#under = { box, floor };
+    this.#ground();
+  }
+
+  /**
+   * Labels of others, at places of the picture's frame.
+   * @param {string} name of a group, which replaces the group of that name
+   * @param {{at: number[], node: HTMLElement}[]} marks
+   */
+  mark(name, marks) {
+    this.#marks.set(name, marks.map((one) => ({ ...one, at: this.near(one.at) })));
+    this.#label();
+  }
+
+  /**
+   * Sensors at poses of the picture's frame, such as of robots.
+   * @param {string} id of the layer
+   * @param {{pose: number[], camera: any, trail?: number[][]}[]} ones camera: null of a cloud's
+   *   sensor; trail: poses before it
+   * @param {string} tint
+   */
+  sensors(id, ones, tint) {
+    const size = 2 * this.#size;
+    const shapes = ones.map(({ pose, camera }) => copies(sensor(camera, size), [this.moveOrigin(pose)]));
+    const trails = ones.map(({ trail = [] }) => polyline(trail.map((pose) => this.near(placeOf(pose)))));
+    const joined = (parts) => Float32Array.from(parts.flatMap((one) => [...one]));
+    this.#viewer.lines(id, { positions: joined(shapes), tint, width: 3 });
+    this.#viewer.lines(`${id} trails`, { positions: joined(trails), tint, width: 1.5 });
   }
 
   /** Which runs are not drawn, by their place. @param {Set<number>} hidden */
@@ -135,7 +189,7 @@ class Scene {
   edges(edges) {
     for (const { kind, tint, dash } of EDGES) {
       const mine = edges.filter((one) => one.kind === kind);
-      const [from, to] = [mine.map((one) => this.#near(one.from)), mine.map((one) => this.#near(one.to))];
+      const [from, to] = [mine.map((one) => this.near(one.from)), mine.map((one) => this.near(one.to))];
       const positions = dash
         ? dashes(from.map((p, i) => [p, to[i]]), dash[0] * this.#size, dash[1] * this.#size)
         : links(from, to);
@@ -155,17 +209,17 @@ class Scene {
     for (const id of ASKED) this.#viewer.remove(id);
     if (asked === null) { this.#label(); return; }
     const size = 2.4 * this.#size, shape = sensor(asked.camera, size);
-    if (asked.pose) this.#viewer.lines("query", { positions: copies(shape, [this.#moveOrigin(asked.pose)]), tint: "query", width: 3.5 });
+    if (asked.pose) this.#viewer.lines("query", { positions: copies(shape, [this.moveOrigin(asked.pose)]), tint: "query", width: 3.5 });
     // of one rank: none is drawn as the answer
     const broken = hollow(shape, size / 8);
-    if (asked.alternatives.length) this.#viewer.lines("alternatives", { positions: copies(broken, asked.alternatives.map((m) => this.#moveOrigin(m))), tint: "query", width: 2.5 });
+    if (asked.alternatives.length) this.#viewer.lines("alternatives", { positions: copies(broken, asked.alternatives.map((m) => this.moveOrigin(m))), tint: "query", width: 2.5 });
     if (asked.pose && asked.axes) {
-      const turn = [...asked.turn.slice(0, 12), ...this.#near(placeOf(asked.pose)), 1];
+      const turn = [...asked.turn.slice(0, 12), ...this.near(placeOf(asked.pose)), 1];
       this.#viewer.lines("ellipsoid", { positions: copies(ellipsoid(asked.axes), [turn]), tint: "query", width: 1.5 });
     }
-    const there = asked.matches.map(({ pose }) => this.#moveOrigin(pose));
+    const there = asked.matches.map(({ pose }) => this.moveOrigin(pose));
     const seen = asked.matches.map(({ camera }, i) => copies(sensor(camera, 1.3 * this.#size), [there[i]]));
-    this.#viewer.lines("matches", { positions: links(asked.matches.map(({ voted }) => this.#near(placeOf(voted))), there.map(placeOf)), tint: "query", width: 1.5 });
+    this.#viewer.lines("matches", { positions: links(asked.matches.map(({ voted }) => this.near(placeOf(voted))), there.map(placeOf)), tint: "query", width: 1.5 });
     this.#viewer.lines("matched", { positions: Float32Array.from(seen.flatMap((one) => [...one])), tint: "match", width: 2.5 });
     this.#label();
   }
@@ -175,42 +229,55 @@ class Scene {
     this.#selected = one;
     if (one === null) { this.#viewer.remove("selected"); this.#label(); return; }
     const path = this.#drawn[one.path];
-    const pose = this.#moveOrigin(path.world[one.place]);
+    const pose = this.moveOrigin(path.world[one.place]);
     this.#viewer.lines("selected", { positions: copies(this.#sensor(path, 1.6 * this.#size), [pose]), tint: "ink", width: 3 });
     this.#label();
   }
 
-  /** Look at all of it. @param {"top" | "side" | "keep"} from which side; keep: as it is */
-  look(from) {
+  /** Look at all of it. @param {"plan" | "space" | "keep"} how keep: as it is */
+  look(how) {
     if (this.#viewer === null) return; // nothing has come yet
-    if (from === "top") this.#viewer.look({ azimuth: 0, elevation: STEEP });
-    if (from === "side") this.#viewer.look({ azimuth: 0.6, elevation: 0.55 });
+    if (how === "plan") this.#viewer.look({ flat: true, azimuth: 0 });
+    if (how === "space") this.#viewer.look({ flat: false, ...ASIDE });
     const seen = this.#drawn.flatMap((_, i) => (this.#hidden.has(i) ? [] : [`path ${i}`, `frustums ${i}`]));
-    this.#viewer.fit([...seen, "query", "alternatives", "matched"].filter((id) => this.#viewer.has(id)));
+    this.#viewer.fit([...seen, "surface", "query", "alternatives", "matched"].filter((id) => this.#viewer.has(id)));
     this.#wide = this.#viewer.camera.distance;
     this.#moved();
   }
 
   /** Look at one place from near by. @param {number[]} pose in the picture's frame */
   approach(pose) {
-    this.#viewer.look({ target: this.#near(placeOf(pose)), distance: 12 * this.#size });
+    this.#viewer.look({ target: this.near(placeOf(pose)), distance: 12 * this.#size });
     this.#moved();
   }
 
-  #near(p) { return p.map((x, k) => x - this.#origin[k]); }
+  /** A place less the origin. @param {number[]} p */
+  near(p) { return p.map((x, k) => x - this.#origin[k]); }
 
-  #moveOrigin(pose) { return [...pose.slice(0, 12), ...this.#near(placeOf(pose)), 1]; }
+  /** A pose less the origin. @param {number[]} pose 16, column-major */
+  moveOrigin(pose) { return [...pose.slice(0, 12), ...this.near(placeOf(pose)), 1]; }
 
   #sensor(path, size) { return sensor(path.isCloud ? null : path.camera, size); }
 
-  #pick(x, y) {
+  /** The frame whose sensor is near a place of the canvas, CSS pixels. @param {number} x
+   * @param {number} y @param {number} within @returns {{path: number, place: number} | null} */
+  pick(x, y, within) {
     const shown = this.#drawn.map((one, path) => ({ one, path })).filter(({ path }) => !this.#hidden.has(path));
-    const all = shown.flatMap(({ one, path }) => one.world.map((m, place) => ({ path, place, at: this.#near(placeOf(m)) })));
+    const all = shown.flatMap(({ one, path }) => one.world.map((m, place) => ({ path, place, at: this.near(placeOf(m)) })));
     if (!this.#viewer.available || !this.#box) return null;
-    const { clientWidth, clientHeight } = this.canvas;
-    const clip = this.#viewer.orbit.projection(clientWidth / clientHeight, this.#box);
-    const found = nearest(all.map((one) => one.at), projector(clip, clientWidth, clientHeight), x, y);
-    return found < 0 ? null : all[found];
+    const found = nearest(all.map((one) => one.at), this.projector(), x, y, within);
+    return found < 0 ? null : { path: all[found].path, place: all[found].place };
+  }
+
+  /** Places less the origin to CSS pixels of the canvas, and metres ahead of the eye. */
+  projector() {
+    const { clientWidth, clientHeight } = this.canvas, { orbit } = this.#viewer;
+    const flat = projector(this.#viewer.clip, clientWidth, clientHeight);
+    const eye = orbit.eye(), { ahead } = orbit.axes();
+    return (p) => {
+      const seen = flat(p);
+      return seen && /** @type {[number, number, number]} */ ([seen[0], seen[1], dot(ahead, p) - dot(ahead, eye)]);
+    };
   }
 
   // more frustums, and smaller ones, the nearer one looks
@@ -221,29 +288,28 @@ class Scene {
     this.#drawn.forEach((one, i) => {
       const share = Math.max(Math.ceil((FRUSTUMS * ratio * one.world.length) / Math.max(total, 1)), 2);
       const size = this.#size / Math.sqrt(ratio), chosen = spaced(one.world.map(placeOf), 0.7 * size, share);
-      const positions = copies(this.#sensor(one, size), chosen.map((k) => this.#moveOrigin(one.world[k])));
+      const positions = copies(this.#sensor(one, size), chosen.map((k) => this.moveOrigin(one.world[k])));
       this.#viewer.lines(`frustums ${i}`, { positions, width: 1.5, visible: !this.#hidden.has(i) });
     });
     this.#paint();
   }
 
   #ground() {
-    if (!this.#box) { this.#viewer.remove("grid"); put(this.#parts.ground); return; }
-    const [axis, sign] = AXES[this.#up];
-    const lowest = (sign > 0 ? this.#box.low[axis] : this.#box.high[axis]) + this.#origin[axis];
+    const box = around([this.#box, this.#under.box]);
+    if (!box) { this.#viewer.remove("grid"); put(this.#parts.ground); return; }
+    const lowest = reachAlong(box, this.#axes.above)[0] + dot(this.#axes.above, this.#origin);
     // what is measured from the floor has it at 0; where that is far from a small path, or unlikely,
     // the grid lies at the path
-    const size = Math.max(...this.#box.high.map((x, k) => x - this.#box.low[k]));
-    const height = sign * lowest >= 0 && sign * lowest < Math.min(3, size) ? 0 : lowest;
-    const { positions, step } = grid(this.#box, this.#up, height, this.#origin);
+    const size = Math.max(...box.high.map((x, k) => x - box.low[k]));
+    const height = this.#under.floor ?? (lowest >= 0 && lowest < Math.min(3, size) ? 0 : lowest);
+    const { positions, step } = grid(box, this.#axes, height, this.#origin);
     this.#viewer.lines("grid", { positions, tint: "line", width: 1 });
-    put(this.#parts.ground, `Grid ${metres(step)}, at ${height === 0 ? "height 0" : "the lowest pose"}`);
+    put(this.#parts.ground, `Grid ${metres(step)}${this.#under.floor !== null ? "" : height === 0 ? ", at height 0" : ", at the lowest pose"}`);
   }
 
   #paint() {
-    const style = getComputedStyle(document.documentElement);
     this.#drawn.forEach((one, i) => {
-      const tint = rgb(style.getPropertyValue(tokenOf(one.colour)));
+      const tint = tintOf(one);
       for (const kind of ["path", "frustums"]) this.#viewer.lines(`${kind} ${i}`, { tint });
     });
   }
@@ -251,18 +317,18 @@ class Scene {
   #label() {
     const made = [];
     this.#drawn.forEach((one, i) => {
-      if (one.world.length) made.push({ path: i, at: this.#near(placeOf(one.world[0])), node: h("span", { class: "paths-label", style: { borderColor: `var(${tokenOf(one.colour)})` } }, String(i + 1)) });
+      if (one.world.length) made.push({ path: i, at: this.near(placeOf(one.world[0])), node: h("span", { class: "paths-label", style: { borderColor: `var(${runToken(one)})` } }, String(i + 1)) });
     });
     this.#asked?.alternatives.forEach((pose, i) => {
-      made.push({ at: this.#near(placeOf(pose)), node: h("span", { class: "paths-label", dataset: { kind: "alternative" } }, letterOf(i)) });
+      made.push({ at: this.near(placeOf(pose)), node: h("span", { class: "paths-label", dataset: { kind: "alternative" } }, letterOf(i)) });
     });
-    if (this.#asked?.pose) made.push({ at: this.#near(placeOf(this.#asked.pose)), node: h("span", { class: "paths-label", dataset: { kind: "query" } }, "Query") });
+    if (this.#asked?.pose) made.push({ at: this.near(placeOf(this.#asked.pose)), node: h("span", { class: "paths-label", dataset: { kind: "query" } }, "Query") });
     if (this.#selected) {
       const { path, place } = this.#selected;
-      made.push({ at: this.#near(placeOf(this.#drawn[path].world[place])), node: h("span", { class: "paths-label", dataset: { kind: "selected" } }, "Chosen") });
+      made.push({ at: this.near(placeOf(this.#drawn[path].world[place])), node: h("span", { class: "paths-label", dataset: { kind: "selected" } }, "Chosen") });
     }
-    this.#labels = made;
-    put(this.#parts.labels, made.map((one) => one.node));
+    this.#labels = [...made, ...[...this.#marks.values()].flat()];
+    put(this.#parts.labels, this.#labels.map((one) => one.node));
     this.#moved();
   }
 

@@ -1,7 +1,7 @@
 // What is drawn, as segments: paths, frustums, edges, the grid, an ellipsoid. Numbers in, numbers
 // out; all of them about an origin near the paths, since those that are drawn have 32 bits.
 
-import { transformed } from "../viewer/matrix.js";
+import { add, dot, scale, transformed } from "../viewer/matrix.js";
 
 /** Half an axis of the ellipsoid that holds 95 % of a normal error in space, in deviations. */
 export const SIGMAS = Math.sqrt(7.8147);
@@ -41,8 +41,8 @@ export function dashes(pairs, dash, gap, most = 40) {
   const out = [];
   for (const [a, b] of pairs) {
     const length = Math.hypot(b[0] - a[0], b[1] - a[1], b[2] - a[2]);
-    const scale = Math.max(length / ((dash + gap) * most), 1);
-    const on = dash * scale, period = (dash + gap) * scale;
+    const times = Math.max(length / ((dash + gap) * most), 1);
+    const on = dash * times, period = (dash + gap) * times;
     const at = (s) => a.map((x, k) => x + (b[k] - x) * Math.min(s / length, 1));
     for (let s = 0; s < length; s += period) out.push(...at(s), ...at(s + on));
   }
@@ -105,31 +105,32 @@ export function boxAbout(places) {
   return { low, high };
 }
 
-/** Which axis is up, and its sign. */
-export const AXES = { z: [2, 1], y: [1, 1], "-y": [1, -1] };
+/** From where to where a box reaches along a direction. @param {{low: number[], high: number[]}} box
+ * @param {number[]} axis of unit length */
+export function reachAlong({ low, high }, axis) {
+  const ends = axis.map((x, k) => [x * low[k], x * high[k]]);
+  return [Math.min, Math.max].map((least) => ends.reduce((sum, pair) => sum + least(...pair), 0));
+}
 
 /**
  * A grid on the ground, a square about what stands on it.
  * @param {{low: number[], high: number[]}} box of what stands on it
- * @param {"z" | "y" | "-y"} up
- * @param {number} height of the ground along the axis that is up (its sign not counted)
+ * @param {{right: number[], ahead: number[], above: number[]}} axes two on the ground, and up; of unit
+ *   length, at right angles
+ * @param {number} height of the ground along `above`
  * @param {number[]} origin what was taken off: lines are at whole steps of the true coordinates
  * @returns {{positions: Float32Array, step: number}} step: metres
  */
-export function grid(box, up, height, origin) {
-  const axis = AXES[up][0], level = [0, 1, 2].filter((k) => k !== axis);
-  const size = Math.max(...level.map((k) => box.high[k] - box.low[k]), 0.2);
+export function grid(box, { right, ahead, above }, height, origin) {
+  const ends = [right, ahead].map((axis) => reachAlong(box, axis));
+  const off = [right, ahead].map((axis) => dot(axis, origin));
+  const size = Math.max(...ends.map(([from, to]) => to - from), 0.2);
   const step = nice(size / 10), out = [];
-  const middle = level.map((k) => (box.low[k] + box.high[k]) / 2 + origin[k]);
+  const middle = ends.map(([from, to], k) => (from + to) / 2 + off[k]);
   const low = middle.map((x) => Math.floor((x - 0.55 * size) / step - 1) * step);
   const high = middle.map((x) => Math.ceil((x + 0.55 * size) / step + 1) * step);
-  const point = (u, v) => {
-    const p = [0, 0, 0];
-    p[level[0]] = u - origin[level[0]];
-    p[level[1]] = v - origin[level[1]];
-    p[axis] = height - origin[axis];
-    return p;
-  };
+  const floor = scale(above, height - dot(above, origin));
+  const point = (u, v) => add(floor, add(scale(right, u - off[0]), scale(ahead, v - off[1])));
   for (let u = 0; u <= Math.round((high[0] - low[0]) / step); u += 1) {
     out.push(...point(low[0] + u * step, low[1]), ...point(low[0] + u * step, high[1]));
   }

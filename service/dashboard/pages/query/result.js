@@ -107,7 +107,7 @@ function lead(answer, before, isOwnPage) {
       pose && poseOf(pose, answer.kind)),
     h("div", { class: "query-verdict-links" },
       (answer.status === "ambiguous" || answer.status === "not_found") && h("a", { class: "button", href: link("maps", mapOf(answer), "coverage") }, "Coverage of the map"),
-      (pose || several.length > 0) && h("a", { class: "button", href: link("maps", mapOf(answer), "paths", { query: answer.query_id }) }, "On the map"),
+      (pose || several.length > 0) && h("a", { class: "button", href: link("maps", mapOf(answer), "place", { query: answer.query_id }) }, "On the map"),
       !isOwnPage && h("a", { class: "button", href: link("queries", answer.query_id), title: "Can be shared for one hour" }, `Answer ${shortId(answer.query_id)}`)));
 }
 

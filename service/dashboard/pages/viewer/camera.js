@@ -1,6 +1,6 @@
 // Where one looks from: an orbit about a target. Angles in radians, lengths in metres.
 
-import { add, cross, dot, multiply, perspective, scale, transformed, viewOf } from "./matrix.js";
+import { add, cross, dot, multiply, parallel, perspective, scale, transformed, viewOf } from "./matrix.js";
 
 /** Angle of view from top to bottom. */
 export const VIEW = (45 * Math.PI) / 180;
@@ -15,10 +15,13 @@ const AXES = {
   z: { above: [0, 0, 1], ahead: [0, 1, 0] },
 };
 
+/** What is up: an axis, or two directions of unit length at right angles.
+ * @typedef {"-y" | "y" | "z" | {above: number[], ahead: number[]}} Up */
+
 export class Orbit {
-  /** @param {"-y" | "y" | "z"} up */
+  /** @param {Up} up */
   constructor(up = "-y") {
-    const { above, ahead } = AXES[up];
+    const { above, ahead } = typeof up === "string" ? AXES[up] : up;
     this.above = above;
     this.ahead = ahead;
     this.right = cross(ahead, above);
@@ -26,12 +29,13 @@ export class Orbit {
     this.distance = 5;
     this.azimuth = 0; // turns to the right
     this.elevation = 0.35; // above the target, looking down
+    this.flat = false; // a plan: straight down, and nothing is smaller for being farther
   }
 
   /** Three directions at right angles: to the right of the screen, up it, and into it. */
   axes() {
     const [ca, sa] = [Math.cos(this.azimuth), Math.sin(this.azimuth)];
-    const [ce, se] = [Math.cos(this.elevation), Math.sin(this.elevation)];
+    const [ce, se] = this.flat ? [0, 1] : [Math.cos(this.elevation), Math.sin(this.elevation)];
     const level = add(scale(this.ahead, ca), scale(this.right, sa));
     const ahead = add(scale(level, ce), scale(this.above, -se));
     const right = add(scale(this.right, ca), scale(this.ahead, -sa));
@@ -42,8 +46,9 @@ export class Orbit {
     return add(this.target, scale(this.axes().ahead, -this.distance));
   }
 
-  /** @param {Partial<Orbit>} where target, distance, azimuth, elevation */
-  look({ target, distance, azimuth, elevation }) {
+  /** @param {Partial<Orbit>} where target, distance, azimuth, elevation, flat */
+  look({ target, distance, azimuth, elevation, flat }) {
+    if (flat !== undefined) this.flat = flat;
     if (target) this.target = [...target];
     if (distance !== undefined) this.distance = Math.min(Math.max(distance, NEAREST), FARTHEST);
     if (azimuth !== undefined) this.azimuth = azimuth;
@@ -77,6 +82,13 @@ export class Orbit {
       .map((axis) => points.map((p) => dot(p, axis)));
     const most = (values) => values.reduce((a, b) => Math.max(a, b), -Infinity);
     const tall = Math.tan(VIEW / 2) * FILLED, wide = tall * aspect;
+    if (this.flat) {
+      const ends = [x, y, z].map((values) => [-most(values.map((v) => -v)), most(values)]);
+      const [at, size] = [ends.map(([a, b]) => (a + b) / 2), ends.map(([a, b]) => b - a)];
+      const target = [axes.right, axes.above, axes.ahead].map((axis, k) => scale(axis, at[k])).reduce(add);
+      this.look({ target, distance: Math.max(size[0] / (2 * wide), size[1] / (2 * tall), 1e-2) });
+      return;
+    }
     // each side of the picture is a plane through the eye that all points must lie behind
     const side = (sign, values, slope) => most(values.map((v, i) => sign * v - slope * z[i]));
     const [left, right] = [side(-1, x, wide), side(1, x, wide)];
@@ -99,11 +111,13 @@ export class Orbit {
   projection(aspect, { low, high }) {
     const { right, above, ahead } = this.axes(), eye = this.eye();
     const view = viewOf(eye, right, above, ahead);
-    let farthest = this.distance;
+    let farthest = this.distance, closest = this.distance;
     for (let corner = 0; corner < 8; corner += 1) {
       const p = low.map((x, k) => ((corner >> k) & 1 ? high[k] : x));
-      farthest = Math.max(farthest, -transformed(view, p)[2]);
+      const depth = -transformed(view, p)[2];
+      [farthest, closest] = [Math.max(farthest, depth), Math.min(closest, depth)];
     }
+    if (this.flat) return multiply(parallel(VIEW, aspect, this.distance, closest - 1, farthest + 1), view);
     const far = farthest * 1.01 + 0.1, near = Math.max(this.distance / 100, far / 5000);
     return multiply(perspective(VIEW, aspect, near, far), view);
   }

@@ -38,8 +38,10 @@ export function hands(canvas, orbit, { changed, fit }) {
       const apart = (at) => Math.max(Math.hypot(at[0] - other[0], at[1] - other[1]), 1);
       orbit.zoom(apart(before) / apart(now));
       orbit.pan(right / 2, -down / 2); // each finger its half
-    } else if (event.shiftKey || (event.buttons & 6) !== 0) {
+    } else if ((event.shiftKey || (event.buttons & 6) !== 0) !== orbit.flat) { // a plan is rather moved than turned
       orbit.pan(right, -down);
+    } else if (orbit.flat) {
+      orbit.orbit(right * ACROSS, 0);
     } else {
       orbit.orbit(right * ACROSS, down * ACROSS);
     }
@@ -57,8 +59,8 @@ export function hands(canvas, orbit, { changed, fit }) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
     const arrow = arrows[event.key];
-    if (arrow && event.shiftKey) orbit.pan(-arrow[0] * STEP, -arrow[1] * STEP);
-    else if (arrow) orbit.orbit(arrow[0] * TURN, arrow[1] * TURN);
+    if (arrow && event.shiftKey !== orbit.flat) orbit.pan(-arrow[0] * STEP, -arrow[1] * STEP);
+    else if (arrow) orbit.orbit(arrow[0] * TURN, orbit.flat ? 0 : arrow[1] * TURN);
     else if (event.key === "+" || event.key === "=") orbit.zoom(NEARER);
     else if (event.key === "-" || event.key === "_") orbit.zoom(1 / NEARER);
     else if (event.key !== "0") return;

@@ -9,7 +9,7 @@ const MODES = { tint: 0, normal: 1, patch: 2, residual: 3, height: 4 };
 const unit = (bytes) => bytes.map((x) => x / 255);
 
 /** The box about a box that has been moved. */
-function movedBox({ low, high }, matrix) {
+export function movedBox({ low, high }, matrix) {
   const out = { low: [Infinity, Infinity, Infinity], high: [-Infinity, -Infinity, -Infinity] };
   for (let corner = 0; corner < 8; corner += 1) {
     const p = transformed(matrix, low.map((x, k) => ((corner >> k) & 1 ? high[k] : x)));
@@ -21,7 +21,7 @@ function movedBox({ low, high }, matrix) {
   return out;
 }
 
-class Layer {
+export class Layer {
   /** Bounds of what is drawn, null of nothing, and some of its points, before its matrix;
    * undefined: to be computed. @type {any} */
   own;
@@ -48,6 +48,23 @@ class Layer {
   /** @type {number | undefined} */
   alpha;
   onTop = false;
+  // of cells, see cells.js
+  /** @type {import("./cells.js").Tile[] | undefined} */
+  tiles;
+  /** @type {number | undefined} every how many-th cell is drawn, up to 31 */
+  every;
+  /** @type {{low: number[], high: number[]} | undefined} all there is, whether it is drawn or not */
+  extent;
+  /** @type {Uint8Array | undefined} rgb of each session */
+  palette;
+  /** @type {number[] | undefined} that the colours of heights reach from and to */
+  heights;
+  /** @type {number[] | null | undefined} what is lower or higher is not drawn */
+  cut;
+  /** @type {number | undefined} greatest code of times seen that colours reach to */
+  most;
+  /** @type {number[] | undefined} codes of times that colours reach from and to */
+  ages;
   // of both
   /** @type {any} a token's name, or red, green, blue */
   tint;
@@ -146,23 +163,7 @@ export class CloudLayer extends Layer {
     gl.vertexAttribPointer(2, 3, gl.BYTE, true, stride, 8);
     gl.enableVertexAttribArray(3);
     gl.vertexAttribIPointer(3, 1, gl.UNSIGNED_BYTE, stride, 11);
-    this.made.texture = this.palette(gl);
-  }
-
-  palette(gl) {
-    const colours = this.patchColours ?? manyColours(4096);
-    const rows = Math.max(1, Math.ceil(colours.length / 3 / 256));
-    const texels = new Uint8Array(256 * rows * 4).fill(150);
-    for (let i = 0; i < colours.length / 3; i += 1) {
-      texels.set(colours.subarray(3 * i, 3 * i + 3), 4 * i);
-    }
-    const texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 256, rows, 0, gl.RGBA, gl.UNSIGNED_BYTE, texels);
-    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
-      gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
-    }
-    return texture;
+    this.made.texture = paletteTexture(gl, this.patchColours ?? manyColours(4096));
   }
 
   draw(gl, { at }, view) {
@@ -284,6 +285,23 @@ export class ShapeLayer extends Layer {
       gl.drawArrays(gl.TRIANGLES, 0, Math.floor(this.positions.length / 9) * 3);
     }
   }
+}
+
+/** Colours by number, 256 a row; those that are none are grey. @param {any} gl
+ * @param {Uint8Array} colours rgb of each */
+export function paletteTexture(gl, colours) {
+  const rows = Math.max(1, Math.ceil(colours.length / 3 / 256));
+  const texels = new Uint8Array(256 * rows * 4).fill(150);
+  for (let i = 0; i < colours.length / 3; i += 1) {
+    texels.set(colours.subarray(3 * i, 3 * i + 3), 4 * i);
+  }
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 256, rows, 0, gl.RGBA, gl.UNSIGNED_BYTE, texels);
+  for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+    gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+  }
+  return texture;
 }
 
 /** Each so many values four times: an instance for each segment would do without, but costs a GPU

@@ -58,6 +58,17 @@ export function perspective(height, aspect, near, far) {
   return [f / aspect, 0, 0, 0, 0, f, 0, 0, 0, 0, (near + far) * d, -1, 0, 0, 2 * near * far * d, 0];
 }
 
+/**
+ * As `perspective`, but all is as large as it would be at a distance; w is that distance everywhere.
+ * @param {number} height @param {number} aspect @param {number} distance
+ * @param {number} near @param {number} far metres before the eye; they may be behind it
+ * @returns {Matrix}
+ */
+export function parallel(height, aspect, distance, near, far) {
+  const f = 1 / Math.tan(height / 2), d = distance / (near - far);
+  return [f / aspect, 0, 0, 0, 0, f, 0, 0, 0, 0, 2 * d, 0, 0, 0, (near + far) * d, distance];
+}
+
 /** Unit quaternion x, y, z, w of a rotation. @param {Matrix} m */
 export function quaternionOf(m) {
   const [a, b, c] = [m[0], m[5], m[10]];

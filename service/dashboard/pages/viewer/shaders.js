@@ -1,6 +1,17 @@
 // What the GPU runs: points, lines of a width (WebGL's own are one pixel), triangles.
 // Colours are sRGB bytes and are written as they are: nothing here is linear light.
 
+/** From dark to bright, readable without colours: viridis. */
+const RAMP = `const vec3 ramp[5] = vec3[5](
+  vec3(0.267, 0.005, 0.329), vec3(0.230, 0.322, 0.546), vec3(0.128, 0.567, 0.551),
+  vec3(0.369, 0.789, 0.383), vec3(0.993, 0.906, 0.144));
+
+vec3 ramped(float share) {
+  float t = clamp(share, 0.0, 1.0) * 4.0;
+  int k = min(int(t), 3);
+  return mix(ramp[k], ramp[k + 1], t - float(k));
+}`;
+
 const POINTS = `#version 300 es
 layout(location = 0) in vec3 at;
 layout(location = 1) in uint group;
@@ -14,10 +25,7 @@ uniform int mode;
 uniform sampler2D palette;
 flat out vec3 colour;
 
-const vec3 ramp[5] = vec3[5](
-  vec3(0.267, 0.005, 0.329), vec3(0.230, 0.322, 0.546), vec3(0.128, 0.567, 0.551),
-  vec3(0.369, 0.789, 0.383), vec3(0.993, 0.906, 0.144));
-
+${RAMP}
 vec3 grouped() {
   if (group == 65535u) return outside;
   return texelFetch(palette, ivec2(int(group & 255u), int(group >> 8)), 0).rgb;
@@ -38,9 +46,7 @@ void main() {
   else if (mode == 2) colour = grouped();
   else if (mode == 3) colour = kept();
   else if (mode == 4) {
-    float h = clamp((dot(world.xyz, above) - heights.x) / max(heights.y - heights.x, 1e-6), 0., 1.);
-    int k = min(int(h * 4.0), 3);
-    colour = mix(ramp[k], ramp[k + 1], h * 4.0 - float(k));
+    colour = ramped((dot(world.xyz, above) - heights.x) / max(heights.y - heights.x, 1e-6));
   } else {
     float facing = abs(dot(turned, normalize(eye - world.xyz)));
     colour = tint * (1.0 - shade * (1.0 - facing));
@@ -52,6 +58,36 @@ precision mediump float;
 flat in vec3 colour;
 out vec4 pixel;
 void main() { pixel = vec4(colour, 1.0); }`;
+
+// bytes of a tile of the surface as the API sends them: place in the tile, times seen; session, age
+const CELLS = `#version 300 es
+layout(location = 0) in uvec4 place;
+layout(location = 1) in uvec2 last;
+uniform mat4 model, clip;
+uniform vec3 above, unknown;
+uniform vec2 pixels, heights, cut, ages;
+uniform float span, size, most; // metres of the tile; pixels at one metre; greatest of times seen
+uniform int mode;
+uniform sampler2D palette;
+flat out vec3 colour;
+
+${RAMP}
+
+void main() {
+  vec4 world = model * vec4((vec3(place.xyz) + 0.5) / 256.0 * span, 1.0);
+  float height = dot(world.xyz, above);
+  gl_Position = clip * world;
+  gl_PointSize = clamp(size / max(gl_Position.w, 1e-6), pixels.x, pixels.y);
+  if (height < cut.x || height > cut.y) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+  float share = clamp((height - heights.x) / max(heights.y - heights.x, 1e-6), 0.0, 1.0);
+  if (mode == 0) colour = ramped(share);
+  else if (mode == 1) { // what is lower is darker: one colour alone has no shape
+    colour = last.x == 65535u ? unknown : texelFetch(palette, ivec2(int(last.x & 255u), int(last.x >> 8)), 0).rgb;
+    colour *= 0.6 + 0.4 * share;
+  }
+  else if (mode == 2) colour = ramped((float(place.w) - 16.0) / max(most - 16.0, 1.0));
+  else colour = last.y == 65535u ? unknown : ramped((float(last.y) - ages.x) / max(ages.y - ages.x, 1.0));
+}`;
 
 // a segment is a strip of four corners, moved off its axis by half its width on the screen
 const LINES = `#version 300 es
@@ -105,7 +141,7 @@ uniform float alpha;
 out vec4 pixel;
 void main() { pixel = vec4(colour * alpha, alpha); }`;
 
-function program(gl, vertex, fragment) {
+function linked(gl, vertex, fragment) {
   const made = gl.createProgram();
   for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(kind);
@@ -127,9 +163,11 @@ function program(gl, vertex, fragment) {
   return { made, at };
 }
 
-/** The three programs of a context, with the places of their uniforms. */
-export const programs = (gl) => ({
-  points: program(gl, POINTS, POINT_COLOUR),
-  lines: program(gl, LINES, LINE_COLOUR),
-  triangles: program(gl, TRIANGLES, TRIANGLE_COLOUR),
-});
+const SOURCES = {
+  points: [POINTS, POINT_COLOUR], cells: [CELLS, POINT_COLOUR], lines: [LINES, LINE_COLOUR],
+  triangles: [TRIANGLES, TRIANGLE_COLOUR],
+};
+
+/** A program of a context, with the places of its uniforms. @param {any} gl
+ * @param {keyof typeof SOURCES} kind @returns {{made: WebGLProgram, at: Object<string, any>}} */
+export const program = (gl, kind) => linked(gl, ...SOURCES[kind]);

@@ -3,13 +3,15 @@
 import { Orbit, VIEW } from "./camera.js";
 import { colourOf, onTheme } from "./colours.js";
 import { hands } from "./controls.js";
+import { CellsLayer } from "./cells.js";
 import { CloudLayer, ShapeLayer, around } from "./layers.js";
 import { dot, transformed } from "./matrix.js";
-import { programs } from "./shaders.js";
+import { program } from "./shaders.js";
 
 export { frustum } from "./shapes.js";
 
 const KEYS = "Arrow keys turn, with Shift they move; plus and minus zoom; 0 shows all.";
+const PLAN_KEYS = "Arrow keys move, with Shift they turn; plus and minus zoom; 0 shows all.";
 const NOTHING = { low: [-1, -1, -1], high: [1, 1, 1] };
 /** More pixels than that per CSS pixel nobody sees, and each costs. */
 const DENSEST = 2;
@@ -17,7 +19,7 @@ const DENSEST = 2;
 /**
  * @typedef {object} Options
  * @property {string} label what is to be seen, for who does not see it
- * @property {"-y" | "y" | "z"} [up] "-y" of a camera's optical axes, "z" of maps and LiDAR
+ * @property {import("./camera.js").Up} [up] "-y" of a camera's optical axes, "z" of maps and LiDAR
  * @property {boolean} [antialias]
  * @property {string} [background] a token's name
  * @property {(lost: boolean) => void} [onlost] the context went, or came back
@@ -37,8 +39,8 @@ export function createViewer(canvas, options) {
 export class Viewer {
   /** @type {any} the context; null without WebGL 2 */
   #gl;
-  /** @type {any} programs of the context; null before there is one */
-  #made = null;
+  /** @type {Object<string, any>} programs of the context */
+  #made = {};
   /** @type {Map<string, any>} */
   #layers = new Map();
   #dirty = 0;
@@ -60,6 +62,7 @@ export class Viewer {
     this.orbit = new Orbit(up);
     this.background = background;
     this.onview = onview;
+    this.label = label;
     this.#gl = canvas.getContext("webgl2", { antialias, alpha: false, powerPreference: "low-power" });
     this.available = this.#gl !== null;
     if (!this.available) {
@@ -73,7 +76,7 @@ export class Viewer {
     canvas.tabIndex = 0;
     canvas.setAttribute("role", "application"); // a screen reader leaves the arrow keys to it
     canvas.setAttribute("aria-roledescription", "3-D view");
-    canvas.setAttribute("aria-label", `${label}. ${KEYS}`);
+    this.#name();
     canvas.style.setProperty("touch-action", "none");
     const changed = () => { this.#fitted = null; this.redraw(); };
     this.#stops.push(
@@ -126,6 +129,11 @@ export class Viewer {
     this.#set(id, told, () => new ShapeLayer("triangles", told));
   }
 
+  /** Cells of a map's surface: tiles, extent, colour, palette, heights, cut; see cells.js. */
+  cells(id, told) {
+    this.#set(id, told, () => new CellsLayer(told));
+  }
+
   #set(id, told, make) {
     if (!this.available) return;
     const layer = this.#layers.get(id);
@@ -136,6 +144,11 @@ export class Viewer {
 
   has(id) {
     return this.#layers.has(id);
+  }
+
+  /** A layer as it is drawn, for tests; see layers.js. @param {string} id */
+  layer(id) {
+    return this.#layers.get(id);
   }
 
   remove(id) {
@@ -154,18 +167,25 @@ export class Viewer {
     this.redraw();
   }
 
-  /** @param {Partial<Orbit>} where target (metres), distance (metres), azimuth, elevation (radians) */
+  /** @param {Partial<Orbit>} where target (metres), distance (metres), azimuth, elevation
+   * (radians), flat (whether it is a plan) */
   look(where) {
     if (!this.available) return;
     this.#fitted = null;
     this.orbit.look(where);
+    if (where.flat !== undefined) this.#name();
     this.redraw();
   }
 
-  /** Where one looks from: target, distance, azimuth, elevation, as `look` takes them. */
+  /** Where one looks from: target, distance, azimuth, elevation, flat, as `look` takes them. */
   get camera() {
-    const { target, distance, azimuth, elevation } = this.orbit;
-    return { target: [...target], distance, azimuth, elevation };
+    const { target, distance, azimuth, elevation, flat } = this.orbit;
+    return { target: [...target], distance, azimuth, elevation, flat };
+  }
+
+  // what is to be seen, and what the keys do there
+  #name() {
+    this.canvas.setAttribute("aria-label", `${this.label}. ${this.orbit.flat ? PLAN_KEYS : KEYS}`);
   }
 
   /** Where a point of the world is on the canvas: CSS pixels from its left and top, and metres
@@ -175,6 +195,23 @@ export class Viewer {
     if (w <= 0) return null;
     const { clientWidth, clientHeight } = this.canvas;
     return [((x / w + 1) / 2) * clientWidth, ((1 - y / w) / 2) * clientHeight, w];
+  }
+
+  /** Whether a graphics card draws, as far as the browser tells. */
+  get isFast() {
+    const known = this.#gl?.getExtension("WEBGL_debug_renderer_info");
+    const name = known ? this.#gl.getParameter(known.UNMASKED_RENDERER_WEBGL) : "";
+    return Boolean(name) && !/swiftshader|llvmpipe|software|basic render/i.test(name);
+  }
+
+  /** Whether nobody has looked elsewhere since `fit`. */
+  get isFitted() {
+    return this.#fitted !== null;
+  }
+
+  /** World to clip coordinates; 16, column-major. */
+  get clip() {
+    return this.#clip();
   }
 
   redraw() {
@@ -213,8 +250,13 @@ export class Viewer {
 
   #begin() {
     for (const layer of this.#layers.values()) layer.free(null); // went with the old context
-    this.#made = programs(this.#gl);
+    this.#made = {};
     this.redraw();
+  }
+
+  // compiled when it is first drawn with
+  #program(kind) {
+    return this.#made[kind] ??= program(this.#gl, kind);
   }
 
   #aspect() {
@@ -246,38 +288,42 @@ export class Viewer {
       canvas.width = width;
       canvas.height = height;
     }
+    const clip = this.#clip();
     const view = {
-      density, heights: this.#heights(), pixelsAtOneMetre: height / 2 / Math.tan(VIEW / 2),
+      clip, density, heights: this.#heights(), pixelsAtOneMetre: height / 2 / Math.tan(VIEW / 2),
     };
     gl.viewport(0, 0, width, height);
     gl.clearColor(...colourOf(this.background).map((x) => x / 255), 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA); // colours come times alpha
-    const clip = this.#clip();
     const clear = (one) => one.kind === "triangles" && (one.alpha ?? 1) < 1;
     const layers = [...this.#layers.values()].filter((one) => one.visible);
-    for (const kind of ["points", "lines", "triangles"]) {
-      const { made, at } = this.#made[kind];
+    for (const kind of ["cells", "points", "lines", "triangles"]) {
+      const mine = layers.filter((one) => one.kind === kind && !one.onTop);
+      if (!mine.length) continue;
+      const { made, at } = this.#program(kind);
       gl.useProgram(made);
       gl.uniformMatrix4fv(at.clip, false, clip);
-      if (kind === "points") {
-        gl.uniform3fv(at.eye, this.orbit.eye());
-        gl.uniform3fv(at.above, this.orbit.above);
-      }
+      if (kind === "points") gl.uniform3fv(at.eye, this.orbit.eye());
+      if (kind === "points" || kind === "cells") gl.uniform3fv(at.above, this.orbit.above);
       if (kind === "lines") gl.uniform2f(at.screen, width, height);
-      const mine = layers.filter((one) => one.kind === kind && !one.onTop);
       for (const one of [...mine.filter((x) => !clear(x)), ...mine.filter(clear)]) {
         gl[clear(one) ? "enable" : "disable"](gl.BLEND);
         gl.depthMask(!clear(one)); // what is behind glass is seen
-        one.draw(gl, this.#made[kind], view);
+        one.draw(gl, this.#program(kind), view);
       }
     }
     gl.disable(gl.BLEND);
     gl.depthMask(true);
     gl.disable(gl.DEPTH_TEST);
-    gl.useProgram(this.#made.lines.made);
-    for (const one of layers) if (one.kind === "lines" && one.onTop) one.draw(gl, this.#made.lines, view);
+    for (const one of layers.filter((x) => x.kind === "lines" && x.onTop)) {
+      const { made, at } = this.#program("lines");
+      gl.useProgram(made);
+      gl.uniformMatrix4fv(at.clip, false, clip);
+      gl.uniform2f(at.screen, width, height);
+      one.draw(gl, this.#program("lines"), view);
+    }
     this.frames += 1;
     this.onview();
   }

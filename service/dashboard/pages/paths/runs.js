@@ -1,60 +1,22 @@
-// The map view: where all runs went, what joins them, and the query of an answer among them.
+// The runs of a map in its picture: where they went, what joins them, and the query of an answer
+// among them.
 
 import { h, put } from "../lib/dom.js";
 import { count } from "../lib/format.js";
 import { plain } from "../lib/prose.js";
-import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
-import { empty } from "../lib/states.js";
 import { multiply, ofRows } from "../viewer/matrix.js";
-import { answerOf, askedPanel } from "./asked.js";
+import { askedPanel } from "./asked.js";
 import { associationsPanel, begin, follow, goesOn, kindOf } from "./associations.js";
 import { chooser } from "./card.js";
-import { associationsOf, edgesOf, MOST_DRAWN, MOST_RUNS, pathOf, runsOf, sessionsOf } from "./data.js";
+import { edgesOf, MOST_DRAWN, MOST_RUNS, pathOf } from "./data.js";
 import { bridges, reach } from "./joined.js";
 import { leftOut, legend } from "./legend.js";
-import { createScene } from "./scene.js";
-import { placeOf } from "./shapes.js";
+import { placeOf, upright } from "./shapes.js";
 import { edgesTable, runsTable } from "./tables.js";
 
-export const styles = ["paths/paths.css", "query/alternatives.css"];
-
-export async function render(root, { params: { map }, search, signal, go }) {
-  const query = search.get("query");
-  const [sessions, associations, asked] = await Promise.all([
-    sessionsOf(map, signal), associationsOf(map, signal),
-    query ? answerOf(query, map, signal).catch(missing) : null,
-  ]);
-  const { runs, without } = runsOf(sessions.items);
-  if (!runs.length) {
-    put(root, nothing(map, without));
-    return;
-  }
-  new Page(root, { map, search, signal, go, runs, without, more: sessions.more, associations, asked });
-  await root.drawn;
-}
-
-/** An answer that is kept no more is no reason to show no map. */
-function missing(error) {
-  if (error.status !== 404) throw error;
-  return { gone: true };
-}
-
-function nothing(map, without) {
-  const text = without.length
-    ? "Its frames have no poses or no session. Send `pose`, `session` and `captured_at` with a frame, or edit them."
-    : "Upload frames with poses to see the paths of the robots here.";
-  const upload = may("write", map) && h("a", { class: "button primary", href: link("maps", map, "upload") }, "Upload frames");
-  const box = empty({ title: "There is no path to draw", text, actions: upload });
-  const list = leftOut(without);
-  if (list) box.append(list);
-  return box;
-}
-
-class Page {
+export class Runs {
   #paths = new Map(); // by run, as they were fetched
-  /** @type {ReturnType<typeof createScene>} */
-  scene;
   /** @type {ReturnType<typeof chooser>} */
   card;
   /** @type {HTMLSelectElement} */
@@ -84,69 +46,71 @@ class Page {
   /** @type {Map<string, any>} */
   #reached = new Map();
 
-  constructor(root, told) {
+  /**
+   * @param {{map: string, signal: AbortSignal, search: URLSearchParams, scene: import("./scene.js").Scene,
+   *   runs: import("./data.js").Run[], without: any[], more: boolean, associations: any[], asked: any,
+   *   names: string[], onframe: (parent: string, reached: Map<string, any>, up: string | null,
+   *   poses: (() => {origin: number[], up: any}) | null) => boolean, onchange: () => void,
+   *   onreveal: () => void}} told more: whether the map has more runs than these; names: other parent
+   *   frames that can be drawn, the best first; onframe: begins the picture of a parent frame, which
+   *   it may put off until poses are there: false; onchange: the address follows; onreveal: a frame
+   *   was chosen
+   */
+  constructor(told) {
+    const { search } = told;
     this.map = told.map;
     this.signal = told.signal;
-    this.go = told.go;
-    this.search = told.search;
+    this.scene = told.scene;
     this.runs = told.runs;
     this.without = told.without;
-    this.more = told.more; // whether the map has more runs than it told
+    this.more = told.more;
     this.associations = told.associations;
     this.asked = told.asked?.gone ? null : told.asked;
-    this.gone = Boolean(told.asked?.gone);
+    this.gone = told.asked?.gone ?? null;
+    this.onframe = told.onframe;
+    this.onchange = told.onchange;
+    this.onreveal = told.onreveal;
     this.#joins = bridges(this.associations);
-    const { search } = told;
-    const known = new Set(this.runs.map((one) => one.parent));
-    this.parent = [search.get("parent"), this.asked?.parent, most(this.runs)].find((one) => known.has(one));
+    this.names = [...new Set([...told.names, ...this.runs.map((one) => one.parent)])];
+    this.parent = [search.get("parent"), this.asked?.parent, told.names[0], most(this.runs)].find((one) => this.names.includes(one)) ?? "";
     this.joined = search.get("joined") !== "no";
     const wanted = search.get("association");
     const over = this.associations.find((one) => one.state === "succeeded");
     this.association = wanted === null ? over ?? null : this.associations.find((one) => one.association_id === wanted) ?? null;
-    this.up = ["z", "y", "-y"].includes(search.get("up")) ? search.get("up") : null;
-    this.#build(root);
-    root.drawn = this.#draw();
+    this.up = ["z", "y", "-y"].includes(search.get("up") ?? "") ? search.get("up") : null;
+    this.#build();
     for (const one of this.associations.filter(goesOn)) this.#follow(one.association_id);
   }
 
-  #build(root) {
-    const stage = h("div", { class: "paths-stage" });
-    this.scene = createScene(stage, { signal: this.signal, onpick: (path, place) => this.#choose({ path, place }) });
+  #build() {
     this.card = chooser({
-      map: this.map, signal: this.signal, onchoose: (one) => this.#choose(one),
+      map: this.map, signal: this.signal, onchoose: (one) => this.choose(one),
       onapproach: () => { const one = this.card.chosen; if (one) this.scene.approach(this.#drawn[one.path].world[one.place]); },
     });
-    const button = (text, onClick) => h("button", { class: "button", type: "button", onClick }, text);
-    this.parents = h("select", { id: "paths-parent", onChange: () => { this.parent = this.parents.value; this.#draw(); } });
-    this.together = h("input", { type: "checkbox", id: "paths-joined", checked: this.joined, onChange: () => { this.joined = this.together.checked; this.#draw(); } });
-    this.ups = h("select", { id: "paths-up", onChange: () => { this.up = this.ups.value || null; this.#draw(); } },
-      [["", "Up axis: auto"], ["z", "Up axis: z"], ["y", "Up axis: y"], ["-y", "Up axis: −y"]].map(([value, text]) => h("option", { value, selected: (this.up ?? "") === value }, text)));
-    this.ups.setAttribute("aria-label", "Up axis");
+    this.parents = h("select", { id: "paths-parent", onChange: () => { this.parent = this.parents.value; this.draw(); } });
+    this.together = h("input", { type: "checkbox", id: "paths-joined", checked: this.joined, onChange: () => { this.joined = this.together.checked; this.draw(); } });
+    this.ups = h("select", { id: "paths-up", onChange: () => { this.up = this.ups.value || null; this.draw(); } },
+      [["", "Auto"], ["z", "z"], ["y", "y"], ["-y", "−y"]].map(([value, text]) => h("option", { value, selected: (this.up ?? "") === value }, text)));
     this.said = h("p", { class: "visually-hidden", role: "status" });
     this.asks = h("div", { hidden: true });
     this.runsBox = h("div", {});
     this.joinsBox = h("div", {});
     this.words = h("details", { class: "card paths-words" });
-    put(root, h("div", { class: "paths" },
-      h("div", { class: "paths-main" },
-        h("div", { class: "toolbar" }, button("Fit", () => this.scene.look("keep")), button("From the side", () => this.scene.look("side")),
-          button("From above", () => this.scene.look("top")), h("div", { class: "paths-up" }, this.ups)),
-        stage, this.card.element, this.words),
-      h("div", { class: "paths-side" }, this.asks,
-        h("section", { class: "card paths-section", "aria-labelledby": "paths-runs" }, h("h2", { id: "paths-runs" }, "Runs"),
-          h("label", { class: "field" }, h("span", {}, "Drawn in the frame"), this.parents),
-          h("label", { class: "paths-check" }, this.together, h("span", {}, "and frames joined to it by associations")),
-          this.runsBox),
-        this.joinsBox), this.said));
+    this.section = h("section", { class: "card paths-section", "aria-labelledby": "paths-runs" }, h("h2", { id: "paths-runs" }, "Runs"),
+      h("div", { class: "paths-frames" }, h("label", { class: "field" }, h("span", {}, "Drawn in the frame"), this.parents),
+        h("label", { class: "field" }, h("span", {}, "Up axis"), this.ups)),
+      h("label", { class: "paths-check" }, this.together, h("span", {}, "and frames joined to it by associations")),
+      this.runsBox);
   }
 
   /** Draw what the choices say; what was fetched before is not fetched again. */
-  async #draw() {
+  async draw() {
     const turn = this.#turn += 1;
     this.#reached = this.joined ? reach(this.parent, this.#joins) : reach(this.parent, []);
     const wanted = this.runs.filter((one) => this.#reached.has(one.parent));
     const shown = wanted.slice().sort((a, b) => (b.last ?? "").localeCompare(a.last ?? "")).slice(0, MOST_DRAWN)
       .sort((a, b) => a.number - b.number);
+    const early = this.onframe(this.parent, this.#reached, this.up, null);
     const found = await Promise.all(shown.map((run) => this.#path(run, shown.length)));
     if (turn !== this.#turn || this.signal.aborted) return;
     const whole = found.filter((one) => one.ids?.length);
@@ -155,14 +119,17 @@ class Page {
       return { ...one, over, world: one.poses.map((pose) => multiply(matrix, pose)) };
     });
     this.#hidden = new Set();
-    const poses = this.#drawn.reduce((sum, one) => sum + one.ids.length, 0);
-    this.scene.show(this.#drawn, `Paths of ${count(this.#drawn.length)} runs, ${count(poses)} poses`, this.up);
+    if (!early) {
+      const poses = this.#drawn.flatMap((one) => one.world.map((matrix) => ({ matrix, isCloud: one.isCloud })));
+      this.onframe(this.parent, this.#reached, this.up, () => ({ origin: poses.length ? placeOf(poses[0].matrix) : [0, 0, 0], up: upright(poses) }));
+    }
+    this.scene.show(this.#drawn);
     this.card.paths(this.#drawn);
     this.#ask();
-    this.scene.look("side");
+    if (!early || this.scene.viewer.isFitted) this.scene.look("keep");
     this.#runs(wanted, shown, found);
     await this.#association();
-    this.#address();
+    this.onchange();
   }
 
   async #path(run, share) {
@@ -179,8 +146,7 @@ class Page {
   }
 
   #runs(wanted, shown, found) {
-    const names = [...new Set(this.runs.map((one) => one.parent))].sort();
-    put(this.parents, names.map((one) => h("option", { value: one, selected: one === this.parent }, one)));
+    put(this.parents, this.names.slice().sort().map((one) => h("option", { value: one, selected: one === this.parent }, one)));
     const without = [...this.without];
     for (const one of found) {
       if (!one.ids?.length) without.push({ name: one.session, frames: one.frames, why: one.why ?? "the parent frame of its poses is not available" });
@@ -208,8 +174,8 @@ class Page {
     const { asked } = this, join = this.#reached.get(asked.parent)?.matrix;
     const drawn = Boolean(join);
     put(this.asks, askedPanel(asked, {
-      drawn, onshow: () => { this.parent = asked.parent; this.#draw(); },
-      onclose: () => { this.asked = null; this.#ask(); this.#address(); },
+      drawn, onshow: () => { this.parent = asked.parent; this.draw(); },
+      onclose: () => { this.asked = null; this.#ask(); this.onchange(); },
     }));
     const camera = this.#drawn.find((one) => one.camera)?.camera ?? null;
     this.scene.ask(drawn ? {
@@ -257,7 +223,7 @@ class Page {
       onchoose: async (id) => {
         this.association = this.associations.find((one) => one.association_id === id) ?? null;
         await this.#association();
-        this.#address();
+        this.onchange();
         document.getElementById("paths-association")?.focus();
       },
       onbegin: () => begin(this.map, this.runs.filter((one, i, all) => all.findIndex((other) => other.session === one.session && other.robot === one.robot) === i), (begun) => this.#begun(begun)),
@@ -278,7 +244,7 @@ class Page {
     this.#panel(null);
     this.scene.edges([]);
     this.#follow(one.association_id);
-    this.#address();
+    this.onchange();
   }
 
   async #follow(id) {
@@ -289,7 +255,7 @@ class Page {
       if (shown) this.association = now;
       if (now.state === "succeeded") {
         this.#joins = bridges(this.associations);
-        await this.#draw();
+        await this.draw();
         put(this.said, `The association has succeeded: ${count(now.result.edges)} edges.`);
       } else if (shown) {
         this.#panel(null);
@@ -297,19 +263,32 @@ class Page {
     }, this.signal);
   }
 
-  #choose(one) {
+  /** Mark a frame and tell of it. @param {{path: number, place: number} | null} one */
+  choose(one) {
     this.card.show(one);
     this.scene.select(one);
+    if (one) this.onreveal();
   }
 
-  /** The address says what is shown, so that it survives a reload. */
-  #address() {
-    const search = {
-      query: this.asked?.id ?? (this.gone ? this.search.get("query") : null), parent: this.parent,
-      joined: this.joined ? null : "no", up: this.up,
+  /** Other parent frames can be drawn. @param {string[]} names */
+  add(names) {
+    this.names = [...new Set([...this.names, ...names])];
+    if (!this.parent) this.parent = this.names[0];
+  }
+
+  /** Poses of a parent frame in that of the picture; null of one that is not drawn. @param {string} parent
+   * @returns {number[] | null} */
+  reached(parent) { return this.#reached.get(parent)?.matrix ?? null; }
+
+  /** A camera of the map, to draw one of which nothing else is known. */
+  get camera() { return this.#drawn.find((one) => one.camera)?.camera ?? null; }
+
+  /** What is drawn, for the address. */
+  get search() {
+    return {
+      query: this.asked?.id ?? this.gone, parent: this.parent, joined: this.joined ? null : "no", up: this.up,
       association: this.association?.association_id ?? (this.associations.length ? "none" : null),
     };
-    this.go(link("maps", this.map, "paths", search), { replace: true, quiet: true });
   }
 }
 
@@ -317,5 +296,5 @@ class Page {
 function most(runs) {
   const counts = new Map();
   for (const one of runs) counts.set(one.parent, (counts.get(one.parent) ?? 0) + one.frames);
-  return [...counts].sort((a, b) => b[1] - a[1] || a[0].localeCompare(b[0]))[0][0];
+  return [...counts].sort((a, b) => b[1] - a[1] || a[0].localeCompare(b[0]))[0]?.[0];
 }
