@@ -51,6 +51,7 @@ from service.routes import (
     queries,
     reconstructions,
     results,
+    selections,
     sessions,
 )
 
@@ -101,7 +102,8 @@ log = logging.getLogger(__name__)
 
 #: In the order in which the document lists them.
 ROUTERS = (
-    maps.router, frames.router, frame_data.router, frame_data.points_router, maps.edits_router,
+    maps.router, frames.router, selections.router, frame_data.router, frame_data.points_router,
+    maps.edits_router,
     sessions.router, frames.imports_router, queries.router, results.history_router,
     results.router,
     queries.similarity_router, sessions.associations_router, coverage.router,

@@ -218,6 +218,15 @@ def list_frames(
     return [rows[one] for one in chosen]
 
 
+def count_listed(connection: Connection, map_number: int, wanted: FrameListing, after: int) -> int:
+    """How many frames of `list_frames`, in the order they came, follow the one of a number."""
+    states = _LIVING if wanted.state is None else (wanted.state,)
+    return count_rows(
+        connection, frames.c.map_number == map_number, frames.c.state.in_(states),
+        frames.c.number > after, *_listing_conditions(wanted),
+    )  # fmt: skip
+
+
 def _is_narrow(wanted: FrameListing) -> bool:
     if wanted.tag or wanted.content_id is not None:
         return False  # these have indexes of their own

@@ -302,6 +302,15 @@ class SessionEdit(Given):
         return self
 
 
+class FrameDeletion(ApiRecord):
+    """A deletion that can be undone."""
+
+    deletion_id: str
+    at: datetime
+    until: datetime = Field(description="Until when its frames can be restored.")
+    frames: int = Field(description="How many can be restored.")
+
+
 class SessionChange(ApiRecord):
     """What became of a session."""
 
@@ -314,6 +323,9 @@ class SessionChange(ApiRecord):
     )
     last_frame_id: str | None = Field(
         default=None, description="Of an edit with frames remaining: send it as `after`."
+    )
+    deletion: FrameDeletion | None = Field(
+        default=None, description="Of a deletion: how to undo this call, where that can be done."
     )
 
 

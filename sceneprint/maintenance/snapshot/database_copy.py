@@ -327,6 +327,14 @@ _USES = (
     " UNION ALL SELECT geometry, frame_number, 'geometry' FROM signatures"
 )
 _USES_OF_JOBS = "SELECT blob AS digest, job_number AS number, 'job' AS role FROM job_files"
+#: Those of deleted frames that can be restored, and those of kept answers, by the tables that have
+#: them: an older database has none of these.
+_MORE_USES = {
+    "job_files": _USES_OF_JOBS,
+    "deleted_frames": "SELECT blob AS digest, frame_number AS number, 'deleted' AS role"
+    " FROM deleted_frames WHERE blob IS NOT NULL",
+    "kept_answers": "SELECT blob AS digest, number, 'answer' AS role FROM kept_answers",
+}
 
 
 @dataclass(frozen=True)
@@ -519,7 +527,14 @@ def referred(connection: sqlite3.Connection) -> Iterator[str]:
 
 
 def _every(connection: sqlite3.Connection) -> str:
-    return f"{_USES} UNION ALL {_USES_OF_JOBS}" if _has_job_files(connection) else _USES
+    return " UNION ALL ".join([_USES, *_more_uses(connection).values()])
+
+
+def _more_uses(connection: sqlite3.Connection) -> dict[str, str]:
+    """Those of `_MORE_USES` whose table a database of this version has."""
+    asked = "SELECT name FROM sqlite_master WHERE type = 'table'"
+    there = {name for (name,) in connection.execute(asked)}
+    return {table: told for table, told in _MORE_USES.items() if table in there}
 
 
 def count_referred(connection: sqlite3.Connection) -> int:
@@ -530,30 +545,35 @@ def count_referred(connection: sqlite3.Connection) -> int:
 
 def uses(connection: sqlite3.Connection, digest: str) -> tuple[BlobUse, ...]:
     """Whose a blob is."""
+    more = _more_uses(connection)
+    used = " UNION ALL ".join([_USES, *(more[one] for one in ("deleted_frames",) if one in more)])
     rows = connection.execute(
         "SELECT maps.name, frames.id, used.role FROM"
-        f" ({_USES}) AS used JOIN frames ON frames.number = used.number"
+        f" ({used}) AS used JOIN frames ON frames.number = used.number"
         " JOIN maps ON maps.number = frames.map_number WHERE CAST(digest AS TEXT) = ?"
         " ORDER BY frames.number",
         (digest,),
     )
-    of_frames = [BlobUse(map=name, frame=frame, role=role) for name, frame, role in rows]
-    if not _has_job_files(connection):
-        return tuple(of_frames)
-    rows = connection.execute(
-        "SELECT maps.name, jobs.id FROM"
-        f" ({_USES_OF_JOBS}) AS used JOIN jobs ON jobs.number = used.number"
-        " JOIN maps ON maps.number = jobs.map_number WHERE CAST(digest AS TEXT) = ?"
-        " ORDER BY jobs.number",
-        (digest,),
-    )
-    return (*of_frames, *(BlobUse(map=name, job=job, role="job") for name, job in rows))
-
-
-def _has_job_files(connection: sqlite3.Connection) -> bool:
-    """Whether the database is of a version that lets jobs refer to blobs."""
-    asked = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name = 'job_files'"
-    return bool(connection.execute(asked).fetchone()[0])
+    found = [BlobUse(map=name, frame=frame, role=role) for name, frame, role in rows]
+    if "job_files" in more:
+        rows = connection.execute(
+            "SELECT maps.name, jobs.id FROM"
+            f" ({_USES_OF_JOBS}) AS used JOIN jobs ON jobs.number = used.number"
+            " JOIN maps ON maps.number = jobs.map_number WHERE CAST(digest AS TEXT) = ?"
+            " ORDER BY jobs.number",
+            (digest,),
+        )
+        found += [BlobUse(map=name, job=job, role="job") for name, job in rows]
+    if "kept_answers" in more:
+        rows = connection.execute(
+            "SELECT maps.name, kept_answers.id FROM kept_answers JOIN kept_answer_maps AS of"
+            " ON of.kept_number = kept_answers.number"
+            " JOIN maps ON maps.number = of.map_number WHERE CAST(blob AS TEXT) = ?"
+            " ORDER BY kept_answers.number, maps.number",
+            (digest,),
+        )
+        found += [BlobUse(map=name, query=query, role="answer") for name, query in rows]
+    return tuple(found)
 
 
 def _connect(path: Path, how: str) -> sqlite3.Connection:

@@ -201,7 +201,8 @@ class BlobUse(_Record):
     map: str
     frame: str | None = None
     job: str | None = None
-    role: Literal["upload", "geometry", "job"]
+    query: str | None = None
+    role: Literal["upload", "geometry", "job", "deleted", "answer"]
 
 
 class LostBlob(_Record):
