@@ -155,7 +155,7 @@ class MapMethods(ServiceConnection):
         captured_before: datetime | None = None, received_after: datetime | None = None,
         received_before: datetime | None = None, parent_frame: str | None = None,
         has_pose: bool | None = None, content_id: str | None = None, name: str | None = None,
-        order: Literal["asc", "desc", "taken"] = "asc",
+        find: str | None = None, order: Literal["asc", "desc", "taken"] = "asc",
     ) -> Iterator[Frame]:  # fmt: skip
         """Frames of a map in the order they came; deleted ones only where asked for.
 
@@ -173,6 +173,7 @@ class MapMethods(ServiceConnection):
         has_pose : whether it has one
         content_id : of its samples and camera, or points and viewpoint
         name : its name begins so, such as "frame-000123"
+        find : its id, its name or its session begins so
         order : "desc" for the newest first; "taken", of one session, in the order in which its
             frames were taken
 
@@ -186,7 +187,7 @@ class MapMethods(ServiceConnection):
             tag=_names(tags), captured_after=captured_after, captured_before=captured_before,
             received_after=received_after, received_before=received_before,
             parent_frame=parent_frame, has_pose=has_pose, content_id=content_id, name=name,
-            order=order,
+            find=find, order=order,
         )  # fmt: skip
         parameters = wanted.model_dump(mode="json", exclude_defaults=True)
         return self._items(Page[Frame], f"{map_path(map_name)}/frames", **parameters)

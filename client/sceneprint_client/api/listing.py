@@ -69,6 +69,9 @@ class FrameListing(Given):
         default=None, description="Of its samples and camera."
     )
     name: _Prefix | None = Field(default=None, description="Its name begins so; case matters.")
+    find: _Prefix | None = Field(
+        default=None, description="Its id, its name or its session begins so; case matters."
+    )
     order: Literal["asc", "desc", "taken"] = Field(
         default="asc",
         description="As they came; `desc`: the newest first; `taken`, of one session: by "

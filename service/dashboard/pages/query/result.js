@@ -9,6 +9,8 @@ import { failed, loading } from "../lib/states.js";
 import { alternativesList } from "./alternatives.js";
 import { choice } from "./choice.js";
 import { funnel } from "./funnel.js";
+import { keepPanel } from "./keep.js";
+import { reconstructionPanel } from "./reconstruction.js";
 import { rows } from "./rows.js";
 import { whyNot } from "./whynot.js";
 import { deviation, differences, keyOf, mapOf, number, verdict } from "./words.js";
@@ -35,13 +37,14 @@ export async function showAnswer(root, answer, { signal, turn = signal, isOwnPag
   const ranked = answer.explanations === null ? fromSimilarities(answer, alike) : { ranking: answer.explanations, told: true };
   const steps = funnel(answer);
   const map = h("section", { class: "card query-heat", "aria-label": "Similarity of the ranking" });
-  put(root, lead(answer, before, isOwnPage),
+  put(root, lead(answer, before, isOwnPage), keepPanel(answer, signal),
     answer.explanations === null && h("p", { class: "muted query-note" },
       "This query ran without explanations. Query again to see the distances of frames that were not selected, and why. ",
       again(answer)),
     rows(answer, ranked, { pictures, choice: looked, before }),
     whyNot(answer, { ask, choice: looked, funnel: steps, change, pick }),
-    h("div", { class: "query-below" }, steps, map));
+    h("div", { class: "query-below" }, steps, map),
+    reconstructionPanel(answer, signal));
   heat(map, answer, { alike, ranked }, looked, signal, turn);
   if (chosen !== null) looked.choose(chosen);
   return { choice: looked };
@@ -68,7 +71,7 @@ function lead(answer, before, isOwnPage) {
       pose && poseOf(pose, answer.kind)),
     h("div", { class: "query-verdict-links" },
       (pose || several.length > 0) && h("a", { class: "button", href: link("maps", mapOf(answer), "paths", { query: answer.query_id }) }, "On the map"),
-      !isOwnPage && h("a", { class: "button", href: link("queries", answer.query_id), title: "Can be shared for one hour" }, `Answer ${shortId(answer.query_id)}`)));
+      !isOwnPage && h("a", { class: "button", href: link("queries", answer.query_id), title: "Can be shared while it is kept, or for an hour" }, `Answer ${shortId(answer.query_id)}`)));
 }
 
 function poseOf(location, kind) {
