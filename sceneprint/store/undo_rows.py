@@ -260,6 +260,13 @@ def restore_frame(connection: Connection, row: MapRow, one: DeletedFrame) -> Non
         values |= {"state": FrameState.RECEIVED, "reason": None, "indexed_at": None}
         # what its map kept once is not judged again
         values["novelty"] = None if was == FrameState.INDEXED else values["novelty"]
+    # a frame that had the id meanwhile, and was deleted as well, gives it up
+    rival = (frames.c.map_number == row.number) & (frames.c.id == values["id"])
+    connection.execute(
+        update(frames)
+        .where(rival, frames.c.number != one.frame_number, frames.c.state == FrameState.DELETED)
+        .values(id=uuid.uuid4().hex)
+    )
     connection.execute(update(frames).where(frames.c.number == one.frame_number).values(**values))
     tags = [{"frame_number": one.frame_number, "tag": tag} for tag in sorted(set(values["tags"]))]
     if tags:

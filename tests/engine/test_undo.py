@@ -131,6 +131,12 @@ def test_what_has_come_again_is_not_restored(full: Engine, uploads: Any) -> None
     with pytest.raises(Conflict, match="was uploaded again"):
         full.undo.restore_one("hall", first)
     assert third in frames(full)
+    # the id is free again where the other frame was deleted as well
+    other = delete(full, [second]).deletion
+    assert restore(full, deletion_id=deletion.deletion_id).frames == 1
+    assert full.get_frame("hall", second).name != "other"
+    (refused,) = restore(full, deletion_id=other.deletion_id).refused
+    assert refused.reason == f"another frame has the id {second}"
 
 
 def module_upload(one: Any, frame_id: str) -> Upload:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 from sqlalchemy import Connection, select
@@ -245,7 +245,7 @@ def _record(found: StoredResult) -> NewRecord:
 
 
 def _listed(row: KeptRow, may_read: Callable[[str], bool]) -> QueryRecord:
-    known: dict[str, Any] = dict(row.record)
-    name = known.pop("map")
-    record = RecordRow(**known, number=row.number, map_number=0)
-    return query_record(record, name, None, None, may_read, kept_record(row))
+    # a version before may have noted less, or more
+    known: dict[str, Any] = {one.name: row.record.get(one.name) for one in fields(RecordRow)}
+    record = RecordRow(**{**known, "number": row.number, "map_number": 0})
+    return query_record(record, row.record["map"], None, None, may_read, kept_record(row))
