@@ -33,6 +33,8 @@ from sceneprint_client.api.admin import NewKey, NewModel
 from sceneprint_client.api.coverage import NewMapCoverage
 from sceneprint_client.api.listing import FrameEdit, MapEdit, SessionEdit
 from sceneprint_client.api.reconstructions import NewReconstruction
+from sceneprint_client.api.results import KeepOptions
+from sceneprint_client.api.selections import FramesEdit, FrameSelection, RestoreOptions
 from sceneprint_client.api.sessions import NewAssociation
 from service import dashboard, problems
 from service.browser_security import origins_of
@@ -70,6 +72,10 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
                 (FrameMeta, "validation"),
                 (FrameEdit, "validation"),
                 (SessionEdit, "validation"),
+                (FrameSelection, "validation"),
+                (FramesEdit, "validation"),
+                (RestoreOptions, "validation"),
+                (KeepOptions, "validation"),
                 (MapEdit, "validation"),
                 (Filter, "validation"),
                 (NamedFrame, "validation"),
