@@ -1,7 +1,8 @@
 """Deletions of frames that can still be undone: what the rows were, and the uploads that stay.
 
-UndoLimits.begin --> Deletion  --remember_frames, in the transaction that deletes-->  rows
-rows  --restore_frames-->  frames as they were, to be signed again  |  --forget_frames-->  nothing
+Deletion, rows of frames  --remember_frames-->  rows, in the transaction that deletes
+rows  --restore_frame-->  a frame as it was, to be signed again
+rows  --forget_frames-->  nothing, once the time is over
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Selected frames of a map, deleted or edited together.
 
-map, FrameSelection  --delete-->  FramesDeleted
-map, FramesEdit  --edit-->  FramesEdited, with the edits that undo it
+map, FrameSelection  --delete_selection-->  FramesDeleted
+map, FramesEdit  --edit_selection-->  FramesEdited, with the edits that undo it
 
 Frames are written some at a time, each block in a transaction of its own, as writers wait
 meanwhile. A call that is repeated finds nothing left to do.
