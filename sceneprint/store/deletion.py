@@ -85,7 +85,7 @@ def delete_frames(
     if not found:
         return []
     if deletion is not None:
-        remember_frames(connection, deletion, [one._mapping for one in found])
+        remember_frames(connection, deletion, [dict(one._mapping) for one in found])
     living = [one.number for one in found]
     own = signatures.c.frame_number.in_(living)
     made = connection.execute(select(signatures.c.geometry).where(own)).scalars()

@@ -53,14 +53,16 @@ def test_an_answer_is_kept_and_released(
     client: Client, map_name: str, references: tuple[FrameReference, ...]
 ) -> None:
     client.create_map(map_name)
-    answer = client.query(map_name, references[0])
+    added = client.upload(map_name, references[0], wait_s=60)
+    answer = client.query(map_name, frame_id=added.frame_id, robot="cart")
+    (record,) = client.queries(map_name)
     told = client.answer_retention(answer.query_id)
     assert (told.kept, told.title) == (False, None)
     until = datetime.now(UTC) + timedelta(days=1)
     kept = client.keep_answer(answer.query_id, "by the door", until)
     assert (kept.kept, kept.title, kept.until) == (True, "by the door", until)
     (listed,) = client.queries(map_name, kept=True)
-    assert listed.query_id == answer.query_id
+    assert (listed.query_id, listed.robot, listed.at) == (answer.query_id, "cart", record.at)
     assert listed.keep is not None
     assert (listed.keep.title, listed.keep.until) == ("by the door", until)
     client.release_answer(answer.query_id)

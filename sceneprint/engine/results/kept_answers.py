@@ -46,10 +46,11 @@ from sceneprint.store.answer_rows import (
     spent_answers,
 )
 from sceneprint.store.deletion import BLOCK, doom
-from sceneprint.store.maps import find_map, find_maps, list_maps
-from sceneprint.store.query_records import NewRecord, RecordRow, WantedRecords
+from sceneprint.store.frame_queries import QueryOrigin
+from sceneprint.store.maps import find_map, find_maps, list_maps, map_of
+from sceneprint.store.query_records import RecordRow, WantedRecords, record_of_answer
 from sceneprint.store.tables import MapRow, frames
-from sceneprint_client.api import FrameName, FrameState, Page
+from sceneprint_client.api import FrameState, Page
 from sceneprint_client.api.results import AnswerRetention, KeepOptions, QueryRecord
 
 
@@ -124,11 +125,11 @@ class KeptAnswers:
         if answer.frame is not None:
             shown.add((answer.frame.map, answer.frame.frame_id))
         numbers = [_number_of(connection, of_maps, *place) for place in sorted(shown)]
-        record = _record(found)
+        asked = [one.number for one in of_maps.values()]
+        record = _record(connection, found, asked)
         return NewKeptAnswer(
-            answer.query_id, blob, size, record.at, record.status, record.robot,
-            {**asdict(record), "maps": answer.maps}, [one.number for one in of_maps.values()],
-            numbers,
+            answer.query_id, blob, size, record["at"], record["status"], record["robot"], record,
+            asked, numbers,
         )  # fmt: skip
 
     def _require_room(self, connection: Connection, row: MapRow, size: int) -> None:
@@ -233,15 +234,23 @@ def _number_of(
     return int(number)
 
 
-def _record(found: StoredResult) -> NewRecord:
-    """The record that the query left, or would have left."""
-    answer, taken = found.answer, found.taken
-    frame = answer.frame
-    asked = AskedQuery(
-        answer.maps, found.query, taken.robot, taken.session, None,
-        None if frame is None else FrameName(map=frame.map, frame_id=frame.frame_id), found.at,
-    )  # fmt: skip
-    return record_of(asked, answer, answer.milliseconds.get("total", 0.0) / 1e3)
+def _record(connection: Connection, found: StoredResult, asked: list[int]) -> dict[str, Any]:
+    """What lists tell of a query: of the record that it left, or would have left.
+
+    The key is left out: records of a key that is revoked are removed, and this one stays.
+    """
+    answer = found.answer
+    left = record_of_answer(connection, asked, answer.query_id, found.at)
+    if left is not None:
+        own = map_of(connection, left.map_number).name
+        return {**asdict(left), "map": own, "maps": answer.maps, "key_id": None}
+    # an upload says who asked; a stored frame only who took it
+    taken = found.taken if answer.frame is None else QueryOrigin(None, None, None)
+    query = AskedQuery(
+        answer.maps, found.query, taken.robot, taken.session, None, answer.frame, found.at
+    )
+    made = record_of(query, answer, answer.milliseconds.get("total", 0.0) / 1e3)
+    return {**asdict(made), "maps": answer.maps}
 
 
 def _listed(row: KeptRow, may_read: Callable[[str], bool]) -> QueryRecord:
