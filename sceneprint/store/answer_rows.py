@@ -100,6 +100,12 @@ def find_answer(connection: Connection, query_id: str) -> KeptRow | None:
     return None if row is None else KeptRow(**row)
 
 
+def expired_answer(connection: Connection, query_id: str) -> list[int]:
+    """Number of the kept answer of an id whose time is over, if nobody has removed it yet."""
+    asked = select(_c.number).where(_c.id == query_id, ~_standing(connection))
+    return list(connection.execute(asked).scalars())
+
+
 def kept_among(connection: Connection, query_ids: Collection[str]) -> dict[str, KeptRow]:
     """Those of some answers that are kept, by their ids."""
     asked = select(kept_answers).where(_c.id.in_(query_ids), _standing(connection))

@@ -165,6 +165,10 @@ def test_an_answer_is_released_at_its_end(full: Engine, asked: str) -> None:
     assert full.kept_answers.remove_spent() == 0
     with full.store.database.write() as connection:
         connection.execute(update(kept_answers).values(until=time.time() - 1))
+    assert not full.kept_answers.retention(full.kept, asked).kept
+    assert keep(full, asked).until is None  # within its hour it may be kept once more
+    with full.store.database.write() as connection:
+        connection.execute(update(kept_answers).values(until=time.time() - 1))
     expire(full)
     with pytest.raises(UnknownQuery):
         full.inspection.answer(asked)

@@ -39,6 +39,7 @@ from sceneprint.store.answer_rows import (
     NewKeptAnswer,
     count_kept,
     edit_kept_answer,
+    expired_answer,
     find_answer,
     keep_answer,
     list_answers,
@@ -109,6 +110,9 @@ class KeptAnswers:
                 if row is not None:
                     row = edit_kept_answer(connection, row, options.title, until)
                 elif self._store.blobs.holds(blob):  # else a removal came first
+                    doom(
+                        connection, remove_answers(connection, expired_answer(connection, query_id))
+                    )
                     new = self._described(connection, found, blob, len(data))
                     row = keep_answer(connection, new, options.title, until)
             if row is not None:
