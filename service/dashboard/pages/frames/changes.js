@@ -36,6 +36,7 @@ export async function deleteFrames(map, selection, { say = () => {}, changed = (
     say("");
     await changed(); // of one that broke off a part is gone
   }
+  if (done === 0) { toast("No frame was left to delete."); return; }
   offerRestore(map, `Deleted ${framesText(done)}.`, deletions, changed);
 }
 
