@@ -103,6 +103,14 @@ class Settings(BaseSettings):
     query_bytes: int = Field(default=256 << 20, ge=0)
     #: Seconds for which an answer can be looked at afterwards.
     query_s: float = Field(default=3600.0, ge=1, le=31_536_000)
+    #: Answers of a map that are kept until somebody releases them; more are refused.
+    kept_answers: int = Field(default=1000, ge=0, le=1_000_000)
+    #: Room for those of a map, bytes.
+    kept_bytes: int = Field(default=256 << 20, ge=0)
+    #: Seconds for which deleted frames can be restored; 0: a deletion is for good at once.
+    undo_s: float = Field(default=600.0, ge=0, le=31_536_000)
+    #: Uploads of deleted frames of a map that are kept for it, bytes; more are deleted for good.
+    undo_bytes: int = Field(default=4 << 30, ge=0)
     #: Streams of events that one service process keeps open at once; more are refused (503).
     event_streams: int = Field(default=64, ge=0, le=10_000)
     #: Newest events of each map that are kept; older ones are removed, 200 bytes each.

@@ -33,6 +33,8 @@ from sceneprint_client.api.admin import NewKey, NewModel
 from sceneprint_client.api.coverage import NewMapCoverage
 from sceneprint_client.api.listing import FrameEdit, MapEdit, SessionEdit
 from sceneprint_client.api.reconstructions import NewReconstruction
+from sceneprint_client.api.results import KeepOptions
+from sceneprint_client.api.selections import FramesEdit, FrameSelection, RestoreOptions
 from sceneprint_client.api.sessions import NewAssociation
 from service import dashboard, problems
 from service.browser_security import origins_of
@@ -51,6 +53,7 @@ from service.routes import (
     queries,
     reconstructions,
     results,
+    selections,
     sessions,
     surface,
 )
@@ -70,6 +73,10 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
                 (FrameMeta, "validation"),
                 (FrameEdit, "validation"),
                 (SessionEdit, "validation"),
+                (FrameSelection, "validation"),
+                (FramesEdit, "validation"),
+                (RestoreOptions, "validation"),
+                (KeepOptions, "validation"),
                 (MapEdit, "validation"),
                 (Filter, "validation"),
                 (NamedFrame, "validation"),
@@ -102,7 +109,8 @@ log = logging.getLogger(__name__)
 
 #: In the order in which the document lists them.
 ROUTERS = (
-    maps.router, frames.router, frame_data.router, frame_data.points_router, maps.edits_router,
+    maps.router, frames.router, selections.router, frame_data.router, frame_data.points_router,
+    maps.edits_router,
     sessions.router, frames.imports_router, queries.router, results.history_router,
     results.router,
     queries.similarity_router, sessions.associations_router, coverage.router, surface.router,

@@ -207,7 +207,9 @@ def test_operators_see_what_goes_on(outputs: dict[str, list[str]]) -> None:
     proxied, refused, audit = one(outputs, "Keys", 1)
     assert (proxied["name"], refused["type"]) == ("robot-7", "/problems/key-required")
     assert len(audit["items"]) == 3
-    assert outputs["Take out"][0].strip() == ""
+    restored, deleted = one(outputs, "Take out")
+    assert restored["state"] == "received"
+    assert deleted["frames"] == deleted["deletion"]["frames"] == 1
     assert one(outputs, "When something is wrong")[0]["type"] == "/problems/unknown-map"
 
 

@@ -16,6 +16,7 @@
       x NotFound                there is no such map, frame or job
         - UnknownMap, UnknownFrame, UnknownSession, UnknownJob, UnknownQuery, UnknownSnapshot
         - UnknownKey            there is no key of that name
+        - UnknownDeletion       there is no deletion that could be undone
       x Conflict                the request contradicts what is there
         - MapExists             a map of that name, made otherwise
         - FrameConflict         the same content with other metadata
@@ -160,6 +161,10 @@ class UnknownKey(NotFound):
 
 class UnknownQuery(NotFound):
     """There is no answer of that id, or no longer."""
+
+
+class UnknownDeletion(NotFound):
+    """There is no deletion of that id that could be undone, or no longer."""
 
 
 class UnknownSnapshot(NotFound):

@@ -12,6 +12,7 @@ from sceneprint_client.api import Frame, FrameState, Map, NewMap, Page
 from sceneprint_client.api.base import checked
 from sceneprint_client.api.listing import (
     Clock,
+    FrameDeletion,
     FrameListing,
     Run,
     Session,
@@ -29,6 +30,12 @@ from sceneprint_client.api.results import (
     FramePatches,
     FrameSignature,
     View,
+)
+from sceneprint_client.api.selections import (
+    FramesDeleted,
+    FramesEdited,
+    FramesRestored,
+    RefusedFrame,
 )
 from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.http import ServiceConnection
@@ -148,7 +155,7 @@ class MapMethods(ServiceConnection):
         captured_before: datetime | None = None, received_after: datetime | None = None,
         received_before: datetime | None = None, parent_frame: str | None = None,
         has_pose: bool | None = None, content_id: str | None = None, name: str | None = None,
-        order: Literal["asc", "desc", "taken"] = "asc",
+        find: str | None = None, order: Literal["asc", "desc", "taken"] = "asc",
     ) -> Iterator[Frame]:  # fmt: skip
         """Frames of a map in the order they came; deleted ones only where asked for.
 
@@ -166,6 +173,7 @@ class MapMethods(ServiceConnection):
         has_pose : whether it has one
         content_id : of its samples and camera, or points and viewpoint
         name : its name begins so, such as "frame-000123"
+        find : its id, its name or its session begins so
         order : "desc" for the newest first; "taken", of one session, in the order in which its
             frames were taken
 
@@ -179,7 +187,7 @@ class MapMethods(ServiceConnection):
             tag=_names(tags), captured_after=captured_after, captured_before=captured_before,
             received_after=received_after, received_before=received_before,
             parent_frame=parent_frame, has_pose=has_pose, content_id=content_id, name=name,
-            order=order,
+            find=find, order=order,
         )  # fmt: skip
         parameters = wanted.model_dump(mode="json", exclude_defaults=True)
         return self._items(Page[Frame], f"{map_path(map_name)}/frames", **parameters)
@@ -210,6 +218,114 @@ class MapMethods(ServiceConnection):
         """Take a frame out of its map; UnknownMap or UnknownFrame where there is none."""
         self._delete(frame_path(map_name, frame_id))
 
+    def restore_frame(self, map_name: str, frame_id: str) -> Frame:
+        """Restore a deleted frame, within ten minutes by default.
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : there is none, or it cannot be restored any more.
+        Conflict : another frame has its id or its content.
+        QuotaExceeded : the map has no room for it.
+        """
+        return self._ask(Frame, "POST", f"{frame_path(map_name, frame_id)}/restore")
+
+    # selected frames
+
+    def delete_frames(
+        self, map_name: str, frame_ids: Sequence[str] | None = None,
+        filter: Mapping[str, Any] | None = None,  # noqa: A002  (as in JSON)
+    ) -> tuple[int, list[FrameDeletion]]:  # fmt: skip
+        """Delete frames by their ids, or all that pass a filter.
+
+        Parameters
+        ----------
+        map_name : of the map
+        frame_ids : at most 1000; those that no frame has are passed over
+        filter : conditions as of `frames`, at least one
+
+        Returns
+        -------
+        count : how many were deleted
+        deletions : for `restore_frames`
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : neither ids nor a filter, or both.
+        """
+        body = given(frame_ids=_listed(frame_ids), filter=filter)
+        count, deletions = 0, list[FrameDeletion]()
+        while True:
+            done = self._ask(
+                FramesDeleted, "POST", f"{map_path(map_name)}/frames/delete", json=body
+            )
+            count += done.frames
+            deletions += [] if done.deletion is None else [done.deletion]
+            if not done.remaining:
+                return count, deletions
+
+    def edit_frames(
+        self, map_name: str, frame_ids: Sequence[str] | None = None,
+        filter: Mapping[str, Any] | None = None,  # noqa: A002  (as in JSON)
+        **changes: Any,
+    ) -> tuple[int, list[dict[str, Any]]]:  # fmt: skip
+        """Edit frames by their ids, or all that pass a filter.
+
+        Parameters
+        ----------
+        map_name, frame_ids, filter : see `delete_frames`
+        changes : `session`, `robot`, `add_tags`, `remove_tags`; see FramesEdit
+
+        Returns
+        -------
+        count : how many were changed
+        inverse : arguments of the calls that undo it
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : nothing is to be changed, or a frame would have too many tags.
+        """
+        body = given(frame_ids=_listed(frame_ids), filter=filter) | changes
+        count, inverse = 0, list[dict[str, Any]]()
+        while True:
+            done = self._ask(FramesEdited, "POST", f"{map_path(map_name)}/frames/edit", json=body)
+            count += done.frames
+            inverse += done.inverse
+            if not done.remaining:
+                return count, inverse
+            body["after"] = done.last_frame_id
+
+    def restore_frames(
+        self, map_name: str, deletion_id: str | None = None, frame_ids: Sequence[str] | None = None
+    ) -> FramesRestored:
+        """Undo a deletion, or restore some deleted frames, within ten minutes by default.
+
+        Parameters
+        ----------
+        map_name : of the map
+        deletion_id : of `deletions`, `delete_frames` or `delete_session`
+        frame_ids : in place of it, at most 1000
+
+        Raises
+        ------
+        UnknownMap, UnknownDeletion : there is none, or it cannot be undone any more.
+        QuotaExceeded : the map has no room for the frames.
+        """
+        body = given(deletion_id=deletion_id, frame_ids=_listed(frame_ids))
+        count, refused = 0, dict[str, RefusedFrame]()
+        while True:
+            done = self._ask(FramesRestored, "POST", f"{map_path(map_name)}/restore", json=body)
+            count += done.frames
+            refused |= {one.frame_id: one for one in done.refused}
+            if not done.remaining or not done.frames:
+                told = {"frames": count, "refused": list(refused.values())}
+                return done.model_copy(update=told)
+
+    def deletions(self, map_name: str) -> Iterator[FrameDeletion]:
+        """Deletions of frames that can still be undone, the newest first; UnknownMap."""
+        return self._items(Page[FrameDeletion], f"{map_path(map_name)}/deletions")
+
     # sessions
 
     def sessions(self, map_name: str) -> Iterator[Session]:
@@ -222,7 +338,7 @@ class MapMethods(ServiceConnection):
         return self._items(Page[Session], f"{map_path(map_name)}/sessions")
 
     def delete_session(self, map_name: str, session: str, robot: str | None = None) -> int:
-        """Delete all frames of a session for good; how many.
+        """Delete all frames of a session; how many. `deletions` and `restore_frames` undo it.
 
         Parameters
         ----------
@@ -384,6 +500,10 @@ class MapMethods(ServiceConnection):
         NotIndexed : it was not kept.
         """
         return self._bytes(f"{frame_path(map_name, frame_id)}/upload")
+
+
+def _listed(names: Sequence[str] | None) -> list[str] | None:
+    return None if names is None else list(names)
 
 
 def _names(given: str | Iterable[str]) -> list[str]:

@@ -25,6 +25,7 @@ from sceneprint_client.api.results import (
     COLOURS,
     MOST_DRAWN,
     TRANSFORMS,
+    AnswerRetention,
     MatchDetails,
     OverlayColour,
     OverlayTransform,
@@ -192,6 +193,7 @@ class QueryMethods(ServiceConnection):
         self, map_name: str | None = None, *,
         status: RecordStatus | Iterable[RecordStatus] = (), robot: str | None = None,
         since: datetime | str | None = None, until: datetime | str | None = None,
+        kept: bool = False,
     ) -> Iterator[QueryRecord]:  # fmt: skip
         """Queries that came, the newest first: a small record of each, kept for 30 days by default.
 
@@ -201,6 +203,7 @@ class QueryMethods(ServiceConnection):
         status : only with this one, or one of these
         robot : only of this robot
         since, until : that came at that time or later, and before that one; with a zone
+        kept : only those whose answers are kept, see `keep_answer`
 
         Raises
         ------
@@ -210,7 +213,7 @@ class QueryMethods(ServiceConnection):
         statuses = [status] if isinstance(status, str) else list(status)
         return self._items(
             Page[QueryRecord], "/v1/queries", map=map_name, status=statuses or None, robot=robot,
-            since=_as_text(since), until=_as_text(until),
+            since=_as_text(since), until=_as_text(until), kept=True if kept else None,
         )  # fmt: skip
 
     def delete_queries(self, map_name: str) -> None:
@@ -226,13 +229,41 @@ class QueryMethods(ServiceConnection):
     # what can be looked at after a query
 
     def answer(self, query_id: str) -> Answer:
-        """The answer to a query once more, for about an hour.
+        """The answer to a query once more, for about an hour, or while it is kept.
 
         Raises
         ------
         UnknownQuery : it is not kept, or no longer.
         """
         return self._ask(Answer, "GET", query_path(query_id))
+
+    def keep_answer(
+        self, query_id: str, title: str | None = None, until: datetime | str | None = None
+    ) -> AnswerRetention:
+        """Keep an answer until it is released; of one that is kept, change title and end.
+
+        Parameters
+        ----------
+        query_id : of the answer
+        title : for people
+        until : when it is released by itself, with a zone; default: never
+
+        Raises
+        ------
+        UnknownQuery : it is not there any more.
+        QuotaExceeded : a map has as many kept answers as it may have.
+        InvalidRequest : a title that is too long, or an end that has passed.
+        """
+        body = given(title=title, until=_as_text(until))
+        return self._ask(AnswerRetention, "POST", f"{query_path(query_id)}/keep", json=body)
+
+    def release_answer(self, query_id: str) -> None:
+        """Keep an answer no longer; UnknownQuery where it is not kept."""
+        self._send("DELETE", f"{query_path(query_id)}/keep")
+
+    def answer_retention(self, query_id: str) -> AnswerRetention:
+        """For how long an answer can be looked at; UnknownQuery where it cannot."""
+        return self._ask(AnswerRetention, "GET", f"{query_path(query_id)}/keep")
 
     def query_cloud(self, query_id: str) -> bytes:
         """The surface that a query saw, points and normals as PLY, in its sensor's frame.

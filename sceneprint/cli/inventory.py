@@ -62,6 +62,7 @@ def _add_listing(group: Any) -> None:
     group.add_argument(
         "--name", metavar="PREFIX", help="original file name starts with this; case matters"
     )
+    group.add_argument("--find", metavar="PREFIX", help="id, file name or session starts with this")
     group.add_argument("--state", choices=[str(state) for state in FrameState])
     group.add_argument("--parent-frame", metavar="NAME", help="parent frame of the poses")
     group.add_argument(
@@ -137,7 +138,8 @@ def run_frames(options: argparse.Namespace) -> int:
                 options.map, None if options.state is None else FrameState(options.state),
                 robot=options.robot or (), session=options.session or (), tags=options.tag or (),
                 parent_frame=options.parent_frame, captured_after=options.after,
-                captured_before=options.before, name=options.name, order=_order(options),
+                captured_before=options.before, name=options.name, find=options.find,
+                order=_order(options),
             )  # fmt: skip
             found = itertools.islice(found, options.limit)
             if stream is None:
@@ -360,6 +362,9 @@ def add_queries(commands: Any) -> None:
     )  # fmt: skip
     command.add_argument("--robot", metavar="NAME", help="only queries of this robot")
     command.add_argument(
+        "--kept", action="store_true", help="only queries whose answers somebody keeps"
+    )
+    command.add_argument(
         "--since", type=_time, metavar="TIME",
         help="only queries that came at or after this time: 2026-11-16T09:30:00Z",
     )  # fmt: skip
@@ -380,7 +385,7 @@ def run_queries(options: argparse.Namespace) -> int:
     with open_client(options) as client:
         found = client.queries(
             options.map, status=options.status, robot=options.robot, since=options.since,
-            until=options.until,
+            until=options.until, kept=options.kept,
         )  # fmt: skip
         _print_queries(islice(found, options.limit), as_json=options.json)
     return 0

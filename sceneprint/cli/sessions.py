@@ -27,7 +27,7 @@ from sceneprint_client.api import JobState
 if TYPE_CHECKING:
     from sceneprint_client import Client
     from sceneprint_client.api import Answer
-    from sceneprint_client.api.listing import Session
+    from sceneprint_client.api.listing import FrameDeletion, Session
     from sceneprint_client.api.reconstructions import Coverage, Reconstruction
     from sceneprint_client.api.sessions import Association, GraphFormat, Join
 
@@ -41,7 +41,7 @@ def add_sessions(commands: Any) -> None:
         "sessions",
         help="list, rename, tag or delete the sessions of a map",
         description="List the sessions of a map. With SESSION: rename it, change the tags of its "
-        "frames, or delete it with all its frames.",
+        "frames, or delete it with all its frames. Deletions can be undone for a while.",
     )
     command.add_argument("map", metavar="MAP")
     command.add_argument("session", nargs="?", metavar="SESSION", help="name of one session")
@@ -58,6 +58,10 @@ def add_sessions(commands: Any) -> None:
         )
     command.add_argument("--delete", action="store_true", help="delete it with all its frames")
     command.add_argument("--yes", action="store_true", help="confirm a deletion")
+    command.add_argument(
+        "--deletions", action="store_true", help="list deletions of frames that can be undone"
+    )
+    command.add_argument("--undo", metavar="ID", help="undo one of these deletions")
     command.add_argument("--json", action="store_true", help="print JSON")
     add_service_options(command)
     command.set_defaults(run=run_sessions)
@@ -74,8 +78,15 @@ def run_sessions(options: argparse.Namespace) -> int:
         raise InvalidRequest("Name the session after the map, to edit or delete it.")
     if options.delete and edits:
         raise InvalidRequest("--delete removes the session. Leave the other changes out.")
+    undo = options.deletions or options.undo is not None
+    if undo and (options.session is not None or edits):
+        raise InvalidRequest("--deletions and --undo apply to the whole map. Name no session.")
     with open_client(options) as client:
-        if options.delete:
+        if options.undo is not None:
+            _undo(client, options.map, options.undo)
+        elif options.deletions:
+            _deletions(client.deletions(options.map), as_json=options.json)
+        elif options.delete:
             _delete_session(client, options)
         elif edits:
             edited = client.edit_session(options.map, options.session, robot=options.robot, **edits)
@@ -96,11 +107,38 @@ def _delete_session(client: Client, options: argparse.Namespace) -> None:
         of = [one for one in of if options.robot in (None, one.robot)]
         n_frames = sum(sum(one.frames.values()) for one in of)
         raise InvalidRequest(
-            f"This would permanently delete session {name} and its {n_frames} frames. Add --yes "
-            "to go ahead."
+            f"This would delete session {name} and its {n_frames} frames. Add --yes to go ahead."
         )
     deleted = client.delete_session(options.map, options.session, options.robot)
     print(f"deleted session {name} and its {deleted} frames")
+    newest = next(client.deletions(options.map), None)
+    if newest is not None:
+        print(
+            f"undo until {newest.until:%H:%M} UTC: sceneprint sessions {options.map} --undo "
+            f"{newest.deletion_id}"
+        )
+
+
+def _undo(client: Client, map_name: str, deletion_id: str) -> None:
+    done = client.restore_frames(map_name, deletion_id)
+    print(f"restored {done.frames} frames")
+    for one in done.refused:
+        print(f"not restored: {one.frame_id}: {one_line(one.reason)}")
+
+
+def _deletions(deletions: Iterable[FrameDeletion], *, as_json: bool) -> None:
+    any_yet = False
+    for one in deletions:
+        if as_json:
+            print(one.model_dump_json())
+            continue
+        if not any_yet:
+            print(f"{'deletion':32}  frames  {'deleted':19}  until (UTC)")
+            any_yet = True
+        at, until = (f"{time:%Y-%m-%d %H:%M:%S}" for time in (one.at, one.until))
+        print(f"{one.deletion_id:32}  {one.frames:6}  {at}  {until}")
+    if not any_yet and not as_json:
+        print("no deletions that can be undone")
 
 
 def _sessions(sessions: Iterable[Session], *, as_json: bool) -> None:

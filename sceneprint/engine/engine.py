@@ -24,7 +24,9 @@ from sceneprint.engine.maps.map_frames import FrameFiles, list_frames
 from sceneprint.engine.maps.map_surface import MapSurfaces, SurfaceUpkeep
 from sceneprint.engine.maps.reencoding import Reencodings
 from sceneprint.engine.maps.surface_job import SURFACE, SurfaceHandler
+from sceneprint.engine.maps.undo import FrameUndo
 from sceneprint.engine.reconstruction import ReconstructionJobs
+from sceneprint.engine.results.kept_answers import KeptAnswers
 from sceneprint.engine.results.query_history import QueryHistory
 from sceneprint.engine.results.rerun import Rerun
 from sceneprint.engine.results.result_views import Inspection, PointClouds
@@ -52,6 +54,7 @@ from sceneprint.store.deletion import remove_map
 from sceneprint.store.reencoding_rows import models_of
 from sceneprint.store.startup_retry import PATIENCE_S, open_patiently
 from sceneprint.store.tables import MapRow
+from sceneprint.store.undo_rows import UndoLimits
 from sceneprint.store.wakeup import Notices, Wakeup
 from sceneprint_client.api import (
     Added,
@@ -98,9 +101,11 @@ class Engine:
         self._reencoding = Reencodings(self.store, self._upkeep)
         self._readers = Readers(self.signers, settings.indexes, settings.search)
         self._vector_tables = VectorTables(self.signers, settings.search)
+        self.kept_answers = KeptAnswers(self.store, settings)
         self.kept = open_results(
-            settings, self.store.blobs, lambda kept: ResultValidity(self.store).asked(kept)
-        )
+            settings, self.store.blobs, lambda kept: ResultValidity(self.store).asked(kept),
+            self.kept_answers.find,
+        )  # fmt: skip
         self.inspection = Inspection(self.store, self.signers, self.kept)
         self._cores = Cores(settings.query_cores)
         self.queries = Queries(self.store, self.signers, self._readers, self.kept, self._cores)
@@ -129,9 +134,12 @@ class Engine:
         self.points = PointClouds(self.store, self.inspection.pairs, self.kept)
         self.reconstructions = ReconstructionJobs(self.store, self.tasks)
         self.retiring = Retention(self.store)
+        self.undo_limits = UndoLimits(settings.undo_s, settings.undo_bytes)
+        self.undo = FrameUndo(self.store, self.bell.ring)
         self.purging = Purging(
-            self.store, self._upkeep, self.kept, self.reconstructions, settings.purge_s
-        )
+            self.store, self._upkeep, self.kept, self.kept_answers, self.undo,
+            self.reconstructions, settings.purge_s,
+        )  # fmt: skip
         self._purged = time.monotonic()
         self.operations = OperatorTasks(self.store, settings, self.bell)
 
@@ -196,7 +204,9 @@ class Engine:
             self._purged = time.monotonic()
             self.store.geometries.forget_older(self.settings.purge_s / 2)
             self._readers.purge(connection)
-        self.kept.forget(ResultValidity(self.store).all_of)  # this node may have no worker
+        self.kept.forget(
+            ResultValidity(self.store, restorable=True).all_of
+        )  # this node may have no worker
 
     # jobs
 
@@ -278,7 +288,7 @@ class Engine:
             return frame_records(connection, row, [frame])[0]
 
     def delete_frame(self, map_name: str, frame_id: str) -> None:
-        """Take a frame out of its map, effective at once.
+        """Take a frame out of its map, effective at once; `undo` puts it back for some time.
 
         Raises
         ------
@@ -287,7 +297,8 @@ class Engine:
         with self.store.database.write() as connection:
             row = stored_maps.find_map(connection, map_name)
             frame = stored_frames.find_frame(connection, row, frame_id)
-            blobs = stored_frames.delete_frame(connection, row, frame)
+            deletion = self.undo_limits.begin(connection, row.number)
+            blobs = stored_frames.delete_frame(connection, row, frame, deletion)
         collect_deleted_blobs(self.store, blobs)
 
     # queries

@@ -1,8 +1,9 @@
-"""Frames and maps deleted for good: what is left in the database, and which blobs must go.
+"""Frames and maps deleted: what is left in the database, and which blobs must go.
 
 Of a deleted frame the row stays, as every reader learns by its revision that it is gone: its id,
 its state, when it came, and how its samples were to be read. Its blobs are noted as doomed in the
-same transaction, so that they go whatever happens to this process.
+same transaction, so that they go whatever happens to this process. Where the deletion can be
+undone, `undo_rows` has what the row was, and refers to the upload.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from sqlalchemy import (
     update,
 )
 
+from sceneprint.store.answer_rows import answers_of_map, remove_answers
 from sceneprint.store.database import Database
 from sceneprint.store.events import record_event, remember
 from sceneprint.store.maps import ROOMLESS, count_on, next_revision
@@ -34,6 +36,8 @@ from sceneprint.store.queue import cancel_jobs
 from sceneprint.store.tables import (
     MapRow,
     count_rows,
+    deleted_frames,
+    deletions,
     doomed,
     events,
     frame_tags,
@@ -50,6 +54,7 @@ from sceneprint.store.tables import (
     surface_touches,
     surfaces,
 )
+from sceneprint.store.undo_rows import Deletion, remember_frames
 from sceneprint_client.api import FrameState
 
 #: What is known of a frame, and not of its camera; cleared with it.
@@ -60,8 +65,9 @@ _KNOWN = (
 
 
 def delete_frames(
-    connection: Connection, row: MapRow, numbers: Sequence[int], reason: str | None = None
-) -> list[str]:
+    connection: Connection, row: MapRow, numbers: Sequence[int], reason: str | None = None,
+    deletion: Deletion | None = None,
+) -> list[str]:  # fmt: skip
     """Take frames out of all searches, and forget what was made of them and known of them.
 
     Parameters
@@ -70,18 +76,20 @@ def delete_frames(
     row : of the map
     numbers : of its frames, a few hundred at most; those that are deleted already are left out
     reason : told with the events, where nobody deleted them
+    deletion : that can be undone; None: it cannot
 
     Returns
     -------
-    blobs : that they referred to, and that are doomed: sweep them when this is committed
+    blobs : that they referred to, and that are doomed: sweep them when this is committed, which
+        leaves those of uploads that can be restored
     """
-    found = connection.execute(
-        select(frames.c.number, frames.c.id, frames.c.blob, frames.c.bytes, frames.c.state)
-        .where(frames.c.number.in_(numbers), frames.c.state != FrameState.DELETED)
-        .order_by(frames.c.number)
-    ).all()
+    wanted = frames.c.number.in_(numbers), frames.c.state != FrameState.DELETED
+    asked = select(frames).where(*wanted).order_by(frames.c.number)
+    found = connection.execute(asked).all()
     if not found:
         return []
+    if deletion is not None:
+        remember_frames(connection, deletion, [dict(one._mapping) for one in found])
     living = [one.number for one in found]
     own = signatures.c.frame_number.in_(living)
     made = connection.execute(select(signatures.c.geometry).where(own)).scalars()
@@ -122,6 +130,8 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     """
     own = select(frames.c.number).where(frames.c.map_number == row.number)
     of_map = select(jobs.c.number).where(jobs.c.map_number == row.number)
+    answers = remove_answers(connection, answers_of_map(connection, row.number))
+    doom(connection, answers)
     asked = (
         select(frames.c.blob).where(frames.c.map_number == row.number),
         select(signatures.c.geometry).where(signatures.c.frame_number.in_(own)),
@@ -131,7 +141,8 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
             for column in (surface_tiles.c.blob, surface_tiles.c.draft)
         ),
     )
-    referred = sorted({blob for one in asked for blob in connection.execute(one).scalars()})
+    found = (blob for one in asked for blob in connection.execute(one).scalars())
+    referred = sorted({*answers, *found})
     doom_found(connection, *asked)
     connection.execute(delete(signatures).where(signatures.c.frame_number.in_(own)))
     tiles = select(surface_tiles.c.number).where(surface_tiles.c.map_number == row.number)
@@ -141,6 +152,9 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     for made in (job_items, job_files):
         connection.execute(delete(made).where(made.c.job_number.in_(of_map)))
     connection.execute(delete(jobs).where(jobs.c.map_number == row.number))
+    # a tombstone has the blob of its upload still, so those that could be restored are among them
+    connection.execute(delete(deleted_frames).where(deleted_frames.c.frame_number.in_(own)))
+    connection.execute(delete(deletions).where(deletions.c.map_number == row.number))
     connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(own)))
     connection.execute(delete(frames).where(frames.c.map_number == row.number))
     connection.execute(delete(query_records).where(query_records.c.map_number == row.number))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import (
+    Column,
     ColumnElement,
     Connection,
     Select,
@@ -21,6 +22,7 @@ from sqlalchemy import (
     or_,
     select,
     tuple_,
+    union,
 )
 
 from sceneprint.store.maps import ROOMLESS
@@ -196,7 +198,9 @@ def list_frames(
     # Adding 0 is how SQLite is told that it shall not take the first way.
     number: ColumnElement[Any] = frames.c.number + 0 if _is_narrow(wanted) else frames.c.number
     numbers: Select[Any] = select(frames.c.number).where(
-        frames.c.map_number == map_number, frames.c.state.in_(states), *_listing_conditions(wanted)
+        frames.c.map_number == map_number,
+        frames.c.state.in_(states),
+        *_listing_conditions(map_number, wanted),
     )
     if wanted.order == "taken":
         numbers = numbers.order_by(*TAKEN_ORDER)
@@ -218,8 +222,17 @@ def list_frames(
     return [rows[one] for one in chosen]
 
 
+def count_listed(connection: Connection, map_number: int, wanted: FrameListing, after: int) -> int:
+    """How many frames of `list_frames`, in the order they came, follow the one of a number."""
+    states = _LIVING if wanted.state is None else (wanted.state,)
+    return count_rows(
+        connection, frames.c.map_number == map_number, frames.c.state.in_(states),
+        frames.c.number > after, *_listing_conditions(map_number, wanted),
+    )  # fmt: skip
+
+
 def _is_narrow(wanted: FrameListing) -> bool:
-    if wanted.tag or wanted.content_id is not None:
+    if wanted.tag or wanted.content_id is not None or wanted.find is not None:
         return False  # these have indexes of their own
     named = (wanted.captured_after, wanted.captured_before, wanted.parent_frame, wanted.has_pose)
     rare = wanted.state not in (None, FrameState.INDEXED)
@@ -228,7 +241,7 @@ def _is_narrow(wanted: FrameListing) -> bool:
     )
 
 
-def _listing_conditions(wanted: FrameListing) -> list[ColumnElement[bool]]:
+def _listing_conditions(map_number: int, wanted: FrameListing) -> list[ColumnElement[bool]]:
     """What must hold of the frames of a list."""
     c, found = frames.c, _common_conditions(wanted, wanted.tag)
     if wanted.received_after is not None:
@@ -242,21 +255,36 @@ def _listing_conditions(wanted: FrameListing) -> list[ColumnElement[bool]]:
     if wanted.content_id is not None:
         found.append(c.content_id == wanted.content_id)
     if wanted.name is not None:
-        found += _named(wanted.name)
+        found += _begins(c.name, wanted.name)
+    if wanted.find is not None:
+        found.append(_known_as(map_number, wanted.find))
     return found
 
 
-def _named(prefix: str) -> list[ColumnElement[bool]]:
-    """That a name begins so, as a range that an index serves: names are in the order of their code
+def _known_as(map_number: int, prefix: str) -> ColumnElement[bool]:
+    """That the id, the name or the session of a frame begins so: each by an index of its own."""
+    own = frames.c.map_number == map_number
+    ways = [
+        select(frames.c.number).where(own, *_begins(column, prefix)).correlate(None)
+        for column in (frames.c.id, frames.c.name)
+    ]
+    # the index of sessions has the state before them
+    living = frames.c.state.in_(_LIVING)
+    ways.append(select(frames.c.number).where(own, living, *_begins(frames.c.session, prefix)))
+    return frames.c.number.in_(union(*ways))
+
+
+def _begins(column: Column[Any], prefix: str) -> list[ColumnElement[bool]]:
+    """That a text begins so, as a range that an index serves: texts are in the order of their code
     points on both databases.
     """
     kept = prefix.rstrip(_LAST)
     if not kept:
-        return [frames.c.name >= prefix]
+        return [column >= prefix]
     above = ord(kept[-1]) + 1
     if above in _SURROGATES:  # no characters
         above = _SURROGATES.stop
-    return [frames.c.name >= prefix, frames.c.name < kept[:-1] + chr(above)]
+    return [column >= prefix, column < kept[:-1] + chr(above)]
 
 
 #: The last code point, and those that stand for halves of others.

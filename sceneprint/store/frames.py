@@ -17,15 +17,18 @@ from sceneprint.store.surface_rows import FUSED_COLUMNS, note_edit
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
+    deleted_frames,
     frame_row,
     frame_tags,
     frames,
     job_files,
+    kept_answers,
     maps,
     rows_among,
     signatures,
     surface_tiles,
 )
+from sceneprint.store.undo_rows import Deletion
 from sceneprint_client.api import FrameState
 
 #: Frames of one content that are looked at: nobody needs more.
@@ -147,10 +150,12 @@ def set_state(
     )
 
 
-def delete_frame(connection: Connection, row: MapRow, frame: FrameRow) -> list[str]:
+def delete_frame(
+    connection: Connection, row: MapRow, frame: FrameRow, deletion: Deletion | None = None
+) -> list[str]:
     """Take a frame out of all searches and forget what was made of it, and known of it.
 
-    The row stays, so that every reader learns of it.
+    The row stays, so that every reader learns of it. `deletion`: see `delete_frames`.
 
     Returns
     -------
@@ -162,11 +167,13 @@ def delete_frame(connection: Connection, row: MapRow, frame: FrameRow) -> list[s
     """
     if frame.state == FrameState.DELETED:
         raise UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted before.")
-    return delete_frames(connection, row, [frame.number])
+    return delete_frames(connection, row, [frame.number], deletion=deletion)
 
 
 def refers_to(connection: Connection, blob: str) -> bool:
-    """Whether a frame that is kept, a signature, a job or a tile refers to a blob."""
+    """Whether a frame that is there or can be restored, a signature, a job, a tile or a kept answer
+    refers to a blob.
+    """
     kept = frames.c.state.not_in(ROOMLESS)
     of_frame = select(frames.c.number).where(frames.c.blob == blob, kept)
     of_artifact = select(signatures.c.frame_number).where(signatures.c.geometry == blob)
@@ -174,7 +181,9 @@ def refers_to(connection: Connection, blob: str) -> bool:
     c = surface_tiles.c
     of_tile = select(c.number).where(c.blob == blob)
     of_draft = select(c.number).where(c.draft == blob)
-    every = (of_frame, of_artifact, of_job, of_tile, of_draft)
+    of_deleted = select(deleted_frames.c.frame_number).where(deleted_frames.c.blob == blob)
+    of_answer = select(kept_answers.c.number).where(kept_answers.c.blob == blob)
+    every = (of_frame, of_artifact, of_job, of_tile, of_draft, of_deleted, of_answer)
     return any(connection.execute(one.limit(1)).first() for one in every)
 
 

@@ -24,7 +24,7 @@ from sceneprint.store.database import Database
 from sceneprint.store.tables import secrets
 
 #: What a number counts: a seal of one kind is none of another.
-Kind = Literal["audit", "event", "frame", "job", "query"]
+Kind = Literal["audit", "deletion", "event", "frame", "job", "query"]
 #: Before everything: what no row has as its number, and so needs no seal.
 START = "0"
 #: A place in a list that is ordered by time: seconds since 1970, and the number of a row.

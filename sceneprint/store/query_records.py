@@ -166,6 +166,25 @@ def list_records(
     return [RecordRow(**row) for row in connection.execute(asked).mappings()]
 
 
+def record_of_answer(
+    connection: Connection, map_numbers: Sequence[int], query_id: str, at: float
+) -> RecordRow | None:
+    """The record of an answer, or None where it left none, or it is gone.
+
+    Parameters
+    ----------
+    connection : of the database
+    map_numbers : of the maps that were asked
+    query_id : of the answer
+    at : when it was given, seconds since 1970: the query came at most an hour before
+    """
+    asked = select(query_records).where(
+        _c.map_number.in_(map_numbers), _c.at.between(at - 3600.0, at + 60.0), _c.id == query_id
+    )
+    row = connection.execute(asked).mappings().first()
+    return None if row is None else RecordRow(**row)
+
+
 def _conditions(wanted: WantedRecords) -> Iterator[ColumnElement[bool]]:
     numbers = wanted.map_numbers
     if numbers is not None:

@@ -416,6 +416,71 @@ surface_touches = Table(
     Index(None, "frame_number"),
 )
 
+#: Answers of queries that are kept until they are released; the blob is as `stored_results` has it.
+kept_answers = Table(
+    "kept_answers",
+    metadata,
+    Column("number", WHOLE, primary_key=True),
+    Column("id", _string(32), nullable=False, unique=True),  # of the answer
+    Column("blob", _string(64), nullable=False),
+    Column("bytes", BigInteger, nullable=False),
+    Column("title", _string(200)),
+    Column("kept_at", Float, nullable=False),
+    Column("until", Float),  # null: until it is released
+    Column("at", Float, nullable=False),  # when the query came; this and the next: as `record`
+    Column("status", _string(16), nullable=False),
+    Column("robot", _string(128)),
+    Column("record", JSON, nullable=False),  # what lists tell of the query
+    Index(None, "blob"),
+    Index(None, "at", "number"),
+    sqlite_autoincrement=True,
+)
+
+#: The maps that a kept answer was asked of: it goes with any of them, and counts in each.
+kept_answer_maps = Table(
+    "kept_answer_maps",
+    metadata,
+    Column("kept_number", WHOLE, ForeignKey("kept_answers.number"), primary_key=True),
+    Column("map_number", WHOLE, ForeignKey("maps.number"), primary_key=True),
+    Index(None, "map_number", "kept_number"),
+)
+
+#: The frames that a kept answer shows: it goes with any of them.
+kept_answer_frames = Table(
+    "kept_answer_frames",
+    metadata,
+    Column("kept_number", WHOLE, ForeignKey("kept_answers.number"), primary_key=True),
+    Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
+    Index(None, "frame_number"),
+)
+
+#: Deletions of frames that can still be undone.
+deletions = Table(
+    "deletions",
+    metadata,
+    Column("number", WHOLE, primary_key=True),
+    Column("id", _string(32), nullable=False, unique=True),
+    Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
+    Column("at", Float, nullable=False),  # by the clock of the database, as `until`
+    Column("until", Float, nullable=False),
+    Index(None, "map_number", "number"),
+    Index(None, "until"),
+    sqlite_autoincrement=True,
+)
+
+#: What the rows of their frames were, and the uploads that must stay for that long.
+deleted_frames = Table(
+    "deleted_frames",
+    metadata,
+    Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
+    Column("deletion_number", WHOLE, ForeignKey("deletions.number"), nullable=False),
+    Column("blob", _string(64)),  # null: its upload was not kept
+    Column("bytes", BigInteger, nullable=False),
+    Column("data", JSON, nullable=False),  # columns of `frames`
+    Index(None, "deletion_number", "frame_number"),
+    Index(None, "blob"),
+)
+
 #: Blobs of what was deleted, until somebody has seen that they are removed.
 doomed = Table(
     "doomed",

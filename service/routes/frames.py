@@ -67,7 +67,10 @@ def get_frame(map_name: str, frame_id: str, here: Here, response: Response) -> F
     "/{frame_id}", status_code=204, responses=declared(404), dependencies=[Depends(may_write)]
 )
 def delete_frame(map_name: str, frame_id: str, here: Here) -> None:
-    """Take a frame out of its map; from now on no query finds it."""
+    """Take a frame out of its map; from now on no query finds it.
+
+    Ten minutes by default, POST /v1/maps/{map_name}/frames/{frame_id}/restore undoes it.
+    """
     here.engine.delete_frame(map_name, frame_id)
 
 

@@ -22,6 +22,8 @@ from sceneprint_client.api.results import (
     RECORD_STATUSES,
     WIDTH,
     WIDTHS,
+    AnswerRetention,
+    KeepOptions,
     MatchDetails,
     OverlayColour,
     OverlayTransform,
@@ -32,7 +34,7 @@ from sceneprint_client.api.results import (
     View,
 )
 from service.auth import Asking, Caller, v1_router
-from service.bodies import media_type
+from service.bodies import media_type, read_record
 from service.context import Context, Here
 from service.problems import declared
 from service.query_bodies import JSON, TEMPLATE, checked, read_object
@@ -241,6 +243,52 @@ async def ask_again(query_id: str, request: Request, here: Here, asking: Asking)
         )
 
 
+# Answers that are kept until somebody releases them.
+
+_KEEP: dict[str, Any] = {
+    "requestBody": {
+        "required": False,
+        "content": {JSON: {"schema": {"$ref": "#/components/schemas/KeepOptions"}}},
+    }
+}
+
+
+@router.get("/keep", responses=declared(404, 422))
+def get_retention(query_id: str, here: Here, asking: Asking) -> AnswerRetention:
+    """For how long the answer can be looked at, and whether somebody keeps it."""
+    readable_answer(query_id, here, asking)
+    return here.engine.kept_answers.retention(here.engine.kept, query_id)
+
+
+@router.post("/keep", responses=declared(400, 404, 409, 413, 415, 422), openapi_extra=_KEEP)
+async def keep_answer(
+    query_id: str, request: Request, here: Here, asking: Asking
+) -> AnswerRetention:
+    """Keep the answer, and what can be looked at after it, until it is released.
+
+    It goes earlier with a map that was asked, and with a frame that it shows. Once more with
+    another `title` or `until` changes these. It takes the scope `write` for every map that was
+    asked.
+    """
+    engine = here.engine
+    await to_thread.run_sync(_writable_answer, query_id, here, asking)
+    options = await read_record(request, KeepOptions, "The request to keep it", optional=True)
+    return await to_thread.run_sync(engine.kept_answers.keep, engine.kept, query_id, options)
+
+
+@router.delete("/keep", status_code=204, responses=declared(404, 422))
+def release_answer(query_id: str, here: Here, asking: Asking) -> None:
+    """Keep the answer no longer. It takes the scope `write` for every map that was asked."""
+    _writable_answer(query_id, here, asking)
+    here.engine.kept_answers.release(query_id)
+
+
+def _writable_answer(query_id: str, here: Context, asking: Caller) -> None:
+    """See that the caller may write to all maps that were asked."""
+    for name in readable_answer(query_id, here, asking).maps:
+        asking.require(name, "write")
+
+
 # What is left of queries for longer than their answers.
 
 history_router = v1_router("/queries", "queries")
@@ -260,6 +308,13 @@ def list_queries(
         AwareDatetime | None, Query(description="That came then or later; with a time zone.")
     ] = None,
     until: Annotated[AwareDatetime | None, Query(description="That came before then.")] = None,
+    kept: Annotated[
+        bool,
+        Query(
+            description="Only those whose answers are kept until they are released, also where "
+            "their records are gone; of several maps, only where you may read all of them."
+        ),
+    ] = False,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> Page[QueryRecord]:
@@ -279,6 +334,8 @@ def list_queries(
         since=None if since is None else since.timestamp(),
         until=None if until is None else until.timestamp(),
     )  # fmt: skip
+    if kept:
+        return here.engine.kept_answers.page(wanted, asking.named, map_name, cursor, limit)
     return here.engine.history.page(wanted, names, cursor, limit, partial(asking.may, "read"))
 
 

@@ -59,14 +59,22 @@ _Robot = Annotated[Label | None, Query(description="Only frames of this robot; d
 async def delete_session_frames(
     map_name: str, session: _SessionName, request: Request, here: Here, robot: _Robot = None
 ) -> SessionChange:
-    """Delete all frames of a session for good.
+    """Delete all frames of a session.
 
-    A call ends after ten seconds: repeat it while `remaining` is not 0.
+    A call ends after ten seconds: repeat it while `remaining` is not 0. Ten minutes by default,
+    POST /v1/maps/{map_name}/restore undoes it.
     """
     request.state.audited = {"session": session, "robot": robot}
     async with here.gate.place():
         return await here.gate.run(
-            partial(delete_session, here.engine.store, map_name, session, robot)
+            partial(
+                delete_session,
+                here.engine.store,
+                map_name,
+                session,
+                robot,
+                undo=here.engine.undo_limits,
+            )
         )
 
 

@@ -115,7 +115,7 @@ def test_a_session_is_renamed_tagged_and_deleted(
 
     refused = sceneprint("sessions", name, new, "--delete", expect=2).stderr
     assert refused == (
-        f"sceneprint sessions: This would permanently delete session {new} and its 3 frames. Add "
+        f"sceneprint sessions: This would delete session {new} and its 3 frames. Add "
         "--yes to go ahead.\n"
     )
     both = sceneprint("sessions", name, new, "--delete", "--tag", "a", expect=2).stderr
@@ -123,6 +123,19 @@ def test_a_session_is_renamed_tagged_and_deleted(
     nameless = sceneprint("sessions", name, "--delete", expect=2).stderr
     assert nameless.endswith(": Name the session after the map, to edit or delete it.\n")
     said = sceneprint("sessions", name, new, "--delete", "--yes").stdout
-    assert said == f"deleted session {new} and its 3 frames\n"
+    head, undo = said.splitlines()
+    assert head == f"deleted session {new} and its 3 frames"
+    deletion = undo.rpartition(" ")[2]
+    assert undo.endswith(f"UTC: sceneprint sessions {name} --undo {deletion}")
+    (listed,) = sceneprint("sessions", name, "--deletions").stdout.splitlines()[1:]
+    assert listed.split()[:2] == [deletion, "3"]
+    assert sceneprint("sessions", name, "--undo", deletion).stdout == "restored 3 frames\n"
+    assert sceneprint("sessions", name, "--deletions").stdout.startswith("no deletions")
+    assert "3" in sceneprint("sessions", name, new).stdout.split()
+    again = sceneprint("sessions", name, "--undo", deletion, expect=2).stderr
+    assert "has no deletion" in again
+    of_one = sceneprint("sessions", name, new, "--deletions", expect=2).stderr
+    assert "Name no session" in of_one
+    sceneprint("sessions", name, new, "--delete", "--yes")
     gone = sceneprint("sessions", name, new, "--delete", "--yes", expect=2).stderr
     assert f"has no frame of session '{new}'" in gone

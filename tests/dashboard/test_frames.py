@@ -302,9 +302,80 @@ def test_an_edit_of_somebody_else_is_not_overwritten_unseen(
     expect(page.locator(".facts dd", has_text="r10")).to_be_visible(timeout=30_000)
 
     page.get_by_role("button", name="Delete").click()
-    sure = page.get_by_role("dialog").get_by_role("button", name="Delete")
-    expect(sure).to_be_disabled()
-    page.get_by_role("dialog").get_by_role("textbox").fill(one[:8])
-    sure.click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
     expect(page.get_by_role("heading", name="No frames yet")).to_be_visible()
     assert station.client.get(mine).json()["state"] == "deleted"
+    page.get_by_role("button", name="Undo", exact=True).click()
+    expect(page.locator(".toast", has_text="Restored 1 frame.")).to_be_visible()
+    restored = station.client.get(mine).json()
+    assert (restored["session"], restored["tags"]) == ("mine", ["a, b", "door", "north"])
+    until(lambda: station.client.get(mine).json()["state"] == "indexed")
+
+
+def test_frames_are_found_selected_changed_and_restored(
+    page: Page, station: Any, settle: Callable[[Page], None], until: Callable[..., Any],
+    axe: Callable[[Page], list[str]],
+) -> None:  # fmt: skip
+    path = station.make_map("picked")
+    came = add(station, "picked", range(6))
+    until(lambda: station.client.get(path).json()["frames"] == {"rejected": 6})
+    for i, one in enumerate(came):
+        session = "monday" if i < 4 else "tuesday"
+        station.client.patch(f"{path}/frames/{one}", json={"session": session, "name": f"n{i}"})
+
+    def sessions() -> dict[str, int]:
+        found = station.client.get(f"{path}/sessions").json()["items"]
+        return {one["session"]: sum(one["frames"].values()) for one in found}
+
+    # by name, by id, by session: one field
+    page.goto(f"{station.home}#/maps/picked")
+    settle(page)
+    for text, found in (("n3", [came[3]]), (came[1], [came[1]]), ("mon", came[3::-1])):
+        page.get_by_label("Find").fill(text)
+        page.keyboard.press("Enter")
+        settle(page)
+        assert ids(page) == found
+    assert "find=mon" in page.url
+
+    # two of those that match are moved, and that is undone
+    for one in ("n0", "n2"):
+        page.get_by_role("checkbox", name=f"Select frame {one}").check()
+    bar = page.get_by_role("group", name="Selected frames")
+    expect(bar).to_contain_text("2 selected")
+    assert axe(page) == []
+    bar.get_by_role("button", name="Move to session").click()
+    page.get_by_role("dialog").get_by_label("Session").fill("wednesday")
+    page.get_by_role("button", name="Save").click()
+    expect(page.locator(".toast", has_text="Changed 2 frames.")).to_be_visible()
+    assert sessions() == {"monday": 2, "tuesday": 2, "wednesday": 2}
+    expect(bar).to_be_hidden()
+    page.get_by_role("button", name="Undo", exact=True).click()
+    expect(page.locator(".toast", has_text="2 frames are as before.")).to_be_visible()
+    assert sessions() == {"monday": 4, "tuesday": 2}
+    settle(page)
+
+    # all that match are tagged, and then deleted; the rest stays
+    page.get_by_role("checkbox", name="Select frame n1").check()
+    bar.get_by_role("button", name="Select all that match the filters").click()
+    expect(bar).to_contain_text("All frames that match")
+    expect(page.locator(".tile-tick input:checked")).to_have_count(4)
+    bar.get_by_role("button", name="Tag").click()
+    page.get_by_label("Add tags").fill("wet, dock")
+    page.keyboard.press("Enter")
+    expect(page.locator(".toast", has_text="Changed 4 frames.")).to_be_visible()
+    assert listed(station, "picked", tag=["wet", "dock"]) == came[:4]
+    settle(page)
+    page.get_by_role("checkbox", name="Select frame n1").check()
+    bar.get_by_role("button", name="Select all that match the filters").click()
+    bar.get_by_role("button", name="Delete").click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(page.locator(".toast", has_text="Deleted 4 frames. You can undo it")).to_be_visible()
+    assert listed(station, "picked") == came[4:]
+    # also by who comes later
+    page.goto(f"{station.home}#/maps/picked/sessions")
+    settle(page)
+    page.get_by_role("button", name="Undo the deletion of 4 frames").click()
+    expect(page.locator(".sessions-scroll tbody tr")).to_have_count(2)
+    assert listed(station, "picked") == came
+    assert listed(station, "picked", tag=["wet", "dock"]) == came[:4]
+    expect(page.get_by_role("heading", name="Recently deleted")).to_be_hidden()

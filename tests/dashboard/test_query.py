@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from playwright.sync_api import expect
 
 
 def tiles(page, row: str) -> list[dict[str, Any]]:
@@ -509,3 +510,57 @@ def test_an_answer_outlives_frames_of_its_ranking(station, page, settle, until):
     assert all(one["rank"] == ranks.get(one["key"], one["rank"]) for one in ranking)
     head = page.locator("[data-row=R] .query-row-head").inner_text()
     assert "6 of 6 compared, 5 shown" in head
+
+
+def test_an_answer_is_kept_shared_and_released(station, open_page, settle, axe, until):
+    page = open_page(permissions=["clipboard-read", "clipboard-write"])
+    frame = station.frames[2].frame_id
+    body = {"frame_id": frame, "k": 3}
+    asked = station.client.post("/v1/maps/building/queries", json=body).json()["query_id"]
+    path = f"/v1/queries/{asked}/keep"
+    page.goto(f"{station.home}#/queries/{asked}")
+    settle(page)
+    panel = page.get_by_role("group", name="Keep this answer")
+    expect(panel).to_contain_text("This answer expires in")
+    panel.get_by_role("button", name="Keep answer").click()
+    panel.get_by_role("button", name="Copy link").click()
+    expect(page.locator(".toast", has_text="The link was copied.")).to_be_visible()
+    assert page.evaluate("() => navigator.clipboard.readText()") == page.url
+    assert station.client.get(path).json()["kept"] is True
+    assert axe(page) == []
+    listed = f"{station.home}#/maps/building/queries?kept=true"
+    page.goto(listed)
+    settle(page)
+    row = page.locator(f"[data-query='{asked}']")
+    expect(row).to_contain_text("kept")
+    row.get_by_role("link", name="Answer").click()
+    settle(page)
+    panel.get_by_role("button", name="Release").click()
+    expect(panel.get_by_role("button", name="Keep answer")).to_be_visible()
+    assert station.client.get(path).json()["kept"] is False
+    page.goto(listed)
+    settle(page)
+    expect(row).to_have_count(0)
+
+
+def test_an_answer_is_reconstructed(station, page, ask, settle, with_open3d):
+    answer = ask("&k=3")
+    page.goto(f"{station.home}#/queries/{answer['query_id']}")
+    settle(page)
+    card = page.locator("section", has=page.get_by_role("heading", name="Reconstruction"))
+    card.get_by_role("button", name="Reconstruct").click()
+    mesh = card.get_by_role("button", name="Mesh (PLY)")
+    expect(mesh).to_be_visible(timeout=120_000)
+    job = page.url.rpartition("reconstruction=")[2]
+    told = station.client.get(f"/v1/reconstructions/{job}").json()
+    assert told["query_id"] == answer["query_id"]
+    expect(card).to_contain_text(f"{len(told['coverage']['views'])} views show")
+    expect(card).to_contain_text(f"{told['coverage']['area_m2']:.1f} m²")
+    with page.expect_download() as download:
+        mesh.click()
+    size = next(one["bytes"] for one in told["files"] if one["name"] == "mesh.ply")
+    assert download.value.path().stat().st_size == size
+    page.reload()  # the address has it
+    settle(page)
+    expect(mesh).to_be_visible()
+    assert card.locator("canvas").get_attribute("aria-label").startswith("The fused surface")

@@ -107,10 +107,16 @@ def test_sessions_are_listed_renamed_tagged_joined_and_deleted(
     dialog.get_by_role("textbox").fill("monday")
     delete.click()
     expect(rows).to_have_count(2, timeout=PATIENCE_MS)
-    expect(page.get_by_role("status").filter(has_text="deleted with 4 frames")).to_be_visible()
+    expect(page.get_by_role("status").filter(has_text="Deleted 4 frames.")).to_be_visible()
     assert set(listed(station, runs)) == {(None, None), ("monday", None)}
+    assert axe(page) == []
+    expect(page.get_by_role("button", name="Undo the deletion of 4 frames")).to_be_visible()
+    page.locator(".toast", has_text="Deleted").get_by_role("button", name="Undo").click()
+    expect(rows).to_have_count(3, timeout=PATIENCE_MS)
+    assert listed(station, runs)["monday", "ann"] == (4, ["dock", "wet"])
     # what others do is seen
-    station.client.delete(f"{runs}/sessions", params={"session": "monday"})
+    told = station.client.delete(f"{runs}/sessions", params={"session": "monday"}).json()
+    assert (told["frames"], told["deletion"]["frames"]) == (5, 5)
     expect(rows).to_have_count(1, timeout=PATIENCE_MS)
 
 

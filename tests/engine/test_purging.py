@@ -31,6 +31,7 @@ from sceneprint.store.postgres.vectors import table_of
 from sceneprint.store.signatures import geometry_blobs, stored_vector
 from sceneprint_client.api import NewMap, Query
 from sceneprint_client.api.reconstructions import NewReconstruction
+from sceneprint_client.api.results import KeepOptions
 
 #: Where PostgreSQL keeps the vectors of signatures.
 VECTORS = table_of(read_model("depth").signature_bytes)
@@ -142,13 +143,14 @@ def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
         row = find_map(connection, "hall")
         for name in ids(engine)[1:]:
             write_frame(connection, row, find_frame(connection, row, name), {"tags": []})
+    assert engine.kept_answers.keep(engine.kept, shows, KeepOptions()).kept
     engine.delete_frame("hall", frame_id)
-    assert places(engine, tmp_path, secret["upload"]) == set()
+    assert places(engine, tmp_path, secret["upload"]) == {"blobs"}  # it can be restored
     with pytest.raises(UnknownQuery):
         engine.inspection.answer(own)
     assert engine.inspection.answer(shows).query_id == shows
     purged = engine.purging.now()
-    assert (purged.answers, purged.reconstructions, purged.indexes) == (2, 1, 1)
+    assert (purged.answers, purged.reconstructions, purged.indexes) == (3, 1, 1)
     for what, wanted in secret.items():
         assert places(engine, tmp_path, wanted) == set(), what
     with pytest.raises(UnknownQuery):
@@ -163,7 +165,9 @@ def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
 
 def test_no_byte_of_a_map_is_left(lived_in, secret, ids, uploads, tmp_path):
     engine, frame_id = lived_in, ids(lived_in)[0]
-    asked(engine, frame_id, uploads)
+    _, shows, _ = asked(engine, frame_id, uploads)
+    engine.kept_answers.keep(engine.kept, shows, KeepOptions())
+    engine.delete_frame("hall", ids(engine)[1])
     engine.delete_map("hall")
     engine.publish_due()
     engine.purging.now()
@@ -225,9 +229,11 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
     monkeypatch.setattr(purge, "PAUSE", 1e4)
     second = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2, purge_s=1)
     workers = [
-        Purging(one.store, one._upkeep, one.kept, one.reconstructions, 0.0)
+        Purging(
+            one.store, one._upkeep, one.kept, one.kept_answers, one.undo, one.reconstructions, 0.0
+        )
         for one in (second, second)
-    ]
+    ]  # fmt: skip
     first.delete_frame("hall", names[0])
     folder = index_folder(first.settings.indexes, first._row("hall"))
     before = newest_number(folder)

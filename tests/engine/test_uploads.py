@@ -13,6 +13,7 @@ from PIL import Image
 from sceneprint.engine import Engine
 from sceneprint.engine.upkeep import garbage_collection
 from sceneprint.errors import FrameConflict, InvalidIntrinsics, UnknownFrame, UselessFrame
+from sceneprint.store.undo_rows import NO_UNDO
 from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
 
 Told = Callable[[Engine], list[str]]
@@ -131,6 +132,7 @@ def test_a_deleted_frame_is_found_no_more_and_may_come_again(
     data, meta, gone = uploads[3].data, uploads[3].meta, ids(full)[3]
     assert full.query_upload("hall", data, meta, ASK).matches[0].frame_id == gone
     before = set(blobs(full))
+    full.undo_limits = NO_UNDO
     full.delete_frame("hall", gone)
     assert len(before - set(blobs(full))) == 2  # upload and artifact
     answer = full.query_upload("hall", data, meta, ASK)
@@ -163,6 +165,7 @@ def test_blobs_stay_while_another_map_refers_to_them(
     assert work_off(empty) == [JobState.SUCCEEDED] * 2
     both = blobs(empty)
     assert len(both) == 2
+    empty.undo_limits = NO_UNDO
     for name, left in (("hall", both), ("other", [])):
         if how == "map":
             empty.delete_map(name)

@@ -55,6 +55,13 @@ OF_A_MAP = {
     "GET /v1/maps/{map_name}/frames/{frame_id}": Case(),
     "PATCH /v1/maps/{map_name}/frames/{frame_id}": Case("write", body={"tags": ["x"]}),
     "DELETE /v1/maps/{map_name}/frames/{frame_id}": Case("write"),
+    "POST /v1/maps/{map_name}/frames/delete": Case("write", body={"frame_ids": ["{frame}"]}),
+    "POST /v1/maps/{map_name}/frames/edit": Case(
+        "write", body={"frame_ids": ["{frame}"], "add_tags": ["x"]}
+    ),
+    "POST /v1/maps/{map_name}/frames/{frame_id}/restore": Case("write"),
+    "POST /v1/maps/{map_name}/restore": Case("write", body={"frame_ids": ["{frame}"]}),
+    "GET /v1/maps/{map_name}/deletions": Case(),
     "GET /v1/maps/{map_name}/frames/{frame_id}/cloud.ply": Case(),
     "GET /v1/maps/{map_name}/frames/{frame_id}/preview.png": Case(),
     "GET /v1/maps/{map_name}/frames/{frame_id}/patches": Case(),
@@ -76,6 +83,9 @@ OF_A_MAP = {
     "GET /v1/queries": Case(query={"map": "{map}"}),
     "DELETE /v1/queries": Case("admin", query={"map": "{map}"}),
     "GET /v1/queries/{query_id}": Case(),
+    "GET /v1/queries/{query_id}/keep": Case(),
+    "POST /v1/queries/{query_id}/keep": Case("write", body={}),
+    "DELETE /v1/queries/{query_id}/keep": Case("write"),
     "GET /v1/queries/{query_id}/cloud.ply": Case(),
     "GET /v1/queries/{query_id}/points": Case(),
     "GET /v1/queries/{query_id}/question": Case(),
@@ -124,6 +134,8 @@ OF_A_MAP = {
 MADE_OF_ANYTHING = (
     "PUT /v1/maps/{map_name}/frames/{frame_id}", "POST /v1/maps/{map_name}/associations",
     "POST /v1/maps/{map_name}/coverage",
+    "POST /v1/maps/{map_name}/frames/delete", "POST /v1/maps/{map_name}/frames/edit",
+    "POST /v1/maps/{map_name}/restore",
 )  # fmt: skip
 #: The operator's: 403 for who has a map, whatever is asked for.
 OF_ALL = (
@@ -383,12 +395,18 @@ def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
     assert {match["map"] for match in asked.json()["matches"]} == {OWN, THEIRS}
     match = f"/matches/{there[OWN].frame}"
     for end in (
-        "", "/cloud.ply", "/similarities", "/points", "/question", "/preview.png", match,
+        "", "/cloud.ply", "/similarities", "/points", "/question", "/preview.png", "/keep", match,
         f"{match}/points",
     ):  # fmt: skip
         unseen(walled, "GET", "/v1/queries/{}" + end, mixed)
     unseen(walled, "POST", "/v1/queries/{}/reconstruction", mixed)
     unseen(walled, "POST", "/v1/queries/{}/again", mixed)
+    assert walled.ask("boss", "POST", f"/v1/queries/{mixed}/keep", json={}).status_code == 200
+    for method in ("GET", "POST", "DELETE"):
+        unseen(walled, method, "/v1/queries/{}/keep", mixed)
+    for path in ("/v1/queries?kept=true", f"/v1/queries?kept=true&map={OWN}"):
+        assert mixed not in walled.ask("admin", "GET", path).text, path
+        assert mixed in walled.ask("boss", "GET", path).text, path
     fused = walled.ask("boss", "POST", f"/v1/queries/{mixed}/reconstruction", json={})
     assert fused.status_code == 202, fused.text
     job = fused.json()["job_id"]
@@ -485,6 +503,8 @@ def test_what_is_not_noted_is_said(operations):
     assert names >= UNNOTED
     assert names - UNNOTED == {
         "create_key", "revoke_key", "create_map", "patch_map", "delete_map", "patch_frame",
+        "delete_frames", "edit_frames", "restore_frames", "restore_frame", "keep_answer",
+        "release_answer",
         "delete_frame", "patch_session", "delete_session_frames", "cancel_job", "retry_job",
         "retry_dead_jobs", "reencode", "cancel_reencoding",
         "begin_association", "delete_association", "begin_coverage", "delete_coverage",

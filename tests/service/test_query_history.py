@@ -75,6 +75,7 @@ def test_each_query_leaves_a_record_of_what_came_of_it(house, shots, refused):
             for name in ("parent_frame", "translation", "rotation")
         },
         "milliseconds": first["milliseconds"], "frame": None, "kept_until": first["kept_until"],
+        "keep": None,
     }  # fmt: skip
     assert first["milliseconds"] >= answer["milliseconds"]["total"]
     kept = house.ask("robot", "GET", f"/v1/queries/{first['query_id']}")

@@ -104,6 +104,10 @@ def passes(one: FrameRow, w: FrameListing) -> bool:
         and (w.has_pose is None or (one.pose is not None) == w.has_pose)
         and (w.content_id is None or one.content_id == w.content_id)
         and (w.name is None or (one.name or "").startswith(w.name))
+        and (
+            w.find is None
+            or any((text or "").startswith(w.find) for text in (one.id, one.name, one.session))
+        )
     )
 
 
@@ -118,6 +122,7 @@ def some_listing(rng: np.random.Generator) -> FrameListing:
         "parent_frame": "p1", "has_pose": bool(rng.random() < 0.5),
         "content_id": f"{rng.integers(0, 50):064d}",
         "name": str(rng.choice(["a", "a/2", "b", "b\U0010ffff", "c\ud7ff", "\U0010ffff", "B"])),
+        "find": str(rng.choice(["a", "s1", "s", "b\U0010ffff", *"0123456789abcdef"])),
     }  # fmt: skip
     names = rng.permutation(list(every))[: rng.integers(0, 4)]
     given = {name: every[name] for name in names}

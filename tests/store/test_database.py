@@ -26,9 +26,10 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.tables import MapRow, metadata
 
 TABLES = [
-    "audit", "doomed", "events", "former_maps", "frame_tags", "frames", "idempotency", "job_files",
-    "job_items", "jobs", "keys", "maps", "models", "query_records", "samples", "secrets",
-    "signatures", "surface_frames", "surface_tiles", "surface_touches", "surfaces",
+    "audit", "deleted_frames", "deletions", "doomed", "events", "former_maps", "frame_tags",
+    "frames", "idempotency", "job_files", "job_items", "jobs", "kept_answer_frames",
+    "kept_answer_maps", "kept_answers", "keys", "maps", "models", "query_records", "samples",
+    "secrets", "signatures", "surface_frames", "surface_tiles", "surface_touches", "surfaces",
 ]  # fmt: skip
 
 

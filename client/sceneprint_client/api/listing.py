@@ -69,6 +69,9 @@ class FrameListing(Given):
         default=None, description="Of its samples and camera."
     )
     name: _Prefix | None = Field(default=None, description="Its name begins so; case matters.")
+    find: _Prefix | None = Field(
+        default=None, description="Its id, its name or its session begins so; case matters."
+    )
     order: Literal["asc", "desc", "taken"] = Field(
         default="asc",
         description="As they came; `desc`: the newest first; `taken`, of one session: by "
@@ -302,6 +305,15 @@ class SessionEdit(Given):
         return self
 
 
+class FrameDeletion(ApiRecord):
+    """A deletion that can be undone."""
+
+    deletion_id: str
+    at: datetime
+    until: datetime = Field(description="Until when its frames can be restored.")
+    frames: int = Field(description="How many can be restored.")
+
+
 class SessionChange(ApiRecord):
     """What became of a session."""
 
@@ -314,6 +326,9 @@ class SessionChange(ApiRecord):
     )
     last_frame_id: str | None = Field(
         default=None, description="Of an edit with frames remaining: send it as `after`."
+    )
+    deletion: FrameDeletion | None = Field(
+        default=None, description="Of a deletion: how to undo this call, where that can be done."
     )
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AwareDatetime, Field
 
-from sceneprint_client.api.base import ApiRecord, Given, Quaternion, Transform, Vector
+from sceneprint_client.api.base import ApiRecord, Given, Note, Quaternion, Transform, Vector
 from sceneprint_client.api.frames import Kind
 from sceneprint_client.api.maps import Preset
 from sceneprint_client.api.matches import Uncertainty, Validation
@@ -54,6 +54,40 @@ class RecordedPose(ApiRecord):
     rotation: Quaternion
 
 
+class KeepOptions(Given):
+    """How to keep an answer."""
+
+    title: Note | None = Field(default=None, description="For people.")
+    until: AwareDatetime | None = Field(
+        default=None,
+        description="It is released then; with a time zone. Default: it is kept until it is "
+        "released.",
+    )
+
+
+class AnswerRetention(ApiRecord):
+    """For how long an answer can be looked at."""
+
+    query_id: str
+    kept: bool = Field(description="Whether somebody keeps it.")
+    title: str | None = None
+    kept_at: datetime | None = Field(default=None, description="Since when it is kept.")
+    until: datetime | None = Field(
+        default=None,
+        description="When it goes, or earlier where room is needed; of a kept one when it is "
+        "released: null, not by itself.",
+    )
+
+
+class KeptAnswer(ApiRecord):
+    """How an answer is kept beyond its hour."""
+
+    title: str | None
+    kept_at: datetime
+    until: datetime | None = Field(description="When it is released; null: not by itself.")
+    bytes: int
+
+
 class QueryRecord(ApiRecord):
     """What came of a query, in short; nothing of what its frame shows."""
 
@@ -87,7 +121,10 @@ class QueryRecord(ApiRecord):
     )
     kept_until: datetime | None = Field(
         description="The answer is kept until then, while there is room; null: not any more, or "
-        "it never was."
+        "it never was. See also `keep`."
+    )
+    keep: KeptAnswer | None = Field(
+        default=None, description="Where somebody keeps the answer for longer."
     )
 
 

@@ -23,6 +23,7 @@ from sceneprint.engine.serializers import when
 from sceneprint.errors import ReadOnlyStore, SceneprintError
 from sceneprint.settings import Settings
 from sceneprint.store import Store
+from sceneprint.store.answer_rows import KeptRow, kept_among
 from sceneprint.store.deletion import DAY_S, remove_in_blocks
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.query_records import (
@@ -42,7 +43,7 @@ from sceneprint.store.queue import read_clock
 from sceneprint_client.api import Answer, FrameName, Page, Query
 from sceneprint_client.api.base import Quaternion, Vector
 from sceneprint_client.api.frames import Kind
-from sceneprint_client.api.results import QueryRecord, RecordedPose, RecordStatus
+from sceneprint_client.api.results import KeptAnswer, QueryRecord, RecordedPose, RecordStatus
 from sceneprint_client.errors import kebab_case
 
 log = logging.getLogger(__name__)
@@ -283,29 +284,19 @@ class QueryHistory:
                 wanted = replace(wanted, map_numbers=tuple(numbers))
             rows = list_records(connection, wanted, before, limit + 1)
             of_maps, of_keys = names_of(connection, rows)
+            kept = {
+                name: kept_record(row)
+                for name, row in kept_among(connection, [row.id for row in rows]).items()
+            }
         more = self._store.seals.next_moment("query", [(r.at, r.number) for r in rows], limit)
-        told = [self._told(row, of_maps, of_keys, may_read) for row in rows[:limit]]
+        told = [
+            query_record(
+                row, of_maps[row.map_number], of_keys.get(row.key_id or ""),
+                row.at + self._settings.query_s, may_read, kept.get(row.id),
+            )
+            for row in rows[:limit]
+        ]  # fmt: skip
         return Page[QueryRecord](items=told, next_cursor=more)
-
-    def _told(
-        self, row: RecordRow, of_maps: dict[int, str], of_keys: dict[str, str],
-        may_read: Callable[[str], bool],
-    ) -> QueryRecord:  # fmt: skip
-        name = of_maps[row.map_number]
-        frame = None
-        if row.frame_id is not None and row.frame_map is not None and may_read(row.frame_map):
-            frame = FrameName(map=row.frame_map, frame_id=row.frame_id)
-        until = row.at + self._settings.query_s
-        return QueryRecord(
-            query_id=row.id, at=when(row.at), map=name,
-            maps=[name] if row.maps is None else [one for one in row.maps if may_read(one)],
-            robot=row.robot, session=row.session,
-            key=None if row.key_id is None else of_keys.get(row.key_id), status=row.status,
-            cause=row.cause, reason=row.reason, pose=_pose(row), support=row.support,
-            rival_ratio=row.rival_ratio, alternatives=row.alternatives,
-            milliseconds=row.milliseconds, kind=row.kind, frame=frame,
-            kept_until=when(until) if row.kept and until > time.time() else None,
-        )  # fmt: skip
 
     # removed
 
@@ -352,6 +343,41 @@ class QueryHistory:
 
 #: Seconds that a list waits for what was just answered to be written.
 _PATIENCE_S = 1.0
+
+
+def query_record(
+    row: RecordRow, map_name: str, key: str | None, until: float | None,
+    may_read: Callable[[str], bool], keep: KeptAnswer | None = None,
+) -> QueryRecord:  # fmt: skip
+    """A record as JSON tells it.
+
+    Parameters
+    ----------
+    row : see RecordRow
+    map_name : of the map that it belongs to
+    key : name of the key that was shown
+    until : when an answer that nobody keeps goes, seconds since 1970
+    may_read : whether the caller may read a map: the names of others are not told
+    keep : how its answer is kept
+    """
+    frame = None
+    if row.frame_id is not None and row.frame_map is not None and may_read(row.frame_map):
+        frame = FrameName(map=row.frame_map, frame_id=row.frame_id)
+    stays = row.kept and until is not None and until > time.time()
+    return QueryRecord(
+        query_id=row.id, at=when(row.at), map=map_name,
+        maps=[map_name] if row.maps is None else [one for one in row.maps if may_read(one)],
+        robot=row.robot, session=row.session, key=key, status=row.status, cause=row.cause,
+        reason=row.reason, pose=_pose(row), support=row.support, rival_ratio=row.rival_ratio,
+        alternatives=row.alternatives, milliseconds=row.milliseconds, kind=row.kind, frame=frame,
+        kept_until=when(until) if stays else None, keep=keep,
+    )  # fmt: skip
+
+
+def kept_record(row: KeptRow) -> KeptAnswer:
+    """How an answer is kept, as JSON tells it."""
+    until = None if row.until is None else when(row.until)
+    return KeptAnswer(title=row.title, kept_at=when(row.kept_at), until=until, bytes=row.bytes)
 
 
 def _pose(row: RecordRow) -> RecordedPose | None:

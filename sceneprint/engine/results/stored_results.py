@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
-from sqlalchemy import select
+from sqlalchemy import ColumnElement, select
 
 from sceneprint.atomic_files import write_whole
 from sceneprint.errors import UnknownQuery, UnusableStore
@@ -37,7 +37,7 @@ from sceneprint.store import Blobs, Store
 from sceneprint.store.blobs.object_client import ListedObject, Objects
 from sceneprint.store.blobs.object_store import ObjectBlobs
 from sceneprint.store.frame_queries import QueryOrigin
-from sceneprint.store.tables import frames, maps
+from sceneprint.store.tables import deleted_frames, frames, maps
 from sceneprint.types import Bytes, Floats
 from sceneprint_client.api import Answer, FrameState, Query
 
@@ -45,7 +45,8 @@ log = logging.getLogger(__name__)
 
 #: Most answers that are kept, however small: a folder is read again for every few.
 MOST_QUERIES = 10_000
-#: Of the bytes and of what they mean. Raise it when either changes.
+#: Of the bytes and of what they mean. Raise it when either changes; `kept_answers` has some of any
+#: age, so `read` must go on reading what versions before wrote.
 SCHEMA_VERSION = 2
 _MAGIC = b"SPQRY"
 #: magic, schema, CRC-32 of all that follows | bytes of head, signature and geometry artifact
@@ -90,6 +91,12 @@ class StoredResult:
 
 #: Whether an answer may still be looked at: of its head alone, the rest may be left out.
 Stands = Callable[[StoredResult], bool]
+#: An answer that is kept elsewhere, by its id; None where it is not.
+Finds = Callable[[str], StoredResult | None]
+
+
+def _nowhere(_: str) -> StoredResult | None:
+    return None
 
 
 class StoredResults(ABC):
@@ -100,10 +107,14 @@ class StoredResults(ABC):
     seconds : how long each is kept
     most_bytes : of all together; 0 keeps none
     stands : whether one that is found may still be looked at
+    kept : finds those that are kept for longer
     """
 
-    def __init__(self, seconds: float, most_bytes: int, stands: Stands = lambda _: True) -> None:
-        self._seconds, self._most, self._stands = seconds, most_bytes, stands
+    def __init__(
+        self, seconds: float, most_bytes: int, stands: Stands = lambda _: True,
+        kept: Finds = _nowhere,
+    ) -> None:  # fmt: skip
+        self._seconds, self._most, self._stands, self._kept = seconds, most_bytes, stands, kept
         self._refused = False  # whether the last answer could not be kept
 
     @abstractmethod
@@ -123,6 +134,9 @@ class StoredResults(ABC):
                 found = self._read(query_id)
                 if found is not None and self._stands(found):
                     return found
+            found = self._kept(query_id)
+            if found is not None and self._stands(found):
+                return found
         raise unknown_query(query_id)
 
     @abstractmethod
@@ -242,9 +256,10 @@ class ResultFolder(StoredResults):
     """
 
     def __init__(
-        self, folder: Path, seconds: float, most_bytes: int, stands: Stands = lambda _: True
-    ) -> None:
-        super().__init__(seconds, most_bytes, stands)
+        self, folder: Path, seconds: float, most_bytes: int, stands: Stands = lambda _: True,
+        kept: Finds = _nowhere,
+    ) -> None:  # fmt: skip
+        super().__init__(seconds, most_bytes, stands, kept)
         self._folder = folder
         self._lock = threading.Lock()
         self._left = 0  # answers until the folder is looked at again
@@ -359,9 +374,9 @@ class ResultObjects(StoredResults):
 
     def __init__(
         self, objects: Objects, seconds: float, most_bytes: int, purge_s: float = 3600.0,
-        stands: Stands = lambda _: True,
+        stands: Stands = lambda _: True, kept: Finds = _nowhere,
     ) -> None:  # fmt: skip
-        super().__init__(seconds, most_bytes, stands)
+        super().__init__(seconds, most_bytes, stands, kept)
         self._objects, self._purge_s = objects, purge_s
         self._slots = threading.BoundedSemaphore(_UNDER_WAY)
         self._lock = threading.Lock()
@@ -469,24 +484,32 @@ class ResultObjects(StoredResults):
 
 
 def open_results(
-    settings: Settings, blobs: Blobs, stands: Stands = lambda _: True
+    settings: Settings, blobs: Blobs, stands: Stands = lambda _: True, kept: Finds = _nowhere
 ) -> StoredResults:
-    """Answers as the settings want them kept; `stands`: see StoredResults."""
+    """Answers as the settings want them kept; `stands` and `kept`: see StoredResults."""
+    seconds, most = settings.query_s, settings.query_bytes
     if isinstance(blobs, ObjectBlobs):
-        return ResultObjects(
-            blobs.objects, settings.query_s, settings.query_bytes, settings.purge_s, stands
-        )
-    return ResultFolder(settings.query_dir, settings.query_s, settings.query_bytes, stands)
+        return ResultObjects(blobs.objects, seconds, most, settings.purge_s, stands, kept)
+    return ResultFolder(settings.query_dir, seconds, most, stands, kept)
 
 
 # Whether what was made of frames and maps still stands, or one of them was deleted since.
 
 
 class ResultValidity:
-    """Looks frames and maps up, once each: of one moment, so make a new one for the next."""
+    """Looks frames and maps up, once each: of one moment, so make a new one for the next.
 
-    def __init__(self, store: Store) -> None:
+    Parameters
+    ----------
+    store : see Store
+    restorable : whether a deleted frame still counts while it can be restored
+    """
+
+    def __init__(self, store: Store, *, restorable: bool = False) -> None:
         self._store = store
+        self._there: ColumnElement[bool] = frames.c.state != FrameState.DELETED
+        if restorable:
+            self._there |= frames.c.number.in_(select(deleted_frames.c.frame_number))
         self._maps: dict[str, float | None] = {}  # when they were made, seconds since 1970
         self._frames: dict[tuple[str, str], float | None] = {}  # when they were received
 
@@ -537,7 +560,7 @@ class ResultValidity:
                     .where(
                         maps.c.name == name,
                         frames.c.id.in_([frame_id for of, frame_id in new if of == name]),
-                        frames.c.state != FrameState.DELETED,
+                        self._there,
                     )
                 )
                 self._frames.update({(name, frame_id): at for frame_id, at in found})

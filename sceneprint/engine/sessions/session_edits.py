@@ -12,26 +12,24 @@ import time
 
 from sqlalchemy import Connection
 
+from sceneprint.engine.maps.selections import AT_ONCE, CALL_S, edited_tags
+from sceneprint.engine.maps.undo import deletion_record
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
-from sceneprint.errors import InvalidRequest, UnknownSession
+from sceneprint.errors import UnknownSession
 from sceneprint.store import Store
 from sceneprint.store.deletion import delete_frames
 from sceneprint.store.frame_queries import count_session, session_frames
 from sceneprint.store.frames import find_frame, frame_of, write_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import FrameRow, MapRow
-from sceneprint_client.api.frames import MOST_TAGS
+from sceneprint.store.undo_rows import NO_UNDO, Deletion, UndoLimits, count_restorable
 from sceneprint_client.api.listing import SessionChange, SessionEdit
-
-#: Frames written in one transaction: other writers wait for some 20 ms.
-AT_ONCE = 100
-#: Seconds after which a call ends with what is left.
-CALL_S = 10.0
 
 
 def delete_session(
-    store: Store, map_name: str, session: str, robot: str | None = None, seconds: float = CALL_S
-) -> SessionChange:
+    store: Store, map_name: str, session: str, robot: str | None = None, seconds: float = CALL_S,
+    undo: UndoLimits = NO_UNDO,
+) -> SessionChange:  # fmt: skip
     """Delete frames of a session, in whatever state, until none is left or the time is over.
 
     Parameters
@@ -40,24 +38,32 @@ def delete_session(
     map_name, session : of the frames
     robot : only those that it took; None for those of all robots
     seconds : after which no further block is begun
+    undo : for how long that can be undone
 
     Raises
     ------
     UnknownMap, UnknownSession : there is none.
     """
     until, deleted = time.monotonic() + seconds, 0
+    deletion: Deletion | None = None
     while True:
         with store.database.write() as connection:
             row = find_map(connection, map_name)
             numbers = session_frames(connection, row.number, session, robot, 0, AT_ONCE)
-            blobs = delete_frames(connection, row, numbers)
+            if numbers and deletion is None:
+                deletion = undo.begin(connection, row.number)
+            blobs = delete_frames(connection, row, numbers, deletion=deletion)
             left = count_session(connection, row.number, session, robot)
+            kept = count_restorable(connection, deletion)
         collect_deleted_blobs(store, blobs)
         deleted += len(numbers)
         if not left or time.monotonic() >= until:
             break
     _require_frames(deleted, row, session, robot)
-    return SessionChange(map=row.name, session=session, robot=robot, frames=deleted, remaining=left)
+    told = deletion_record(deletion, kept) if deletion is not None and kept else None
+    return SessionChange(
+        map=row.name, session=session, robot=robot, frames=deleted, remaining=left, deletion=told
+    )
 
 
 def edit_session(
@@ -121,16 +127,7 @@ def _values(frame: FrameRow, edit: SessionEdit) -> dict[str, object]:
     if edit.robot is not None:
         values["robot"] = edit.robot
     if edit.add_tags or edit.remove_tags:
-        gone = set(edit.remove_tags)
-        tags = [tag for tag in frame.tags if tag not in gone]
-        tags += [tag for tag in dict.fromkeys(edit.add_tags) if tag not in tags]
-        if len(tags) > MOST_TAGS:
-            raise InvalidRequest(
-                f"Frame {frame.id} would have {len(tags)} tags, and a frame has at most "
-                f"{MOST_TAGS}. Remove some with `remove_tags`.",
-                (("add_tags", "too many"),),
-            )
-        values["tags"] = tags
+        values["tags"] = edited_tags(frame, edit)
     return values
 
 

@@ -1,6 +1,7 @@
 """No byte of a deleted frame is left, some time after it was deleted: what deleting it left behind.
 
-A deletion takes the frame's rows and blobs at once. Left are blobs of a process that died half way,
+A deletion takes the frame out of all searches at once, and its rows and blobs when it can no longer
+be undone. Left are then blobs of a process that died half way,
 surfaces and answers that the frame is part of, this node's indexes and what readers hold of it, and
 pages and log of SQLite. On PostgreSQL dead rows are VACUUM's.
 """
@@ -13,7 +14,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from sceneprint.engine.maps.undo import FrameUndo
 from sceneprint.engine.reconstruction import ReconstructionJobs
+from sceneprint.engine.results.kept_answers import KeptAnswers
 from sceneprint.engine.results.stored_results import ResultValidity, StoredResults
 from sceneprint.engine.upkeep.garbage_collection import collect_doomed_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
@@ -55,16 +58,16 @@ class Purging:
 
     Parameters
     ----------
-    store, upkeep, kept, reconstructions : of the engine
+    store, upkeep, kept, kept_answers, undo, reconstructions : of the engine
     purge_s : seconds after which nothing may be left
     """
 
     def __init__(
-        self, store: Store, upkeep: Upkeep, kept: StoredResults,
-        reconstructions: ReconstructionJobs, purge_s: float,
+        self, store: Store, upkeep: Upkeep, kept: StoredResults, kept_answers: KeptAnswers,
+        undo: FrameUndo, reconstructions: ReconstructionJobs, purge_s: float,
     ) -> None:  # fmt: skip
         self._store, self._upkeep, self._kept = store, upkeep, kept
-        self._reconstructions = reconstructions
+        self._kept_answers, self._undo, self._reconstructions = kept_answers, undo, reconstructions
         self._every_s = purge_s / 2  # what is deleted just after a look is gone in time too
         self._next = time.monotonic() + self._every_s
 
@@ -78,7 +81,7 @@ class Purging:
         return self._all(before, self._upkeep.is_rested, seconds=min(_SWEEP_S, self._every_s))
 
     def now(self) -> Purged:
-        """Remove all that is left at once.
+        """Remove all that is left at once; no deletion can be undone afterwards.
 
         Raises
         ------
@@ -107,13 +110,15 @@ class Purging:
                     failed.append(error)
                 return 0
 
-        standing = ResultValidity(self._store)
+        tried(lambda: self._undo.purge(everything=before is None))
+        standing = ResultValidity(self._store, restorable=True)
         with self._store.database.read() as connection:
             rows = [row for row in list_maps(connection) if wanted(row)]
         found = Purged(
             blobs=tried(lambda: collect_doomed_blobs(self._store, before, seconds)),
             reconstructions=tried(lambda: self._reconstructions.forget(standing)),
-            answers=tried(lambda: self._kept.forget(standing.all_of)),
+            answers=tried(lambda: self._kept.forget(standing.all_of))
+            + tried(self._kept_answers.remove_spent),
             indexes=sum(tried(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]
         )
         self._store.database.shrink_log()

@@ -333,6 +333,15 @@ _USES_OF_SURFACES = " UNION ALL ".join(
     f" WHERE {column} IS NOT NULL"
     for column in ("blob", "draft")
 )
+#: Those of jobs, surfaces, deleted frames that can be restored and kept answers, by the tables that
+#: have them: an older database has none of these.
+_MORE_USES = {
+    "job_files": _USES_OF_JOBS,
+    "surface_tiles": _USES_OF_SURFACES,
+    "deleted_frames": "SELECT blob AS digest, frame_number AS number, 'deleted' AS role"
+    " FROM deleted_frames WHERE blob IS NOT NULL",
+    "kept_answers": "SELECT blob AS digest, number, 'answer' AS role FROM kept_answers",
+}
 
 
 @dataclass(frozen=True)
@@ -525,12 +534,14 @@ def referred(connection: sqlite3.Connection) -> Iterator[str]:
 
 
 def _every(connection: sqlite3.Connection) -> str:
-    parts = [_USES]
-    if _has_table(connection, "job_files"):
-        parts.append(_USES_OF_JOBS)
-    if _has_table(connection, "surface_tiles"):
-        parts.append(_USES_OF_SURFACES)
-    return " UNION ALL ".join(parts)
+    return " UNION ALL ".join([_USES, *_more_uses(connection).values()])
+
+
+def _more_uses(connection: sqlite3.Connection) -> dict[str, str]:
+    """Those of `_MORE_USES` whose table a database of this version has."""
+    asked = "SELECT name FROM sqlite_master WHERE type = 'table'"
+    there = {name for (name,) in connection.execute(asked)}
+    return {table: told for table, told in _MORE_USES.items() if table in there}
 
 
 def count_referred(connection: sqlite3.Connection) -> int:
@@ -541,17 +552,26 @@ def count_referred(connection: sqlite3.Connection) -> int:
 
 def uses(connection: sqlite3.Connection, digest: str) -> tuple[BlobUse, ...]:
     """Whose a blob is."""
+    more = _more_uses(connection)
+    used = " UNION ALL ".join([_USES, *(more[one] for one in ("deleted_frames",) if one in more)])
     rows = connection.execute(
         "SELECT maps.name, frames.id, used.role FROM"
-        f" ({_USES}) AS used JOIN frames ON frames.number = used.number"
+        f" ({used}) AS used JOIN frames ON frames.number = used.number"
         " JOIN maps ON maps.number = frames.map_number WHERE CAST(digest AS TEXT) = ?"
         " ORDER BY frames.number",
         (digest,),
     )
     found = [BlobUse(map=name, frame=frame, role=role) for name, frame, role in rows]
-    if _has_table(connection, "job_files"):
-        found += _uses_of_jobs(connection, digest)
-    if _has_table(connection, "surface_tiles"):
+    if "job_files" in more:
+        rows = connection.execute(
+            "SELECT maps.name, jobs.id FROM"
+            f" ({_USES_OF_JOBS}) AS used JOIN jobs ON jobs.number = used.number"
+            " JOIN maps ON maps.number = jobs.map_number WHERE CAST(digest AS TEXT) = ?"
+            " ORDER BY jobs.number",
+            (digest,),
+        )
+        found += [BlobUse(map=name, job=job, role="job") for name, job in rows]
+    if "surface_tiles" in more:
         rows = connection.execute(
             f"SELECT DISTINCT maps.name FROM ({_USES_OF_SURFACES}) AS used"
             " JOIN maps ON maps.number = used.number WHERE CAST(digest AS TEXT) = ?"
@@ -559,24 +579,16 @@ def uses(connection: sqlite3.Connection, digest: str) -> tuple[BlobUse, ...]:
             (digest,),
         )
         found += [BlobUse(map=name, role="surface") for (name,) in rows]
+    if "kept_answers" in more:
+        rows = connection.execute(
+            "SELECT maps.name, kept_answers.id FROM kept_answers JOIN kept_answer_maps AS of"
+            " ON of.kept_number = kept_answers.number"
+            " JOIN maps ON maps.number = of.map_number WHERE CAST(blob AS TEXT) = ?"
+            " ORDER BY kept_answers.number, maps.number",
+            (digest,),
+        )
+        found += [BlobUse(map=name, query=query, role="answer") for name, query in rows]
     return tuple(found)
-
-
-def _uses_of_jobs(connection: sqlite3.Connection, digest: str) -> list[BlobUse]:
-    rows = connection.execute(
-        "SELECT maps.name, jobs.id FROM"
-        f" ({_USES_OF_JOBS}) AS used JOIN jobs ON jobs.number = used.number"
-        " JOIN maps ON maps.number = jobs.map_number WHERE CAST(digest AS TEXT) = ?"
-        " ORDER BY jobs.number",
-        (digest,),
-    )
-    return [BlobUse(map=name, job=job, role="job") for name, job in rows]
-
-
-def _has_table(connection: sqlite3.Connection, name: str) -> bool:
-    """Whether the database is of a version that has a table."""
-    asked = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name = ?"
-    return bool(connection.execute(asked, (name,)).fetchone()[0])
 
 
 def _connect(path: Path, how: str) -> sqlite3.Connection:

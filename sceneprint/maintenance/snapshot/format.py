@@ -201,7 +201,8 @@ class BlobUse(_Record):
     map: str
     frame: str | None = None
     job: str | None = None
-    role: Literal["upload", "geometry", "job", "surface"]
+    query: str | None = None
+    role: Literal["upload", "geometry", "job", "surface", "deleted", "answer"]
 
 
 class LostBlob(_Record):

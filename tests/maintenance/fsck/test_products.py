@@ -1,21 +1,25 @@
-"""Files of long jobs: checked, taken along, and forgotten where they are lost."""
+"""Blobs of no living frame: files of jobs, kept answers, uploads that can be restored."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sceneprint.engine import Engine
+from sceneprint.formats.image.depth_file import encode_png
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 from sceneprint.settings import Settings
 from sceneprint.store import Store
+from sceneprint.store.answer_rows import NewKeptAnswer, keep_answer
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import JobFile, add_files, files_of, find_job
 from sceneprint.store.surface_rows import add_surface, find_surface, tiles_to_rebuild, write_tile
-from sceneprint_client.api import NewMap
+from sceneprint_client.api import CameraIntrinsics, FrameMeta, NewMap
+from sceneprint_client.api.selections import RestoreOptions
 
 
 @pytest.fixture
@@ -120,3 +124,48 @@ def test_a_lost_tile_is_named_and_made_again(settings, tiled, condition):
         surface = find_surface(connection, row.number)
         assert surface is not None
         assert surface.edits < surface.pose_edits  # so that workers look at it
+
+
+@pytest.fixture
+def kept(settings: Settings) -> tuple[str, str, str]:
+    """A kept answer and its blob, and a deletion that can be undone."""
+    with Engine(settings) as engine:
+        engine.create_map(NewMap(name="hall", model="depth"))
+        blob = engine.store.blobs.put(b"an answer")
+        png = encode_png(np.full((48, 64), 2000, np.uint16))
+        lens = CameraIntrinsics(width=64, height=48, fx=60, fy=60, cx=32, cy=24)
+        frame, _ = engine.add_frame("hall", png, FrameMeta(intrinsics=lens, robot="r1"))
+        with engine.store.database.write() as connection:
+            row = find_map(connection, "hall")
+            new = NewKeptAnswer(
+                "ab" * 16, blob, 9, 1.0, "found", None, {"map": "hall"}, [row.number], []
+            )
+            keep_answer(connection, new, None, None)
+        engine.delete_frame("hall", frame.frame_id)
+        (deletion,) = engine.undo.list_all("hall", None, 9).items
+    return new.id, blob, deletion.deletion_id
+
+
+def test_a_snapshot_has_kept_answers_and_what_can_be_restored(settings, kept, tmp_path):
+    assert list(fsck(settings, grace_s=0)) == []
+    take_snapshot(settings, tmp_path / "all.tar")
+    restore_snapshot(tmp_path / "all.tar", tmp_path / "again")
+    again = Settings(data_dir=tmp_path / "again", database_url=None)
+    assert list(fsck(again, grace_s=0)) == []
+    with Engine(again) as engine:
+        assert engine.store.blobs.get(kept[1]) == b"an answer"
+        done = engine.undo.restore("hall", RestoreOptions(deletion_id=kept[2]))
+        assert done.frames == 1
+        assert [one.robot for one in engine.list_frames("hall").items] == ["r1"]
+    assert list(fsck(again, grace_s=0)) == []
+
+
+def test_a_lost_answer_is_named_and_kept_no_longer(settings, kept):
+    (settings.blob_dir / kept[1][:2] / kept[1]).unlink()
+    (found,) = fsck(settings, grace_s=0)
+    assert (found.finding.kind, found.finding.what) == (
+        "missing-answer", f"the kept answer {kept[0]}"
+    )  # fmt: skip
+    (done,) = fsck(settings, grace_s=0, repair=True)
+    assert done.done == "it is kept no longer"
+    assert list(fsck(settings, grace_s=0)) == []

@@ -3,12 +3,12 @@ import { h, put } from "../lib/dom.js";
 import { STATES } from "./badge.js";
 
 /** Of the address, those that choose frames. */
-export const FILTERS = ["robot", "session", "state", "tag", "name", "captured_after", "captured_before"];
+export const FILTERS = ["find", "robot", "session", "state", "tag", "captured_after", "captured_before"];
 // more choices than this are typed, with suggestions: nobody scrolls through a list of thousands
 const MOST_LISTED = 200;
 
 /**
- * Fields for robot, session, state, tag, file name and time.
+ * Fields for an id, name or session, for robot, session, state, tag and time.
  * @param {URLSearchParams} search of the address
  * @param {Object<string, any>[]} runs `items` of the map's sessions
  * @param {(change: Object<string, string | null>) => void} choose null takes a filter away
@@ -59,13 +59,13 @@ export function filterBar(search, runs, choose) {
   }
 
   const tag = (event) => choose({ tag: event.target.value.trim() || null });
-  const name = (event) => choose({ name: event.target.value.trim() || null });
+  const find = (event) => choose({ find: event.target.value.trim() || null });
   const element = h("div", { class: "filters", role: "group", "aria-label": "Filters" },
+    field("find", "Find", Object.assign(typed("find", [], find, "id, file name or session"), { type: "search" })),
     listed("robot", "Robot", names("robot"), "All robots"),
     listed("session", "Session", names("session"), "All sessions"),
     listed("state", "State", STATES, "All except deleted"),
     field("tag", "Tag", typed("tag", [], tag)),
-    field("name", "File name", typed("name", [], name, "starts with")),
     moment("captured_after", "Taken from"),
     moment("captured_before", "Taken until"));
   const refill = (given) => { for (const fill of fills) fill(given); };
@@ -87,7 +87,7 @@ function local(iso) {
  * @returns {number | null}
  */
 export function countOf(search, runs) {
-  const uncounted = ["tag", "name", "captured_after", "captured_before"];
+  const uncounted = ["tag", "find", "captured_after", "captured_before"];
   if (runs === null || uncounted.some((name) => search.has(name))) return null;
   const states = search.getAll("state");
   const passes = (run, name) => !search.has(name) || search.getAll(name).includes(run[name]);

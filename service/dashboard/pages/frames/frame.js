@@ -1,11 +1,12 @@
 // One frame: what it looks like, what is known of it, which frames are near.
-import { at, bytes, get, save, send } from "../lib/api.js";
+import { at, bytes, get, save } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { frameLabel, shortId } from "../lib/format.js";
+import { frameLabel } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
-import { confirm, toast } from "../lib/states.js";
+import { confirm } from "../lib/states.js";
 import { about } from "./about.js";
+import { deleteFrames } from "./changes.js";
 import { editFrame } from "./edit.js";
 import { follow } from "./following.js";
 import { neighbours } from "./neighbours.js";
@@ -78,12 +79,11 @@ export async function render(root, { params, search, signal, go, title, actions 
 
   async function remove() {
     const sure = await confirm({
-      title: "Delete this frame?", word: shortId(frame.frame_id), action: "Delete",
-      text: "Queries no longer find it, and its upload is removed from disk. This cannot be undone.",
+      title: "Delete this frame?", action: "Delete",
+      text: "Queries no longer find it. You can undo this for a while: the message that follows says until when.",
     });
     if (!sure) return;
-    await send("DELETE", path);
-    toast(`Frame ${shortId(frame.frame_id)} was deleted.`);
+    await deleteFrames(params.map, { frame_ids: [frame.frame_id] });
     if (!signal.aborted) go(link("maps", params.map));
   }
 

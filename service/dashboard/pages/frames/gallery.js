@@ -9,6 +9,7 @@ import { isPending } from "./badge.js";
 import { countOf, filterBar, FILTERS } from "./filters.js";
 import { follow } from "./following.js";
 import { before, remember } from "./pages.js";
+import { selectionBar } from "./selection.js";
 import { tile } from "./tile.js";
 import { viewSwitch } from "./views.js";
 
@@ -18,7 +19,7 @@ const PAGE = 24;
 const FILL_MS = 300; // frames come in bursts
 const MOST_COME = 1000;
 
-/** The page: #/maps/NAME?view=&robot=&session=&state=&tag=&captured_after=&captured_before=&order=&cursor=&page= */
+/** The page: #/maps/NAME?view=&find=&robot=&session=&state=&tag=&captured_after=&captured_before=&order=&cursor=&page= */
 export async function render(root, { params, search, signal, go, title, actions }) {
   const path = at("maps", params.map);
   title(params.map);
@@ -50,7 +51,11 @@ export async function render(root, { params, search, signal, go, title, actions 
     event.preventDefault(); // its `#frames` would be taken for an address
     grid.querySelector("a")?.focus();
   } }, "Skip to the frames");
-  put(root, past, bar, h("div", { class: "gallery-head" }, views, order, clear, over), news, place, under);
+  const selected = canWrite ? selectionBar(params.map, {
+    filter: () => filterOf(wanted), total: () => countOf(wanted, runs && !runs.next_cursor ? runs.items : null),
+    changed: () => Promise.all([fetchList(), fetchRuns()]),
+  }) : null;
+  put(root, past, bar, h("div", { class: "gallery-head" }, views, order, clear, over), selected, news, place, under);
 
   /** Another list begins at its first page. */
   function turn(asked) {
@@ -96,7 +101,11 @@ export async function render(root, { params, search, signal, go, title, actions 
     put(news);
     come.clear();
     tiles.clear();
-    for (const frame of page.items) tiles.set(frame.frame_id, tile(frame, { view: viewOf(wanted), signal: both }));
+    for (const frame of page.items) {
+      const tick = frame.state === "deleted" ? null : selected?.box(frame);
+      tiles.set(frame.frame_id, tile(frame, { view: viewOf(wanted), signal: both, tick }));
+    }
+    selected?.keep(new Set(tiles.keys()));
     put(grid, [...tiles.values()]);
     put(place, page.items.length ? grid : nothing());
     grid.removeAttribute("aria-busy");
@@ -208,6 +217,13 @@ export async function render(root, { params, search, signal, go, title, actions 
       if (newest && !tiles.has(newest.frame_id)) arrived(newest.frame_id);
     },
   });
+}
+
+/** The filters of an address as the API takes them in a body; null where there are none. */
+function filterOf(search) {
+  const several = ["robot", "session", "tag"];
+  const given = FILTERS.filter((name) => search.has(name));
+  return given.length ? Object.fromEntries(given.map((name) => [name, several.includes(name) ? search.getAll(name) : search.get(name)])) : null;
 }
 
 function viewOf(search) {

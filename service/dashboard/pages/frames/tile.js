@@ -33,13 +33,13 @@ export function preview(frame, { view = "depth", width = PREVIEW, signal }) {
 /**
  * A tile; `show(frame, view)` draws it again when either has changed.
  * @param {Object<string, any>} frame
- * @param {{view: string, search?: Object<string, any>, signal?: AbortSignal}} how
+ * @param {{view: string, signal?: AbortSignal, tick?: Element | null}} how tick: a box that selects it
  * @returns {HTMLElement & {show: (frame: Object<string, any>, view: string) => void, frame: any}}
  */
-export function tile(frame, { view, signal }) {
+export function tile(frame, { view, signal, tick = null }) {
   const shown = h("div", { class: "tile-top" });
   const words = h("div", { class: "tile-words" });
-  const element = Object.assign(h("li", { class: "tile", dataset: { frame: frame.frame_id } }, shown, words), { show, frame });
+  const element = Object.assign(h("li", { class: "tile", dataset: { frame: frame.frame_id } }, shown, words, tick), { show, frame });
   /** @type {string | null} */
   let drawn = null;
   function show(given, wanted) {

@@ -18,6 +18,7 @@ export const STATUSES = {
 export const LOST = ["ambiguous", "not_found", "failed"];
 const CHOICES = [["", "All outcomes"], ["lost", "Without a pose"], ...Object.entries(STATUSES).map(([name, [, text]]) => [name, text])];
 const PERIODS = [["", "Any time"], ["1", "Last hour"], ["24", "Last 24 hours"], ["168", "Last 7 days"]];
+const KEPT = [["", "All queries"], ["true", "Kept answers"]];
 const HOUR_MS = 3_600_000;
 const AT_ONCE = 50;
 const TOGETHER_MS = 500; // events of a burst are one look
@@ -28,7 +29,7 @@ export async function render(root, { params, search, signal, go, title }) {
   title(`Queries of ${map}`);
   const come = soon(root, "Loading the queries");
   /** @type {any} */
-  const asked = Object.fromEntries(["status", "robot", "last", "since", "until"].map((name) => [name, search.get(name)]));
+  const asked = Object.fromEntries(["status", "robot", "last", "since", "until", "kept"].map((name) => [name, search.get(name)]));
   const to = (change) => go(link("maps", map, "queries", { ...asked, ...change }));
 
   const body = h("tbody", { role: "rowgroup" });
@@ -79,16 +80,17 @@ export async function render(root, { params, search, signal, go, title }) {
     h("div", { class: "toolbar", role: "group", "aria-label": "Filters" },
       select("queries-status", "Outcome", CHOICES, asked.status, (status) => to({ status })),
       select("queries-last", "Period", periods(asked), asked.last ?? (isPeriod(asked) ? "chosen" : null), (last) => to({ last, since: null, until: null })),
+      select("queries-kept", "Answers", KEPT, asked.kept, (kept) => to({ kept })),
       robotField(asked.robot, (robot) => to({ robot }))),
     news), card, none, more);
   follow(map, asked, signal, (events) => { fresh += events; tell(); });
 }
 
 /** Parameters of the list, by what the address says. */
-function wanted({ status, robot, last, since, until }) {
+function wanted({ status, robot, last, since, until, kept }) {
   const hours = Number(last);
   return {
-    status: status === "lost" ? LOST : status, robot, until,
+    status: status === "lost" ? LOST : status, robot, until, kept,
     since: last && Number.isFinite(hours) ? new Date(Date.now() - hours * HOUR_MS).toISOString() : since,
   };
 }
@@ -99,7 +101,7 @@ function follow(map, asked, signal, heard) {
   const fits = ({ status, robot }) => (!asked.robot || asked.robot === robot)
     && (!asked.status || asked.status === status || (asked.status === "lost" && LOST.includes(status)));
   watch({ map, kinds: ["query.answered"], signal, onevent: (event) => {
-    if (asked.until !== null || !fits(event.data)) return;
+    if (asked.until !== null || asked.kept !== null || !fits(event.data)) return;
     waiting += 1;
     if (waiting === 1) setTimeout(() => { if (!signal.aborted) heard(waiting); waiting = 0; }, TOGETHER_MS);
   } });
@@ -134,8 +136,9 @@ function why({ reason, frame }) {
   return [coded(sentence(reason)), frame && [" ", h("a", { class: "mono", href: link("maps", frame.map, "frames", frame.frame_id), title: frame.frame_id }, `frame ${shortId(frame.frame_id)}`)]];
 }
 
-/** The answer while it is kept, and afterwards that it is not. */
-function answer({ query_id: id, kept_until: until, status }) {
+/** The answer while it is there, and afterwards that it is not. */
+function answer({ query_id: id, kept_until: until, keep, status }) {
+  if (keep) return [h("a", { class: "mono", href: link("queries", id), "aria-label": `Answer ${shortId(id)}` }, shortId(id)), h("span", { class: "queries-more muted" }, keep.title ? `kept: ${keep.title}` : "kept")];
   if (until && Date.parse(until) > Date.now()) return h("a", { class: "mono", href: link("queries", id), "aria-label": `Answer ${shortId(id)}` }, shortId(id));
   const text = status === "failed" ? ["no answer", "The query failed."] : ["expired", "Answers expire after about an hour; this record stays longer."];
   return h("span", { class: "muted", title: `${text[1]} Query ${id}.` }, text[0]);

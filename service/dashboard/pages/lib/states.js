@@ -65,16 +65,18 @@ export function gone(back, signal) {
 /**
  * Say what has happened, at the edge of the page.
  * @param {string} text
- * @param {{kind?: "good" | "bad"}} [how]
+ * @param {{kind?: "good" | "bad", action?: {text: string, act: () => void, seconds: number}}} [how]
+ *   action: a button, and for how long it is there
  */
-export function toast(text, { kind = "good" } = {}) {
+export function toast(text, { kind = "good", action } = {}) {
   const region = document.getElementById("toasts");
   const close = h("button", { class: "button quiet", type: "button", "aria-label": "Dismiss", onClick: () => one.remove() }, "×");
-  const one = h("div", { class: "toast", dataset: { kind } }, shape(kind), h("span", {}, coded(text)), close);
+  const button = action && h("button", { class: "button", type: "button", onClick: () => { one.remove(); action.act(); } }, action.text);
+  const one = h("div", { class: "toast", dataset: { kind } }, shape(kind), h("span", {}, coded(text)), button, close);
   region.append(one);
   while (region.children.length > 4) region.firstChild?.remove();
   // what went wrong stays until it was seen
-  if (kind === "good") setTimeout(() => one.remove(), 1000 * TOAST_S);
+  if (kind === "good") setTimeout(() => one.remove(), 1000 * (action?.seconds ?? TOAST_S));
 }
 
 /**

@@ -1,4 +1,5 @@
-// An answer by its id, as a robot or a colleague tells it: kept for about an hour.
+// An answer by its id, as a robot or a colleague tells it: there for about an hour, or while somebody
+// keeps it.
 import { at, get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { shortId, time } from "../lib/format.js";

@@ -10,6 +10,8 @@ import { choice } from "./choice.js";
 import { funnel } from "./funnel.js";
 import { overlayInset } from "./inset.js";
 import { posePlan } from "./poseplan.js";
+import { keepPanel } from "./keep.js";
+import { reconstructionPanel } from "./reconstruction.js";
 import { rows } from "./rows.js";
 import { whyNot } from "./whynot.js";
 import { deviation, differences, keyOf, mapOf, number, verdict } from "./words.js";
@@ -44,7 +46,8 @@ export async function showAnswer(root, answer, how) {
   const plan = posePlan(answer, { backdrops: how.backdrops, choice: looked, signal });
   const inset = overlayInset(answer, { pictures, choice: looked, signal, wanted: seen.match, onshow: (key) => { seen.match = key; onseen(seen); } });
   const why = reasons(answer, { ...how, seen, onseen, signal }, looked);
-  put(root, lead(answer, before, isOwnPage), h("div", { class: "query-views" }, plan, inset), why);
+  put(root, lead(answer, before, isOwnPage), keepPanel(answer, signal), h("div", { class: "query-views" }, plan, inset),
+    reconstructionPanel(answer, signal), why);
   if (chosen !== null) looked.choose(chosen);
   await why.ready;
   return { choice: looked };
@@ -108,7 +111,7 @@ function lead(answer, before, isOwnPage) {
     h("div", { class: "query-verdict-links" },
       (answer.status === "ambiguous" || answer.status === "not_found") && h("a", { class: "button", href: link("maps", mapOf(answer), "coverage") }, "Coverage of the map"),
       (pose || several.length > 0) && h("a", { class: "button", href: link("maps", mapOf(answer), "place", { query: answer.query_id }) }, "On the map"),
-      !isOwnPage && h("a", { class: "button", href: link("queries", answer.query_id), title: "Can be shared for one hour" }, `Answer ${shortId(answer.query_id)}`)));
+      !isOwnPage && h("a", { class: "button", href: link("queries", answer.query_id), title: "Can be shared while it is kept, or for an hour" }, `Answer ${shortId(answer.query_id)}`)));
 }
 
 function poseOf(location, kind) {

@@ -1,9 +1,8 @@
-// A session renamed, tagged or deleted: one call each, repeated for what it had no time for.
-import { at, send } from "../lib/api.js";
+// A session renamed, tagged or deleted, each of which can be undone.
+import { deleteFrames, editFrames, framesText as of } from "../frames/changes.js";
 import { h, put } from "../lib/dom.js";
-import { count } from "../lib/format.js";
 import { coded } from "../lib/prose.js";
-import { confirm, sheet, toast } from "../lib/states.js";
+import { confirm, sheet } from "../lib/states.js";
 
 /**
  * @typedef {{say: (text: string) => void, changed: () => Promise<void>}} How say: of what is under
@@ -22,10 +21,9 @@ export function renameSession(map, one, all, how) {
       if (name === one.session) return;
       if (known.has(name) && joins !== name) {
         joins = name;
-        throw Object.assign(new Error(`There is a session ${name}. Rename again to join the two; they cannot be told apart afterwards.`), { status: 409 });
+        throw Object.assign(new Error(`There is a session ${name}. Rename again to join the two.`), { status: 409 });
       }
-      const frames = await edit(map, one, { session: name }, how, dialog);
-      toast(`${one.session} is called ${name} now: ${of(frames)}.`);
+      await edit(map, one, { session: name }, how, dialog);
     },
   });
 }
@@ -42,8 +40,7 @@ export function tagSession(map, one, all, how) {
       const added = tags.filter((tag) => !known.includes(tag));
       const removed = one.tags.filter((tag) => !tag.split(",").every((part) => tags.includes(part.trim())));
       if (!added.length && !removed.length) return;
-      const frames = await edit(map, one, { add_tags: added, remove_tags: removed }, how, dialog);
-      toast(`${of(frames)} of ${one.session} were tagged.`);
+      await edit(map, one, { add_tags: added, remove_tags: removed }, how, dialog);
     },
   });
 }
@@ -51,36 +48,16 @@ export function tagSession(map, one, all, how) {
 /** Ask for the name of a session to be typed, and delete all its frames. @param {string} map
  * @param {Session} one @param {Session[]} all @param {How} how */
 export async function deleteSession(map, one, all, how) {
-  const text = [h("p", {}, `All its ${of(framesOf(one, all))} with their uploads and signatures are permanently deleted. Only a snapshot can restore them.`), others(one, all)];
+  const text = [h("p", {}, `All its ${of(framesOf(one, all))} are deleted, and queries no longer find them. You can undo this for a while: the message that follows says until when.`), others(one, all)];
   if (!(await confirm({ title: `Delete ${one.session}?`, text, word: one.session, action: "Delete session" }))) return;
-  let done = 0;
-  try {
-    for (let left = 1; left > 0;) {
-      const { data } = await send("DELETE", at("maps", map, "sessions"), { params: chosen(one) });
-      [done, left] = [done + data.frames, data.remaining];
-      how.say(left ? `Deleting ${one.session}: ${of(left)} left…` : "");
-    }
-  } finally {
-    how.say("");
-    await how.changed(); // of one that broke off a part is gone
-  }
-  toast(`${one.session} was deleted with ${of(done)}.`);
+  await deleteFrames(map, { filter: chosen(one) }, how);
   if (document.activeElement === document.body) document.getElementById("title").focus({ preventScroll: true }); // its row is gone
 }
 
-/** Send an edit until no frame remains; how many were edited. */
-async function edit(map, one, json, how, dialog) {
-  let [done, after] = [0, null];
-  try {
-    do {
-      const { data } = await send("PATCH", at("maps", map, "sessions"), { json, params: { ...chosen(one), after } });
-      [done, after] = [done + data.frames, data.remaining ? data.last_frame_id : null];
-      if (after) put(dialog.querySelector(".sessions-left"), `${of(data.remaining)} left…`);
-    } while (after !== null);
-  } finally {
-    await how.changed();
-  }
-  return done;
+/** Edit all frames of a session, and say in the dialog how far that is. */
+function edit(map, one, changes, how, dialog) {
+  const say = (text) => put(dialog.querySelector(".sessions-left"), text);
+  return editFrames(map, { filter: chosen(one), ...changes }, { say, changed: how.changed });
 }
 
 /** A dialog with one field that stays until it is saved; what is refused is told at the field. */
@@ -113,9 +90,9 @@ function form(one, all, { title, label, value, action, hint = "", save }) {
   });
 }
 
-/** What the API asks for to find the session. @param {Session} one */
+/** The filter that its frames pass. @param {Session} one */
 function chosen(one) {
-  return { session: one.session, robot: one.robot };
+  return { session: [one.session], robot: one.robot === null ? [] : [one.robot] };
 }
 
 /** Rows that a call for one changes: where it names no robot, those of all robots. */
@@ -130,8 +107,4 @@ function framesOf(one, all) {
 function others(one, all) {
   const robots = reached(one, all).map((row) => row.robot).filter((robot) => robot !== one.robot);
   return robots.length > 0 && h("p", {}, h("strong", {}, "Frames that name no robot cannot be chosen alone"), `: those of ${robots.join(", ")} in this session are meant as well.`);
-}
-
-function of(frames) {
-  return `${count(frames)} ${frames === 1 ? "frame" : "frames"}`;
 }

@@ -1,4 +1,6 @@
-// Sessions of a map: who took what in which run, and when; renamed, tagged and deleted as a whole.
+// Sessions of a map: who took what in which run, and when; renamed, tagged and deleted as a whole,
+// and deletions undone.
+import { recentDeletions } from "../frames/changes.js";
 import { at, get, watch } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, seconds } from "../lib/format.js";
@@ -33,6 +35,7 @@ export async function render(root, { params, signal, title, actions }) {
   /** @type {Timer} */
   let timer = null;
   let looks = 0;
+  const deleted = canWrite ? recentDeletions(params.map, { signal, changed: () => look() }) : null;
   const show = rows(body, (one) => JSON.stringify([one.session, one.robot]), (one) => row(one));
 
   function row(one) {
@@ -69,6 +72,7 @@ export async function render(root, { params, signal, title, actions }) {
       next.push(...told.items);
       after = told.next_cursor;
     }
+    await deleted?.look();
     if (turn !== looks) return; // a newer one is under way, or was faster
     [found, cursor] = [next, after];
     draw();
@@ -80,12 +84,12 @@ export async function render(root, { params, signal, title, actions }) {
   }
 
   function draw() {
-    if (!found.length) { put(root, said, empty({ title: "No sessions yet", text: "A session is what one robot took in one run. Uploads name it, by default after their folder or recording." })); return; }
+    if (!found.length) { put(root, said, deleted, empty({ title: "No sessions yet", text: "A session is what one robot took in one run. Uploads name it, by default after their folder or recording." })); return; }
     show(found);
     more.hidden = cursor === null;
     const frames = found.reduce((n, one) => n + sum(one.frames), 0);
     put(summary, cursor === null ? `${count(found.length)} ${found.length === 1 ? "session" : "sessions"} · ${count(frames)} frames` : `The first ${count(found.length)} sessions`);
-    if (!card.isConnected) put(root, h("div", { class: "toolbar" }, summary, said), card, more);
+    if (!card.isConnected) put(root, h("div", { class: "toolbar" }, summary, said), card, more, deleted);
   }
 
   async function again() {

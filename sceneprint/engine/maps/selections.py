@@ -1,0 +1,190 @@
+"""Selected frames of a map, deleted or edited together.
+
+map, FrameSelection  --delete_selection-->  FramesDeleted
+map, FramesEdit  --edit_selection-->  FramesEdited, with the edits that undo it
+
+Frames are written some at a time, each block in a transaction of its own, as writers wait
+meanwhile. A call that is repeated finds nothing left to do.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+
+from sqlalchemy import Connection, select
+
+from sceneprint.engine.maps.undo import deletion_record
+from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
+from sceneprint.errors import InvalidRequest
+from sceneprint.store import Store
+from sceneprint.store.deletion import delete_frames
+from sceneprint.store.frame_queries import TakenPosition, count_listed, list_frames
+from sceneprint.store.frames import find_frame, write_frame
+from sceneprint.store.maps import find_map
+from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
+from sceneprint.store.undo_rows import Deletion, UndoLimits, count_restorable
+from sceneprint_client.api import FrameState
+from sceneprint_client.api.frames import MOST_TAGS
+from sceneprint_client.api.listing import SessionEdit
+from sceneprint_client.api.selections import (
+    MOST_SELECTED,
+    FramesDeleted,
+    FramesEdit,
+    FramesEdited,
+    FrameSelection,
+)
+
+#: Frames written in one transaction: other writers wait for some 20 ms.
+AT_ONCE = 100
+#: Seconds after which a call ends with what is left.
+CALL_S = 10.0
+
+
+def delete_selection(
+    store: Store, map_name: str, wanted: FrameSelection, undo: UndoLimits, seconds: float = CALL_S
+) -> FramesDeleted:
+    """Delete selected frames until none is left or the time is over.
+
+    Parameters
+    ----------
+    store : see Store
+    map_name : of the map
+    wanted : which frames
+    undo : for how long that can be undone
+    seconds : after which no further block is begun
+
+    Raises
+    ------
+    UnknownMap : there is none.
+    """
+    until, deleted = time.monotonic() + seconds, 0
+    deletion: Deletion | None = None
+    last = 0
+    while True:
+        with store.database.write() as connection:
+            row = find_map(connection, map_name)
+            some = _selected(connection, row, wanted, last, AT_ONCE)
+            if some and deletion is None:
+                deletion = undo.begin(connection, row.number)
+            numbers = [one.number for one in some]
+            blobs = delete_frames(connection, row, numbers, deletion=deletion)
+            last = numbers[-1] if numbers else last
+            left = _count(connection, row, wanted, last)
+            kept = count_restorable(connection, deletion)
+        collect_deleted_blobs(store, blobs)
+        deleted += len(some)
+        if not left or time.monotonic() >= until:
+            break
+    told = deletion_record(deletion, kept) if deletion is not None and kept else None
+    return FramesDeleted(map=row.name, frames=deleted, remaining=left, deletion=told)
+
+
+def edit_selection(
+    store: Store, map_name: str, edit: FramesEdit, seconds: float = CALL_S
+) -> FramesEdited:
+    """Edit selected frames, 1000 of them at most, until none is left or the time is over.
+
+    Parameters
+    ----------
+    store, map_name, seconds : see `delete_selection`
+    edit : which frames, and what to change
+
+    Raises
+    ------
+    UnknownMap, UnknownFrame : there is none; of the frame `after`.
+    InvalidRequest : a frame would have more tags than it may have. The frames before it are
+        changed.
+    """
+    until, done, changed = time.monotonic() + seconds, 0, 0
+    inverse: dict[str, dict[str, Any]] = {}
+    with store.database.read() as connection:
+        row = find_map(connection, map_name)
+        at = None if edit.after is None else find_frame(connection, row, edit.after)
+    last, last_id = (0, None) if at is None else (at.number, at.id)
+    while True:
+        with store.database.write() as connection:
+            row = find_map(connection, map_name)
+            some = _selected(connection, row, edit, last, AT_ONCE)
+            for frame in some:
+                changed += _edit(connection, row, frame, edit, inverse)
+                last, last_id = frame.number, frame.id
+            left = _count(connection, row, edit, last)
+        done += len(some)
+        if not left or done >= MOST_SELECTED or time.monotonic() >= until:
+            break
+    return FramesEdited(
+        map=row.name, frames=changed, remaining=left, last_frame_id=last_id if left else None,
+        inverse=list(inverse.values()),
+    )  # fmt: skip
+
+
+def edited_tags(frame: FrameRow, edit: FramesEdit | SessionEdit) -> list[str]:
+    """The tags of a frame after an edit.
+
+    Raises
+    ------
+    InvalidRequest : they are too many.
+    """
+    gone = set(edit.remove_tags)
+    tags = [tag for tag in frame.tags if tag not in gone]
+    tags += [tag for tag in dict.fromkeys(edit.add_tags) if tag not in tags]
+    if len(tags) > MOST_TAGS:
+        raise InvalidRequest(
+            f"Frame {frame.id} would have {len(tags)} tags, and a frame has at most "
+            f"{MOST_TAGS}. Remove some with `remove_tags`.",
+            (("add_tags", "too many"),),
+        )
+    return tags
+
+
+def _edit(
+    connection: Connection, row: MapRow, frame: FrameRow, edit: FramesEdit,
+    inverse: dict[str, dict[str, Any]],
+) -> int:  # fmt: skip
+    """Edit a frame, and add to what undoes it; 0 where it was so already."""
+    values: dict[str, Any] = {}
+    for name in ("session", "robot"):
+        if name in edit.model_fields_set:
+            values[name] = getattr(edit, name)
+    if edit.add_tags or edit.remove_tags:
+        values["tags"] = edited_tags(frame, edit)
+    values = {name: value for name, value in values.items() if getattr(frame, name) != value}
+    if not values:
+        return 0
+    write_frame(connection, row, frame, values)
+    back: dict[str, Any] = {name: getattr(frame, name) for name in values if name != "tags"}
+    if "tags" in values:
+        now = values["tags"]
+        back["add_tags"] = [tag for tag in frame.tags if tag not in now]
+        back["remove_tags"] = [tag for tag in now if tag not in frame.tags]
+    key = json.dumps(back, sort_keys=True)
+    inverse.setdefault(key, {"frame_ids": [], **back})["frame_ids"].append(frame.id)
+    return 1
+
+
+def _selected(
+    connection: Connection, row: MapRow, wanted: FrameSelection, after: int, limit: int
+) -> list[FrameRow]:
+    """The next selected frames, in the order they came."""
+    if wanted.filter is not None:
+        beyond = TakenPosition(after, None, None)
+        return list_frames(connection, row.number, beyond, limit, _in_order(wanted))
+    asked = select(frames).where(
+        frames.c.map_number == row.number, frames.c.id.in_(wanted.frame_ids or []),
+        frames.c.state != FrameState.DELETED, frames.c.number > after,
+    )  # fmt: skip
+    found = connection.execute(asked.order_by(frames.c.number).limit(limit)).mappings()
+    return [frame_row(one) for one in found]
+
+
+def _count(connection: Connection, row: MapRow, wanted: FrameSelection, after: int) -> int:
+    """How many selected frames come after one."""
+    if wanted.filter is not None:
+        return count_listed(connection, row.number, _in_order(wanted), after)
+    return len(_selected(connection, row, wanted, after, MOST_SELECTED))
+
+
+def _in_order(wanted: FrameSelection) -> Any:
+    return None if wanted.filter is None else wanted.filter.model_copy(update={"order": "asc"})

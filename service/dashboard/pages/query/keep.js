@@ -1,0 +1,69 @@
+// Keep an answer beyond its hour, and the link that shares it.
+import { at, get, send } from "../lib/api.js";
+import { h, once, put } from "../lib/dom.js";
+import { time } from "../lib/format.js";
+import { link } from "../lib/router.js";
+import { may } from "../lib/session.js";
+import { toast } from "../lib/states.js";
+
+/**
+ * A button that keeps an answer; of one that is kept its link, and a button that releases it.
+ * @param {Object<string, any>} answer
+ * @param {AbortSignal} signal
+ * @returns {HTMLElement}
+ */
+export function keepPanel(answer, signal) {
+  const path = `${at("queries", answer.query_id)}/keep`;
+  const mayKeep = answer.maps.length > 0 && answer.maps.every((map) => may("write", map));
+  const place = h("div", { class: "toolbar query-keep", role: "group", "aria-label": "Keep this answer" });
+  const said = h("span", { class: "visually-hidden", role: "status" });
+  const panel = h("div", {}, said, place);
+
+  const keep = once(async () => {
+    const { data } = await send("POST", path, { json: {}, signal });
+    draw(data);
+    put(said, "The answer is kept.");
+    place.querySelector("button")?.focus();
+  });
+  const release = once(async () => {
+    await send("DELETE", path, { signal });
+    draw(await get(path, { signal }).catch((error) => {
+      if (error.status !== 404) throw error;
+      return { kept: false, until: null }; // its hour was over
+    }));
+    toast("The answer is no longer kept.");
+  });
+
+  /** @param {Object<string, any>} told as GET /keep tells it */
+  function draw(told) {
+    if (!told.kept) {
+      put(place, mayKeep && h("button", { class: "button", type: "button", onClick: keep }, "Keep answer"),
+        told.until && h("span", { class: "muted" }, "This answer expires ", time(told.until), "."));
+      return;
+    }
+    put(place, h("button", { class: "button", type: "button", onClick: copy }, "Copy link"),
+      mayKeep && h("button", { class: "button quiet", type: "button", onClick: release }, "Release"),
+      h("span", { class: "muted" }, told.title ? `Kept as “${told.title}”` : "Kept",
+        told.until ? [", released ", time(told.until), "."] : " until it is released."));
+  }
+
+  async function copy() {
+    const address = new URL(link("queries", answer.query_id), location.href).href;
+    try {
+      await navigator.clipboard.writeText(address);
+      toast("The link was copied.");
+    } catch { // no permission, or a page without TLS: whoever asked can copy it by hand
+      const field = h("input", { class: "mono", readonly: true, value: address, "aria-label": "Link to this answer" });
+      place.querySelector("input")?.remove();
+      place.append(field);
+      field.focus();
+      field.select();
+    }
+  }
+
+  get(path, { signal }).then(draw, (error) => {
+    if (error.name === "AbortError" || error.status === 404) return; // it was not stored
+    throw error;
+  });
+  return panel;
+}

@@ -1,0 +1,112 @@
+"""Selected frames of a map, deleted or edited together, and deletions undone."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Annotated, Any
+
+from fastapi import Depends, Query, Request
+
+from sceneprint.engine.maps.selections import delete_selection, edit_selection
+from sceneprint_client.api import Frame, Page
+from sceneprint_client.api.listing import FrameDeletion
+from sceneprint_client.api.selections import (
+    FramesDeleted,
+    FramesEdit,
+    FramesEdited,
+    FrameSelection,
+    FramesRestored,
+    RestoreOptions,
+)
+from service.auth import may_read, may_write, v1_router
+from service.bodies import read_record
+from service.context import Here
+from service.problems import declared
+
+router = v1_router("/maps/{map_name}", "frames")
+
+_STATUSES = declared(400, 404, 413, 415, 422)
+
+
+def _body(name: str) -> dict[str, Any]:
+    schema = {"$ref": f"#/components/schemas/{name}"}
+    return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
+
+
+@router.post(
+    "/frames/delete", responses=_STATUSES, openapi_extra=_body("FrameSelection"),
+    dependencies=[Depends(may_write)],
+)  # fmt: skip
+async def delete_frames(map_name: str, request: Request, here: Here) -> FramesDeleted:
+    """Delete frames by their ids, or all that pass a filter.
+
+    No query finds them from then on. A call ends after ten seconds: repeat it while `remaining` is
+    not 0. Ten minutes by default, POST /v1/maps/{map_name}/restore undoes it.
+    """
+    wanted = await read_record(request, FrameSelection, "The selection")
+    request.state.audited = _audited(wanted)
+    engine = here.engine
+    async with here.gate.place():
+        return await here.gate.run(
+            partial(delete_selection, engine.store, map_name, wanted, engine.undo_limits)
+        )
+
+
+@router.post(
+    "/frames/edit", responses=_STATUSES, openapi_extra=_body("FramesEdit"),
+    dependencies=[Depends(may_write)],
+)  # fmt: skip
+async def edit_frames(map_name: str, request: Request, here: Here) -> FramesEdited:
+    """Move frames to a session, rename their robot, add or remove tags: by ids, or by a filter.
+
+    A call edits at most 1000 frames: repeat it with `after` while `remaining` is not 0. `inverse`
+    has what undoes it.
+    """
+    edit = await read_record(request, FramesEdit, "The edit of the frames")
+    request.state.audited = _audited(edit)
+    async with here.gate.place():
+        return await here.gate.run(partial(edit_selection, here.engine.store, map_name, edit))
+
+
+@router.post(
+    "/restore", responses=declared(400, 404, 413, 415, 422), openapi_extra=_body("RestoreOptions"),
+    dependencies=[Depends(may_write)],
+)  # fmt: skip
+async def restore_frames(map_name: str, request: Request, here: Here) -> FramesRestored:
+    """Undo a deletion, or restore some deleted frames, with all that was known of them.
+
+    Frames that were indexed are signed again. Quotas hold. A call ends after ten seconds: repeat it
+    while `remaining` is not 0.
+    """
+    wanted = await read_record(request, RestoreOptions, "The request to restore frames")
+    request.state.audited = _audited(wanted)
+    async with here.gate.place():
+        return await here.gate.run(partial(here.engine.undo.restore, map_name, wanted))
+
+
+@router.post(
+    "/frames/{frame_id}/restore", responses=declared(404, 409), dependencies=[Depends(may_write)]
+)
+def restore_frame(map_name: str, frame_id: str, here: Here) -> Frame:
+    """Restore a deleted frame, while that can be done; 409 where another has its id or content."""
+    here.engine.undo.restore_one(map_name, frame_id)
+    return here.engine.get_frame(map_name, frame_id)
+
+
+@router.get("/deletions", responses=declared(404, 422), dependencies=[Depends(may_read)])
+def list_deletions(
+    map_name: str,
+    here: Here,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> Page[FrameDeletion]:
+    """Deletions of frames that can still be undone, the newest first."""
+    return here.engine.undo.list_all(map_name, cursor, limit)
+
+
+def _audited(asked: FrameSelection | RestoreOptions) -> dict[str, Any]:
+    """What the audit log tells of a request: ids by their number only."""
+    told = asked.model_dump(mode="json", exclude_defaults=True)
+    if "frame_ids" in told:
+        told["frame_ids"] = len(told["frame_ids"])
+    return told

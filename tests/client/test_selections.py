@@ -1,0 +1,71 @@
+"""What a client does with many frames at once, with deletions, and with kept answers."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from sceneprint.errors import InvalidRequest, UnknownDeletion, UnknownFrame, UnknownQuery
+from sceneprint.formats.dataset import FrameReference
+from sceneprint_client import Client
+
+
+def test_frames_are_deleted_edited_and_restored(
+    client: Client, map_name: str, references: tuple[FrameReference, ...]
+) -> None:
+    client.create_map(map_name)
+    ids = [client.upload(map_name, one).frame_id for one in references[:3]]
+    client.edit_frames(map_name, ids, session="monday", add_tags=["door"])
+    before = {one.frame_id: (one.session, one.tags) for one in client.frames(map_name)}
+    assert before == dict.fromkeys(ids, ("monday", ["door"]))
+    assert [one.frame_id for one in client.frames(map_name, find=ids[1])] == ids[1:2]
+    assert len(list(client.frames(map_name, find="mon"))) == 3
+
+    count, inverse = client.edit_frames(
+        map_name, filter={"session": ["monday"]}, session=None, remove_tags=["door"]
+    )
+    assert count == 3
+    assert [(one.session, one.tags) for one in client.frames(map_name)] == [(None, [])] * 3
+    for one in inverse:
+        client.edit_frames(map_name, **one)
+    assert {one.frame_id: (one.session, one.tags) for one in client.frames(map_name)} == before
+
+    count, (deletion,) = client.delete_frames(map_name, filter={"tag": ["door"]})
+    assert (count, deletion.frames) == (3, 3)
+    assert list(client.deletions(map_name)) == [deletion]
+    assert list(client.frames(map_name)) == []
+    restored = client.restore_frames(map_name, frame_ids=ids[:1])
+    assert (restored.frames, restored.refused) == (1, [])
+    assert client.restore_frames(map_name, deletion.deletion_id).frames == 2
+    assert {one.frame_id: (one.session, one.tags) for one in client.frames(map_name)} == before
+    with pytest.raises(UnknownDeletion):
+        client.restore_frames(map_name, deletion.deletion_id)
+    client.delete_frame(map_name, ids[0])
+    assert client.restore_frame(map_name, ids[0]).tags == ["door"]
+    with pytest.raises(UnknownFrame):
+        client.restore_frame(map_name, ids[0])
+    with pytest.raises(InvalidRequest, match="`filter` has no condition"):
+        client.delete_frames(map_name, filter={})
+
+
+def test_an_answer_is_kept_and_released(
+    client: Client, map_name: str, references: tuple[FrameReference, ...]
+) -> None:
+    client.create_map(map_name)
+    added = client.upload(map_name, references[0], wait_s=60)
+    answer = client.query(map_name, frame_id=added.frame_id, robot="cart")
+    (record,) = client.queries(map_name)
+    told = client.answer_retention(answer.query_id)
+    assert (told.kept, told.title) == (False, None)
+    until = datetime.now(UTC) + timedelta(days=1)
+    kept = client.keep_answer(answer.query_id, "by the door", until)
+    assert (kept.kept, kept.title, kept.until) == (True, "by the door", until)
+    (listed,) = client.queries(map_name, kept=True)
+    assert (listed.query_id, listed.robot, listed.at) == (answer.query_id, "cart", record.at)
+    assert listed.keep is not None
+    assert (listed.keep.title, listed.keep.until) == ("by the door", until)
+    client.release_answer(answer.query_id)
+    assert list(client.queries(map_name, kept=True)) == []
+    with pytest.raises(UnknownQuery):
+        client.release_answer(answer.query_id)

@@ -1,0 +1,170 @@
+"""Selected frames: deleted and edited by their ids or a filter, and what undoes an edit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from sceneprint.engine import Engine
+from sceneprint.engine.maps import selections as module
+from sceneprint.engine.maps.selections import delete_selection, edit_selection
+from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
+from sceneprint.store.undo_rows import NO_UNDO
+from sceneprint_client.api import FrameMeta
+from sceneprint_client.api.listing import FrameListing
+from sceneprint_client.api.selections import FramesEdit, FrameSelection, RestoreOptions
+
+#: Session, robot and tags of each of twelve uploads.
+TAKEN = [("a", "r1", ["x"])] * 5 + [("b", "r2", ["x", "y"])] * 4 + [(None, None, [])] * 3
+
+
+@pytest.fixture(autouse=True)
+def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "AT_ONCE", 2)
+
+
+@pytest.fixture
+def ids(empty: Engine, uploads: Any) -> list[str]:
+    """Twelve frames that nobody signs: states do not matter."""
+    made = []
+    for i, (upload, (session, robot, tags)) in enumerate(zip(uploads, TAKEN, strict=True)):
+        known = {"session": session, "robot": robot, "tags": tags, "name": f"{i:02d}.png"}
+        meta = FrameMeta.model_validate(upload.meta.model_dump() | known)
+        made.append(empty.add_frame("hall", upload.data, meta)[0].frame_id)
+    return made
+
+
+def known(engine: Engine) -> dict[str, tuple[Any, ...]]:
+    """Session, robot and tags of all frames by their ids."""
+    found = engine.list_frames("hall", None, 100).items
+    return {one.frame_id: (one.session, one.robot, sorted(one.tags)) for one in found}
+
+
+def delete(engine: Engine, **wanted: Any) -> Any:
+    return delete_selection(engine.store, "hall", FrameSelection(**wanted), engine.undo_limits)
+
+
+def edit(engine: Engine, seconds: float = 10.0, **wanted: Any) -> Any:
+    return edit_selection(engine.store, "hall", FramesEdit(**wanted), seconds)
+
+
+def test_frames_are_deleted_by_their_ids_once(empty: Engine, ids: list[str]) -> None:
+    told = delete(empty, frame_ids=[ids[0], ids[7], "none", ids[0], ids[3]])
+    assert (told.frames, told.remaining, told.deletion.frames) == (3, 0, 3)
+    assert list(known(empty)) == [one for one in ids if one not in (ids[0], ids[3], ids[7])]
+    again = delete(empty, frame_ids=[ids[0], ids[7]])
+    assert (again.frames, again.remaining, again.deletion) == (0, 0, None)
+    assert len(empty.undo.list_all("hall", None, 9).items) == 1
+    with pytest.raises(UnknownMap):
+        delete_selection(empty.store, "attic", FrameSelection(frame_ids=ids), NO_UNDO)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "places"),
+    [
+        ({"session": ["a"]}, [0, 1, 2, 3, 4]), ({"robot": "r2"}, [5, 6, 7, 8]),
+        ({"tag": ["x", "y"]}, [5, 6, 7, 8]), ({"name": "0"}, list(range(10))),
+        ({"find": "1"}, [10, 11]), ({"find": "b"}, [5, 6, 7, 8]), ({"session": ["c"]}, []),
+        ({"state": "received", "order": "desc"}, list(range(12))),
+    ],
+)  # fmt: skip
+def test_frames_are_deleted_by_a_filter(
+    empty: Engine, ids: list[str], wanted: dict[str, Any], places: list[int]
+) -> None:
+    if wanted.get("find") is not None:  # an id may begin so as well
+        places = [i for i, one in enumerate(ids) if i in places or one.startswith(wanted["find"])]
+    told = delete(empty, filter=wanted)
+    assert (told.frames, told.remaining) == (len(places), 0)
+    assert list(known(empty)) == [one for i, one in enumerate(ids) if i not in places]
+
+
+def test_a_call_that_runs_out_of_time_says_what_is_left(empty: Engine, ids: list[str]) -> None:
+    wanted = FrameSelection(filter=FrameListing(session=["a"]))
+    told = [
+        delete_selection(empty.store, "hall", wanted, empty.undo_limits, seconds=0.0)
+        for _ in range(4)
+    ]
+    assert [(one.frames, one.remaining) for one in told] == [(2, 3), (2, 1), (1, 0), (0, 0)]
+    assert [one.deletion and one.deletion.frames for one in told] == [2, 2, 1, None]
+    for one in told[:3]:
+        empty.undo.restore("hall", RestoreOptions(deletion_id=one.deletion.deletion_id))
+    assert list(known(empty)) == ids
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"session": "b"}, {"session": None}, {"robot": "r9", "session": "z"},
+        {"add_tags": ["y", "n"]}, {"remove_tags": ["x"], "add_tags": ["n"]}, {"robot": None},
+    ],
+)  # fmt: skip
+def test_an_edit_is_undone_by_its_inverse(
+    empty: Engine, ids: list[str], changes: dict[str, Any]
+) -> None:
+    before = known(empty)
+    told = edit(empty, filter={"name": "0"}, **changes)
+
+    def wanted(session: str | None, robot: str | None, tags: list[str]) -> tuple[Any, ...]:
+        kept = [one for one in tags if one not in changes.get("remove_tags", [])]
+        return (
+            changes.get("session", session), changes.get("robot", robot),
+            sorted({*kept, *changes.get("add_tags", [])}),
+        )  # fmt: skip
+
+    after = {one: wanted(*before[one]) if i < 10 else before[one] for i, one in enumerate(ids)}
+    assert known(empty) == after
+    assert told.frames == sum(after[one] != before[one] for one in ids)
+    assert (told.remaining, told.last_frame_id) == (0, None)
+    again = edit(empty, filter={"name": "0"}, **changes)
+    assert (again.frames, again.inverse) == (0, [])
+    assert sum(len(one["frame_ids"]) for one in told.inverse) == told.frames
+    for one in told.inverse:
+        edit(empty, **one)
+    assert known(empty) == before
+
+
+def test_an_edit_goes_on_after_the_last_frame(empty: Engine, ids: list[str]) -> None:
+    first = edit(empty, 0.0, filter={"session": "a"}, session="c")
+    assert (first.frames, first.remaining, first.last_frame_id) == (2, 3, ids[1])
+    rest = edit(empty, filter={"session": "a"}, session="c", after=first.last_frame_id)
+    assert (rest.frames, rest.remaining) == (3, 0)
+    with pytest.raises(UnknownFrame):
+        edit(empty, filter={"session": "a"}, session="c", after="none")
+
+
+def test_one_call_edits_so_many(
+    empty: Engine, ids: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MOST_SELECTED", 4)
+    told = edit(empty, filter={"name": "0"}, robot="r3")
+    assert (told.frames, told.remaining, told.last_frame_id) == (4, 6, ids[3])
+
+
+def test_too_many_tags_are_refused(empty: Engine, ids: list[str]) -> None:
+    with pytest.raises(InvalidRequest, match="33 tags, and a frame has at most 32"):
+        edit(empty, frame_ids=ids[:1], add_tags=[f"t{i}" for i in range(32)])
+    assert known(empty)[ids[0]] == ("a", "r1", ["x"])
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {}, {"frame_ids": []}, {"frame_ids": ["a"] * 1001}, {"filter": {}},
+        {"filter": {"order": "desc"}}, {"filter": {"state": "deleted"}},
+        {"frame_ids": ["a"], "filter": {"name": "a"}}, {"filter": {"nothing": 1}},
+    ],
+)  # fmt: skip
+def test_what_selects_nothing_or_everything_is_refused(given: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        FrameSelection.model_validate(given)
+
+
+def test_an_edit_changes_something() -> None:
+    for given in ({}, {"add_tags": []}, {"after": "a"}):
+        with pytest.raises(ValidationError, match="name session, robot, add_tags or remove_tags"):
+            FramesEdit.model_validate({"frame_ids": ["a"]} | given)
+    for given in ({}, {"deletion_id": "a", "frame_ids": ["b"]}):
+        with pytest.raises(ValidationError, match="give either `deletion_id` or `frame_ids`"):
+            RestoreOptions.model_validate(given)
