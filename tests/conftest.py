@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache
@@ -50,9 +50,10 @@ TOGETHER = ("dashboard", "service", "client", "cli_service", "scenes", "ros2")
 #: Files that are begun next: no process is left alone with one of them in the end.
 LONG = (
     "test_container.py", "test_on_postgres.py", "test_deployment.py", "test_fleet.py",
-    "test_failover.py", "test_fleets.py", "test_isolation.py", "test_bench_rows.py",
-    "test_quality.py", "test_same_as_evaluate.py", "test_soak.py", "test_siege.py",
-    "test_tour.py", "test_kill.py", "test_docs.py", "test_survival.py",
+    "test_failover.py", "test_fleets.py", "test_bench_rows.py", "test_quality.py",
+    "test_same_as_evaluate.py", "test_soak.py", "test_siege.py", "test_tour.py", "test_docs.py",
+    "test_survival.py", "test_training.py", "test_lookalikes.py", "test_examples.py",
+    "test_work.py", "test_limits.py",
 )  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -70,7 +71,6 @@ def pytest_configure(config: pytest.Config) -> None:
     """Begin the server that the whole run is on, where it is; see tests/on_postgres."""
     # of processes that tests begin, too: a job that nobody asked for would be counted
     os.environ.setdefault("SCENEPRINT_SURFACES", "asked")
-    gc.disable()  # what is imported stays, and would be looked through again and again
     config.addinivalue_line("markers", "sqlite_only(reason): of nothing that PostgreSQL does")
     config.addinivalue_line("markers", "thorough: takes long, and runs with `make test-thorough`")
     if ON_POSTGRES and "PYTEST_XDIST_WORKER" not in os.environ:
@@ -99,6 +99,7 @@ class UnitScheduling(LoadFileScheduling):
         return unit_of(nodeid)
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> UnitScheduling | None:
     """With `--dist loadfile`, keep folders together that share a service."""
     return UnitScheduling(config, log) if config.getoption("dist") == "loadfile" else None
@@ -122,10 +123,14 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
         _folder.close()
 
 
-def pytest_collection_finish() -> None:
-    """Let the collector look at what tests make, and at nothing older."""
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Let the collector look at what tests make, and at nothing older, which all stays."""
+    gc.disable()
+    found = yield
     gc.freeze()
     gc.enable()
+    return found
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
