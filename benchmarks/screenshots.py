@@ -136,8 +136,8 @@ def views(client: httpx.Client, made: list[Shot]) -> list[View]:
     for name in (MAP, HALL, SIDES):
         fuse(client, name)
     for name in (MAP, SIDES):
-        asked = {"not_within_s": 0}
-        told = client.post(f"/v1/maps/{name}/coverage", json=asked).raise_for_status().json()
+        whole = {"not_within_s": 0}
+        told = client.post(f"/v1/maps/{name}/coverage", json=whole).raise_for_status().json()
         _done(client, told["coverage_id"])
     ids = [str(one["frame_id"]) for one in _listed(client, MAP)]
     asked = {"frame_id": ids[3], "k": 4, "explain": True, "explain_frame": ids[-1]}
