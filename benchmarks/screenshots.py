@@ -136,9 +136,7 @@ def views(client: httpx.Client, made: list[Shot]) -> list[View]:
     for name in (MAP, HALL, SIDES):
         fuse(client, name)
     for name in (MAP, SIDES):
-        whole = {"not_within_s": 0}
-        told = client.post(f"/v1/maps/{name}/coverage", json=whole).raise_for_status().json()
-        _done(client, told["coverage_id"])
+        _measure_coverage(client, name)
     ids = [str(one["frame_id"]) for one in _listed(client, MAP)]
     asked = {"frame_id": ids[3], "k": 4, "explain": True, "explain_frame": ids[-1]}
     answer = client.post(f"/v1/maps/{MAP}/queries", json=asked).raise_for_status().json()
@@ -160,6 +158,12 @@ def _listed(client: httpx.Client, name: str, state: str | None = None) -> list[d
     params = {"limit": "100"} if state is None else {"limit": "100", "state": state}
     items = client.get(f"/v1/maps/{name}/frames", params=params).raise_for_status().json()["items"]
     return sorted(items, key=lambda one: str(one["captured_at"]))
+
+
+def _measure_coverage(client: httpx.Client, name: str) -> None:
+    asked = {"not_within_s": 0}
+    told = client.post(f"/v1/maps/{name}/coverage", json=asked).raise_for_status().json()
+    _done(client, told["coverage_id"])
 
 
 def _done(client: httpx.Client, job: str) -> None:
