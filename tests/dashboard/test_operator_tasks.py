@@ -99,8 +99,8 @@ def test_a_frame_is_found_by_its_name_in_2(within: Any, page: Page, lost: dict[s
     asked: list[str] = []
     page.on("request", lambda one: "/queries" in one.url and asked.append(one.url))
     with within(2) as operator:
-        operator.map("named")
-        operator.click(page.get_by_label("File name"))
+        operator.click(page.locator(".map[data-map=named] .map-count"))
+        operator.click(page.get_by_label("Find"))
         page.keyboard.type("dock-entr")
         page.keyboard.press("Enter")
         operator.settle(page)
@@ -109,11 +109,22 @@ def test_a_frame_is_found_by_its_name_in_2(within: Any, page: Page, lost: dict[s
     assert asked == []  # to look for a frame is no query
 
 
-def test_the_whole_map_is_seen_after_2(within: Any, page: Page) -> None:
-    with within(2) as operator:
+def test_the_whole_map_is_seen_after_1(within: Any, page: Page) -> None:
+    with within(1) as operator:
         operator.map("building")
-        operator.tab("Map view")
         expect(page.locator(".paths-run")).to_have_count(2)
+
+
+def test_a_robot_that_is_lost_is_seen_after_1(
+    within: Any, page: Page, lost: dict[str, Any]
+) -> None:
+    with within(1) as operator:
+        operator.map("four-sides")
+        robot = page.locator(".place-robots > li[data-robot=spot]")
+        expect(robot).to_contain_text("not found", ignore_case=True)
+        expect(robot.get_by_role("link", name="Not found")).to_have_attribute(
+            "href", f"#/queries/{lost['query_id']}"
+        )
 
 
 def test_badly_covered_areas_take_2(within: Any, page: Page, lost: dict[str, Any]) -> None:
@@ -125,38 +136,32 @@ def test_badly_covered_areas_take_2(within: Any, page: Page, lost: dict[str, Any
         expect(page.locator(".cover-cell").first).to_be_visible()
 
 
-# Failed jobs and their retry are in test_operations.py. Tasks that have a place here once their
-# pages do: a session deleted in 3, a kept answer shared in 2, two sessions compared, a robot that
-# moves.
-
-
-def test_the_first_frame_is_five_tabs_away(station: Any, page: Page, settle: Settle) -> None:
-    page.goto(f"{station.home}#/maps/building")
-    settle(page)
-    for name in ("Skip to content", "Skip to the frames"):
-        page.keyboard.press("Tab")
-        expect(page.get_by_role("link", name=name)).to_be_focused()
+def test_a_session_is_deleted_in_3(within: Any, page: Page, lost: dict[str, Any]) -> None:
+    del lost  # its fixture has named the session
+    name = 5 * "a-long-name-of-a-session"
+    with within(3) as operator:
+        operator.map("named")
+        operator.tab("Sessions")
+        row = page.locator("tbody tr", has_text=name)
+        operator.click(row.get_by_role("button", name="Delete"))
+        page.get_by_role("dialog").get_by_role("textbox").fill(name)
         page.keyboard.press("Enter")
-    assert page.evaluate("() => document.activeElement.closest('.tile')?.dataset.frame") == (
-        station.frames[-1].frame_id
-    )
-    page.set_viewport_size({"width": 390, "height": 844})
-    columns = "() => getComputedStyle(document.getElementById('frames')).gridTemplateColumns"
-    assert len(page.evaluate(columns).split()) == 2
+        expect(row).to_have_count(0)
+    page.locator(".toast", has_text="Deleted").get_by_role("button", name="Undo").click()
+    expect(row).to_have_count(1)
 
 
-def test_a_long_name_of_a_session_stretches_nothing(
-    station: Any, page: Page, settle: Settle, lost: dict[str, Any], until: Callable[..., Any]
+def test_an_answer_is_kept_and_shared_in_2(
+    within: Any, page: Page, settle: Settle, station: Any, lost: dict[str, Any]
 ) -> None:
-    del lost  # its fixture has named a session
-    until(lambda: station.client.get("/v1/maps/named").json()["frames"].get("indexed") == 1)
-    page.set_viewport_size({"width": 390, "height": 844})
-    for address in ("", "/query", "/coverage", "/sessions"):
-        page.goto(f"{station.home}#/maps/named{address}")
+    with within(2) as operator:
+        page.goto(f"{station.home}#/queries/{lost['query_id']}")
         settle(page)
-        assert page.evaluate("() => document.documentElement.scrollWidth") <= 390
-    page.goto(f"{station.home}#/maps/named/query")
-    settle(page)
-    tile = page.locator(".query-picker-grid .query-pick").bounding_box()
-    assert tile is not None
-    assert tile["width"] < 358
+        panel = page.get_by_role("group", name="Keep this answer")
+        operator.click(panel.get_by_role("button", name="Keep answer"))
+        operator.click(panel.get_by_role("button", name="Copy link"))
+        expect(page.locator(".toast, .query-keep input")).to_have_count(1)
+    assert station.client.get(f"/v1/queries/{lost['query_id']}/keep").json()["kept"] is True
+
+
+# Failed jobs and their retry are in test_operations.py.

@@ -41,7 +41,7 @@ export function mapCard(map, { signal, changed }) {
   const element = h("article", { class: "card map", "aria-labelledby": id, dataset: { map: map.name } },
     h("div", { class: "map-head" }, h("div", {}, parts.heading, parts.name), tools),
     h("div", { class: "map-figures" },
-      h("p", {}, parts.number, h("span", { class: "muted" }, " indexed")), parts.growth),
+      h("a", { class: "map-count", href: link("maps", map.name) }, parts.number, h("span", { class: "muted" }, " indexed frames")), parts.growth),
     parts.badges,
     h("dl", { class: "map-facts" },
       h("div", {}, h("dt", {}, "Model"), parts.model),
