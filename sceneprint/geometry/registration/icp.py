@@ -17,7 +17,19 @@ import numpy as np
 from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.geometry.pose.rigid import solve_positive, turned
 from sceneprint.geometry.registration.overlap import LookupTarget, nearest_alike, sampled, target_of
-from sceneprint.geometry.surface.camera import PINHOLE, depth_of, grown, kind_of, project
+from sceneprint.geometry.surface.camera import (
+    BLOCK,
+    PINHOLE,
+    depth_of,
+    gather,
+    gather_pixels,
+    grown,
+    kind_of,
+    move_all,
+    project_all,
+    transposed,
+    within,
+)
 from sceneprint.types import Floats, Floats32, Ints32, Surface
 
 
@@ -81,63 +93,6 @@ def _add(
         g[a] -= wa * residual
         for b in range(a + 1):
             A[a, b] += wa * row[b]
-
-
-#: Points that are worked on at once: their numbers stay in the first level of the cache.
-_BLOCK = 256
-
-
-@disjoint_kernel
-def _moved(
-    px: Floats32, py: Floats32, pz: Floats32, xx: float, xy: float, xz: float, shift: float,
-    out: Floats,
-) -> None:  # fmt: skip
-    """One coordinate of points under a transform, of which this is a row."""
-    for i in range(len(px)):
-        out[i] = xx * px[i] + xy * py[i] + xz * pz[i] + shift
-
-
-@disjoint_kernel
-def _projected(
-    camera: Floats, x: Floats, y: Floats, z: Floats, count: int, column: Floats, line: Floats,
-    depth: Floats,
-) -> None:  # fmt: skip
-    """`camera.project` of points."""
-    if camera[0] != 0:
-        for i in range(count):
-            column[i], line[i], depth[i] = project(camera, x[i], y[i], z[i])
-        return
-    nearest, fx, fy, cx, cy = camera[1], camera[2], camera[3], camera[4], camera[5]
-    for i in range(count):
-        u, v = x[i] / z[i] * fx + cx + 0.5, y[i] / z[i] * fy + cy + 0.5
-        column[i] = u if z[i] > nearest else -1.0
-        line[i] = v if z[i] > nearest else -1.0
-        depth[i] = z[i]
-
-
-@disjoint_kernel
-def _within(
-    column: Floats, line: Floats, count: int, edge: float, width: int, height: int, places: Ints32
-) -> int:
-    """Indices of the points all of whose 3 x 3 pixels lie in the map; how many."""
-    right, bottom, found = width - edge, height - 1.0, 0
-    for i in range(count):
-        inside = (column[i] >= edge) & (line[i] >= 1) & (column[i] < right) & (line[i] < bottom)
-        places[found] = i
-        found += 1 if inside else 0
-    return found
-
-
-@disjoint_kernel
-def _chosen(values: Floats, places: Ints32, count: int, out: Floats) -> None:
-    for i in range(count):
-        out[i] = values[np.uint64(places[i])]
-
-
-@disjoint_kernel
-def _pixels(values: Floats, places: Ints32, count: int, out: Ints32) -> None:
-    for i in range(count):
-        out[i] = np.int32(values[np.uint64(places[i])])
 
 
 @disjoint_kernel
@@ -277,27 +232,22 @@ def _accumulate(
     edge = 0.0 if camera[0] == 1 and camera[6] > 0 else 1.0
     moved, seen, inside, rows = room[:3], room[3:6], room[6:10], room[10:17]
     nearest, weights, sums, used = room[17], room[18], np.zeros(28), 0
-    places, best, columns, lines = indices[0], indices[1], indices[2], indices[3]
-    for start in range(0, source.shape[1], _BLOCK):
-        end = min(start + _BLOCK, source.shape[1])
-        for a in range(3):
-            _moved(
-                source[0][start:end], source[1][start:end], source[2][start:end],
-                T[a, 0], T[a, 1], T[a, 2], T[a, 3], moved[a],
-            )  # fmt: skip
-        column, line, depth = seen[0], seen[1], seen[2]
-        _projected(camera, moved[0], moved[1], moved[2], end - start, column, line, depth)
-        count = _within(column, line, end - start, edge, width, height, places)
-        for a in range(3):
-            _chosen(moved[a], places, count, inside[a])
-        _chosen(depth, places, count, inside[3])
-        _pixels(column, places, count, columns)
-        _pixels(line, places, count, lines)
+    places, best, pixels = indices[0], indices[1], indices[2:]
+    for start in range(0, source.shape[1], BLOCK):
+        count = min(BLOCK, source.shape[1] - start)
+        move_all(source, T, start, count, moved)
+        project_all(camera, moved, count, seen)
+        count = within(seen, count, edge, width - edge, 1.0, height - 1.0, places)
+        gather(moved, places, count, inside)
+        gather(seen[2:], places, count, inside[3:])
+        gather_pixels(seen, places, count, pixels)
         x, y, z = inside[0], inside[1], inside[2]
         nearest[:count] = 1e9
         best[:count] = -1
         for beside in range(-1, 2):
-            _nearest_in_line(shown, width, columns, lines, beside, x, y, z, count, nearest, best)
+            _nearest_in_line(
+                shown, width, pixels[0], pixels[1], beside, x, y, z, count, nearest, best
+            )
         _weighed(
             source, start, places, shown, facing, x, y, z, inside[3], nearest, best, T, gate,
             numbers, count, rows, weights,
@@ -313,16 +263,6 @@ def _accumulate(
     for a in range(6):
         g[a] = -sums[21 + a]
     return used, sums[27]
-
-
-@kernel
-def _every(source: Floats32, step: int) -> Floats32:
-    """Every `step`-th of some points (N, 6), number by number: (6, n)."""
-    chosen = np.empty((6, (len(source) + step - 1) // step), np.float32)
-    for a in range(6):
-        for i in range(chosen.shape[1]):
-            chosen[a, i] = source[i * step, a]
-    return chosen
 
 
 @kernel
@@ -373,10 +313,10 @@ def refine_in_place(
     A, g, step = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     before, turn = np.zeros((3, 3)), np.zeros((3, 3))
     used, squares = 0, 0.0
-    room, indices = np.empty((19, _BLOCK)), np.empty((4, _BLOCK), np.int32)
-    every = few = _every(source, 1)
+    room, indices = np.empty((19, BLOCK)), np.empty((4, BLOCK), np.int32)
+    whole = few = transposed(source, 1)
     if int(numbers[9]) > 1 and thinned > 0:
-        few = _every(source, int(numbers[9]))
+        few = transposed(source, int(numbers[9]))
     for iteration in range(iterations):
         share = iteration / max(iterations - 1, 1)
         gate = numbers[1] * (numbers[2] / numbers[1]) ** share
@@ -388,7 +328,7 @@ def refine_in_place(
                 source, each, points, normals, camera, heads, chain, T, gate, numbers, A, g
             )
         else:
-            own = few if iteration < thinned else every
+            own = few if iteration < thinned else whole
             used, squares = _accumulate(
                 own, points, normals, camera, T, gate, numbers, room, indices, A, g
             )
