@@ -97,7 +97,7 @@ class Kernel:
 
         from sceneprint.geometry.kernel_cache import DisjointCompiler, KernelCache
 
-        options = {"pipeline_class": DisjointCompiler} if self._disjoint else {}
+        options: dict[str, Any] = {"pipeline_class": DisjointCompiler} if self._disjoint else {}
         compiler: Any = numba.njit(nogil=True, error_model="numpy", **options)(self.function)
         if compiler is not self.function:  # as it is under NUMBA_DISABLE_JIT, to be debugged
             cache = KernelCache(self.function)
