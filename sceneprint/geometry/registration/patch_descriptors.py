@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -121,7 +122,8 @@ def _lie(
         radial = radial if flat > 1e-3 else 0.0
         e = min(max((cosine + 1.0) * 0.5, 0.0), 1.0) * angles - 0.5
         g = min(max((radial + 1.0) * 0.5, 0.0), 1.0) * angles - 0.5
-        ie, ig = np.int32(np.floor(e)), np.int32(np.floor(g))
+        ie: Any = np.int32(np.floor(e))
+        ig: Any = np.int32(np.floor(g))
         lies[0, k], lies[1, k], lies[2, k] = squares[j], flat, height
         lies[3, k], lies[4, k], lies[5, k] = e - ie, g - ig, areas[j]
         e0, e1 = max(ie, 0) * angles, min(ie + 1, angles - 1) * angles
@@ -142,7 +144,8 @@ def _spread(
         i = np.uint64(places[k])
         a = flat[i] / radius * n_flat - 0.5
         b = (height[i] / radius + 1.0) * 0.5 * n_high - 0.5
-        ia, ib = np.int32(np.floor(a)), np.int32(np.floor(b))
+        ia: Any = np.int32(np.floor(a))
+        ib: Any = np.int32(np.floor(b))
         fa, fb = a - ia, b - ib
         a0, a1 = min(max(ia, 0), n_flat - 1), min(max(ia + 1, 0), n_flat - 1)
         b0, b1 = min(max(ib, 0), n_high - 1), min(max(ib + 1, 0), n_high - 1)

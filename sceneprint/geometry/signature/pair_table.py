@@ -263,7 +263,8 @@ def _bin(value: float, edges: Floats, hints: Ints32, origin: float, per_unit: fl
     """Index of the first edge above a value. Cells of hints are narrower than bins."""
     cell = min(max((value - origin) * per_unit, 0.0), len(hints) - 1.0)
     b = hints[np.uint64(np.int32(cell))]
-    return b + 1 if value >= edges[np.uint64(b)] else b
+    found: int = b + 1 if value >= edges[np.uint64(b)] else b
+    return found
 
 
 @disjoint_kernel
