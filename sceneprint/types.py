@@ -81,6 +81,7 @@ Camera = Intrinsics | Sphere
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Ints32 = NDArray[np.int32]
+Ints64 = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 __all__ = [

@@ -5,7 +5,8 @@ installation. Never `parallel` (a forked child dies in OpenMP), and never `fastm
 compiler may then neither reorder sums nor fuse products, so that one frame gives the same
 bytes on every processor. Division follows IEEE, as numpy's does: a check before each would
 keep the compiler from working on eight or sixteen numbers at once, so kernels guard their
-divisors themselves. For the same reason inner loops write one array each.
+divisors themselves. For the same reason inner loops write one array each, unless the kernel is
+disjoint: then the compiler knows that what it writes is nothing it reads.
 
 A kernel's code holds that of the kernels it calls, and numbers of other files, so what is on
 disk is valid for these too, and not for its own file alone, which is all that numba looks at:
@@ -42,11 +43,16 @@ class Kernel:
     """A loop over arrays that is compiled, or loaded, when it is first called.
 
     numba is imported then and not before: a service answers without it.
+
+    Parameters
+    ----------
+    function : of arrays and numbers
+    disjoint : whether no array that it writes shares memory with another that it is given
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., Any], *, disjoint: bool = False) -> None:
         update_wrapper(self, function)
-        self.function = function
+        self.function, self._disjoint = function, disjoint
         self._known = dict(cast(dict[str, Any], getattr(function, "__globals__", {})))
         self._compiler: Any = None
         self._stamp = ""
@@ -89,9 +95,10 @@ class Kernel:
     def _make(self) -> Any:
         import numba
 
-        from sceneprint.geometry.kernel_cache import KernelCache
+        from sceneprint.geometry.kernel_cache import DisjointCompiler, KernelCache
 
-        compiler: Any = numba.njit(nogil=True, error_model="numpy")(self.function)
+        options: dict[str, Any] = {"pipeline_class": DisjointCompiler} if self._disjoint else {}
+        compiler: Any = numba.njit(nogil=True, error_model="numpy", **options)(self.function)
         if compiler is not self.function:  # as it is under NUMBA_DISABLE_JIT, to be debugged
             cache = KernelCache(self.function)
             self._stamp = repr(cache.stamp(_made_of(self.function, self._known)))
@@ -103,6 +110,15 @@ class Kernel:
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a loop over arrays to machine code on its first call; cached on disk."""
     return cast(Callable[P, R], Kernel(function))
+
+
+def disjoint_kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """As `kernel`, of a loop none of whose arrays shares memory with one that it writes.
+
+    Only so can it look up scattered numbers (gather) for several elements at once: elsewhere the
+    compiler must take each store for one that may change what is looked up next.
+    """
+    return cast(Callable[P, R], Kernel(function, disjoint=True))
 
 
 def cached_at(function: Any) -> tuple[str, bool]:

@@ -1,4 +1,5 @@
-"""Where kernels' machine code is kept: numba's folders, and what a wheel or an image brought.
+"""How numba compiles kernels, and where their machine code is kept: in numba's folders, or in
+those that a wheel or an image brought.
 
 numba keeps code by the processor that it was compiled on. What comes with an installation was
 compiled for any processor of a kind (`TARGET`). It is found in numba's folder and beside the
@@ -18,9 +19,18 @@ from numba.core.caching import (
     IndexDataCacheFile,
     InTreeCacheLocator,
 )
+from numba.core.compiler import Compiler
 from numba.core.registry import cpu_target
 
 from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES
+
+
+class DisjointCompiler(Compiler):
+    """Compiles kernels none of whose arrays shares memory with one that they write."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.state.flags.noalias = True
 
 
 class _BesideTheSource(InTreeCacheLocator):

@@ -21,11 +21,17 @@ def record_event(
     **data: Any,
 ) -> None:
     """Note an event; `kind` is one of `KINDS` of the API."""
-    connection.execute(
-        insert(events).values(
-            at=time.time(), kind=kind, map=map_name, frame_id=frame_id, job_id=job_id, data=data
-        )
-    )
+    connection.execute(insert(events).values(event_values(kind, map_name, frame_id, job_id, data)))
+
+
+def event_values(
+    kind: str, map_name: str | None, frame_id: str | None, job_id: str | None, data: dict[str, Any]
+) -> dict[str, Any]:
+    """Columns of an event that happens now."""
+    return {
+        "at": time.time(), "kind": kind, "map": map_name, "frame_id": frame_id, "job_id": job_id,
+        "data": data,
+    }  # fmt: skip
 
 
 def anchor_of(connection: Connection, map_name: str) -> str:

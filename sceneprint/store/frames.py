@@ -6,22 +6,44 @@ import uuid
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, delete, func, insert, select, update
+from sqlalchemy import (
+    CTE,
+    Column,
+    ColumnElement,
+    Connection,
+    Insert,
+    String,
+    Table,
+    cast,
+    delete,
+    exists,
+    func,
+    insert,
+    literal,
+    or_,
+    select,
+    update,
+)
+from sqlalchemy.sql.dml import ReturningUpdate
+from sqlalchemy.types import TypeEngine
 
 from sceneprint.errors import UnknownFrame
 from sceneprint.store.deletion import delete_frames
-from sceneprint.store.events import record_event
+from sceneprint.store.events import event_values, record_event
 from sceneprint.store.maps import ROOMLESS, count_on, find_map
-from sceneprint.store.queue import now
+from sceneprint.store.queue import job_values, now
 from sceneprint.store.surface_rows import FUSED_COLUMNS, note_edit
 from sceneprint.store.tables import (
+    TEXT,
     FrameRow,
     MapRow,
     deleted_frames,
+    events,
     frame_row,
     frame_tags,
     frames,
     job_files,
+    jobs,
     kept_answers,
     maps,
     rows_among,
@@ -51,16 +73,98 @@ def add_frame(
         frame_id = uuid.uuid4().hex
     else:
         _free(connection, map_number, frame_id)
-    pose = values["pose"]
-    place = {} if pose is None else {f"pose_{axis}": pose[i][3] for i, axis in enumerate("xyz")}
-    made = insert(frames).values(
-        id=frame_id, map_number=map_number, state=FrameState.RECEIVED,
-        received_at=now(connection), **values, **place,
-    )  # fmt: skip
+    made = insert(frames).values(_received(connection, map_number, frame_id, values))
     row = frame_row(connection.execute(made.returning(frames)).mappings().one())
     count_on(connection, map_number, 1, values["bytes"])
     _write_tags(connection, row.number, row.tags)
     return row
+
+
+def _received(
+    connection: Connection, map_number: int, frame_id: str, values: dict[str, Any]
+) -> dict[str, Any]:
+    pose = values["pose"]
+    place = {} if pose is None else {f"pose_{axis}": pose[i][3] for i, axis in enumerate("xyz")}
+    state, at = FrameState.RECEIVED, now(connection)
+    own = {"id": frame_id, "map_number": map_number, "state": state, "received_at": at}
+    return {**own, **values, **place}
+
+
+def receive_frame(
+    connection: Connection, row: MapRow, values: dict[str, Any], priority: int
+) -> tuple[str, str] | None:
+    """Take a frame whose content its map lacks, and queue its signing: all that most uploads are.
+
+    Others wait for this, so it is one statement on PostgreSQL, whose answer takes a round trip, and
+    on SQLite, where nothing but inserting follows the first one, one for each table.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    row : of the map, as it was when somebody looked
+    values : see `add_frame`
+    priority : of the job
+
+    Returns
+    -------
+    ids : of the frame and of its job; None, and nothing was written, where the map is gone, has no
+        room or has the content: `add_frame` and what is asked before it say which
+    """
+    frame_id, job = uuid.uuid4().hex, job_values(connection, "sign", priority)
+    frame = _received(connection, row.number, frame_id, values)
+    of_job = {**job, "map_number": row.number}
+    told = event_values("frame.received", row.name, frame_id, job["id"], {})
+    room, tags = _room_taken(row, values), sorted(set(values["tags"]))
+    if connection.dialect.name == "sqlite":
+        if connection.execute(room).first() is None:
+            return None
+        made = insert(frames).values(frame).returning(frames.c.number)
+        number = connection.execute(made).scalar_one()
+        _write_tags(connection, number, tags)
+        connection.execute(insert(jobs).values(frame_number=number, **of_job))
+        connection.execute(insert(events).values(told))
+        return frame_id, job["id"]
+    new = _inserted(frames, frame, room.cte("room")).returning(frames.c.number).cte("new")
+    others = [_inserted(jobs, of_job, new, frame_number=new.c.number), _inserted(events, told, new)]
+    others += [_inserted(frame_tags, {"tag": tag}, new, frame_number=new.c.number) for tag in tags]
+    asked = select(new.c.number).add_cte(*(one.cte(f"other_{i}") for i, one in enumerate(others)))
+    return None if connection.execute(asked).first() is None else (frame_id, job["id"])
+
+
+def _room_taken(row: MapRow, values: dict[str, Any]) -> ReturningUpdate[tuple[int]]:
+    """Count a frame more, if its map is that of `row` still, has room, and lacks the content."""
+    alike = frames.c.map_number == row.number, frames.c.content_id == values["content_id"]
+    size = values["bytes"]
+    return (
+        update(maps)
+        .where(
+            maps.c.number == row.number,
+            maps.c.name == row.name,
+            or_(maps.c.quota_frames.is_(None), maps.c.used_frames < maps.c.quota_frames),
+            or_(maps.c.quota_bytes.is_(None), maps.c.used_bytes + size <= maps.c.quota_bytes),
+            ~exists().where(*alike),
+        )
+        .values(used_frames=maps.c.used_frames + 1, used_bytes=maps.c.used_bytes + size)
+        .returning(maps.c.number)
+    )
+
+
+def _inserted(
+    table: Table, values: dict[str, Any], source: CTE, **more: ColumnElement[Any]
+) -> Insert:
+    """A row inserted for each of another statement's, PostgreSQL."""
+    names = [*values, *more]
+    given = [_typed(table.c[name], value) for name, value in values.items()]
+    return insert(table).from_select(names, select(*given, *more.values()).select_from(source))
+
+
+def _typed(column: Column[Any], value: Any) -> ColumnElement[Any]:
+    """A value of a SELECT, whose columns have the types of the values, not of the table."""
+    if isinstance(value, ColumnElement):
+        return value
+    # a cast to a length would cut off what the table refuses
+    kind: TypeEngine[Any] = TEXT if isinstance(column.type, String) else column.type
+    return cast(literal(value, column.type), kind)
 
 
 def renew_frame(connection: Connection, number: int, values: dict[str, Any]) -> FrameRow:

@@ -230,23 +230,29 @@ def enqueue(
     kind, frame_number, priority, model_id, data : see the table
     map_number : where it is of no single frame; else the frame's map is taken
     """
-    job_id = uuid.uuid4().hex
-    made = now(connection)
-    if data is None and request_id() is not None:
-        data = {"request_id": request_id()}  # whose log its worker's lines belong to
     of_map: Any = map_number
     if frame_number is not None:
         of_map = (
             select(frames.c.map_number).where(frames.c.number == frame_number).scalar_subquery()
         )
-    connection.execute(
-        insert(jobs).values(
-            id=job_id, kind=kind, map_number=of_map, frame_number=frame_number,
-            model_id=model_id, data=data, state=JobState.QUEUED,
-            priority=priority, attempts=0, failures=0, token=0, run_after=made, created_at=made,
-        )
-    )  # fmt: skip
-    return find_job(connection, job_id)
+    values = job_values(connection, kind, priority, model_id, data)
+    made = insert(jobs).values(map_number=of_map, frame_number=frame_number, **values)
+    return job_row(connection.execute(made.returning(jobs)).mappings().one())
+
+
+def job_values(
+    connection: Connection, kind: str, priority: int, model_id: str | None = None,
+    data: dict[str, Any] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Columns of a job that is queued now, but for what it is about: see `enqueue`."""
+    made = now(connection)
+    if data is None and request_id() is not None:
+        data = {"request_id": request_id()}  # whose log its worker's lines belong to
+    return {
+        "id": uuid.uuid4().hex, "kind": kind, "model_id": model_id, "data": data,
+        "state": JobState.QUEUED, "priority": priority, "attempts": 0, "failures": 0, "token": 0,
+        "run_after": made, "created_at": made,
+    }  # fmt: skip
 
 
 def due_in_s(connection: Connection) -> float | None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from sqlalchemy import event
 
 from sceneprint.engine import Engine
 from sceneprint.engine.upkeep import garbage_collection
@@ -53,6 +54,35 @@ def test_the_same_upload_is_the_frame_that_is_there(
     assert again.state == FrameState.INDEXED
     assert told(empty) == ["map.created", "frame.received", "frame.indexed"]
     assert empty.counts() == ({"indexed": 1}, {"succeeded": 1})
+
+
+def test_while_others_wait_a_new_frame_takes_one_statement_or_one_for_each_table(
+    empty: Engine, uploads: Any
+) -> None:
+    """On PostgreSQL each is a round trip, and nobody else writes meanwhile."""
+    database, said = empty.store.database, list[str]()
+
+    def note(connection: Any, _cursor: Any, statement: str, *_: Any) -> None:
+        begins = "advisory" in statement or statement.startswith("BEGIN")
+        if "sceneprint_write" in connection.get_execution_options() and not begins:
+            said.append(statement)
+
+    event.listen(database._engine, "before_cursor_execute", note)
+    tagged = with_(uploads[0].meta, tags=["a", "b"], robot="R2", session="night")
+    added, new = empty.add_frame("hall", uploads[0].data, tagged)
+    written = ["UPDATE maps", "INSERT INTO frames", "INSERT INTO frame_tags", "INSERT INTO jobs",
+               "INSERT INTO events"]  # fmt: skip
+    if database.is_sqlite:
+        assert [one.partition(" (")[0].partition(" SET")[0] for one in said] == written
+    else:
+        assert len(said) == 1
+        assert all(said[0].count(one) == 1 + ("tags" in one) for one in written)
+    event.remove(database._engine, "before_cursor_execute", note)
+    assert new
+    found = empty.get_frame("hall", added.frame_id)
+    assert (found.tags, found.robot, found.session) == (["a", "b"], "R2", "night")
+    assert empty.get_job(added.job_id).frame_id == added.frame_id
+    assert empty.get_map("hall").frames == {"received": 1}
 
 
 @pytest.mark.parametrize(

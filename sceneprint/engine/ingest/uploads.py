@@ -27,6 +27,7 @@ from sceneprint.store.frames import (
     frames_of_content,
     living_frame,
     loosen,
+    receive_frame,
     renew_frame,
     write_frame,
 )
@@ -234,6 +235,17 @@ class _Prepared:
     content: str
     known: dict[str, Any]
 
+    @property
+    def of_blob(self) -> dict[str, Any]:
+        """Columns that follow from the bytes and from how they were sent."""
+        size, novelty = len(self.upload.data), self.upload.if_novel
+        return {"blob": self.blob, "bytes": size, "novelty": novelty}
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """Columns of a new frame; see `add_frame`."""
+        return {"content_id": self.content, **self.of_blob, **self.known}
+
 
 class Uploads:
     """Takes frames into maps; safe to share between threads.
@@ -317,7 +329,7 @@ class Uploads:
                     del ready[i]
         again = False
         if ready:
-            outcomes, again = self._write(map_name, ready, outcomes, once, fence)
+            outcomes, again = self._write(row, ready, outcomes, once, fence)
         if any(one is not None and one.new for one in outcomes) and not again:
             self._bell.ring()
         return [one for one in outcomes if one is not None], again
@@ -361,10 +373,15 @@ class Uploads:
         return UploadResult(there.model_copy(update={"reason": repair.without_loss(there.reason)}))
 
     def _write(
-        self, map_name: str, ready: dict[int, _Prepared], known: list[UploadResult | None],
+        self, row: MapRow, ready: dict[int, _Prepared], known: list[UploadResult | None],
         once: IdempotentRequest | None, fence: Callable[[Connection], None] | None,
     ) -> tuple[list[UploadResult | None], bool]:  # fmt: skip
         """Store those uploads of which it is not known yet what comes of them.
+
+        Parameters
+        ----------
+        row : of the map, as it was before they were decoded
+        ready, known, once, fence : see `add_all`
 
         Returns
         -------
@@ -379,15 +396,18 @@ class Uploads:
         def do(connection: Connection) -> tuple[list[UploadResult | None], bool] | None:
             if fence is not None:
                 fence(connection)
-            row = find_map(connection, map_name)
-            before = _before(connection, row, once)
-            if before is not None:
-                left[:] = blobs
-                return list(before), True
+            if once is not None:
+                before = _before(connection, find_map(connection, row.name), once)
+                if before is not None:
+                    left[:] = blobs
+                    return list(before), True
             if not all(map(self._store.blobs.holds, blobs)):
                 return None  # a deletion has removed one
             left.clear()
-            written = {i: _stored(connection, row, one, left) for i, one in todo.items()}
+            written = {
+                i: _taken(connection, row, one) or _stored(connection, row.name, one, left)
+                for i, one in todo.items()
+            }
             outcomes = [written.get(i, one) for i, one in enumerate(known)]
             came = [one for one in outcomes if one is not None]
             # what had no room may have it when it is sent again
@@ -419,9 +439,22 @@ def _before(
     return None if data is None else replayed(connection, row, data)
 
 
-def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[str]) -> UploadResult:
+def _taken(connection: Connection, row: MapRow, ready: _Prepared) -> UploadResult | None:
+    """An upload of a new frame; None where it is none, or was not taken: see `_stored`."""
+    if ready.upload.frame_id is not None:
+        return None
+    ids = receive_frame(connection, row, ready.columns, ready.upload.priority)
+    if ids is None:
+        return None
+    added = Added(frame_id=ids[0], job_id=ids[1], state=FrameState.RECEIVED, reason=None)
+    return UploadResult(added, new=True)
+
+
+def _stored(
+    connection: Connection, map_name: str, ready: _Prepared, left: list[str]
+) -> UploadResult:
     """What comes of an upload; blobs that are of no use any more are added to `left`."""
-    upload = ready.upload
+    upload, row = ready.upload, find_map(connection, map_name)
     try:  # once more: another upload may have been first
         frame = find_duplicate(connection, row, ready.content, ready.known, upload.frame_id)
     except errors.FrameConflict as error:
@@ -440,14 +473,12 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
     except errors.QuotaExceeded as error:
         left.append(ready.blob)
         return UploadResult(None, error=error)
-    of_blob = {"blob": ready.blob, "bytes": len(upload.data), "novelty": upload.if_novel}
     if frame is None:
-        values = {"content_id": ready.content, **of_blob, **ready.known}
-        frame = add_frame(connection, row.number, values, upload.frame_id)
+        frame = add_frame(connection, row.number, ready.columns, upload.frame_id)
     else:  # it was given up, and somebody asks for another try
         left.append(frame.blob)  # it was packed otherwise
         labels = _missing_labels(frame, ready.known)
-        frame = renew_frame(connection, frame.number, {**of_blob, **labels})
+        frame = renew_frame(connection, frame.number, {**ready.of_blob, **labels})
     job = enqueue(connection, "sign", frame.number, upload.priority)
     record_event(connection, "frame.received", row.name, frame.id, job.id)
     added = Added(frame_id=frame.id, job_id=job.id, state=frame.state, reason=None)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.types import Floats
+from sceneprint.types import Floats, Ints64
 
 
 def inverse(T: Floats) -> Floats:
@@ -74,15 +74,37 @@ def distinct(
     metres, radians : two that are nearer than both are one
     most : of them
     """
-    chosen: list[int] = []
     order = np.argsort(-scores, kind="stable")
-    left = np.ones(len(order), bool)
-    while left.any() and len(chosen) < most:
-        best = int(order[np.argmax(left[order])])
-        chosen.append(best)
-        left &= ~are_near(transforms, transforms[best], metres, radians)
-        left[best] = False
-    return chosen
+    chosen = np.empty(min(most, len(order)), np.int64)
+    found = _choose(np.ascontiguousarray(transforms), order, metres, math.cos(radians), chosen)
+    kept: list[int] = chosen[:found].tolist()
+    return kept
+
+
+@kernel
+def _choose(
+    transforms: Floats, order: Ints64, metres: float, cosine: float, chosen: Ints64
+) -> int:  # fmt: skip
+    """Those in an order that are near none chosen before, as `are_near` has it; how many."""
+    found = 0
+    for i in order:
+        if found == len(chosen):
+            break
+        T, distinct = transforms[i], True
+        for k in range(found):
+            U = transforms[chosen[k]]
+            square, trace = 0.0, 0.0
+            for a in range(3):
+                square += (T[a, 3] - U[a, 3]) ** 2
+                for b in range(3):
+                    trace += T[a, b] * U[a, b]
+            if np.sqrt(square) <= metres and (trace - 1.0) / 2.0 >= cosine:
+                distinct = False
+                break
+        if distinct:
+            chosen[found] = i
+            found += 1
+    return found
 
 
 def nearest_rotation(M: Floats) -> Floats:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.geometry.pose.rigid import rotation_of_covariance
 from sceneprint.types import Floats, Ints32, Patches
 
@@ -36,7 +36,7 @@ class ConsensusParameters:
     inlier_cosine: float = 0.85  #: of the angle between their normals
 
 
-@kernel
+@disjoint_kernel
 def _lengths(points: Floats, i: int, lengths: Floats) -> None:
     """From point i to each later one; points (3, M)."""
     x, y, z = points[0], points[1], points[2]
@@ -44,6 +44,35 @@ def _lengths(points: Floats, i: int, lengths: Floats) -> None:
     for j in range(i + 1, len(lengths)):
         dx, dy, dz = x[j] - ix, y[j] - iy, z[j] - iz
         lengths[j] = np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@disjoint_kernel
+def _as_long(
+    da: Floats, db: Floats, i: int, tolerance: float, minimum: float, places: Ints32
+) -> int:
+    """Which of the later correspondences are as far from i in both frames; how many."""
+    found = 0
+    for j in range(i + 1, len(da)):
+        apart = (abs(da[j] - db[j]) > tolerance) | (da[j] < minimum) | (db[j] < minimum)
+        places[found] = j
+        found += 0 if apart else 1
+    return found
+
+
+@kernel
+def _alike_angles(a: float, b: float, most: float) -> bool:
+    """Whether two angles, given by their cosines, differ by no more than `most`, which is below pi.
+
+    Angles differ by no less than their cosines do, and by most where one of them is 0: an
+    arccosine is needed only between these bounds.
+    """
+    a, b = min(max(a, -1.0), 1.0), min(max(b, -1.0), 1.0)
+    apart = abs(a - b)
+    if apart > most + 1e-9:
+        return False
+    if apart < 1.0 - np.cos(most) - 1e-9:
+        return True
+    return not abs(np.arccos(a) - np.arccos(b)) > most
 
 
 @kernel
@@ -63,8 +92,7 @@ def _compatible(
         return False
     ca = n[0, i] * n[0, j] + n[1, i] * n[1, j] + n[2, i] * n[2, j]
     cb = m[0, i] * m[0, j] + m[1, i] * m[1, j] + m[2, i] * m[2, j]
-    ca, cb = min(max(ca, -1.0), 1.0), min(max(cb, -1.0), 1.0)
-    if abs(np.arccos(ca) - np.arccos(cb)) > angle:
+    if not _alike_angles(ca, cb, angle):
         return False
     # the signed triple product tells a scene from its mirror image
     ta = (
@@ -88,13 +116,11 @@ def _graph(
 ) -> None:  # fmt: skip
     """Bit j of row i: correspondences i and j are compatible. All arrays (3, M)."""
     count = p.shape[1]
-    da, db = np.empty(count), np.empty(count)
+    da, db, places = np.empty(count), np.empty(count), np.empty(count, np.int32)
     for i in range(count):
         _lengths(p, i, da)
         _lengths(q, i, db)
-        for j in range(i + 1, count):
-            if abs(da[j] - db[j]) > tolerance or da[j] < minimum or db[j] < minimum:
-                continue
+        for j in places[: _as_long(da, db, i, tolerance, minimum, places)]:
             if _compatible(p, n, q, m, i, j, tolerance, angle):
                 bits[i, j >> 6] |= np.uint64(1) << np.uint64(j & 63)
                 bits[j, i >> 6] |= np.uint64(1) << np.uint64(i & 63)

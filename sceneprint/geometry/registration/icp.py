@@ -14,10 +14,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.geometry.pose.rigid import solve_positive, turned
 from sceneprint.geometry.registration.overlap import LookupTarget, nearest_alike, sampled, target_of
-from sceneprint.geometry.surface.camera import PINHOLE, depth_at, depth_of, grown, kind_of, project
+from sceneprint.geometry.surface.camera import (
+    BLOCK,
+    PINHOLE,
+    depth_of,
+    gather,
+    gather_pixels,
+    grown,
+    kind_of,
+    move_all,
+    project_all,
+    transposed,
+    within,
+)
 from sceneprint.types import Floats, Floats32, Ints32, Surface
 
 
@@ -69,24 +81,6 @@ class Refined:
 
 
 @kernel
-def _nearest_pixel(
-    camera: Floats, points: Floats32, u: int, v: int, x: float, y: float, z: float
-) -> tuple[int, int, float]:
-    """Of the 3 x 3 pixels about (u, v), the one whose point is nearest: column, row, squared."""
-    column, row, nearest = -9, -1, 1e9
-    for line in range(v - 1, v + 2):
-        for place in range(u - 1, u + 2):
-            ex, ey, ez = (
-                x - points[line, place, 0], y - points[line, place, 1],
-                z - points[line, place, 2],
-            )  # fmt: skip
-            square = ex * ex + ey * ey + ez * ez
-            if square < nearest and depth_at(camera, points, line, place) > 0:
-                nearest, column, row = square, place, line
-    return column, row, nearest
-
-
-@kernel
 def _add(
     A: Floats, g: Floats, row: Floats, x: float, y: float, z: float,
     mx: float, my: float, mz: float, residual: float, weight: float,
@@ -101,56 +95,174 @@ def _add(
             A[a, b] += wa * row[b]
 
 
+@disjoint_kernel
+def _nearest_in_line(
+    points: Floats32, width: int, column: Ints32, line: Ints32, beside: int,
+    x: Floats, y: Floats, z: Floats, count: int, nearest: Floats, best: Ints32,
+) -> None:  # fmt: skip
+    """Of the three pixels in a line beside that of each point: the nearest one that shows
+    anything, if it is nearer than `nearest`; that squared, and its index in the flat map.
+    """
+    for i in range(count):
+        start, middle = (line[i] + beside) * width, column[i]
+        # the last column of a closed sphere has the first for its neighbour
+        first = start + (middle - 1 if middle > 0 else width - 1)
+        second = start + middle
+        third = start + (middle + 1 if middle < width - 1 else 0)
+        least, found = nearest[i], best[i]
+        for place in (first, second, third):
+            at = np.uint64(place) * np.uint64(3)
+            a, b, c = points[at], points[at + np.uint64(1)], points[at + np.uint64(2)]
+            ex, ey, ez = x[i] - a, y[i] - b, z[i] - c
+            square = ex * ex + ey * ey + ez * ez
+            nearer = (square < least) & ((c != 0) | (a != 0) | (b != 0))
+            least = square if nearer else least
+            found = np.int32(place) if nearer else found
+        nearest[i], best[i] = least, found
+
+
+@disjoint_kernel
+def _weighed(
+    source: Floats32, start: int, places: Ints32, points: Floats32, normals: Floats32,
+    x: Floats, y: Floats, z: Floats, depth: Floats, nearest: Floats, best: Ints32, T: Floats,
+    gate: float, numbers: Floats, count: int, rows: Floats, weights: Floats,
+) -> None:  # fmt: skip
+    """Rows of the Jacobian and residuals, (7, n), of points with their nearest pixels; weights,
+    negative where the two do not belong together.
+    """
+    least_cosine, reference, power = numbers[3], numbers[4], numbers[6]
+    per_depth, kind = numbers[7], numbers[8]
+    xx, xy, xz, yx, yy, yz = T[0, 0], T[0, 1], T[0, 2], T[1, 0], T[1, 1], T[1, 2]
+    zx, zy, zz = T[2, 0], T[2, 1], T[2, 2]
+    for i in range(count):
+        at = np.uint64(max(best[i], 0)) * np.uint64(3)
+        mx, my, mz = normals[at], normals[at + np.uint64(1)], normals[at + np.uint64(2)]
+        residual = (
+            (x[i] - points[at]) * mx + (y[i] - points[at + np.uint64(1)]) * my
+            + (z[i] - points[at + np.uint64(2)]) * mz
+        )  # fmt: skip
+        limit = gate * grown(depth[i], reference, power)
+        own = np.uint64(start + places[i])
+        nx, ny, nz = source[3, own], source[4, own], source[5, own]
+        cosine = (
+            (xx * nx + xy * ny + xz * nz) * mx
+            + (yx * nx + yy * ny + yz * nz) * my
+            + (zx * nx + zy * ny + zz * nz) * mz
+        )
+        tukey = 1.0 - (residual / limit) ** 2
+        near = np.float32(
+            depth_of(kind, source[0, own], source[1, own], source[2, own]) * per_depth
+        )
+        far = depth[i] * per_depth
+        weight = tukey * tukey / (0.25 + (near**4 + far**4) * 0.125)
+        apart = (best[i] < 0) | (nearest[i] > 9.0 * limit * limit)
+        apart = apart | (abs(residual) > limit) | (cosine < least_cosine)
+        weights[i] = -1.0 if apart else weight
+        rows[0, i] = y[i] * mz - z[i] * my
+        rows[1, i] = z[i] * mx - x[i] * mz
+        rows[2, i] = x[i] * my - y[i] * mx
+        rows[3, i], rows[4, i], rows[5, i], rows[6, i] = mx, my, mz, residual
+
+
+@disjoint_kernel
+def _kept(weights: Floats, count: int, places: Ints32) -> int:
+    """Indices of the weights that are not negative; how many."""
+    found = 0
+    for i in range(count):
+        places[found] = i
+        found += 1 if weights[i] >= 0 else 0
+    return found
+
+
+@disjoint_kernel
+def _add_all(rows: Floats, weights: Floats, places: Ints32, count: int, sums: Floats) -> None:
+    """Shares of points in the normal equations, one after the other.
+
+    sums (28,): the lower triangle of A row by row, then -g and the weighted squares. All stay in
+    registers, which numba does for nothing but single variables.
+    """
+    r0, r1, r2, r3, r4, r5, r6 = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6]
+    aa, ba, bb, ca, cb, cc = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+    da, db, dc, dd = sums[6], sums[7], sums[8], sums[9]
+    ea, eb, ec, ed, ee = sums[10], sums[11], sums[12], sums[13], sums[14]
+    fa, fb, fc, fd, fe, ff = sums[15], sums[16], sums[17], sums[18], sums[19], sums[20]
+    ga, gb, gc, gd, ge, gf, gg = (
+        sums[21], sums[22], sums[23], sums[24], sums[25], sums[26], sums[27]
+    )  # fmt: skip
+    for k in range(count):
+        i = np.uint64(places[k])
+        a, b, c, d, e, f, g = r0[i], r1[i], r2[i], r3[i], r4[i], r5[i], r6[i]
+        weight = weights[i]
+        w = weight * a
+        aa, ga = aa + w * a, ga + w * g
+        w = weight * b
+        ba, bb, gb = ba + w * a, bb + w * b, gb + w * g
+        w = weight * c
+        ca, cb, cc, gc = ca + w * a, cb + w * b, cc + w * c, gc + w * g
+        w = weight * d
+        da, db, dc, dd, gd = da + w * a, db + w * b, dc + w * c, dd + w * d, gd + w * g
+        w = weight * e
+        ea, eb, ec, ed, ee = ea + w * a, eb + w * b, ec + w * c, ed + w * d, ee + w * e
+        ge += w * g
+        w = weight * f
+        fa, fb, fc, fd, fe = fa + w * a, fb + w * b, fc + w * c, fd + w * d, fe + w * e
+        ff, gf = ff + w * f, gf + w * g
+        gg += weight * g * g
+    for k, value in enumerate(
+        (aa, ba, bb, ca, cb, cc, da, db, dc, dd, ea, eb, ec, ed, ee, fa, fb, fc, fd, fe, ff,
+         ga, gb, gc, gd, ge, gf, gg)
+    ):  # fmt: skip
+        sums[k] = value
+
+
 @kernel
 def _accumulate(
-    source: Floats32, step: int, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
-    gate: float, numbers: Floats, A: Floats, g: Floats,
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats, gate: float,
+    numbers: Floats, room: Floats, indices: Ints32, A: Floats, g: Floats,
 ) -> tuple[int, float]:  # fmt: skip
-    """Normal equations of one Gauss-Newton step on every `step`-th point; returns how many took
+    """Normal equations of one Gauss-Newton step on the points of (6, N); returns how many took
     part, and the sum of their weighted squares.
+
+    Blocks of points go through one step after the other, so that the compiler works on several
+    at once; sums are added up in the order of the points.
     """
     height, width = points.shape[0], points.shape[1]
-    least_cosine, reference, kind, per_depth = numbers[3], numbers[4], numbers[8], numbers[7]
+    shown, facing = points.reshape(-1), normals.reshape(-1)
     # on a closed sphere the first column has a neighbour before it: the last
     edge = 0.0 if camera[0] == 1 and camera[6] > 0 else 1.0
-    row = np.zeros(6)
-    used, squares = 0, 0.0
-    for i in range(0, len(source), step):
-        px, py, pz = source[i, 0], source[i, 1], source[i, 2]
-        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        column, line, depth = project(camera, x, y, z)
-        if not (column >= edge and line >= 1 and column < width - edge and line < height - 1):
-            continue
-        u = int(column)
-        if u == width - 1:  # of a closed sphere; negative columns count from the last
-            u -= width
-        u, v, square = _nearest_pixel(camera, points, u, int(line), x, y, z)
-        if v < 0:
-            continue
-        mx, my, mz = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
-        residual = (
-            (x - points[v, u, 0]) * mx + (y - points[v, u, 1]) * my + (z - points[v, u, 2]) * mz
-        )
-        limit = gate * grown(depth, reference, numbers[6])
-        if abs(residual) > limit or square > 9.0 * limit * limit:
-            continue
-        nx, ny, nz = source[i, 3], source[i, 4], source[i, 5]
-        cosine = (
-            (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz) * mx
-            + (T[1, 0] * nx + T[1, 1] * ny + T[1, 2] * nz) * my
-            + (T[2, 0] * nx + T[2, 1] * ny + T[2, 2] * nz) * mz
-        )
-        if cosine < least_cosine:
-            continue
-        tukey = 1.0 - (residual / limit) ** 2
-        near, far = np.float32(depth_of(kind, px, py, pz) * per_depth), depth * per_depth
-        weight = tukey * tukey / (0.25 + (near**4 + far**4) * 0.125)
-        _add(A, g, row, x, y, z, mx, my, mz, residual, weight)
-        squares += weight * residual * residual
-        used += 1
-    return used, squares
+    moved, seen, inside, rows = room[:3], room[3:6], room[6:10], room[10:17]
+    nearest, weights, sums, used = room[17], room[18], np.zeros(28), 0
+    places, best, pixels = indices[0], indices[1], indices[2:]
+    for start in range(0, source.shape[1], BLOCK):
+        count = min(BLOCK, source.shape[1] - start)
+        move_all(source, T, start, count, moved)
+        project_all(camera, moved, count, seen)
+        count = within(seen, count, edge, width - edge, 1.0, height - 1.0, places)
+        gather(moved, places, count, inside)
+        gather(seen[2:], places, count, inside[3:])
+        gather_pixels(seen, places, count, pixels)
+        x, y, z = inside[0], inside[1], inside[2]
+        nearest[:count] = 1e9
+        best[:count] = -1
+        for beside in range(-1, 2):
+            _nearest_in_line(
+                shown, width, pixels[0], pixels[1], beside, x, y, z, count, nearest, best
+            )
+        _weighed(
+            source, start, places, shown, facing, x, y, z, inside[3], nearest, best, T, gate,
+            numbers, count, rows, weights,
+        )  # fmt: skip
+        count = _kept(weights, count, places)
+        _add_all(rows, weights, places, count, sums)
+        used += count
+    k = 0
+    for a in range(6):
+        for b in range(a + 1):
+            A[a, b] = sums[k]
+            k += 1
+    for a in range(6):
+        g[a] = -sums[21 + a]
+    return used, sums[27]
 
 
 @kernel
@@ -201,6 +313,10 @@ def refine_in_place(
     A, g, step = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     before, turn = np.zeros((3, 3)), np.zeros((3, 3))
     used, squares = 0, 0.0
+    room, indices = np.empty((19, BLOCK)), np.empty((4, BLOCK), np.int32)
+    whole = few = transposed(source, 1)
+    if int(numbers[9]) > 1 and thinned > 0:
+        few = transposed(source, int(numbers[9]))
     for iteration in range(iterations):
         share = iteration / max(iterations - 1, 1)
         gate = numbers[1] * (numbers[2] / numbers[1]) ** share
@@ -212,8 +328,9 @@ def refine_in_place(
                 source, each, points, normals, camera, heads, chain, T, gate, numbers, A, g
             )
         else:
+            own = few if iteration < thinned else whole
             used, squares = _accumulate(
-                source, each, points, normals, camera, T, gate, numbers, A, g
+                own, points, normals, camera, T, gate, numbers, room, indices, A, g
             )
         for a in range(6):
             for b in range(a):

@@ -17,9 +17,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.geometry.frame_cache import cached_per_frame
-from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.geometry.pose.rigid import inverses
-from sceneprint.geometry.surface.camera import camera_of, depth_at, grown, project
+from sceneprint.geometry.surface.camera import (
+    BLOCK,
+    camera_of,
+    depth_at,
+    depth_of,
+    gather,
+    gather_pixels,
+    grown,
+    move_all,
+    project_all,
+    transposed,
+    within,
+)
 from sceneprint.geometry.surface.cloud import mixed
 from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches, Sphere, Surface
 
@@ -238,58 +250,102 @@ def sampled(surface: Surface, stride: int) -> Floats32:
 UNKNOWN, AGREES, VIOLATES = 0, 1, 2
 
 
+#: What `_compare` leaves to `_sees_through`.
+_BEFORE = 3
+
+
+@disjoint_kernel
+def _compare(
+    source: Floats32, start: int, places: Ints32, count: int, points: Floats32, normals: Floats32,
+    camera: Floats, moved: Floats, pixels: Ints32, T: Floats, tolerances: Floats, said: Bytes,
+) -> None:  # fmt: skip
+    """What the pixel at each point says of it; `_BEFORE` where the point lies before its surface.
+
+    source (6, N), places : from `start` on; moved (4, n), pixels (2, n) : of those points, their
+    coordinates and depth, and where they are seen
+    """
+    on_surface, on_point, least_cosine = tolerances[0], tolerances[1], tolerances[2]
+    margin, reference, power = tolerances[3], tolerances[4], tolerances[6]
+    xx, xy, xz, yx, yy, yz = T[0, 0], T[0, 1], T[0, 2], T[1, 0], T[1, 1], T[1, 2]
+    zx, zy, zz = T[2, 0], T[2, 1], T[2, 2]
+    nxs, nys, nzs, width, kind = source[3], source[4], source[5], points.shape[1], camera[0]
+    shown, facing = points.reshape(-1), normals.reshape(-1)
+    for i in range(count):
+        at = np.uint64(pixels[1, i] * width + pixels[0, i]) * np.uint64(3)
+        a, b, c = shown[at], shown[at + np.uint64(1)], shown[at + np.uint64(2)]
+        mx, my, mz = facing[at], facing[at + np.uint64(1)], facing[at + np.uint64(2)]
+        seen, depth = depth_of(kind, a, b, c), moved[3, i]
+        dx, dy, dz = moved[0, i] - a, moved[1, i] - b, moved[2, i] - c
+        plane = abs(dx * mx + dy * my + dz * mz)
+        grow = grown(depth, reference, power)
+        own = np.uint64(start + places[i])
+        nx, ny, nz = nxs[own], nys[own], nzs[own]
+        cosine = (
+            (xx * nx + xy * ny + xz * nz) * mx
+            + (yx * nx + yy * ny + yz * nz) * my
+            + (zx * nx + zy * ny + zz * nz) * mz
+        )
+        gate = on_point * grow
+        agrees = (plane < on_surface * grow) & (cosine > least_cosine)
+        agrees = agrees & (dx * dx + dy * dy + dz * dz < gate * gate)
+        before = (depth - seen < -margin * grow) & (plane > margin * grow)
+        says = AGREES if agrees else (_BEFORE if before else UNKNOWN)
+        said[i] = says if seen > 0 else UNKNOWN
+
+
+@kernel
+def _sees_through(
+    points: Floats32, camera: Floats, u: int, v: int, depth: float, tolerances: Floats
+) -> bool:
+    """Whether a point before the surface of its pixel lies before those of the pixels about it
+    too: at an edge, a pixel near by may show the surface that the point is on.
+    """
+    height, width, edge = points.shape[0], points.shape[1], int(tolerances[5])
+    nearest = depth_at(camera, points, v, u)
+    for line in range(max(v - edge, 0), min(v + edge + 1, height)):
+        for column in range(u - edge, u + edge + 1):
+            beside = column
+            if column < 0 or column >= width:
+                if camera[0] == 0 or camera[6] == 0:
+                    continue
+                beside = column % width  # around the back of a closed sphere
+            there = depth_at(camera, points, line, beside)
+            if there > 0:
+                nearest = min(nearest, there)
+    margin: float = tolerances[3] * grown(depth, tolerances[4], tolerances[6])
+    return depth < nearest - margin
+
+
 @kernel
 def _look_up_seen(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
     tolerances: Floats, said: Bytes,
 ) -> None:  # fmt: skip
-    """What the maps of a target with a camera say of the source's points (N, 6) under T, (N,)."""
+    """What the maps of a target with a camera say of the source's points (6, N) under T, (N,)."""
     height, width = points.shape[0], points.shape[1]
-    on_surface, on_point, least_cosine = tolerances[0], tolerances[1], tolerances[2]
-    margin, reference, edge = tolerances[3], tolerances[4], int(tolerances[5])
-    for i in range(len(source)):
-        said[i] = UNKNOWN
-        px, py, pz = source[i, 0], source[i, 1], source[i, 2]
-        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        column, line, depth = project(camera, x, y, z)
-        if not (column >= 0 and line >= 0 and column < width and line < height):
-            continue
-        u, v = int(column), int(line)
-        seen = depth_at(camera, points, v, u)
-        if seen <= 0:
-            continue
-        dx, dy, dz = x - points[v, u, 0], y - points[v, u, 1], z - points[v, u, 2]
-        mx, my, mz = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
-        plane = abs(dx * mx + dy * my + dz * mz)
-        grow = grown(depth, reference, tolerances[6])
-        if plane < on_surface * grow:
-            nx, ny, nz = source[i, 3], source[i, 4], source[i, 5]
-            cosine = (
-                (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz) * mx
-                + (T[1, 0] * nx + T[1, 1] * ny + T[1, 2] * nz) * my
-                + (T[2, 0] * nx + T[2, 1] * ny + T[2, 2] * nz) * mz
-            )
-            gate = on_point * grow
-            if cosine > least_cosine and dx * dx + dy * dy + dz * dz < gate * gate:
-                said[i] = AGREES
-                continue
-        if depth - seen < -margin * grow and plane > margin * grow:
-            # at an edge, a pixel near by may show the surface that the point is on
-            nearest = seen
-            for line_ in range(max(v - edge, 0), min(v + edge + 1, height)):
-                for column_ in range(u - edge, u + edge + 1):
-                    beside = column_
-                    if column_ < 0 or column_ >= width:
-                        if camera[0] == 0 or camera[6] == 0:
-                            continue
-                        beside = column_ % width  # around the back of a closed sphere
-                    there = depth_at(camera, points, line_, beside)
-                    if there > 0:
-                        nearest = min(nearest, there)
-            if depth < nearest - margin * grow:
-                said[i] = VIOLATES
+    moved, seen, inside = np.empty((3, BLOCK)), np.empty((3, BLOCK)), np.empty((4, BLOCK))
+    places, pixels = np.empty(BLOCK, np.int32), np.empty((2, BLOCK), np.int32)
+    own = np.empty(BLOCK, np.uint8)
+    said[:] = UNKNOWN
+    for start in range(0, source.shape[1], BLOCK):
+        count = min(BLOCK, source.shape[1] - start)
+        move_all(source, T, start, count, moved)
+        project_all(camera, moved, count, seen)
+        count = within(seen, count, 0.0, width, 0.0, height, places)
+        gather(moved, places, count, inside)
+        gather(seen[2:], places, count, inside[3:])
+        gather_pixels(seen, places, count, pixels)
+        _compare(
+            source, start, places, count, points, normals, camera, inside, pixels, T, tolerances,
+            own,
+        )  # fmt: skip
+        for i in range(count):
+            says = own[i]
+            if says == _BEFORE:
+                u, v = pixels[0, i], pixels[1, i]
+                through = _sees_through(points, camera, u, v, inside[3, i], tolerances)
+                says = VIOLATES if through else UNKNOWN
+            said[start + places[i]] = says
 
 
 @kernel
@@ -326,7 +382,7 @@ def _look_up(
     if camera[0] == 2:
         _look_up_near(source, points, normals, camera, heads, chain, T, tolerances, said)
     else:
-        _look_up_seen(source, points, normals, camera, T, tolerances, said)
+        _look_up_seen(transposed(source, 1), points, normals, camera, T, tolerances, said)
 
 
 @kernel
@@ -339,10 +395,8 @@ def weigh_overlap(
     _look_up(source, points, normals, camera, heads, chain, T, tolerances, said)
     inliers, violations = 0.0, 0.0
     for i in range(len(source)):
-        if said[i] == AGREES:
-            inliers += weights[i]
-        elif said[i] == VIOLATES:
-            violations += weights[i]
+        inliers += weights[i] if said[i] == AGREES else 0.0
+        violations += weights[i] if said[i] == VIOLATES else 0.0
     return inliers, violations
 
 

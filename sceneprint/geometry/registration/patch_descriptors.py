@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.types import Bytes, Floats, Floats32, Ints32, Patches
 
 #: Bins of the two angles, the same at every scale.
@@ -78,59 +79,128 @@ class Compression:
 RANGE = 0.25
 
 
+@disjoint_kernel
+def _squares(x: Floats, y: Floats, z: Floats, i: int, out: Floats) -> None:
+    """Squared distances of patch i from all."""
+    ix, iy, iz = x[i], y[i], z[i]
+    for j in range(len(out)):
+        dx, dy, dz = x[j] - ix, y[j] - iy, z[j] - iz
+        out[j] = dx * dx + dy * dy + dz * dz
+
+
+@disjoint_kernel
+def _nearer(squares: Floats, count: int, but: int, limit: float, places: Ints32) -> int:
+    """Indices of squared distances below a limit, but for one; how many."""
+    found = 0
+    for j in range(count):
+        places[found] = j
+        found += 1 if (squares[j] < limit) & (j != but) else 0
+    return found
+
+
+@disjoint_kernel
+def _lie(
+    points: Floats, normals: Floats, areas: Floats, squares: Floats, i: int, places: Ints32,
+    count: int, angles: int, lies: Floats, bins: Ints32,
+) -> None:  # fmt: skip
+    """How other patches lie about patch i.
+
+    lies (6, n): squared distance, distance in the plane, height, share of the upper bin of either
+    angle, and area. bins (4, n): of both angles, the upper one of the second changing first.
+    """
+    x, y, z, nx, ny, nz = points[0], points[1], points[2], normals[0], normals[1], normals[2]
+    ix, iy, iz, ax, ay, az = x[i], y[i], z[i], nx[i], ny[i], nz[i]
+    for k in range(count):
+        j = np.uint64(places[k])
+        dx, dy, dz = x[j] - ix, y[j] - iy, z[j] - iz
+        bx, by, bz = nx[j], ny[j], nz[j]
+        height = dx * ax + dy * ay + dz * az
+        cosine = ax * bx + ay * by + az * bz
+        flat = np.sqrt(max(squares[j] - height * height, 0.0))
+        # of the other normal, along the direction in the plane
+        radial = (bx * dx + by * dy + bz * dz - height * cosine) / flat
+        radial = radial if flat > 1e-3 else 0.0
+        e = min(max((cosine + 1.0) * 0.5, 0.0), 1.0) * angles - 0.5
+        g = min(max((radial + 1.0) * 0.5, 0.0), 1.0) * angles - 0.5
+        ie: Any = np.int32(np.floor(e))
+        ig: Any = np.int32(np.floor(g))
+        lies[0, k], lies[1, k], lies[2, k] = squares[j], flat, height
+        lies[3, k], lies[4, k], lies[5, k] = e - ie, g - ig, areas[j]
+        e0, e1 = max(ie, 0) * angles, min(ie + 1, angles - 1) * angles
+        g0, g1 = max(ig, 0), min(ig + 1, angles - 1)
+        bins[0, k], bins[1, k], bins[2, k], bins[3, k] = e0 + g0, e0 + g1, e1 + g0, e1 + g1
+
+
+@disjoint_kernel
+def _spread(
+    lies: Floats, places: Ints32, count: int, radius: float, n_flat: int, n_high: int,
+    n_angles: int, weights: Floats, starts: Ints32,
+) -> None:  # fmt: skip
+    """Weights (4, n) of patches in the bins of distance and height at a scale, and where these
+    start.
+    """
+    flat, height, area = lies[1], lies[2], lies[5]
+    for k in range(count):
+        i = np.uint64(places[k])
+        a = flat[i] / radius * n_flat - 0.5
+        b = (height[i] / radius + 1.0) * 0.5 * n_high - 0.5
+        ia: Any = np.int32(np.floor(a))
+        ib: Any = np.int32(np.floor(b))
+        fa, fb = a - ia, b - ib
+        a0, a1 = min(max(ia, 0), n_flat - 1), min(max(ia + 1, 0), n_flat - 1)
+        b0, b1 = min(max(ib, 0), n_high - 1), min(max(ib + 1, 0), n_high - 1)
+        w0, w1 = area[i] * (1.0 - fa), area[i] * fa
+        weights[0, k], weights[1, k] = w0 * (1.0 - fb), w0 * fb
+        weights[2, k], weights[3, k] = w1 * (1.0 - fb), w1 * fb
+        starts[0, k], starts[1, k] = (a0 * n_high + b0) * n_angles, (a0 * n_high + b1) * n_angles
+        starts[2, k], starts[3, k] = (a1 * n_high + b0) * n_angles, (a1 * n_high + b1) * n_angles
+
+
+@disjoint_kernel
+def _add(
+    lies: Floats, bins: Ints32, places: Ints32, count: int, weights: Floats, starts: Ints32,
+    histogram: Floats32,
+) -> None:  # fmt: skip
+    """The sixteen shares of each patch, one patch after the other."""
+    for k in range(count):
+        i = np.uint64(places[k])
+        fe, fg = lies[3, i], lies[4, i]
+        for c in range(4):
+            low, high = weights[c, k] * (1.0 - fe), weights[c, k] * fe
+            start = starts[c, k]
+            histogram[np.uint64(start + bins[0, i])] += low * (1.0 - fg)
+            histogram[np.uint64(start + bins[1, i])] += low * fg
+            histogram[np.uint64(start + bins[2, i])] += high * (1.0 - fg)
+            histogram[np.uint64(start + bins[3, i])] += high * fg
+
+
 @kernel
 def _accumulate(
-    means: Floats, normals: Floats, areas: Floats, scales: Floats, angles: int, out: Floats32
+    points: Floats, normals: Floats, areas: Floats, scales: Floats, angles: int, out: Floats32
 ) -> None:
-    """Each pair's area into the sixteen bins about it, at each scale that reaches it."""
-    count = len(means)
+    """Each pair's area into the sixteen bins about it, at each scale that reaches it.
+
+    points, normals : (3, P)
+    """
+    count, n_angles = len(areas), angles * angles
     reach = 0.0
     for s in range(len(scales)):
         reach = max(reach, scales[s, 0])
+    squares, lies, weights = np.empty(count), np.empty((6, count)), np.empty((4, count))
+    within, near = np.empty(count, np.int32), np.empty(count, np.int32)
+    bins, starts = np.empty((4, count), np.int32), np.empty((4, count), np.int32)
     for i in range(count):
-        for j in range(count):
-            if i == j:
-                continue
-            dx, dy, dz = (
-                means[j, 0] - means[i, 0], means[j, 1] - means[i, 1], means[j, 2] - means[i, 2]
-            )  # fmt: skip
-            square = dx * dx + dy * dy + dz * dz
-            if square >= reach * reach:
-                continue
-            ax, ay, az = normals[i, 0], normals[i, 1], normals[i, 2]
-            bx, by, bz = normals[j, 0], normals[j, 1], normals[j, 2]
-            height = dx * ax + dy * ay + dz * az
-            cosine = ax * bx + ay * by + az * bz
-            flat = np.sqrt(max(square - height * height, 0.0))
-            radial = 0.0  # of the other normal, along the direction in the plane
-            if flat > 1e-3:
-                radial = (bx * dx + by * dy + bz * dz - height * cosine) / flat
-            e = min(max((cosine + 1.0) * 0.5, 0.0), 1.0) * angles - 0.5
-            g = min(max((radial + 1.0) * 0.5, 0.0), 1.0) * angles - 0.5
-            ie, ig = int(np.floor(e)), int(np.floor(g))
-            fe, fg = e - ie, g - ig
-            e0, e1 = max(ie, 0), min(ie + 1, angles - 1)
-            g0, g1 = max(ig, 0), min(ig + 1, angles - 1)
-            start = 0
-            for s in range(len(scales)):
-                radius, n_flat, n_high = scales[s, 0], int(scales[s, 1]), int(scales[s, 2])
-                if square < radius * radius:
-                    a = flat / radius * n_flat - 0.5
-                    b = (height / radius + 1.0) * 0.5 * n_high - 0.5
-                    ia, ib = int(np.floor(a)), int(np.floor(b))
-                    fa, fb = a - ia, b - ib
-                    for da in range(2):
-                        xa = min(max(ia + da, 0), n_flat - 1)
-                        wa = areas[j] * (fa if da else 1.0 - fa)
-                        for db in range(2):
-                            xb = min(max(ib + db, 0), n_high - 1)
-                            w = wa * (fb if db else 1.0 - fb)
-                            base = start + (xa * n_high + xb) * angles * angles
-                            out[i, base + e0 * angles + g0] += w * (1.0 - fe) * (1.0 - fg)
-                            out[i, base + e0 * angles + g1] += w * (1.0 - fe) * fg
-                            out[i, base + e1 * angles + g0] += w * fe * (1.0 - fg)
-                            out[i, base + e1 * angles + g1] += w * fe * fg
-                start += n_flat * n_high * angles * angles
+        _squares(points[0], points[1], points[2], i, squares)
+        reached = _nearer(squares, count, i, reach * reach, within)
+        _lie(points, normals, areas, squares, i, within, reached, angles, lies, bins)
+        start = 0
+        for s in range(len(scales)):
+            radius, n_flat, n_high = scales[s, 0], int(scales[s, 1]), int(scales[s, 2])
+            found = _nearer(lies[0], reached, -1, radius * radius, near)
+            _spread(lies, near, found, radius, n_flat, n_high, n_angles, weights, starts)
+            end = start + n_flat * n_high * n_angles
+            _add(lies, bins, near, found, weights, starts, out[i, start:end])
+            start = end
 
 
 @kernel
@@ -163,7 +233,8 @@ def patch_descriptors(patches: Patches, p: PatchDescriptorParameters) -> Floats3
     (P, D) float32, each row of length 1 where there is a patch within the nearest reach
     """
     out = np.zeros((len(patches), p.dimension), np.float32)
-    _accumulate(patches.means, patches.normals, patches.areas, p.scales, ANGLES, out)
+    points, normals = (np.ascontiguousarray(x.T) for x in (patches.means, patches.normals))
+    _accumulate(points, normals, patches.areas, p.scales, ANGLES, out)
     _normalise(p.scales, ANGLES, out)
     return out
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.kernel import cached_at, kernel
+from sceneprint.geometry.kernel import cached_at, disjoint_kernel, kernel
 from sceneprint.geometry.signature.mixture import Mixture
 from sceneprint.geometry.signature.pair_features import (
     FEATURE_DIMENSION,
@@ -230,92 +230,85 @@ def part(
 # Patches (P)  --count_pairs-->  PairCounts (B bins)
 #
 # All pairs are used: a sample of them would make the signature of one frame differ from itself
-# (docs/paper.md, R11). The inner loops run over all later patches at once and write one array
-# each, which is what lets the compiler work on eight numbers at a time.
+# (docs/paper.md, R11). The inner loops run over all later patches, which lets the compiler work on
+# several at a time.
 
 
-@kernel
-def _lengths(x: Floats, y: Floats, z: Floats, i: int, d: Floats) -> None:
-    ix, iy, iz = x[i], y[i], z[i]
-    for j in range(i + 1, len(d)):
-        rx, ry, rz = x[j] - ix, y[j] - iy, z[j] - iz
-        d[j] = np.sqrt(rx * rx + ry * ry + rz * rz)
-
-
-@kernel
-def _inverses(d: Floats, i: int, inverse: Floats) -> None:
-    for j in range(i + 1, len(d)):
-        inverse[j] = 1.0 / (d[j] + 1e-300)  # pairs in one place are left out by their distance
-
-
-@kernel
-def _projections(points: Floats, normals: Floats, i: int, inverse: Floats, i_u: Floats) -> None:
-    """n_i . u, with u from patch i to patch j."""
-    x, y, z = points[0], points[1], points[2]
-    ix, iy, iz = x[i], y[i], z[i]
-    ax, ay, az = normals[0, i], normals[1, i], normals[2, i]
-    for j in range(i + 1, len(i_u)):
-        along = (x[j] - ix) * ax + (y[j] - iy) * ay + (z[j] - iz) * az
-        i_u[j] = along * inverse[j]
-
-
-@kernel
-def _other_projections(
-    points: Floats, normals: Floats, i: int, inverse: Floats, j_u: Floats
+@disjoint_kernel
+def _invariants(
+    points: Floats, normals: Floats, i: int, d: Floats, i_u: Floats, j_u: Floats, turn: Floats
 ) -> None:
-    """n_j . u, with u from patch i to patch j."""
-    x, y, z = points[0], points[1], points[2]
-    nx, ny, nz = normals[0], normals[1], normals[2]
-    ix, iy, iz = x[i], y[i], z[i]
-    for j in range(i + 1, len(j_u)):
-        along = (x[j] - ix) * nx[j] + (y[j] - iy) * ny[j] + (z[j] - iz) * nz[j]
-        j_u[j] = along * inverse[j]
-
-
-@kernel
-def _sines(points: Floats, normals: Floats, i: int, inverse: Floats, sine: Floats) -> None:
-    """u . (n_i x n_j): sine part of the dihedral angle about u, from n_i to n_j."""
-    x, y, z = points[0], points[1], points[2]
-    nx, ny, nz = normals[0], normals[1], normals[2]
-    ix, iy, iz = x[i], y[i], z[i]
-    ax, ay, az = nx[i], ny[i], nz[i]
-    for j in range(i + 1, len(sine)):
+    """Of patch i and each later one, with u from i to j: their distance, n_i . u, n_j . u, and the
+    diamond angle, as `_diamond`, of the dihedral angle about u from n_i to n_j.
+    """
+    x, y, z, nx, ny, nz = points[0], points[1], points[2], normals[0], normals[1], normals[2]
+    ix, iy, iz, ax, ay, az = x[i], y[i], z[i], nx[i], ny[i], nz[i]
+    for j in range(i + 1, len(d)):
         rx, ry, rz = x[j] - ix, y[j] - iy, z[j] - iz
+        length = np.sqrt(rx * rx + ry * ry + rz * rz)
+        inverse = 1.0 / (length + 1e-300)  # pairs in one place are left out by their distance
+        along_i = (rx * ax + ry * ay + rz * az) * inverse
+        along_j = (rx * nx[j] + ry * ny[j] + rz * nz[j]) * inverse
         cx, cy, cz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
-        sine[j] = (cx * nx[j] + cy * ny[j] + cz * nz[j]) * inverse[j]
+        sine = (cx * nx[j] + cy * ny[j] + cz * nz[j]) * inverse
+        cosine = ax * nx[j] + ay * ny[j] + az * nz[j] - along_i * along_j
+        t = sine / (abs(cosine) + abs(sine) + 1e-300)
+        right = 4.0 + t if sine < 0.0 else t
+        turn[j] = 2.0 - t if cosine < 0.0 else right
+        d[j], i_u[j], j_u[j] = length, along_i, along_j
 
 
-@kernel
-def _cosines(normals: Floats, i: int, i_u: Floats, j_u: Floats, cosine: Floats) -> None:
-    """n_i . n_j less what both have along u: cosine part of the dihedral angle."""
-    nx, ny, nz = normals[0], normals[1], normals[2]
-    ax, ay, az = nx[i], ny[i], nz[i]
-    for j in range(i + 1, len(cosine)):
-        cosine[j] = ax * nx[j] + ay * ny[j] + az * nz[j] - i_u[j] * j_u[j]
+@disjoint_kernel
+def _bin(value: float, edges: Floats, hints: Ints32, origin: float, per_unit: float) -> int:
+    """Index of the first edge above a value. Cells of hints are narrower than bins."""
+    cell = min(max((value - origin) * per_unit, 0.0), len(hints) - 1.0)
+    b = hints[np.uint64(np.int32(cell))]
+    found: int = b + 1 if value >= edges[np.uint64(b)] else b
+    return found
 
 
-@kernel
-def _turns(cosine: Floats, sine: Floats, i: int, turn: Floats) -> None:
-    """Diamond angle of the dihedral angle, as `_diamond`."""
-    for j in range(i + 1, len(turn)):
-        t = sine[j] / (abs(cosine[j]) + abs(sine[j]) + 1e-300)
-        turn[j] = 2.0 - t if cosine[j] < 0.0 else (4.0 + t if sine[j] < 0.0 else t)
-
-
-@kernel
-def _bins(
-    values: Floats, sign: float, edges: Floats, hints: Ints32, origin: float, extent: float,
-    i: int, bins: Ints32,
+@disjoint_kernel
+def _pair_bins(
+    d: Floats, i_u: Floats, j_u: Floats, turn: Floats, i: int, radius: float, colinearity: float,
+    distance: Floats, angle: Floats, dihedral: Floats, of_distance: Ints32, of_angle: Ints32,
+    of_dihedral: Ints32, n_angles: int, n_dihedrals: int, there: Ints32, back: Ints32,
 ) -> None:  # fmt: skip
-    """Index of the first edge above sign * value. Cells of hints are narrower than bins."""
-    last, per_unit = len(hints) - 1, len(hints) / extent
-    for j in range(i + 1, len(values)):
-        value = sign * values[j]
-        cell = min(max(int((value - origin) * per_unit), 0), last)
-        b = hints[cell]
-        if value >= edges[b]:
-            b += 1
-        bins[j] = b
+    """Bins of the pairs (i, j) and (j, i); -1 of a pair that is none."""
+    per_metre, per_cosine = len(of_distance) / radius, len(of_angle) / 2.0
+    per_turn = len(of_dihedral) / 4.0
+    for j in range(i + 1, len(d)):
+        row = _bin(d[j], distance, of_distance, 0.0, per_metre)
+        mu = _bin(-i_u[j], angle, of_angle, -1.0, per_cosine)
+        alpha = _bin(-j_u[j], angle, of_angle, -1.0, per_cosine)
+        phi = _bin(turn[j], dihedral, of_dihedral, 0.0, per_turn)
+        last = phi if phi < n_dihedrals else 0
+        near = (d[j] < radius) & (d[j] > 0.0)
+        # (i, j): angles of n_i and n_j to u
+        bin_ij = ((row * n_angles + mu) * n_angles + alpha) * n_dihedrals + last
+        there[j] = np.int32(bin_ij if near & (abs(i_u[j]) <= colinearity) else -1)
+        # (j, i): u turns round, the normals change places
+        mu, alpha = n_angles - 1 - alpha, n_angles - 1 - mu
+        bin_ji = ((row * n_angles + mu) * n_angles + alpha) * n_dihedrals + last
+        back[j] = np.int32(bin_ji if near & (abs(j_u[j]) <= colinearity) else -1)
+
+
+@disjoint_kernel
+def _add(
+    there: Ints32, back: Ints32, i: int, weights: Floats32, counts: Floats32, total: float
+) -> tuple[int, float]:
+    """Add the weights of pairs to their bins: number of pairs, and `total` with their weights."""
+    found, own = 0, weights[i]
+    for j in range(i + 1, len(there)):
+        weight = own * weights[j]
+        if there[j] >= 0:
+            counts[np.uint64(there[j])] += weight
+            total += weight
+            found += 1
+        if back[j] >= 0:
+            counts[np.uint64(back[j])] += weight
+            total += weight
+            found += 1
+    return found, total
 
 
 @kernel
@@ -326,39 +319,17 @@ def _count(
 ) -> tuple[int, float]:  # fmt: skip
     """Add the weight of both orders of every pair; returns number and weight of all."""
     n = points.shape[1]
-    d, inverse, i_u, j_u = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    sine, cosine, turn = np.empty(n), np.empty(n), np.empty(n)
-    row, mu = np.empty(n, np.int32), np.empty(n, np.int32)
-    alpha, phi = np.empty(n, np.int32), np.empty(n, np.int32)
+    d, i_u, j_u, turn = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    there, back = np.empty(n, np.int32), np.empty(n, np.int32)
     n_pairs, total = 0, 0.0
     for i in range(n):
-        _lengths(points[0], points[1], points[2], i, d)
-        _inverses(d, i, inverse)
-        _projections(points, normals, i, inverse, i_u)
-        _other_projections(points, normals, i, inverse, j_u)
-        _sines(points, normals, i, inverse, sine)
-        _cosines(normals, i, i_u, j_u, cosine)
-        _turns(cosine, sine, i, turn)
-        _bins(d, 1.0, distance, hints[0], 0.0, radius, i, row)
-        _bins(i_u, -1.0, angle, hints[1], -1.0, 2.0, i, mu)
-        _bins(j_u, -1.0, angle, hints[1], -1.0, 2.0, i, alpha)
-        _bins(turn, 1.0, dihedral, hints[2], 0.0, 4.0, i, phi)
-        for j in range(i + 1, n):
-            if d[j] >= radius or d[j] <= 0.0:
-                continue
-            last = phi[j] if phi[j] < n_dihedrals else 0
-            weight = weights[i] * weights[j]
-            if abs(i_u[j]) <= colinearity:  # (i, j): angles of n_i and n_j to u
-                bin_ij = (row[j] * n_angles + mu[j]) * n_angles + alpha[j]
-                counts[bin_ij * n_dihedrals + last] += weight
-                total += weight
-                n_pairs += 1
-            if abs(j_u[j]) <= colinearity:  # (j, i): u turns round, the normals change places
-                other_mu, other_alpha = n_angles - 1 - alpha[j], n_angles - 1 - mu[j]
-                bin_ji = (row[j] * n_angles + other_mu) * n_angles + other_alpha
-                counts[bin_ji * n_dihedrals + last] += weight
-                total += weight
-                n_pairs += 1
+        _invariants(points, normals, i, d, i_u, j_u, turn)
+        _pair_bins(
+            d, i_u, j_u, turn, i, radius, colinearity, distance, angle, dihedral,
+            hints[0], hints[1], hints[2], n_angles, n_dihedrals, there, back,
+        )  # fmt: skip
+        found, total = _add(there, back, i, weights, counts, total)
+        n_pairs += found
     return n_pairs, total
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.types import Floats, Floats32, Hierarchy, Intrinsics, Ints32, Patches, Surface
 
 
@@ -233,10 +233,10 @@ class HierarchyParameters:
     normal_weight: float = 3.0  #: of 1 - cos(normals), beside squared patch diameters
 
 
-@kernel
+@disjoint_kernel
 def _nearer(
     patches: Floats, centre: Floats, scale: float, weight: float, c: int,
-    distance: Floats, nearest: Floats, labels: Ints32,
+    nearest: Floats, labels: Ints32,
 ) -> None:  # fmt: skip
     """Move to cluster `c` all patches that are nearer to its centre than to their own."""
     x, y, z, nx, ny, nz = (
@@ -245,11 +245,9 @@ def _nearer(
     for k in range(len(labels)):
         dx, dy, dz = x[k] - centre[0], y[k] - centre[1], z[k] - centre[2]
         cosine = nx[k] * centre[3] + ny[k] * centre[4] + nz[k] * centre[5]
-        distance[k] = (dx * dx + dy * dy + dz * dz) * scale + weight * (1.0 - cosine)
-    for k in range(len(labels)):
-        labels[k] = c if distance[k] < nearest[k] else labels[k]
-    for k in range(len(labels)):
-        nearest[k] = min(distance[k], nearest[k])
+        distance = (dx * dx + dy * dy + dz * dz) * scale + weight * (1.0 - cosine)
+        labels[k] = np.int32(c) if distance < nearest[k] else labels[k]
+        nearest[k] = min(distance, nearest[k])
 
 
 @kernel
@@ -259,12 +257,12 @@ def _k_means(
     """Labels of (6, P) positions and normals; clusters that end empty are numbered still."""
     n = patches.shape[1]
     centres = np.empty((n_clusters, 6))
-    distance, nearest = np.empty(n), np.full(n, np.inf)
+    nearest = np.full(n, np.inf)
     labels = np.zeros(n, np.int32)
     chosen = int(np.argmax(areas))
     for c in range(n_clusters):  # farthest-point sampling
         centres[c] = patches[:, chosen]
-        _nearer(patches, centres[c], scale, weight, c, distance, nearest, labels)
+        _nearer(patches, centres[c], scale, weight, c, nearest, labels)
         chosen = int(np.argmax(nearest))
     for _ in range(iterations):
         sums = np.zeros((n_clusters, 7))
@@ -280,7 +278,7 @@ def _k_means(
                     centres[c, d] = sums[c, d] / sums[c, 6]
                     if length > 1e-9:
                         centres[c, 3 + d] = sums[c, 3 + d] / length
-            _nearer(patches, centres[c], scale, weight, c, distance, nearest, labels)
+            _nearer(patches, centres[c], scale, weight, c, nearest, labels)
     return labels
 
 
