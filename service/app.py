@@ -36,7 +36,7 @@ from sceneprint_client.api.reconstructions import NewReconstruction
 from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.selections import FramesEdit, FrameSelection, RestoreOptions
 from sceneprint_client.api.sessions import NewAssociation
-from service import dashboard, problems
+from service import api_docs, dashboard, problems
 from service.browser_security import origins_of
 from service.context import Context, Gate
 from service.event_stream import Feed
@@ -188,10 +188,11 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
     # lead whoever follows it, with a key, to where Host says, and behind a proxy away from TLS
     app = FastAPI(
         title="sceneprint", version=__version__, description=DESCRIPTION, lifespan=lifespan,
-        redirect_slashes=False,
+        redirect_slashes=False, docs_url=None, redoc_url=None,
     )  # fmt: skip
     for router in (*ROUTERS, admin.router):  # as they are: `include_router` would make each anew
         app.router.routes.extend(router.routes)
+    app.include_router(api_docs.routes())
     app.include_router(dashboard.routes(dashboard.files_in(dashboard.PAGES)))
     problems.install(app)
     app.add_middleware(

@@ -21,28 +21,19 @@ _ALWAYS: Headers = [
 ]
 #: An answer is data: were it ever shown as a page, it could load and run nothing.
 _NOTHING = b"default-src 'none'; frame-ancestors 'none'"
-#: The pages of the documentation load Swagger UI and ReDoc from where FastAPI has them.
-_DOCS = (
-    b"default-src 'none'; script-src https://cdn.jsdelivr.net 'unsafe-inline'; "
-    b"style-src https://cdn.jsdelivr.net https://fonts.googleapis.com 'unsafe-inline'; "
-    b"font-src https://fonts.gstatic.com; img-src https: data:; worker-src blob:; "
-    b"connect-src 'self'; frame-ancestors 'none'"
-)
-_DOC_PATHS = ("/docs", "/docs/oauth2-redirect", "/redoc")
 
 
-def security_headers(path: str, given: Headers) -> Headers:
+def security_headers(given: Headers) -> Headers:
     """Headers that an answer needs and has not.
 
     Parameters
     ----------
-    path : that was asked for
     given : headers that the answer has
     """
     there = {name.lower() for name, _ in given}
     wanted = [
         *_ALWAYS,
-        (b"content-security-policy", _DOCS if path in _DOC_PATHS else _NOTHING),
+        (b"content-security-policy", _NOTHING),
         (b"cache-control", b"no-store"),  # maps change, and answers are not for all
     ]
     return [(name, value) for name, value in wanted if name not in there]

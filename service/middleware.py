@@ -94,7 +94,7 @@ class RequestMiddleware:
                     *own,
                     *([] if standing is None else standing.headers()),
                 ]
-                message["headers"] = said + security_headers(scope["path"], said)
+                message["headers"] = said + security_headers(said)
                 await note(scope, status, said)
             await send(message)
 

@@ -164,7 +164,7 @@ def install(app: FastAPI) -> None:
         # `RequestMiddleware` does not see this one
         for name, value in getattr(request.state, "headers", ()):
             answer.headers[name.decode()] = value.decode()
-        for name, value in security_headers(request.url.path, answer.raw_headers):
+        for name, value in security_headers(answer.raw_headers):
             answer.headers[name.decode()] = value.decode()
         answer.headers["Connection"] = "close"  # as uvicorn does, unsaid, after an exception
         return answer

@@ -96,6 +96,6 @@ async def _answer(scope: Scope, send: Send) -> None:
         (b"content-type", b"application/json"),
         (b"x-request-id", uuid.uuid4().hex.encode()),
     ]
-    headers += security_headers("/healthz", headers)
+    headers += security_headers(headers)
     await send({"type": "http.response.start", "status": 200, "headers": headers})
     await send({"type": "http.response.body", "body": body if scope["method"] == "GET" else b""})

@@ -233,3 +233,10 @@ def test_nothing_is_wider_than_a_small_screen(
         page.set_viewport_size({"width": width, "height": 900})
         assert page.evaluate("() => document.documentElement.scrollWidth") <= width
         assert page.evaluate(small) == []
+
+
+def test_the_api_s_page_draws_every_operation_with_its_own_files(page: Page, station: Any) -> None:
+    told = station.client.get("/openapi.json").json()
+    operations = sum(len(one) for one in told["paths"].values())
+    page.goto(station.home.replace("/dashboard", "/docs"))
+    expect(page.locator(".opblock")).to_have_count(operations)
