@@ -32,7 +32,7 @@ from sceneprint.engine.search.verification import (
     nearest_first,
     placed,
     prior_of,
-    rivals,
+    validate_elsewhere,
     validated,
     wanted_of,
 )
@@ -176,7 +176,7 @@ def _with_rivals(
     """The last frame, with frames validated that look like it elsewhere."""
     if last.asked.geometry is None:
         return last
-    more = rivals(
+    more = validate_elsewhere(
         store, last.searched, last.tried, estimate, last.asked.geometry, query, deadline, p,
         last.asked.up,
     )  # fmt: skip

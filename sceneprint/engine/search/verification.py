@@ -163,7 +163,7 @@ def validated(
     return Validated(chosen, matches, unreadable, untried, late, opened)
 
 
-def rivals(
+def validate_elsewhere(
     store: Store, searched: Searched, tried: Validated, estimate: PoseEstimate | None,
     geometry: Geometry, query: Query, deadline: Deadline, p: ValidationParameters,
     up: Floats | None,
