@@ -230,7 +230,7 @@ def _views(
     for tab in ("jobs", "events", "keys", "audit", "snapshots"):
         yield View(tab, f"#/operations?tab={tab}")
     yield View("new-map", "#/", press=("New map",))
-    yield View("new-key", "#/operations?tab=keys", press=("Make a key",))
+    yield View("new-key", "#/operations?tab=keys", press=("Create a key",))
     yield View("job-dead", f"#/operations/jobs/{dead}")
     yield View("key", "#/", headers=ELSEWHERE)
     yield View("key-too-little", "#/operations?tab=keys", headers=ELSEWHERE, key=key)

@@ -127,6 +127,7 @@ def test_what_waits_and_who_works(make_engine, uploads):
     assert engine.operations.statistics.tell(1).workers == []
 
 
+@pytest.mark.sqlite_only("reads the size of its file")
 def test_indexes_and_sizes_are_told(data, make_engine):
     engine = make_engine(data)
     indexed = engine.get_map("hall").frames["indexed"]

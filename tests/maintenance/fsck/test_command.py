@@ -70,6 +70,7 @@ def test_it_says_what_it_would_do_and_what_it_did(
     assert fsck("--map", "hall", expect=0).splitlines()[-1] == "no problems found"
 
 
+@pytest.mark.sqlite_only("PostgreSQL holds no such row")
 def test_what_cannot_be_checked_or_repaired_has_its_own_code(
     house: Any, fsck: Callable[..., str]
 ) -> None:

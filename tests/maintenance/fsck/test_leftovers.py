@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from sceneprint.engine import Engine
 
 DIGEST = "ab" * 32
@@ -21,6 +23,7 @@ def kinds(outcomes: Any) -> list[tuple[str, str, bool]]:
     return sorted((one.finding.kind, Path(one.finding.what).name, one.left) for one in outcomes)
 
 
+@pytest.mark.sqlite_only("compares every file of the data folder")
 def test_old_leftovers_are_removed_and_young_ones_are_not(house: Any) -> None:
     """A young one may be an upload between its blob and its commit."""
     blobs, index = house.data / "blobs", next((house.data / "index").glob("hall*"))

@@ -49,6 +49,7 @@ def names(store: Store, job_id: str) -> list[str]:
         return list(files_of(connection, find_job(connection, job_id).number))
 
 
+@pytest.mark.sqlite_only("restores to a database of its own in the folder")
 def test_sound_files_of_jobs_are_no_finding_and_belong_to_a_snapshot(settings, made, tmp_path):
     assert list(fsck(settings, grace_s=0)) == []
     take_snapshot(settings, tmp_path / "all.tar")
@@ -146,6 +147,7 @@ def kept(settings: Settings) -> tuple[str, str, str]:
     return new.id, blob, deletion.deletion_id
 
 
+@pytest.mark.sqlite_only("restores to a database of its own in the folder")
 def test_a_snapshot_has_kept_answers_and_what_can_be_restored(settings, kept, tmp_path):
     assert list(fsck(settings, grace_s=0)) == []
     take_snapshot(settings, tmp_path / "all.tar")

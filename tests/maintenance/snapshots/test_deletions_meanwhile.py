@@ -5,11 +5,14 @@ from __future__ import annotations
 import threading
 import time
 
+import pytest
+
 from sceneprint.engine import Engine
 from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.maintenance.snapshot.restoration import verify_snapshot
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_what_is_deleted_meanwhile_is_in_it(data, tmp_path, settings, rows):
     """All frames go as soon as the database was copied, and no blob has been."""
     with Engine(settings(data)) as engine:
