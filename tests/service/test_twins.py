@@ -100,6 +100,11 @@ def live(one: Twin, small_model: Any) -> None:
         assert measured.status_code == 202, measured.text
         one.ids["coverage"] = measured.json()["coverage_id"]
         one.disturb()
+    body = {"before": "run", "after": "run-2"}
+    compared = one.ask("boss", "POST", f"{path}/differences", json=body)
+    assert compared.status_code == 202, compared.text
+    one.ids["difference"] = compared.json()["difference_id"]
+    one.disturb()
     built = one.ask("boss", "POST", f"{path}/surface")
     assert built.status_code == 202, built.text
     one.disturb()
