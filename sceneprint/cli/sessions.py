@@ -1,4 +1,4 @@
-"""`sceneprint sessions`, `associate`, `difference`, `reconstruct`: runs, and what is made of them."""
+"""`sceneprint sessions`, `associate`, `difference`, `reconstruct`: runs, and what comes of them."""
 
 from __future__ import annotations
 

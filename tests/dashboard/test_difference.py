@@ -57,9 +57,7 @@ def test_two_sessions_are_compared_and_seen_side_by_side(
         button.click()
         expect(button).to_have_attribute("aria-pressed", "true")
         for kind in kinds:
-            expect(legend.locator(f"[data-kind={kind}]")).to_contain_text(
-                f"{result[kind]:,} cells"
-            )
+            expect(legend.locator(f"[data-kind={kind}]")).to_contain_text(f"{result[kind]:,} cells")
         expect(legend.locator("li")).to_have_count(len(kinds))
         drawn = """kinds => { const { viewer } = document.querySelector(".overlay-canvas");
             return kinds.filter((kind) => viewer.layer(kind)?.visible)

@@ -249,7 +249,9 @@ def there(walled, small_shots, until) -> dict[str, There]:
         surface = f"/v1/maps/{name}/surface"
         until(lambda at=surface: walled.ask("boss", "GET", at).json()["state"] == "ready")
         tiles = walled.ask("boss", "GET", f"{surface}/tiles").json()["items"]
-        jobs = [one.headers["location"].rpartition("/")[2] for one in (begun, fused, measured, compared)]
+        jobs = [
+            one.headers["location"].rpartition("/")[2] for one in (begun, fused, measured, compared)
+        ]
         found[name] = There(
             name, frame, query, sent[0]["job_id"], *jobs, tiles[0]["digest"], session
         )
@@ -437,7 +439,7 @@ def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
 def unseen(walled: Any, method: str, path: str, id_: str) -> None:
     """See that an id is to the key as one that nothing has."""
     answers = [
-        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"------"))
+        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"-------"))
         for one in (id_, NO_ID)
     ]
     assert told(*answers[0]) == told(*answers[1])

@@ -311,8 +311,8 @@ class Job(ApiRecord):
     job_id: str
     kind: str = Field(
         description="`sign`, `import`, `associate`, `coverage`, `difference`, `surface`, "
-        "`reconstruct`, `snapshot`, or `reencode`: that one signs an indexed frame once more, with the model to "
-        "come or as what was made of it is damaged."
+        "`reconstruct`, `snapshot`, or `reencode`: that one signs an indexed frame once more, with "
+        "the model to come or as what was made of it is damaged."
     )
     state: JobState
     map: str | None = Field(description="That it is about; null for `snapshot`.")

@@ -1,9 +1,9 @@
 """No byte of a deleted frame is left, some time after it was deleted: what deleting it left behind.
 
 A deletion takes the frame out of all searches at once, and its rows and blobs when it can no longer
-be undone. Left are then blobs of a process that died half way,
-surfaces and answers that the frame is part of, this node's indexes and what readers hold of it, and
-pages and log of SQLite. On PostgreSQL dead rows are VACUUM's.
+be undone. Left are then blobs of a process that died half way, surfaces, differences and answers
+that the frame is part of, this node's indexes and what readers hold of it, and pages and log of
+SQLite. On PostgreSQL dead rows are VACUUM's.
 """
 
 from __future__ import annotations
