@@ -1,6 +1,7 @@
 """Two sessions of a map compared: jobs begun, listed, done in slices, read and removed.
 
-    frames of both sessions  --fuse-->  cells of each  --judge-->  same, gone, new, unseen
+    frames of both sessions  --add_views-->  cells of each  --frame_verdicts-->  their counts
+    counts  --cell_states-->  same, gone, new, unseen
 
 A slice fuses some frames, or has some of them judge the cells of the other session, and stores how
 far it came in one file of the job.
@@ -289,13 +290,11 @@ class DifferenceHandler:
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
             positions[side] = cell_positions(state.cells[side], progress["cell_m"])
             states[side] = cell_states(state.counts[side], len(frames[other]))
-        groups = [
-            positions[side][states[side] == own]
-            for side, own in (
-                ("after", SAME), ("before", CHANGED), ("after", CHANGED),
-                ("before", UNSEEN), ("after", UNSEEN),
-            )
-        ]  # fmt: skip
+        kinds: tuple[tuple[Side, int], ...] = (
+            ("after", SAME), ("before", CHANGED), ("after", CHANGED),
+            ("before", UNSEEN), ("after", UNSEEN),
+        )  # fmt: skip
+        groups = [positions[side][states[side] == own] for side, own in kinds]
         points = np.concatenate(groups)
         counts = [len(one) for one in groups]
         with self._store.database.read() as connection:
