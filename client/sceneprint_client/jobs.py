@@ -7,7 +7,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeVar, get_args
 
 import httpx
 
@@ -45,7 +45,9 @@ from sceneprint_client.requests import (
     query_path,
     reconstruction_path,
 )
-from sceneprint_client.surface_points import SurfacePoints, decode_points
+
+if TYPE_CHECKING:
+    from sceneprint_client.surface_points import SurfacePoints
 
 #: A record of what a job does, with its `state`.
 _Begun = TypeVar("_Begun", Association, MapCoverage, Difference, Reconstruction)
@@ -538,6 +540,8 @@ class JobMethods(ServiceConnection):
         NotIndexed : it is not over, or did not succeed.
         Refused : the service is of another version.
         """
+        from sceneprint_client.surface_points import decode_points  # loads numpy
+
         return decode_points(self._bytes(f"{difference_path(map_name, difference_id)}/points"))
 
     def delete_difference(self, map_name: str, difference_id: str) -> None:
