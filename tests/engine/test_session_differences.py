@@ -106,7 +106,7 @@ def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
         assert asdict(first) == asdict(second)
         engine.tasks._keep(again, second)
         slices += 1
-    assert slices == 12  # each frame is fused, and heard
+    assert slices == 12  # each frame is fused, and judges
     told = engine.differences.get("hall", begun.difference_id)
     assert told.result == whole.result
     files = [engine.differences.points("hall", one.difference_id) for one in (whole, told)]

@@ -196,7 +196,7 @@ class DifferenceHandler:
         self._store, self._signers = store, signers
 
     def __call__(self, task: LongJob, until: float) -> SliceResult:
-        """A slice: at least one frame fused or heard, or the conclusion."""
+        """A slice: at least one frame fused, or one that judges cells; the last concludes."""
         asked = NewDifference.model_validate(task.data)
         until = min(until, time.monotonic() + SLICE_S)
         with self._store.database.read() as connection:
@@ -254,7 +254,7 @@ class DifferenceHandler:
             state.counts[side] = no_verdicts(count_cells(state.cells[side]))
 
     def _judge(self, row: MapRow, progress: dict[str, Any], state: _State, until: float) -> None:
-        """Hear frames about the cells of the other session, as far as the time goes."""
+        """Have frames judge the cells of the other session, as far as the time goes."""
         p = self._signers(row.model_id).model.parameters.validation.agreement
         order = _order(progress["frames"])
         positions = {side: cell_positions(state.cells[side], progress["cell_m"]) for side in SIDES}

@@ -86,7 +86,7 @@ class Page {
     if (one && goesOn(one)) put(this.body);
     else if (one) put(this.body, empty({ title: "The comparison did not succeed", text: coded(one.error ?? one.state) }));
     else put(this.body, empty({ title: "Not compared yet", text: before === after ? "Choose two sessions." : `Compare ${before} with ${after} to see what is gone and what is new.` }));
-    if (one && goesOn(one)) await this.#follow(one.difference_id, turn);
+    if (one && goesOn(one)) this.#follow(one.difference_id, turn); // the page is there meanwhile
   }
 
   async begin() {
