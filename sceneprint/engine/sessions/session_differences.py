@@ -35,6 +35,7 @@ from sceneprint.errors import (
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.points.web import MEDIA_TYPE, encode_points
 from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.registration.session_difference import (
     CHANGED,
     SAME,
@@ -201,11 +202,14 @@ class DifferenceHandler:
         until = min(until, time.monotonic() + SLICE_S)
         with self._store.database.read() as connection:
             row = living_map(connection, task.of_map)
+        parameters = self._signers(row.model_id).model.parameters  # while no connection is held
+        with self._store.database.read() as connection:
             if task.progress:
                 progress = dict(task.progress)
                 file = queue.files_of(connection, task.job.number).get(STATE)
             else:
-                progress, file = self._begin(connection, row, asked), None
+                cell_m = cell_width(parameters.cloud.voxel_size)
+                progress, file = _begin(connection, row, asked, cell_m), None
         state = _State() if file is None else _State.read(self._store.blobs.get(file.blob))
         if progress["done"] < progress["total"] // 2:
             self._fuse(row, progress, state, until)
@@ -213,25 +217,10 @@ class DifferenceHandler:
                 progress |= {"done": 0, "skipped": 0, "cell_m": 2 * progress["cell_m"]}
                 return SliceResult(False, progress, drop=(STATE,))
         else:
-            self._judge(row, progress, state, until)
+            self._judge(row, progress, state, until, parameters.validation.agreement)
         if progress["done"] < progress["total"]:
             return SliceResult(False, progress, files=[self._file(STATE, state.data())])
         return self._conclude(row, progress, state)
-
-    def _begin(self, connection: Connection, row: MapRow, asked: NewDifference) -> dict[str, Any]:
-        parent = shared_parent(connection, row, asked)
-        frames = {
-            side: _spread(
-                posed_in_session(connection, row.number, getattr(asked, side), parent),
-                api.MOST_COMPARED,
-            )
-            for side in SIDES
-        }
-        voxel_m = self._signers(row.model_id).model.parameters.cloud.voxel_size
-        return {
-            "done": 0, "total": 2 * sum(map(len, frames.values())), "skipped": 0,
-            "frames": frames, "parent": parent, "cell_m": cell_width(voxel_m),
-        }  # fmt: skip
 
     def _fuse(self, row: MapRow, progress: dict[str, Any], state: _State, until: float) -> None:
         """Add what frames saw to the cells of their sessions, as far as the time goes."""
@@ -253,9 +242,11 @@ class DifferenceHandler:
             state.cells[side] = add_views(state.cells[side], views[side])
             state.counts[side] = no_verdicts(count_cells(state.cells[side]))
 
-    def _judge(self, row: MapRow, progress: dict[str, Any], state: _State, until: float) -> None:
+    def _judge(
+        self, row: MapRow, progress: dict[str, Any], state: _State, until: float,
+        p: OverlapParameters,
+    ) -> None:  # fmt: skip
         """Have frames judge the cells of the other session, as far as the time goes."""
-        p = self._signers(row.model_id).model.parameters.validation.agreement
         order = _order(progress["frames"])
         positions = {side: cell_positions(state.cells[side], progress["cell_m"]) for side in SIDES}
         for side, number in order[progress["done"] - len(order) :]:
@@ -353,6 +344,24 @@ class _State:
         file = io.BytesIO()
         np.savez(file, **arrays)
         return file.getvalue()
+
+
+def _begin(
+    connection: Connection, row: MapRow, asked: NewDifference, cell_m: float
+) -> dict[str, Any]:
+    """Progress of a job that begins: the frames that it compares, and where."""
+    parent = shared_parent(connection, row, asked)
+    frames = {
+        side: _spread(
+            posed_in_session(connection, row.number, getattr(asked, side), parent),
+            api.MOST_COMPARED,
+        )
+        for side in SIDES
+    }
+    return {
+        "done": 0, "total": 2 * sum(map(len, frames.values())), "skipped": 0, "frames": frames,
+        "parent": parent, "cell_m": cell_m,
+    }  # fmt: skip
 
 
 def _order(frames: dict[Side, list[int]]) -> list[tuple[Side, int]]:
