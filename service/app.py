@@ -31,6 +31,7 @@ from sceneprint_client.api import (
 )
 from sceneprint_client.api.admin import NewKey, NewModel
 from sceneprint_client.api.coverage import NewMapCoverage
+from sceneprint_client.api.differences import NewDifference
 from sceneprint_client.api.listing import FrameEdit, MapEdit, SessionEdit
 from sceneprint_client.api.reconstructions import NewReconstruction
 from sceneprint_client.api.results import KeepOptions
@@ -46,6 +47,7 @@ from service.rate_limits import RateLimits
 from service.routes import (
     admin,
     coverage,
+    differences,
     frame_data,
     frames,
     jobs,
@@ -87,6 +89,7 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
                 (NewKey, "validation"),
                 (NewAssociation, "validation"),
                 (NewMapCoverage, "validation"),
+                (NewDifference, "validation"),
                 (NewModel, "validation"),
                 (NewReconstruction, "validation"),
                 (Problem, "serialization"),
@@ -113,7 +116,8 @@ ROUTERS = (
     maps.edits_router,
     sessions.router, frames.imports_router, queries.router, results.history_router,
     results.router,
-    queries.similarity_router, sessions.associations_router, coverage.router, surface.router,
+    queries.similarity_router, sessions.associations_router, coverage.router, differences.router,
+    surface.router,
     reconstructions.router, jobs.router,
     jobs.events_router, admin.operations_router, admin.snapshots_router, admin.keys_router,
 )  # fmt: skip

@@ -1,11 +1,13 @@
-"""What a job does: jobs themselves, imports, associations, coverage, reconstructions."""
+"""What a job does: jobs themselves, imports, associations, coverage, differences of sessions,
+reconstructions.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeVar, get_args
 
 import httpx
 
@@ -27,6 +29,7 @@ from sceneprint_client.api.coverage import (
     MapCoverage,
     NewMapCoverage,
 )
+from sceneprint_client.api.differences import Difference, NewDifference
 from sceneprint_client.api.frames import ImportItem, ImportOptions
 from sceneprint_client.api.reconstructions import NewReconstruction, Reconstruction
 from sceneprint_client.api.sessions import Association, Edge, GraphFormat, NewAssociation
@@ -35,6 +38,7 @@ from sceneprint_client.http import ServiceConnection, error_of, read_record
 from sceneprint_client.requests import (
     association_path,
     coverage_path,
+    difference_path,
     given,
     job_path,
     map_path,
@@ -42,8 +46,11 @@ from sceneprint_client.requests import (
     reconstruction_path,
 )
 
+if TYPE_CHECKING:
+    from sceneprint_client.surface_points import SurfacePoints
+
 #: A record of what a job does, with its `state`.
-_Begun = TypeVar("_Begun", Association, MapCoverage, Reconstruction)
+_Begun = TypeVar("_Begun", Association, MapCoverage, Difference, Reconstruction)
 #: Pauses between two looks at a job, seconds: the first, and the longest.
 _PAUSES_S = (0.02, 0.5)
 #: Jobs that are looked at in one round; workers take them in about this order.
@@ -476,6 +483,70 @@ class JobMethods(ServiceConnection):
     def delete_coverage(self, map_name: str, coverage_id: str) -> None:
         """Delete a coverage job with its result; UnknownMap or UnknownJob where there is none."""
         self._delete(coverage_path(map_name, coverage_id))
+
+    # differences of sessions
+
+    def compare_sessions(
+        self, map_name: str, before: str, after: str, *, parent_frame: str | None = None,
+        timeout_s: float = 3600.0, progress: Callable[[int, int], None] | None = None,
+    ) -> Difference:  # fmt: skip
+        """Compare two sessions of a map: which surfaces are gone, and which are new.
+
+        Parameters
+        ----------
+        map_name : of the map
+        before, after : the earlier and the later session
+        parent_frame : of the poses; default: the one that most frames of both share
+        timeout_s : for its end; 0 to return at once. It goes on, whoever waits
+        progress : called with the number of steps that are done, and of all
+
+        Returns
+        -------
+        difference : `difference.state.over` is False where the time ran out
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : one session twice or one that is not there, or the two share no parent
+            frame.
+        """
+        wanted = checked(
+            NewDifference, "The difference", before=before, after=after,
+            **given(parent_frame=parent_frame),
+        )  # fmt: skip
+        begun = self._ask(
+            Difference, "POST", f"{map_path(map_name)}/differences",
+            json=wanted.model_dump(mode="json", exclude_unset=True),
+        )  # fmt: skip
+        return self._until_over(
+            begun, lambda: self.difference(map_name, begun.difference_id), timeout_s, progress
+        )
+
+    def difference(self, map_name: str, difference_id: str) -> Difference:
+        """A difference as it is now; UnknownMap or UnknownJob where there is none."""
+        return self._ask(Difference, "GET", difference_path(map_name, difference_id))
+
+    def differences(self, map_name: str) -> Iterator[Difference]:
+        """Differences of a map, the newest first; UnknownMap."""
+        return self._items(Page[Difference], f"{map_path(map_name)}/differences")
+
+    def difference_points(self, map_name: str, difference_id: str) -> SurfacePoints:
+        """Cells of both sessions as points. `patches` says what each is: SAME, GONE, NEW,
+        UNSEEN_AFTER or UNSEEN_BEFORE of `sceneprint_client.api.differences`.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : there is none.
+        NotIndexed : it is not over, or did not succeed.
+        Refused : the service is of another version.
+        """
+        from sceneprint_client.surface_points import decode_points  # loads numpy
+
+        return decode_points(self._bytes(f"{difference_path(map_name, difference_id)}/points"))
+
+    def delete_difference(self, map_name: str, difference_id: str) -> None:
+        """Delete a difference with its points; UnknownMap or UnknownJob where there is none."""
+        self._delete(difference_path(map_name, difference_id))
 
     # reconstructions
 

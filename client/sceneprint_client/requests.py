@@ -133,6 +133,11 @@ def coverage_path(map_name: str, coverage_id: str) -> str:
     return f"{map_path(map_name)}/coverage/{_part(coverage_id, 'coverage', UnknownJob)}"
 
 
+def difference_path(map_name: str, difference_id: str) -> str:
+    """Path of a difference; UnknownMap or UnknownJob as `map_path`."""
+    return f"{map_path(map_name)}/differences/{_part(difference_id, 'difference', UnknownJob)}"
+
+
 def surface_path(map_name: str) -> str:
     """Path of the surface of a map; UnknownMap as `map_path`."""
     return f"{map_path(map_name)}/surface"

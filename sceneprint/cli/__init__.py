@@ -31,6 +31,7 @@ COMMANDS = {
     "similarity": "query",
     "associate": "sessions",
     "coverage": "coverage",
+    "difference": "sessions",
     "surface": "surface",
     "frames": "inventory",
     "sessions": "sessions",

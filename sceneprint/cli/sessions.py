@@ -1,4 +1,4 @@
-"""`sceneprint sessions`, `associate` and `reconstruct`: runs of a map, and what is made of them."""
+"""`sceneprint sessions`, `associate`, `difference`, `reconstruct`: runs, and what comes of them."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from sceneprint_client.api import JobState
 if TYPE_CHECKING:
     from sceneprint_client import Client
     from sceneprint_client.api import Answer
+    from sceneprint_client.api.differences import Difference
     from sceneprint_client.api.listing import FrameDeletion, Session
     from sceneprint_client.api.reconstructions import Coverage, Reconstruction
     from sceneprint_client.api.sessions import Association, GraphFormat, Join
@@ -337,6 +338,90 @@ def _join(one: Join) -> list[str]:
 
 #: Longest wait for a worker, seconds.
 _PATIENCE_S = 600.0
+
+
+def add_difference(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "difference",
+        help="compare two sessions: what is gone, what is new",
+        description="Compare two sessions of a map whose frames have poses in one parent frame. "
+        "Counts cells that are the same, gone, new, or seen by one session only, and can write "
+        "them as a coloured point cloud: gone orange, new blue, same grey, unseen dark grey.",
+    )
+    command.add_argument("map", metavar="MAP")
+    command.add_argument("before", metavar="BEFORE", help="the earlier session")
+    command.add_argument("after", metavar="AFTER", help="the later session")
+    command.add_argument(
+        "--parent-frame", metavar="NAME", help="of the poses (default: the one of most frames)"
+    )
+    command.add_argument("--out", type=Path, metavar="FILE", help="write the cells as a PLY")
+    command.add_argument("--json", action="store_true", help="print JSON")
+    add_service_options(command)
+    command.set_defaults(run=run_difference)
+
+
+def run_difference(options: argparse.Namespace) -> int:
+    """Compare, and wait; returns 2 where it did not succeed."""
+    if options.out is not None:
+        check_writable(options.out)
+    with open_client(options) as client, tqdm(desc="difference", disable=None) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        told = client.compare_sessions(
+            options.map, options.before, options.after, parent_frame=options.parent_frame,
+            progress=progress,
+        )  # fmt: skip
+        if told.result is not None and options.out is not None:
+            write_whole(options.out, _difference_ply(client, told))
+    print(told.model_dump_json() if options.json else "\n".join(difference_lines(told)))
+    if told.result is not None and options.out is not None and not options.json:
+        print(f"wrote {one_line(str(options.out))}")
+    return 0 if told.state is JobState.SUCCEEDED else 2
+
+
+def difference_lines(told: Difference) -> list[str]:
+    """A difference for people."""
+    name, result = f"difference {told.difference_id}", told.result
+    if result is None:
+        why = "" if told.error is None else f": {one_line(told.error)}"
+        return [f"{name} is {told.state}{why}"]
+    before, after = one_line(told.asked.before), one_line(told.asked.after)
+    skipped = f", {result.skipped} skipped" if result.skipped else ""
+    counts = {
+        "same": result.same, f"gone since {before}": result.gone, f"new in {after}": result.new,
+        f"only {before} saw": result.unseen_after, f"only {after} saw": result.unseen_before,
+    }  # fmt: skip
+    return [
+        f"{name}: {result.frames_before} frames of {before}, {result.frames_after} of {after}"
+        f"{skipped}; cells of {result.cell_m:g} m in {one_line(result.parent_frame)}",
+        *(f"  {count:7} {what}" for what, count in counts.items()),
+    ]
+
+
+#: Colours of points in a file, by what they are: see `sceneprint_client.api.differences`.
+_DIFFERENCE_COLOURS = (
+    (165, 170, 175), (230, 110, 20), (40, 110, 220), (95, 100, 105), (95, 100, 105),
+)  # fmt: skip
+
+
+def _difference_ply(client: Client, told: Difference) -> bytes:
+    """The cells of both sessions as a PLY file."""
+    import numpy as np
+
+    from sceneprint.formats.points.ply_export import write_ply
+
+    found = client.difference_points(told.map, told.difference_id)
+    colours = np.array(_DIFFERENCE_COLOURS, np.uint8)[found.patches]
+    parent = "" if told.result is None else told.result.parent_frame
+    comments = [
+        f"sessions {told.asked.before} and {told.asked.after} of map {told.map}",
+        f"points of {parent}, metres; gone orange, new blue, same grey, unseen dark grey",
+    ]
+    return write_ply(found.points, colours=colours, comments=comments)
 
 
 def add_reconstruct(commands: Any) -> None:

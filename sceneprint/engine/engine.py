@@ -37,6 +37,11 @@ from sceneprint.engine.search.query import Queries
 from sceneprint.engine.serializers import frame_records, map_record
 from sceneprint.engine.sessions.association_job import Associating
 from sceneprint.engine.sessions.associations import ASSOCIATE, AssociationJobs
+from sceneprint.engine.sessions.session_differences import (
+    DIFFERENCE,
+    DifferenceHandler,
+    DifferenceJobs,
+)
 from sceneprint.engine.signers import Signers, warm
 from sceneprint.engine.upkeep.frame_retention import Retention
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
@@ -124,6 +129,8 @@ class Engine:
         self.coverage = CoverageJobs(self.store, self.tasks)
         measuring = CoverageHandler(self.store, self.signers, self.queries)
         self.tasks.register(COVERAGE, measuring)
+        self.differences = DifferenceJobs(self.store, self.tasks)
+        self.tasks.register(DIFFERENCE, DifferenceHandler(self.store, self.signers))
         self.surfaces = MapSurfaces(self.store, self.bell)
         self.tasks.register(SURFACE, SurfaceHandler(self.store, self.signers))
         self._surface_upkeep = SurfaceUpkeep(
@@ -138,7 +145,7 @@ class Engine:
         self.undo = FrameUndo(self.store, self.bell.ring)
         self.purging = Purging(
             self.store, self._upkeep, self.kept, self.kept_answers, self.undo,
-            self.reconstructions, settings.purge_s,
+            self.reconstructions, self.differences, settings.purge_s,
         )  # fmt: skip
         self._purged = time.monotonic()
         self.operations = OperatorTasks(self.store, settings, self.bell)

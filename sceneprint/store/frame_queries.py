@@ -30,6 +30,7 @@ from sceneprint.store.tables import (
     FrameRow,
     MapRow,
     count_rows,
+    deleted_frames,
     frame_row,
     frame_tags,
     frames,
@@ -536,6 +537,44 @@ def numbers_of_session(
     if robot is not None:
         asked = asked.where(frames.c.robot == robot)
     return list(connection.execute(asked.order_by(*TAKEN_ORDER)).scalars())
+
+
+def parents_of_session(connection: Connection, map_number: int, session: str) -> dict[str, int]:
+    """Parent frames of the poses of a session's indexed frames: how many frames each has."""
+    c = frames.c
+    asked = select(c.pose_parent, func.count()).where(*_posed_in(map_number, session))
+    found = connection.execute(asked.group_by(c.pose_parent).order_by(c.pose_parent))
+    return {row[0]: row[1] for row in found}
+
+
+def posed_in_session(
+    connection: Connection, map_number: int, session: str, parent: str
+) -> list[int]:
+    """Numbers of a session's indexed frames with poses in a parent frame, in the order in which
+    they were taken.
+    """
+    own = (*_posed_in(map_number, session), frames.c.pose_parent == parent)
+    return list(
+        connection.execute(select(frames.c.number).where(*own).order_by(*TAKEN_ORDER)).scalars()
+    )
+
+
+def _posed_in(map_number: int, session: str) -> list[ColumnElement[bool]]:
+    c = frames.c
+    return [
+        c.map_number == map_number, c.state == FrameState.INDEXED, c.session == session,
+        c.pose_parent.is_not(None), c.pose_x.is_not(None),
+    ]  # fmt: skip
+
+
+def any_gone(connection: Connection, numbers: Iterable[int]) -> bool:
+    """Whether any of some frames is not there any more, and cannot be restored either."""
+    own = set(numbers)
+    there = (frames.c.state != FrameState.DELETED) | frames.c.number.in_(
+        select(deleted_frames.c.frame_number)
+    )
+    asked = select(frames.c.number).where(there)
+    return len(own) > sum(1 for _ in rows_among(connection, asked, frames.c.number, own))
 
 
 def numbers_of_runs(

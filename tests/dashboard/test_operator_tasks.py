@@ -151,6 +151,27 @@ def test_a_session_is_deleted_in_3(within: Any, page: Page, lost: dict[str, Any]
     expect(row).to_have_count(1)
 
 
+def test_two_sessions_are_compared_in_3(
+    within: Any, page: Page, settle: Settle, station: Any, until: Callable[..., Any]
+) -> None:
+    path = station.make_map("twice")
+    for sent, session in zip(station.frames[:2], ("first", "second"), strict=True):
+        form = sent.form()
+        meta = {**sent.meta, "session": session}
+        added = station.client.post(
+            f"{path}/frames", files=form["files"], data={"meta": json.dumps(meta)}
+        )
+        assert added.status_code == 202, added.text
+    until(lambda: station.client.get(path).json()["frames"].get("indexed") == 2)
+    with within(3) as operator:
+        page.goto(f"{station.home}#/maps/twice/sessions")
+        settle(page)
+        operator.click(page.get_by_role("link", name="Compare session second"))
+        operator.click(page.get_by_role("button", name="Compare"))
+        legend = page.get_by_role("list", name="Legend")
+        expect(legend.locator("[data-kind=same]")).to_contain_text("in both", timeout=60_000)
+
+
 def test_an_answer_is_kept_and_shared_in_2(
     within: Any, page: Page, settle: Settle, station: Any, lost: dict[str, Any]
 ) -> None:

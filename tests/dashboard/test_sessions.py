@@ -54,7 +54,7 @@ def test_sessions_are_listed_renamed_tagged_joined_and_deleted(
     ann = rows.filter(has_text="ann").filter(has_text="monday")
     for text in ("2026-11-20 09:00:00 – 09:00:01", "1.0 s", "dock"):
         expect(ann).to_contain_text(text)
-    expect(ann.get_by_role("link", name="monday")).to_have_attribute(
+    expect(ann.get_by_role("link", name="monday", exact=True)).to_have_attribute(
         "href", "#/maps/runs?session=monday&robot=ann"
     )
     expect(rows.first).to_contain_text("none")  # frames without a session cannot be named

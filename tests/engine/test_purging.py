@@ -230,7 +230,8 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
     second = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2, purge_s=1)
     workers = [
         Purging(
-            one.store, one._upkeep, one.kept, one.kept_answers, one.undo, one.reconstructions, 0.0
+            one.store, one._upkeep, one.kept, one.kept_answers, one.undo, one.reconstructions,
+            one.differences, 0.0,
         )
         for one in (second, second)
     ]  # fmt: skip

@@ -113,6 +113,13 @@ OF_A_MAP = {
     "GET /v1/maps/{map_name}/coverage/{job_id}/frames": Case(),
     "GET /v1/maps/{map_name}/coverage/{job_id}/changes": Case(query={"since": "{coverage}"}),
     "GET /v1/maps/{map_name}/coverage/{job_id}/plan.png": Case(),
+    "POST /v1/maps/{map_name}/differences": Case(
+        "write", body={"before": "{session}", "after": "{session}-2"}
+    ),
+    "GET /v1/maps/{map_name}/differences": Case(),
+    "GET /v1/maps/{map_name}/differences/{job_id}": Case(),
+    "DELETE /v1/maps/{map_name}/differences/{job_id}": Case("write"),
+    "GET /v1/maps/{map_name}/differences/{job_id}/points": Case(),
     "GET /v1/maps/{map_name}/surface": Case(),
     "POST /v1/maps/{map_name}/surface": Case("write"),
     "DELETE /v1/maps/{map_name}/surface": Case("write"),
@@ -133,7 +140,7 @@ OF_A_MAP = {
 #: In the key's own map, an id or session may be named as another map has it: it says nothing.
 MADE_OF_ANYTHING = (
     "PUT /v1/maps/{map_name}/frames/{frame_id}", "POST /v1/maps/{map_name}/associations",
-    "POST /v1/maps/{map_name}/coverage",
+    "POST /v1/maps/{map_name}/coverage", "POST /v1/maps/{map_name}/differences",
     "POST /v1/maps/{map_name}/frames/delete", "POST /v1/maps/{map_name}/frames/edit",
     "POST /v1/maps/{map_name}/restore",
 )  # fmt: skip
@@ -163,6 +170,7 @@ class There:
     association: str
     reconstruction: str
     coverage: str
+    difference: str
     tile: str
     session: str
 
@@ -170,7 +178,7 @@ class There:
         """The id that a part of a path stands for."""
         kinds = {
             "associations": self.association, "reconstructions": self.reconstruction,
-            "coverage": self.coverage,
+            "coverage": self.coverage, "differences": self.difference,
         }  # fmt: skip
         jobs = [one for kind, one in kinds.items() if f"/{kind}" in operation]
         return {
@@ -195,15 +203,16 @@ class There:
             self.association,
             self.reconstruction,
             self.coverage,
+            self.difference,
             self.tile,
         ]
 
 
 @pytest.fixture(scope="module")
 def there(walled, small_shots, until) -> dict[str, There]:
-    """Two maps with two frames each, and of each an answer and a job of every kind."""
+    """Two maps with three frames each, and of each an answer and a job of every kind."""
     found = {}
-    for name, pair in ((OWN, small_shots[:2]), (THEIRS, small_shots[1:3])):
+    for name, some in ((OWN, small_shots[:3]), (THEIRS, small_shots[1:4])):
         made = walled.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
         assert made.status_code == 201
         session = f"run-of-{name}"
@@ -211,16 +220,17 @@ def there(walled, small_shots, until) -> dict[str, There]:
             walled.ask(
                 "boss", "POST", f"/v1/maps/{name}/frames", headers={"Prefer": "wait=60"},
                 **shot.form(
-                    session=session, captured_at=f"2026-11-16T09:30:0{number}Z",
+                    session=session if number < 2 else f"{session}-2",
+                    captured_at=f"2026-11-16T09:30:0{number}Z",
                     pose={
                         "parent_frame": name, "translation": {"x": number, "y": 0, "z": 0},
                         "rotation": {"w": 1, "x": 0, "y": 0, "z": 0},
                     },
                 ),
             ).json()
-            for number, shot in enumerate(pair)
+            for number, shot in enumerate(some)
         ]  # fmt: skip
-        assert [one["state"] for one in sent] == ["indexed", "indexed"]
+        assert [one["state"] for one in sent] == ["indexed"] * 3
         frame = sent[0]["frame_id"]
         asked = walled.ask("boss", "POST", f"/v1/maps/{name}/queries", json={"frame_id": frame})
         query = asked.json()["query_id"]
@@ -231,16 +241,21 @@ def there(walled, small_shots, until) -> dict[str, There]:
         assert fused.status_code == 202, fused.text
         measured = walled.ask("boss", "POST", f"/v1/maps/{name}/coverage")
         assert measured.status_code == 202, measured.text
+        body = {"before": session, "after": f"{session}-2"}
+        compared = walled.ask("boss", "POST", f"/v1/maps/{name}/differences", json=body)
+        assert compared.status_code == 202, compared.text
         built = walled.ask("boss", "POST", f"/v1/maps/{name}/surface")
         assert built.status_code == 202, built.text
         surface = f"/v1/maps/{name}/surface"
         until(lambda at=surface: walled.ask("boss", "GET", at).json()["state"] == "ready")
         tiles = walled.ask("boss", "GET", f"{surface}/tiles").json()["items"]
-        jobs = [one.headers["location"].rpartition("/")[2] for one in (begun, fused, measured)]
+        jobs = [
+            one.headers["location"].rpartition("/")[2] for one in (begun, fused, measured, compared)
+        ]
         found[name] = There(
             name, frame, query, sent[0]["job_id"], *jobs, tiles[0]["digest"], session
         )
-    found[NONE] = There(NONE, *[NO_ID] * 7, f"run-of-{NONE}")
+    found[NONE] = There(NONE, *[NO_ID] * 8, f"run-of-{NONE}")
     return found
 
 
@@ -332,6 +347,7 @@ def test_lists_have_nothing_of_another_map(walled, there, operations):
               f"/v1/stats?map={OWN}", f"/v1/jobs?map={OWN}", f"/v1/events?map={OWN}",
               "/v1/jobs?kind=associate", "/v1/jobs?kind=reconstruct", "/readyz", "/openapi.json",
               f"/v1/maps/{OWN}/associations", f"/v1/maps/{OWN}/coverage",
+              f"/v1/maps/{OWN}/differences",
               f"/v1/maps/{OWN}/surface", f"/v1/maps/{OWN}/surface/tiles",
               f"/v1/maps/{OWN}/sessions"]  # fmt: skip
     for path in listed:
@@ -346,7 +362,8 @@ def test_lists_have_nothing_of_another_map(walled, there, operations):
     assert [one["name"] for one in mine] == [OWN]
     jobs = walled.ask("reader", "GET", "/v1/jobs?limit=1000").json()["items"]
     assert {job["map"] for job in jobs} == {OWN}
-    assert len(jobs) == 6  # two frames, an association, a reconstruction, a coverage, a surface
+    # three frames, an association, a reconstruction, a coverage, a difference, a surface
+    assert len(jobs) == 8
     events = walled.ask("reader", "GET", "/v1/events?limit=1000").json()["items"]
     assert {event["map"] for event in events} == {OWN}
 
@@ -422,7 +439,7 @@ def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
 def unseen(walled: Any, method: str, path: str, id_: str) -> None:
     """See that an id is to the key as one that nothing has."""
     answers = [
-        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"------"))
+        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"-------"))
         for one in (id_, NO_ID)
     ]
     assert told(*answers[0]) == told(*answers[1])
@@ -508,6 +525,7 @@ def test_what_is_not_noted_is_said(operations):
         "delete_frame", "patch_session", "delete_session_frames", "cancel_job", "retry_job",
         "retry_dead_jobs", "reencode", "cancel_reencoding",
         "begin_association", "delete_association", "begin_coverage", "delete_coverage",
+        "begin_difference", "delete_difference",
         "begin_surface", "delete_surface",
         "reconstruct", "delete_reconstruction",
         "add_import", "take_snapshot", "delete_snapshot", "delete_queries",

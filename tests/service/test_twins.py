@@ -74,8 +74,9 @@ class Twin:
 def live(one: Twin, small_model: Any) -> None:
     """What happens in alpha, and in the busy one always something else before and after."""
     path = "/v1/maps/alpha"
-    for number, shot in enumerate(one.shots[:4]):
-        form = shot.form(session="run", captured_at=f"2026-11-16T09:30:0{number}Z", pose={
+    for number, shot in enumerate(one.shots[:5]):
+        session = "run" if number < 4 else "run-2"
+        form = shot.form(session=session, captured_at=f"2026-11-16T09:30:0{number}Z", pose={
             "parent_frame": "hall", "translation": {"x": number, "y": 0, "z": 0},
             "rotation": {"w": 1, "x": 0, "y": 0, "z": 0},
         })  # fmt: skip
@@ -100,6 +101,11 @@ def live(one: Twin, small_model: Any) -> None:
         assert measured.status_code == 202, measured.text
         one.ids["coverage"] = measured.json()["coverage_id"]
         one.disturb()
+    body = {"before": "run", "after": "run-2"}
+    compared = one.ask("boss", "POST", f"{path}/differences", json=body)
+    assert compared.status_code == 202, compared.text
+    one.ids["difference"] = compared.json()["difference_id"]
+    one.disturb()
     built = one.ask("boss", "POST", f"{path}/surface")
     assert built.status_code == 202, built.text
     one.disturb()
@@ -114,7 +120,7 @@ def live(one: Twin, small_model: Any) -> None:
 def path_of(one: Twin, pattern: str) -> str:
     """A path of the document, about what there is in alpha."""
     paths = {"association": "associations", "reconstruction": "reconstructions",
-             "coverage": "coverage"}  # fmt: skip
+             "coverage": "coverage", "difference": "differences"}  # fmt: skip
     kinds = [kind for kind, path in paths.items() if f"/{path}/" in pattern]
     names = {
         "map_name": "alpha", "frame_id": "frame-1", "query_id": one.ids["query_id"],
@@ -140,7 +146,7 @@ def everything(one: Twin) -> Iterator[str]:
             for query in queries.get(pattern, [""]):
                 yield one.told("reader", "GET", path_of(one, pattern) + query)
     for path in ("frames?limit=3", "frames?limit=2&order=desc", "associations?limit=1",
-                 "coverage?limit=1",
+                 "coverage?limit=1", "differences?limit=1",
                  "jobs?limit=3", "events?limit=5", "events?limit=5&order=oldest"):  # fmt: skip
         path = path if path.startswith(("jobs", "events")) else f"maps/alpha/{path}"
         cursor = ""
@@ -160,6 +166,7 @@ def everything(one: Twin) -> Iterator[str]:
         ("DELETE", "/v1/maps/alpha/frames/frame-3", None),
         ("DELETE", f"/v1/maps/alpha/associations/{one.ids['association']}", None),
         ("DELETE", f"/v1/maps/alpha/coverage/{one.ids['coverage']}", None),
+        ("DELETE", f"/v1/maps/alpha/differences/{one.ids['difference']}", None),
         ("DELETE", "/v1/maps/alpha/surface", None),
         ("POST", "/v1/maps", {"name": "bravo"}),
         ("GET", "/v1/events", None),
@@ -214,7 +221,8 @@ def test_it_is_all_there(both):
     """Else the test above would prove nothing."""
     text = "".join(both[0])
     # the frames' poses contradict what they show, so that their matches disagree
-    for part in ("frame.indexed", "association.found", "coverage.measured", "surface.updated",
+    for part in ("frame.indexed", "association.found", "coverage.measured", "difference.found",
+                 "surface.updated",
                  "cursor=",
                  '"status":"ambiguous"',
                  "end_header",

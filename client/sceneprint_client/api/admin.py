@@ -310,9 +310,9 @@ class Job(ApiRecord):
 
     job_id: str
     kind: str = Field(
-        description="`sign`, `import`, `associate`, `coverage`, `surface`, `reconstruct`, "
-        "`snapshot`, or `reencode`: that one signs an indexed frame once more, with the model to "
-        "come or as what was made of it is damaged."
+        description="`sign`, `import`, `associate`, `coverage`, `difference`, `surface`, "
+        "`reconstruct`, `snapshot`, or `reencode`: that one signs an indexed frame once more, with "
+        "the model to come or as what was made of it is damaged."
     )
     state: JobState
     map: str | None = Field(description="That it is about; null for `snapshot`.")
@@ -383,6 +383,7 @@ KINDS = {
     "surface.updated": "A job that fused the surface of a map is over; `data` has `frames` and "
     "`tiles`.",
     "coverage.measured": "A job that measured a map's coverage is over; `data` is its result.",
+    "difference.found": "A job that compared two sessions is over; `data` is its result.",
     "key.created": "A key was made; of no map.",
     "key.revoked": "A key opens nothing any more; of no map.",
 }

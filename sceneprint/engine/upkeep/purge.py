@@ -1,9 +1,9 @@
 """No byte of a deleted frame is left, some time after it was deleted: what deleting it left behind.
 
 A deletion takes the frame out of all searches at once, and its rows and blobs when it can no longer
-be undone. Left are then blobs of a process that died half way,
-surfaces and answers that the frame is part of, this node's indexes and what readers hold of it, and
-pages and log of SQLite. On PostgreSQL dead rows are VACUUM's.
+be undone. Left are then blobs of a process that died half way, surfaces, differences and answers
+that the frame is part of, this node's indexes and what readers hold of it, and pages and log of
+SQLite. On PostgreSQL dead rows are VACUUM's.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from sceneprint.engine.maps.undo import FrameUndo
 from sceneprint.engine.reconstruction import ReconstructionJobs
 from sceneprint.engine.results.kept_answers import KeptAnswers
 from sceneprint.engine.results.stored_results import ResultValidity, StoredResults
+from sceneprint.engine.sessions.session_differences import DifferenceJobs
 from sceneprint.engine.upkeep.garbage_collection import collect_doomed_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.errors import BusyIndex, SceneprintError, UnknownJob, UnknownMap
@@ -43,13 +44,14 @@ class Purged:
     Parameters
     ----------
     blobs : that were doomed, and left behind
-    answers, reconstructions : that showed what is gone
+    answers, reconstructions, differences : that showed what is gone
     indexes : that were made anew or removed
     """
 
     blobs: int
     answers: int
     reconstructions: int
+    differences: int
     indexes: int
 
 
@@ -58,16 +60,18 @@ class Purging:
 
     Parameters
     ----------
-    store, upkeep, kept, kept_answers, undo, reconstructions : of the engine
+    store, upkeep, kept, kept_answers, undo, reconstructions, differences : of the engine
     purge_s : seconds after which nothing may be left
     """
 
     def __init__(
         self, store: Store, upkeep: Upkeep, kept: StoredResults, kept_answers: KeptAnswers,
-        undo: FrameUndo, reconstructions: ReconstructionJobs, purge_s: float,
+        undo: FrameUndo, reconstructions: ReconstructionJobs, differences: DifferenceJobs,
+        purge_s: float,
     ) -> None:  # fmt: skip
         self._store, self._upkeep, self._kept = store, upkeep, kept
         self._kept_answers, self._undo, self._reconstructions = kept_answers, undo, reconstructions
+        self._differences = differences
         self._every_s = purge_s / 2  # what is deleted just after a look is gone in time too
         self._next = time.monotonic() + self._every_s
 
@@ -117,6 +121,7 @@ class Purging:
         found = Purged(
             blobs=tried(lambda: collect_doomed_blobs(self._store, before, seconds)),
             reconstructions=tried(lambda: self._reconstructions.forget(standing)),
+            differences=tried(self._differences.forget),
             answers=tried(lambda: self._kept.forget(standing.all_of))
             + tried(self._kept_answers.remove_spent),
             indexes=sum(tried(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]

@@ -8,7 +8,7 @@ import { confirm, empty, toast } from "../lib/states.js";
 import { flat, nameOf } from "../plan/axes.js";
 import { cornersOf, laySurface, surfaceOf, unseen } from "../plan/backdrop.js";
 import { Plan } from "../plan/plan.js";
-import { beginCoverage, cancelCoverage, followCoverage, goesOn } from "./measurement.js";
+import { beginCoverage, cancelCoverage, followJob, goesOn } from "./measurement.js";
 import { OUTCOMES, outcomeMark, TRENDS } from "./outcomes.js";
 import { areaCard, cellsTable, changesCard, countsCard, worstCard } from "./panels.js";
 import { cellAt, drawCells, drawFrames, hit, keyOf } from "./sheet.js";
@@ -291,7 +291,7 @@ class Page {
   }
 
   async follow(id) {
-    await followCoverage(this.map, id, (now) => {
+    await followJob(`${this.path}/${id}`, (now) => {
       const place = this.all.findIndex((one) => one.coverage_id === id);
       if (now === null) { this.all.splice(place, 1); this.show(); return; }
       this.all[place] = now;

@@ -7,7 +7,7 @@ import { sheet } from "../lib/states.js";
 const POLL_MS = 700;
 const OVER = new Set(["succeeded", "failed", "dead", "cancelled"]);
 
-/** Whether it goes on. @param {Object<string, any>} one a coverage job */
+/** Whether it goes on. @param {Object<string, any>} one a long job */
 export const goesOn = (one) => !OVER.has(one.state);
 
 /**
@@ -67,18 +67,18 @@ export function beginCoverage(map, { sessions, robots }, onbegun) {
 }
 
 /**
- * Follow a coverage job until it is over.
- * @param {string} map @param {string} id
+ * Follow a long job until it is over.
+ * @param {string} path of its record
  * @param {(now: Object<string, any> | null) => void} onchange null: somebody deleted it
  * @param {AbortSignal} signal
  */
-export async function followCoverage(map, id, onchange, signal) {
+export async function followJob(path, onchange, signal) {
   for (;;) {
     await new Promise((resolve) => { setTimeout(resolve, POLL_MS); });
     if (signal.aborted) return;
     if (document.hidden) continue;
     try {
-      const now = await get(at("maps", map, "coverage", id), { signal });
+      const now = await get(path, { signal });
       onchange(now);
       if (!goesOn(now)) return;
     } catch (error) {

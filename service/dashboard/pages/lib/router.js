@@ -7,6 +7,7 @@ export const ROUTES = [
   { path: "maps/:map", page: "frames/gallery.js", area: "maps", section: "frames", title: "Frames" },
   { path: "maps/:map/frames/:frame", page: "frames/frame.js", area: "maps", section: "frames", title: "Frame" },
   { path: "maps/:map/sessions", page: "sessions/sessions.js", area: "maps", section: "sessions", title: "Sessions" },
+  { path: "maps/:map/difference", page: "difference/difference.js", area: "maps", section: "sessions", title: "Difference" },
   { path: "maps/:map/upload", page: "frames/upload.js", area: "maps", section: "upload", title: "Upload" },
   { path: "maps/:map/query", page: "query/ask.js", area: "maps", section: "query", title: "Query" },
   { path: "maps/:map/queries", page: "history/queries.js", area: "maps", section: "queries", title: "Queries" },

@@ -10,7 +10,7 @@ const KIND = {
   indexed: "good", created: "good", done: "good", found: "good", reencoded: "good",
   failed: "bad", rejected: "warn", missed: "warn", deleted: "warn", revoked: "warn",
 };
-const KINDS = [["", "All kinds"], ["frame.", "Frames"], ["frame.failed", "Failures"], ["map.", "Maps"], ["query.", "Queries"], ["import.", "Imports"], ["association.", "Associations"], ["coverage.", "Coverage"], ["surface.", "Surfaces"], ["key.", "Keys"]];
+const KINDS = [["", "All kinds"], ["frame.", "Frames"], ["frame.failed", "Failures"], ["map.", "Maps"], ["query.", "Queries"], ["import.", "Imports"], ["association.", "Associations"], ["coverage.", "Coverage"], ["difference.", "Differences"], ["surface.", "Surfaces"], ["key.", "Keys"]];
 const AT_ONCE = 100;
 const MOST = 500; // rows: a page that is left open for a day stays light
 const RENEW_S = 20;

@@ -23,7 +23,7 @@ export async function render(root, { params, signal, title, actions }) {
   const body = h("tbody", {});
   const card = h("div", { class: "card sessions-scroll", tabindex: "0", role: "region", "aria-label": "Sessions" }, h("table", { class: "table" },
     h("thead", {}, h("tr", {}, COLUMNS.map(([text, number]) => h("th", { scope: "col", class: number && "number" }, text)),
-      canWrite && h("th", { scope: "col" }, h("span", { class: "visually-hidden" }, "Actions")))), body));
+      h("th", { scope: "col" }, h("span", { class: "visually-hidden" }, "Actions")))), body));
   const summary = h("p", { class: "muted number" });
   const said = h("p", { class: "muted number", role: "status" });
   const more = h("button", { class: "button sessions-more", type: "button", onClick: () => older() }, "Show more sessions");
@@ -40,7 +40,7 @@ export async function render(root, { params, signal, title, actions }) {
 
   function row(one) {
     const { session, robot } = one;
-    const frames = sum(one.frames);
+    const frames = sum(one.frames), before = previous(one, found);
     const href = link("maps", params.map, { session, robot });
     const states = Object.entries(one.frames).filter(([state]) => state !== "indexed").map(([state, n]) => `${count(n)} ${state}`);
     const act = (name) => async () => (await import("./edit.js"))[name](params.map, one, found, { say: (text) => put(said, text), changed: look });
@@ -56,8 +56,9 @@ export async function render(root, { params, signal, title, actions }) {
       h("td", { class: "number" }, one.first_captured_at === null ? "–" : seconds((Date.parse(one.last_captured_at) - Date.parse(one.first_captured_at)) / 1000)),
       h("td", {}, h("span", { class: "sessions-tags" }, one.tags.map((tag) => h("a", { class: "chip", href: link("maps", params.map, { session, robot, tag }) }, tag)))),
       // frames without a session cannot be named, and so not changed together
-      canWrite && h("td", {}, session !== null && h("span", { class: "sessions-actions" },
-        button("Rename", "renameSession"), button("Tag", "tagSession"), button("Delete", "deleteSession", "danger"))));
+      h("td", {}, session !== null && h("span", { class: "sessions-actions" },
+        before !== null && h("a", { class: "button", href: link("maps", params.map, "difference", { before, after: session }), "aria-label": `Compare session ${session}` }, "Compare"),
+        canWrite && [button("Rename", "renameSession"), button("Tag", "tagSession"), button("Delete", "deleteSession", "danger")])));
   }
 
   // as many pages as are shown, so that a row that changed stays where it is looked at
@@ -111,6 +112,16 @@ export async function render(root, { params, signal, title, actions }) {
     map: params.map, kinds: ["frame.", "events."], onevent: heard, signal,
     onstate: (state) => { if (state === "live" && !began) { began = true; heard(); } }, // what came between list and stream
   });
+}
+
+/** The session with poses that was taken last before another; null where there is no other one.
+ * @param {Object<string, any>} one @param {Object<string, any>[]} all */
+function previous(one, all) {
+  const others = all.filter((other) => other.session !== null && other.session !== one.session && other.with_pose > 0);
+  if (!one.with_pose || !others.length) return null;
+  const earlier = others.filter((other) => (other.first_captured_at ?? "") < (one.first_captured_at ?? ""));
+  const latest = (a, b) => ((b.first_captured_at ?? "") > (a.first_captured_at ?? "") ? b : a);
+  return (earlier.length ? earlier : others).reduce(latest).session;
 }
 
 /** Frames in all states. @param {Object<string, number>} states */

@@ -1,0 +1,391 @@
+"""Two sessions of a map compared: jobs begun, listed, done in slices, read and removed.
+
+    frames of both sessions  --add_views-->  cells of each  --frame_verdicts-->  their counts
+    counts  --cell_states-->  same, gone, new, unseen
+
+A slice fuses some frames, or has some of them judge the cells of the other session, and stores how
+far it came in one file of the job.
+"""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any, Literal
+
+import numpy as np
+from sqlalchemy import Connection
+
+from sceneprint.engine.jobs.map_jobs import MapJobs
+from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Tasks
+from sceneprint.engine.maps.plan_axes import parent_axes
+from sceneprint.engine.maps.surface_job import cell_width, surface_points
+from sceneprint.engine.serializers import job_progress, when
+from sceneprint.engine.signers import Signers
+from sceneprint.errors import (
+    DamagedBlob,
+    InvalidRequest,
+    NotIndexed,
+    UnknownJob,
+    UnknownMap,
+    UnreadableGeometry,
+)
+from sceneprint.formats.artifact import read_geometry
+from sceneprint.formats.points.web import MEDIA_TYPE, encode_points
+from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.registration.overlap import OverlapParameters
+from sceneprint.geometry.registration.session_difference import (
+    CHANGED,
+    SAME,
+    UNSEEN,
+    SessionCells,
+    VerdictCounts,
+    add_views,
+    cell_positions,
+    cell_states,
+    count_cells,
+    frame_verdicts,
+    no_verdicts,
+)
+from sceneprint.geometry.surface.cell_fusion import CELL_SUM, ViewStamp, seen_cells
+from sceneprint.store import Store, queue
+from sceneprint.store.frame_queries import (
+    any_gone,
+    parents_of_session,
+    posed_in_session,
+    stops_of,
+)
+from sceneprint.store.maps import find_map, living_map, map_of
+from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
+from sceneprint.store.signatures import geometry_blobs
+from sceneprint.store.tables import JobRow, MapRow
+from sceneprint.types import Floats, Geometry
+from sceneprint_client.api import Page
+from sceneprint_client.api import differences as api
+from sceneprint_client.api.differences import Difference, DifferenceResult, NewDifference
+from sceneprint_client.surface_tiles import NO_SESSION
+
+#: Kind of the jobs.
+DIFFERENCE = "difference"
+#: As of coverage: a worker does a slice when nothing else waits.
+PRIORITY = REENCODING_PRIORITY - 1
+#: Seconds of a slice, at most: so long a frame that has just come waits for a worker.
+SLICE_S = 3.0
+#: Cells of a session: with more, the job begins again with cells twice as wide.
+MOST_CELLS = 500_000
+#: Cells of views that are held before they are fused.
+_HELD = 1_000_000
+#: Files of such a job: how far it came, until it is over; and the points.
+STATE, POINTS = "state.npz", "points"
+
+Side = Literal["before", "after"]
+SIDES: tuple[Side, Side] = ("before", "after")
+
+
+def shared_parent(connection: Connection, row: MapRow, asked: NewDifference) -> str:
+    """The parent frame in which two sessions are compared.
+
+    Raises
+    ------
+    InvalidRequest : a session is not there, has no poses, or they share no parent frame.
+    """
+    counts = {}
+    for side in SIDES:
+        name: str = getattr(asked, side)
+        counts[side] = parents_of_session(connection, row.number, name)
+        if not counts[side]:
+            raise InvalidRequest(
+                f"Map {row.name!r} has no indexed frame with a pose of session {name!r:.80}. "
+                f"See GET /v1/maps/{row.name}/sessions.",
+                ((side, "no indexed frame with a pose"),),
+            )
+    before, after = (counts[side] for side in SIDES)
+    shared = sorted(before.keys() & after.keys(), key=lambda p: (-min(before[p], after[p]), p))
+    if asked.parent_frame is not None and asked.parent_frame not in shared:
+        raise InvalidRequest(
+            f"Sessions {asked.before!r:.80} and {asked.after!r:.80} do not both have poses in "
+            f"parent frame {asked.parent_frame!r:.80}. "
+            + (f"Choose from {', '.join(shared)!r:.300}." if shared else "They share none."),
+            (("parent_frame", "not of both sessions"),),
+        )
+    if not shared:
+        raise InvalidRequest(
+            f"Session {asked.before!r:.80} has poses in {', '.join(before)!r:.200}, session "
+            f"{asked.after!r:.80} in {', '.join(after)!r:.200}: they share no parent frame. "
+            "Associate the sessions, and give their frames poses in one parent frame.",
+            (("after", "no parent frame in common"),),
+        )
+    return asked.parent_frame or shared[0]
+
+
+class DifferenceJobs:
+    """Differences of sessions."""
+
+    def __init__(self, store: Store, tasks: Tasks) -> None:
+        self._store, self._tasks = store, tasks
+        self._jobs = MapJobs(store, DIFFERENCE, "difference", "differences")
+
+    def begin(self, map_name: str, asked: NewDifference) -> Difference:
+        """Queue a comparison.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : the sessions cannot be compared.
+        """
+        with self._store.database.read() as connection:
+            shared_parent(connection, find_map(connection, map_name), asked)
+        data = asked.model_dump(mode="json", exclude_unset=True)
+        job, _ = self._tasks.begin(DIFFERENCE, map_name, data, PRIORITY)
+        return self.get(map_name, job.job_id)
+
+    def list_all(
+        self, map_name: str, cursor: str | None = None, limit: int = 100
+    ) -> Page[Difference]:
+        """Differences of a map, the newest first; see `MapJobs.page`."""
+        found, more = self._jobs.page(map_name, cursor, limit)
+        items = [_difference_record(job, map_name) for job in found]
+        return Page[Difference](items=items, next_cursor=more)
+
+    def get(self, map_name: str, job_id: str) -> Difference:
+        """A difference; UnknownMap or UnknownJob where there is none."""
+        with self._store.database.read() as connection:
+            return _difference_record(self._jobs.find(connection, map_name, job_id), map_name)
+
+    def remove(self, map_name: str, job_id: str) -> None:
+        """Delete a difference with its points; see `MapJobs.remove`."""
+        self._jobs.remove(map_name, job_id)
+
+    def points(self, map_name: str, job_id: str) -> queue.JobFile:
+        """The file of its points.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : there is none.
+        NotIndexed : it did not succeed.
+        """
+        with self._store.database.read() as connection:
+            job = self._jobs.find(connection, map_name, job_id)
+            found = queue.files_of(connection, job.number).get(POINTS)
+        if found is None:
+            raise NotIndexed(
+                f"Difference {job.id} is {job.state}; its points exist once it has succeeded. "
+                f"See GET /v1/maps/{map_name}/differences/{job.id}."
+            )
+        return found
+
+    def forget(self) -> int:
+        """Remove those of which any frame was deleted since: they show it; returns how many."""
+        with self._store.database.read() as connection:
+            gone = [
+                (map_of(connection, job.map_number).name, job.id)
+                for job in queue.jobs_with_files(connection, DIFFERENCE)
+                if job.map_number is not None and any_gone(connection, _frames_of(job))
+            ]
+        for name, job_id in gone:
+            with suppress(UnknownMap, UnknownJob):  # somebody else has
+                self.remove(name, job_id)
+        return len(gone)
+
+
+class DifferenceHandler:
+    """Does the jobs."""
+
+    def __init__(self, store: Store, signers: Signers) -> None:
+        self._store, self._signers = store, signers
+
+    def __call__(self, task: LongJob, until: float) -> SliceResult:
+        """A slice: at least one frame fused, or one that judges cells; the last concludes."""
+        asked = NewDifference.model_validate(task.data)
+        until = min(until, time.monotonic() + SLICE_S)
+        with self._store.database.read() as connection:
+            row = living_map(connection, task.of_map)
+        parameters = self._signers(row.model_id).model.parameters  # while no connection is held
+        with self._store.database.read() as connection:
+            if task.progress:
+                progress = dict(task.progress)
+                file = queue.files_of(connection, task.job.number).get(STATE)
+            else:
+                cell_m = cell_width(parameters.cloud.voxel_size)
+                progress, file = _begin(connection, row, asked, cell_m), None
+        state = _State() if file is None else _State.read(self._store.blobs.get(file.blob))
+        if progress["done"] < progress["total"] // 2:
+            self._fuse(row, progress, state, until)
+            if max(map(count_cells, state.cells.values())) > MOST_CELLS:
+                progress |= {"done": 0, "skipped": 0, "cell_m": 2 * progress["cell_m"]}
+                return SliceResult(False, progress, drop=(STATE,))
+        else:
+            self._judge(row, progress, state, until, parameters.validation.agreement)
+        if progress["done"] < progress["total"]:
+            return SliceResult(False, progress, files=[self._file(STATE, state.data())])
+        return self._conclude(row, progress, state)
+
+    def _fuse(self, row: MapRow, progress: dict[str, Any], state: _State, until: float) -> None:
+        """Add what frames saw to the cells of their sessions, as far as the time goes."""
+        views: dict[Side, list[SessionCells]] = {side: [] for side in SIDES}
+        held = 0
+        for side, number in _order(progress["frames"])[progress["done"] :]:
+            posed = self._posed(row, number, progress["parent"])
+            if posed is None:
+                progress["skipped"] += 1
+            else:
+                points = moved(posed[1], surface_points(posed[0]))
+                stamp = ViewStamp(number, None, NO_SESSION)
+                views[side].append(seen_cells(points, progress["cell_m"], stamp))
+                held += count_cells(views[side][-1])
+            progress["done"] += 1
+            if time.monotonic() >= until or held > _HELD:
+                break
+        for side in SIDES:
+            state.cells[side] = add_views(state.cells[side], views[side])
+            state.counts[side] = no_verdicts(count_cells(state.cells[side]))
+
+    def _judge(
+        self, row: MapRow, progress: dict[str, Any], state: _State, until: float,
+        p: OverlapParameters,
+    ) -> None:  # fmt: skip
+        """Have frames judge the cells of the other session, as far as the time goes."""
+        order = _order(progress["frames"])
+        positions = {side: cell_positions(state.cells[side], progress["cell_m"]) for side in SIDES}
+        for side, number in order[progress["done"] - len(order) :]:
+            posed = self._posed(row, number, progress["parent"])
+            if posed is not None:
+                other: Side = "after" if side == "before" else "before"
+                said = frame_verdicts(positions[other], posed[0].surface, posed[1], p)
+                state.counts[other].add(said)
+            progress["done"] += 1
+            if time.monotonic() >= until:
+                break
+
+    def _posed(self, row: MapRow, number: int, parent: str) -> tuple[Geometry, Floats] | None:
+        """The artifact of a frame and its T_parent_sensor; None where it is lost or was edited."""
+        with self._store.database.read() as connection:
+            stop = stops_of(connection, [number]).get(number)
+            blob = geometry_blobs(connection, [number], row.model_id).get(number)
+        if stop is None or stop.pose is None or stop.parent != parent or blob is None:
+            return None
+        try:
+            return read_geometry(self._store.blobs.get(blob)), np.array(stop.pose)
+        except (DamagedBlob, UnreadableGeometry):
+            return None
+
+    def _file(self, name: str, data: bytes) -> queue.JobFile:
+        return queue.JobFile(name, self._store.blobs.put(data), len(data), MEDIA_TYPE)
+
+    def _conclude(self, row: MapRow, progress: dict[str, Any], state: _State) -> SliceResult:
+        """Counts, and the points of all cells by what they are."""
+        frames = progress["frames"]
+        positions, states = {}, {}
+        for side, other in zip(SIDES, reversed(SIDES), strict=True):
+            positions[side] = cell_positions(state.cells[side], progress["cell_m"])
+            states[side] = cell_states(state.counts[side], len(frames[other]))
+        kinds: tuple[tuple[Side, int], ...] = (
+            ("after", SAME), ("before", CHANGED), ("after", CHANGED),
+            ("before", UNSEEN), ("after", UNSEEN),
+        )  # fmt: skip
+        groups = [positions[side][states[side] == own] for side, own in kinds]
+        points = np.concatenate(groups)
+        counts = [len(one) for one in groups]
+        with self._store.database.read() as connection:
+            axes = parent_axes(connection, row, frames["before"] + frames["after"]).axes
+        result = DifferenceResult(
+            same=counts[api.SAME], gone=counts[api.GONE], new=counts[api.NEW],
+            unseen_after=counts[api.UNSEEN_AFTER], unseen_before=counts[api.UNSEEN_BEFORE],
+            cell_m=progress["cell_m"], parent_frame=progress["parent"],
+            up=np.cross(axes[0], axes[1]).tolist(), frames_before=len(frames["before"]),
+            frames_after=len(frames["after"]), skipped=progress["skipped"],
+        )  # fmt: skip
+        labels = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+        file = self._file(POINTS, encode_points(points, patches=labels))
+        return SliceResult(
+            True, progress, files=[file], drop=(STATE,), result=result.model_dump(mode="json"),
+            event="difference.found",
+        )  # fmt: skip
+
+
+class _State:
+    """Cells of both sessions, and what was said of them so far."""
+
+    def __init__(self) -> None:
+        self.cells: dict[Side, SessionCells] = {side: {} for side in SIDES}
+        self.counts: dict[Side, VerdictCounts] = {side: no_verdicts(0) for side in SIDES}
+
+    @classmethod
+    def read(cls, data: bytes) -> _State:
+        """What `data` wrote."""
+        state = cls()
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            for side in SIDES:
+                places, rows = arrays[f"{side}_places"], arrays[f"{side}_rows"].view(CELL_SUM)
+                ends = np.cumsum(arrays[f"{side}_sizes"])
+                state.cells[side] = {
+                    (x, y, z): rows[end - size : end]
+                    for (x, y, z), size, end in zip(
+                        places.tolist(), arrays[f"{side}_sizes"].tolist(), ends.tolist(),
+                        strict=True,
+                    )
+                }  # fmt: skip
+                agreeing, through = arrays[f"{side}_said"]
+                state.counts[side] = VerdictCounts(agreeing, through)
+        return state
+
+    def data(self) -> bytes:
+        """As a file: the same bytes for the same cells."""
+        arrays: dict[str, Any] = {}
+        for side in SIDES:
+            cells, counts = self.cells[side], self.counts[side]
+            rows = np.concatenate([np.zeros(0, CELL_SUM), *cells.values()])
+            arrays[f"{side}_places"] = np.array(list(cells), np.int64).reshape(-1, 3)
+            arrays[f"{side}_sizes"] = np.array([len(own) for own in cells.values()], np.int64)
+            arrays[f"{side}_rows"] = np.frombuffer(rows.tobytes(), np.uint8)
+            arrays[f"{side}_said"] = np.stack([counts.agreeing, counts.through])
+        file = io.BytesIO()
+        np.savez(file, **arrays)
+        return file.getvalue()
+
+
+def _begin(
+    connection: Connection, row: MapRow, asked: NewDifference, cell_m: float
+) -> dict[str, Any]:
+    """Progress of a job that begins: the frames that it compares, and where."""
+    parent = shared_parent(connection, row, asked)
+    frames = {
+        side: _spread(
+            posed_in_session(connection, row.number, getattr(asked, side), parent),
+            api.MOST_COMPARED,
+        )
+        for side in SIDES
+    }
+    return {
+        "done": 0, "total": 2 * sum(map(len, frames.values())), "skipped": 0, "frames": frames,
+        "parent": parent, "cell_m": cell_m,
+    }  # fmt: skip
+
+
+def _order(frames: dict[Side, list[int]]) -> list[tuple[Side, int]]:
+    """Frames of both sessions in the order of the job."""
+    return [(side, number) for side in SIDES for number in frames[side]]
+
+
+def _frames_of(job: JobRow) -> list[int]:
+    """Numbers of the frames that a job compares."""
+    frames: dict[Side, list[int]] = (job.progress or {}).get("frames", {})
+    return [number for _, number in _order(frames)] if frames else []
+
+
+def _spread(numbers: Sequence[int], most: int) -> list[int]:
+    """At most so many of some numbers, evenly."""
+    if len(numbers) <= most:
+        return list(numbers)
+    return [numbers[i * len(numbers) // most] for i in range(most)]
+
+
+def _difference_record(job: JobRow, map_name: str) -> Difference:
+    return Difference(
+        difference_id=job.id, map=map_name, asked=NewDifference.model_validate(job.data or {}),
+        state=job.state, progress=job_progress(job),
+        result=None if job.result is None else DifferenceResult.model_validate(job.result),
+        error=job.error, created_at=when(job.created_at), finished_at=when(job.finished_at),
+    )  # fmt: skip

@@ -1,0 +1,78 @@
+"""The page that compares two sessions beside the API: begun on it, its counts, its three views."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+Settle = Callable[[Page], None]
+PATIENCE_MS = 60_000
+SIDES = ("monday", "tuesday")
+
+
+@pytest.fixture(scope="module")
+def weeks(station: Any, until: Callable[..., Any]) -> str:
+    """Path of a map whose sessions are one view of a room and the next one, an hour apart."""
+    path = str(station.make_map("weeks", title="Weeks"))
+    for i, (sent, session) in enumerate(zip(station.frames[:2], SIDES, strict=True)):
+        form = sent.form()
+        meta = {**sent.meta, "session": session, "captured_at": f"2026-11-20T0{i}:00:00Z"}
+        added = station.client.post(
+            f"{path}/frames", files=form["files"], data={"meta": json.dumps(meta)}
+        )
+        assert added.status_code == 202, added.text
+    until(lambda: station.client.get(path).json()["frames"].get("indexed") == 2)
+    return path
+
+
+def test_two_sessions_are_compared_and_seen_side_by_side(
+    station: Any, weeks: str, page: Page, settle: Settle, axe: Callable[[Page], list[str]]
+) -> None:
+    page.goto(f"{station.home}#/maps/weeks/sessions")
+    settle(page)
+    page.get_by_role("link", name="Compare session tuesday").click()
+    settle(page)
+    assert "difference?before=monday&after=tuesday" in page.url
+    expect(page.get_by_role("heading", name="Not compared yet")).to_be_visible()
+    assert station.client.get(f"{weeks}/differences").json()["items"] == []  # looking begins none
+    assert axe(page) == []
+    page.get_by_role("button", name="Compare").click()
+    legend = page.get_by_role("list", name="Legend")
+    expect(legend).to_be_visible(timeout=PATIENCE_MS)
+    settle(page)
+    (told,) = station.client.get(f"{weeks}/differences").json()["items"]
+    result = told["result"]
+    assert result["same"] > 500
+    shown = {
+        "Before": ("same", "gone", "unseen_after"),
+        "After": ("same", "new", "unseen_before"),
+        "Difference": ("same", "gone", "new", "unseen_after", "unseen_before"),
+    }
+    for name, kinds in shown.items():
+        button = page.get_by_role("button", name=name, exact=True)
+        button.click()
+        expect(button).to_have_attribute("aria-pressed", "true")
+        for kind in kinds:
+            expect(legend.locator(f"[data-kind={kind}]")).to_contain_text(f"{result[kind]:,} cells")
+        expect(legend.locator("li")).to_have_count(len(kinds))
+        drawn = """kinds => { const { viewer } = document.querySelector(".overlay-canvas");
+            return kinds.filter((kind) => viewer.layer(kind)?.visible)
+                .map((kind) => [kind, viewer.layer(kind).points.count]); }"""
+        everything = page.evaluate(drawn, list(shown["Difference"]))
+        assert dict(everything) == {kind: result[kind] for kind in kinds if result[kind]}
+    assert axe(page) == []
+    page.get_by_role("button", name="Before", exact=True).click()
+    page.reload()
+    settle(page)
+    expect(page.get_by_role("button", name="Before", exact=True)).to_have_attribute(
+        "aria-pressed", "true"
+    )
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.get_by_role("link", name="To the sessions").click()
+    settle(page)
+    assert page.url.endswith("#/maps/weeks/sessions")

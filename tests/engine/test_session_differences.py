@@ -1,0 +1,135 @@
+"""Two sessions of a map compared through the engine: a box that came, slices that are lost, and a
+frame that is deleted afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.engine.jobs.tasks import LongJob
+from sceneprint.engine.sessions.session_differences import DifferenceHandler
+from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
+from sceneprint.geometry.pose.rigid import inverse, moved
+from sceneprint_client.api import JobState
+from sceneprint_client.api.differences import GONE, NEW, Difference, NewDifference
+from sceneprint_client.surface_points import SurfacePoints, decode_points
+
+WorkOff = Callable[[Engine], list[JobState | None]]
+#: Of the box's front, before the cameras; and the pixels that it fills there.
+BOX_M = 0.8
+BOX = (slice(120, 360), slice(160, 480))
+
+
+@pytest.fixture
+def compared(
+    empty: Engine, uploads: Any, make_upload: Callable[..., Any], work_off: WorkOff
+) -> Any:
+    """Map `hall`: three frames of a room in session a, and in session b with something before the
+    camera; one frame of another room in session c. Returns the engine and the box's pose."""
+    for one in uploads[:3]:
+        meta = one.meta.model_copy(update={"session": "a"})
+        empty.add_frame("hall", one.data, meta)
+    for one in uploads[:3]:
+        depth = one.frame.depth.copy()
+        depth[BOX] = np.where(depth[BOX] > BOX_M, BOX_M, depth[BOX])
+        frame = replace(one.frame, depth=depth, pose=one.pose)
+        sent = make_upload(frame, one.room, session="b")
+        empty.add_frame("hall", sent.data, sent.meta)
+    other = uploads[6].meta.model_copy(update={"session": "c"})
+    empty.add_frame("hall", uploads[6].data, other)
+    assert set(work_off(empty)) == {JobState.SUCCEEDED}
+    return empty, [one.pose for one in uploads[:3]]
+
+
+def difference(engine: Engine, work_off: WorkOff, before: str, after: str) -> Difference:
+    begun = engine.differences.begin("hall", NewDifference(before=before, after=after))
+    assert begun.state is JobState.QUEUED
+    assert work_off(engine)[-1] is JobState.SUCCEEDED
+    return engine.differences.get("hall", begun.difference_id)
+
+
+def points_of(engine: Engine, told: Difference) -> SurfacePoints:
+    file = engine.differences.points("hall", told.difference_id)
+    return decode_points(engine.store.blobs.get(file.blob))
+
+
+def test_what_came_is_new_and_what_went_is_gone(compared: Any, work_off: WorkOff) -> None:
+    engine, poses = compared
+    told = difference(engine, work_off, "a", "b")
+    result = told.result
+    assert result is not None
+    assert (result.frames_before, result.frames_after, result.skipped) == (3, 3, 0)
+    assert result.cell_m == 0.05
+    assert result.new > 80
+    assert result.gone <= 0.002 * result.same
+    found = points_of(engine, told)
+    assert found.patches is not None
+    counts = np.bincount(found.patches, minlength=5).tolist()
+    assert counts == [
+        result.same, result.gone, result.new, result.unseen_after, result.unseen_before,
+    ]  # fmt: skip
+    # what is new lies on the box of one of the frames
+    new = found.points[found.patches == NEW]
+    depths = np.stack([moved(inverse(T), new)[:, 2] for T in poses])
+    assert (np.abs(depths - BOX_M).min(axis=0) < 0.05).mean() > 0.95
+    back = difference(engine, work_off, "b", "a")
+    assert back.result is not None
+    assert (back.result.gone, back.result.new) == (result.new, result.gone)
+    gone = points_of(engine, back)
+    np.testing.assert_array_equal(gone.points[gone.patches == GONE], new)
+
+
+def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
+    compared: Any, work_off: WorkOff, due_now: Callable[[Engine], None]
+) -> None:
+    engine, _ = compared
+    whole = difference(engine, work_off, "a", "b")
+    begun = engine.differences.begin("hall", NewDifference(before="a", after="b"))
+    with pytest.raises(NotIndexed, match="is queued"):
+        engine.differences.points("hall", begun.difference_id)
+    handler = DifferenceHandler(engine.store, engine.signers)
+    slices = 0
+    while not engine.differences.get("hall", begun.difference_id).state.over:
+        lost = engine.claim("dies")
+        assert isinstance(lost, LongJob)
+        first = handler(lost, 0.0)
+        due_now(engine)
+        again = engine.claim("lives")
+        assert isinstance(again, LongJob)
+        assert engine.tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
+        second = handler(again, 0.0)
+        assert asdict(first) == asdict(second)
+        engine.tasks._keep(again, second)
+        slices += 1
+    assert slices == 12  # each frame is fused, and judges
+    told = engine.differences.get("hall", begun.difference_id)
+    assert told.result == whole.result
+    files = [engine.differences.points("hall", one.difference_id) for one in (whole, told)]
+    assert files[0].blob == files[1].blob
+    # the frames of a comparison are shown by it: with one of them it goes
+    assert engine.differences.forget() == 0
+    page = engine.list_frames("hall").items
+    engine.delete_frame("hall", next(one.frame_id for one in page if one.session == "b"))
+    engine.purging.now()
+    for one in (whole, told):
+        with pytest.raises(UnknownJob):
+            engine.differences.get("hall", one.difference_id)
+    assert not engine.store.blobs.holds(files[0].blob)
+
+
+def test_sessions_that_cannot_be_compared_are_refused(compared: Any) -> None:
+    engine, _ = compared
+    for asked, why in (
+        ({"before": "a", "after": "z"}, "no indexed frame with a pose of session 'z'"),
+        ({"before": "a", "after": "c"}, "share no parent frame"),
+        ({"before": "a", "after": "b", "parent_frame": "x"}, "parent frame 'x'. Choose from"),
+    ):
+        with pytest.raises(InvalidRequest, match=why):
+            engine.differences.begin("hall", NewDifference.model_validate(asked))
+    with pytest.raises(ValueError, match="the same session"):
+        NewDifference(before="a", after="a")
