@@ -693,6 +693,26 @@ def placed_frames(
     return [PlacedFrame(*row) for row in connection.execute(asked)]
 
 
+@dataclass(frozen=True)
+class FrameViewpoint:
+    """Where a frame was taken; fields as in the table."""
+
+    number: int
+    map_number: int
+    pose_parent: str
+    pose: Any
+    cloud: Any
+
+
+def viewpoints_among(connection: Connection, numbers: Iterable[int]) -> list[FrameViewpoint]:
+    """Where the frames of some numbers were taken; those without a pose are left out."""
+    c = frames.c
+    asked = select(c.number, c.map_number, c.pose_parent, c.pose, c.cloud).where(
+        c.state != FrameState.DELETED, c.pose_x.is_not(None)
+    )
+    return [FrameViewpoint(*row) for row in rows_among(connection, asked, c.number, numbers)]
+
+
 def positions_of_map(connection: Connection, map_number: int) -> dict[str, NDArray[np.float64]]:
     """Where the indexed frames of a map were taken: (n, 3) of each parent frame, metres."""
     c = frames.c

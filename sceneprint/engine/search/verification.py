@@ -35,7 +35,13 @@ from sceneprint.localization import (
 )
 from sceneprint.matches import PairMatch, associate
 from sceneprint.store import Store
-from sceneprint.store.frame_queries import PlacedFrame, has_parent_frame, placed_frames
+from sceneprint.store.frame_queries import (
+    FrameViewpoint,
+    PlacedFrame,
+    has_parent_frame,
+    placed_frames,
+    viewpoints_among,
+)
 from sceneprint.store.frames import frames_of
 from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import FrameRow
@@ -184,11 +190,10 @@ def validate_elsewhere(
 
     def posed(numbers: Sequence[int]) -> dict[int, PosedFrame]:
         with store.queried.read() as connection:
-            rows = frames_of(connection, numbers)
+            found = viewpoints_among(connection, numbers)
         return {
-            number: PosedFrame(parent_key(row), np.array(row.pose), row.cloud is None)
-            for number, row in rows.items()
-            if row.pose is not None
+            one.number: PosedFrame(parent_key(one), np.array(one.pose), one.cloud is None)
+            for one in found
         }
 
     before = {match.index for match in tried.matches}
@@ -353,7 +358,7 @@ def nearest_first(
     return sorted(chosen, key=far)
 
 
-def parent_key(row: FrameRow) -> str:
+def parent_key(row: FrameRow | FrameViewpoint) -> str:
     """A parent frame by its map: another map may call its own the same."""
     return f"{row.map_number} {row.pose_parent}"
 
