@@ -278,6 +278,21 @@ def test_points_lie_where_they_are_projected(stage: Page) -> None:
         assert there[2] == pytest.approx(point[2] + 2)
 
 
+def test_pixels_before_the_first_frame_have_the_canvas_size(stage: Page) -> None:
+    told = stage.evaluate(
+        """() => {
+          const canvas = document.createElement("canvas");
+          canvas.style.setProperty("width", "40px");
+          canvas.style.setProperty("height", "30px");
+          document.body.append(canvas);
+          const early = viewer.createViewer(canvas, { label: "Early" });
+          const sizes = [early.pixels().length, early.pixels(1, 1, 2, 2).length];
+          early.destroy();
+          return sizes; }"""
+    )
+    assert told == [40 * 30 * 4, 2 * 2 * 4]
+
+
 def test_the_nearer_hides_the_farther_and_none_is_too_small(stage: Page) -> None:
     far, near = (0.0, 0.0, 3.0), (0.0, 0.0, 0.0)
     ground = drawn(stage)[0, 0].tolist()

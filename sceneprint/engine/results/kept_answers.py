@@ -193,7 +193,10 @@ class KeptAnswers:
                 wanted = replace(wanted, map_numbers=tuple(numbers))
             rows = list_answers(connection, wanted, named, before, limit + 1)
         more = self._store.seals.next_moment("query", [(r.at, r.number) for r in rows], limit)
-        may_read: Callable[[str], bool] = lambda name: names is None or name in names  # noqa: E731
+
+        def may_read(name: str) -> bool:
+            return names is None or name in names
+
         told = [_listed(row, may_read) for row in rows[:limit]]
         return Page[QueryRecord](items=told, next_cursor=more)
 

@@ -229,8 +229,9 @@ export class Viewer {
 
   /** Draw now and read: rgba bytes row by row from the upper left, of all or a part, in device
    * pixels. Chromium warns in its console that this is slow. */
-  pixels(x = 0, y = 0, width = this.canvas.width, height = this.canvas.height) {
-    this.#draw();
+  pixels(x = 0, y = 0, wide = 0, high = 0) {
+    this.#draw(); // which gives the canvas its size
+    const width = wide || this.canvas.width, height = high || this.canvas.height;
     const copy = /** @type {OffscreenCanvasRenderingContext2D} */ (new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true }));
     copy.drawImage(this.canvas, -x, -y);
     return copy.getImageData(0, 0, width, height).data;
