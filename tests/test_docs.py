@@ -23,6 +23,8 @@ from sceneprint.models import PRESETS, read_model
 ROOT = Path(__file__).resolve().parent.parent
 PAPER = (ROOT / "docs/paper.md").read_text()
 README = (ROOT / "README.md").read_text()
+STARTED = (ROOT / "docs/getting_started.md").read_text()
+LIBRARY = (ROOT / "docs/library.md").read_text()
 ARCHITECTURE = (ROOT / "docs/architecture.md").read_text()
 MODEL = (ROOT / "docs/model.md").read_text()
 PAGES = [
@@ -137,7 +139,7 @@ def blocks(text: str, language: str) -> list[str]:
 
 @contextmanager
 def served(line: str, folder: Path, environment: dict[str, str]) -> Iterator[None]:
-    """The README's service, running."""
+    """The documented service, running."""
     program, *arguments = line.split()
     assert (program, arguments) == (".venv/bin/sceneprint", ["serve"])
     process = subprocess.Popen(
@@ -159,22 +161,35 @@ def served(line: str, folder: Path, environment: dict[str, str]) -> Iterator[Non
         assert (process.returncode, out) == (0, f"sceneprint: dashboard {url}/dashboard\n")
 
 
-def test_readme_commands_are_known() -> None:
-    lines = [line for block in blocks(README, "sh") for line in block.strip().splitlines()]
+def commands_of(text: str) -> list[str]:
+    return [line for block in blocks(text, "sh") for line in block.strip().splitlines()]
+
+
+def test_readme_has_two_commands_one_example_and_at_most_700_words() -> None:
+    assert commands_of(README) == ["make demo", ".venv/bin/sceneprint serve"]
+    assert len(blocks(README, "python")) == 1
+    assert len(README.split()) <= 700
+
+
+def test_the_index_of_the_documentation_names_every_page() -> None:
+    linked = set(re.findall(r"\]\((\w+\.md)\)", (ROOT / "docs/README.md").read_text()))
+    assert linked == {page.name for page in (ROOT / "docs").glob("*.md")} - {"README.md"}
+
+
+def test_documented_commands_are_known() -> None:
+    lines = commands_of(STARTED + LIBRARY)
     commands = [line.split()[1:] for line in lines if line.startswith(".venv/bin/sceneprint ")]
-    assert len(commands) == 22
+    assert len(commands) == len(lines) == 22
     known = parser()
     for command in commands:
         assert known.parse_args(command).command == command[0]
 
 
 @pytest.mark.thorough
-def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
-    """Every command but `make`, which the tests themselves run under, in the README's order."""
-    commands = [line for block in blocks(README, "sh") for line in block.strip().splitlines()]
-    makes = [line for line in commands if line.startswith("make")]
-    assert makes == ["make demo"]
-    serve, *rest = [line for line in commands if line not in makes]
+def test_documented_commands_and_examples_run(tmp_path: Path) -> None:
+    """README, Getting started and Library, but for `make`, which the tests themselves run under."""
+    serve, *rest = commands_of(STARTED + LIBRARY)
+    assert serve == commands_of(README)[1]
     assert len(rest) == 21
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -221,7 +236,8 @@ def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
     pairs = json.loads((tmp_path / "pairs.json").read_text())
     assert set(pairs["validation"]) >= {"precision", "recall", "accepted"}
     assert (tmp_path / "plots/contact.png").stat().st_size > 10_000
-    client, library, place = blocks(README, "python")
+    (client,) = blocks(README, "python")
+    library, place = blocks(LIBRARY, "python")
     assert re.match(r"found x=\S+ y=\S+ z=\S+$", run_example(client, tmp_path).strip())
     assert len([line for line in library.splitlines() if line]) <= 10
     # the first frame of room 0 is found in other frames of room 0, and in none of room 1
@@ -312,11 +328,11 @@ def test_requests_are_walked_through_step_by_step(
     assert last in files
 
 
-def test_readme_camera_is_valid_json() -> None:
+def test_documented_camera_is_valid_json() -> None:
     from sceneprint.formats.dataset import Camera
     from sceneprint.types import Intrinsics
 
-    (example,) = blocks(README, "json")
+    (example,) = blocks(STARTED, "json")
     fields = json.loads(example)
     scale = fields.pop("depth_scale")
     assert Camera(Intrinsics(**fields), scale).depth_scale == 1000
