@@ -17,7 +17,7 @@ from tqdm import tqdm
 from benchmarks.encode import Clock, points_of
 from benchmarks.pairs import FramePair
 from sceneprint.errors import MissingDependency
-from sceneprint.geometry.pose.rigid import difference
+from sceneprint.geometry.rigid import difference
 from sceneprint.lab.evaluation.pairs.pair_run import METHODS, register
 from sceneprint.models import Model
 from sceneprint.open3d_loader import open3d

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidRequest, UselessFrame
-from sceneprint.geometry.pose.rigid import inverse, moved
+from sceneprint.geometry.rigid import inverse, moved
 from sceneprint.geometry.surface.coverage import TriangleMesh
 from sceneprint.geometry.surface.depth_image import halved
 from sceneprint.open3d_loader import open3d

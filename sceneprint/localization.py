@@ -17,11 +17,10 @@ from typing import Literal
 
 import numpy as np
 
-from sceneprint.geometry.pose.average import PoseAverage, average_poses
-from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.registration.covariance import error_of, place_covariance, transported
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.rigid import PoseAverage, average_poses, inverse
 from sceneprint.geometry.validation.acceptance import Strength
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,

@@ -10,12 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sceneprint.geometry.pose.average import average_poses
-from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.registration.alignment import are_scans
 from sceneprint.geometry.registration.gravity import Ups
 from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.rigid import average_poses, inverse
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,

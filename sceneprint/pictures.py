@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.atomic_files import write_whole
-from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.rigid import moved
 from sceneprint.geometry.surface.depth_image import inverse_depth, surface
 from sceneprint.models import Model
 from sceneprint.signing import describe

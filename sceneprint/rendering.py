@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.pose.average import levelling
-from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.rigid import levelling, moved
 from sceneprint.geometry.surface.coverage import TriangleMesh
 from sceneprint.types import Bytes, DepthFrame, Floats, Floats32, Ints32
 

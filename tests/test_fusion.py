@@ -9,7 +9,7 @@ import pytest
 
 from sceneprint.errors import InvalidRequest, UselessFrame
 from sceneprint.fusion import FusionParameters, fuse, within
-from sceneprint.geometry.pose.average import levelling
+from sceneprint.geometry.rigid import levelling
 from sceneprint.geometry.surface.coverage import (
     TriangleMesh,
     added_areas,

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.formats.pose_graph import PoseEdge, g2o, information_of
-from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.rigid import inverse
 from sceneprint.types import Floats
 
 

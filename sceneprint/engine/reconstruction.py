@@ -34,7 +34,7 @@ from sceneprint.errors import (
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.points.ply_export import write_ply
 from sceneprint.fusion import BAND, FusionParameters, fuse, within
-from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.surface.coverage import added_areas, observed_volume, of_views, share_seen
 from sceneprint.geometry.surface.depth_image import doubled
 from sceneprint.open3d_loader import open3d

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.errors import NotFound, NotIndexed
-from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.rigid import moved
 from sceneprint.scenes.appearance import (
     MAP_POINT_M,
     TRACK,

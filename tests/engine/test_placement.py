@@ -16,7 +16,7 @@ from sceneprint.engine.search.answer_status import Outcome, answer_status
 from sceneprint.engine.search.query import localization_of
 from sceneprint.engine.search.verification import Validated
 from sceneprint.errors import InvalidPose, InvalidRequest
-from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.localization import (
     AlternativePose,

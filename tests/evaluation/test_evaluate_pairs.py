@@ -13,7 +13,7 @@ from PIL import Image
 
 from sceneprint.cli import main
 from sceneprint.formats.points.ply_export import write_ply
-from sceneprint.geometry.pose.rigid import difference
+from sceneprint.geometry.rigid import difference
 from sceneprint.lab.evaluation.pairs.pair_run import BINS, METHODS, points_of, register
 from sceneprint.lab.evaluation.protocol import every_frame
 from sceneprint.models import Model, save_model

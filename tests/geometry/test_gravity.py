@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.pose.average import mean_direction
-from sceneprint.geometry.pose.rigid import difference, inverse, inverses
 from sceneprint.geometry.registration.gravity import (
     NO_UPS,
     GravityParameters,
@@ -27,6 +25,7 @@ from sceneprint.geometry.registration.patch_descriptors import (
     SlopeGate,
     correspondences,
 )
+from sceneprint.geometry.rigid import difference, inverse, inverses, mean_direction
 from sceneprint.geometry.validation.ambiguity import AmbiguityParameters, best_alternative
 from sceneprint.geometry.validation.validation import validate, validate_without_up
 from sceneprint.lab.synth import KINECT, symmetric_box, take, trajectory

@@ -6,7 +6,6 @@ from types import ModuleType
 
 import numpy as np
 
-from sceneprint.geometry.pose.rigid import moved
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.registration.session_difference import (
     CHANGED,
@@ -20,6 +19,7 @@ from sceneprint.geometry.registration.session_difference import (
     frame_verdicts,
     no_verdicts,
 )
+from sceneprint.geometry.rigid import moved
 from sceneprint.geometry.surface.cell_fusion import ViewStamp, seen_cells
 from sceneprint.types import Bytes, Floats, Intrinsics, Surface
 from sceneprint_client.surface_tiles import NO_SESSION

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from sceneprint import pipeline
 from sceneprint.errors import ModelMismatch
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.pose.rigid import difference, inverse
 from sceneprint.geometry.registration.alignment import align, samples_of
 from sceneprint.geometry.registration.overlap import explained, overlap_counts, sampled
+from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
 from sceneprint.geometry.validation.validation import (
     PairValidation,

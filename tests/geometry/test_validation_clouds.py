@@ -12,7 +12,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.pose.rigid import difference, inverse, moved
 from sceneprint.geometry.registration.icp import FINE, refine
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
@@ -20,6 +19,7 @@ from sceneprint.geometry.registration.overlap import (
     looked_up,
     sampled,
 )
+from sceneprint.geometry.rigid import difference, inverse, moved
 from sceneprint.geometry.scale import scaled
 from sceneprint.geometry.validation.acceptance import (
     AcceptanceParameters,

@@ -24,7 +24,7 @@ from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.formats.points.ply_export import points_of, write_ply
-from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.rigid import moved
 from sceneprint.previews import depth_view, normals_view, onto, patches_view, picture, vista_of
 from sceneprint.signing import hierarchy_of, see
 from sceneprint.store import Store, frame_queries

@@ -31,7 +31,7 @@ from sceneprint.errors import (
     UnreadableGeometry,
 )
 from sceneprint.formats.artifact import read_geometry
-from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.rigid import moved
 from sceneprint.geometry.surface.cell_fusion import FACTOR, TilePlace
 from sceneprint.store import Store, queue
 from sceneprint.store import surface_rows as stored

@@ -24,7 +24,7 @@ from sceneprint.engine.serializers import tag_of
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
 from sceneprint.formats.artifact import read_geometry
-from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.rigid import moved
 from sceneprint.geometry.surface.cell_fusion import (
     CELL_SUM,
     FACTOR,

@@ -27,11 +27,11 @@ from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.points.ply_export import points_of, write_ply
 from sceneprint.formats.points.web import LIMIT, encode_points, thinned
-from sceneprint.geometry.pose.rigid import inverse, moved
 from sceneprint.geometry.registration.covariance import PAIR_METHOD
 from sceneprint.geometry.registration.gravity import NO_UPS, Ups
 from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.geometry.retrieval.distance import pairwise_distances, similarity
+from sceneprint.geometry.rigid import inverse, moved
 from sceneprint.geometry.validation.inspection import (
     AGREES,
     VIOLATES,

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.engine.serializers import sensor_of, transform
-from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.registration.covariance import (
     PAIR_METHOD,
     PLACE_METHOD,
@@ -19,6 +18,7 @@ from sceneprint.geometry.registration.covariance import (
 )
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.retrieval.dpp import Selection
+from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.localization import PoseEstimate
 from sceneprint.matches import PairMatch

@@ -34,7 +34,6 @@ from sceneprint.errors import (
 )
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.points.web import MEDIA_TYPE, encode_points
-from sceneprint.geometry.pose.rigid import moved
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.registration.session_difference import (
     CHANGED,
@@ -49,6 +48,7 @@ from sceneprint.geometry.registration.session_difference import (
     frame_verdicts,
     no_verdicts,
 )
+from sceneprint.geometry.rigid import moved
 from sceneprint.geometry.surface.cell_fusion import CELL_SUM, ViewStamp, seen_cells
 from sceneprint.store import Store, queue
 from sceneprint.store.frame_queries import (

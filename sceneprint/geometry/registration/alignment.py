@@ -18,7 +18,6 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.geometry.frame_cache import cached_per_frame
-from sceneprint.geometry.pose.rigid import distinct, inverse, inverses
 from sceneprint.geometry.registration.consensus import ConsensusParameters, consensus
 from sceneprint.geometry.registration.gravity import (
     GravityParameters,
@@ -61,6 +60,7 @@ from sceneprint.geometry.registration.sequence_alignment import (
     SequenceParameters,
     sequence_correspondences,
 )
+from sceneprint.geometry.rigid import distinct, inverse, inverses
 from sceneprint.geometry.surface.camera import kind_of
 from sceneprint.types import Floats, Floats32, Geometry, Ints32, Sphere, Surface
 

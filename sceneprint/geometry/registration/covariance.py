@@ -20,9 +20,8 @@ from typing import Literal
 
 import numpy as np
 
-from sceneprint.geometry.pose.average import PoseAverage
-from sceneprint.geometry.pose.rigid import rotation_angle
 from sceneprint.geometry.registration.icp import Refined
+from sceneprint.geometry.rigid import PoseAverage, rotation_angle
 from sceneprint.types import Floats
 
 Method = Literal["information-scaled", "votes-and-spread"]

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.geometry.kernel import disjoint_kernel, kernel
-from sceneprint.geometry.pose.rigid import solve_positive, turned
 from sceneprint.geometry.registration.overlap import LookupTarget, nearest_alike, sampled, target_of
+from sceneprint.geometry.rigid import solve_positive, turned
 from sceneprint.geometry.surface.camera import (
     BLOCK,
     PINHOLE,

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.registration.overlap import (
     AGREES,
     UNKNOWN,
@@ -27,6 +26,7 @@ from sceneprint.geometry.registration.overlap import (
     looked_up,
     tolerances,
 )
+from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.surface.cell_fusion import CellSums, TilePlace, fused
 from sceneprint.types import Bytes, Floats, Surface
 from sceneprint_client.surface_tiles import SIDE

@@ -23,7 +23,6 @@ import numpy as np
 
 from sceneprint.geometry.frame_cache import cached_per_frame
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.pose.rigid import are_near, distinct
 from sceneprint.geometry.registration.gravity import NO_UPS, Ups, are_level
 from sceneprint.geometry.registration.icp import COARSE, QUICK, RefinementParameters, refined_all
 from sceneprint.geometry.registration.overlap import (
@@ -32,6 +31,7 @@ from sceneprint.geometry.registration.overlap import (
     PlaneView,
     explained,
 )
+from sceneprint.geometry.rigid import are_near, distinct
 from sceneprint.types import Floats, Patches
 
 

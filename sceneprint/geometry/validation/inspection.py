@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.pose.rigid import inverse, moved
 from sceneprint.geometry.registration.consensus import ConsensusParameters
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
@@ -25,6 +24,7 @@ from sceneprint.geometry.registration.overlap import (
     tolerances,
     weigh_overlap,
 )
+from sceneprint.geometry.rigid import inverse, moved
 from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches, Surface
 
 #: What becomes of a point: nothing to compare it with, or beside the surface; on it; before it.

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sceneprint.geometry.pose.rigid import rotation_angle
+from sceneprint.geometry.rigid import rotation_angle
 from sceneprint.geometry.validation.validation import PairValidation
 
 #: Error of a depth camera's transform for each radian between the two views, metres: distortion

@@ -18,13 +18,6 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.geometry.core_pool import both
-from sceneprint.geometry.pose.rigid import (
-    difference,
-    inverse,
-    inverses,
-    nearest_rotation,
-    rotation_angle,
-)
 from sceneprint.geometry.registration.alignment import (
     Alignment,
     AlignmentParameters,
@@ -47,6 +40,13 @@ from sceneprint.geometry.registration.overlap import (
     sampled,
 )
 from sceneprint.geometry.registration.sequence_alignment import Matching
+from sceneprint.geometry.rigid import (
+    difference,
+    inverse,
+    inverses,
+    nearest_rotation,
+    rotation_angle,
+)
 from sceneprint.geometry.surface.camera import kind_of
 from sceneprint.geometry.validation.acceptance import (
     AcceptanceParameters,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.rigid import moved
 from sceneprint.lab.evaluation.protocol import VIEWS, QueryOutcome, ValidatedPair
 from sceneprint.types import AnyFrame, Cloud, Floats
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from sceneprint.atomic_files import write_whole
 from sceneprint.formats.points.ply_export import write_ply
-from sceneprint.geometry.pose.average import levelling
-from sceneprint.geometry.pose.rigid import inverse, moved
 from sceneprint.geometry.retrieval.distance import similarity
+from sceneprint.geometry.rigid import inverse, levelling, moved
 from sceneprint.lab.evaluation.diversity import FARTHEST, coverage, equal_views
 from sceneprint.lab.evaluation.measures import bound_of, first_error
 from sceneprint.lab.evaluation.protocol import VIEWS, Error, FrameStore, QueryOutcome, ValidatedPair

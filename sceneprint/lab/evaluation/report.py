@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.rigid import inverse
 from sceneprint.lab.evaluation.baselines.comparison_report import baseline_rows, recalls
 from sceneprint.lab.evaluation.diversity import diversity
 from sceneprint.lab.evaluation.measures import (

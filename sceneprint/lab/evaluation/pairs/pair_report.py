@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sceneprint.geometry.pose.average import levelling
-from sceneprint.geometry.pose.rigid import inverse, moved
+from sceneprint.geometry.rigid import inverse, levelling, moved
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Evidence
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.lab.evaluation.measures import (
