@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.geometry.rigid import difference, inverse
-from sceneprint.lab.evaluation.pairs.pair_run import (
+from sceneprint.lab.evaluation.pair_run import (
     BINS,
     inside,
     peer_points,

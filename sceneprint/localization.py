@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from sceneprint.geometry.registration.covariance import error_of, place_covariance, transported
+from sceneprint.geometry.registration.icp import error_of, place_covariance, transported
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.rigid import PoseAverage, average_poses, inverse
@@ -35,8 +35,8 @@ from sceneprint.geometry.validation.map_verification import (
     starts_about,
     view_separations,
 )
-from sceneprint.geometry.validation.match_ranking import preferred
-from sceneprint.matches import PairMatch
+from sceneprint.geometry.validation.validation import preferred
+from sceneprint.pipeline import PairMatch
 from sceneprint.types import Floats, Geometry
 
 LocalizationStatus = Literal["found", "ambiguous", "not_found"]

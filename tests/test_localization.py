@@ -39,8 +39,7 @@ from sceneprint.localization import (
     unconfirmed,
     views_of_rows,
 )
-from sceneprint.matches import PairMatch, associate
-from sceneprint.pipeline import Signer, open_signer, prepare, retrieve
+from sceneprint.pipeline import PairMatch, Signer, associate, open_signer, prepare, retrieve
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics, Patches, Surface
 
 

@@ -19,7 +19,7 @@ from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import DamagedBlob, UnknownMap
 from sceneprint.geometry.rigid import difference
-from sceneprint.matches import associate
+from sceneprint.pipeline import associate
 from sceneprint.store.tables import frames, signatures
 from sceneprint_client.api import NewMap, Query
 

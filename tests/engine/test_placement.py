@@ -26,8 +26,7 @@ from sceneprint.localization import (
     localize,
     views_of_rows,
 )
-from sceneprint.matches import PairMatch, associate
-from sceneprint.pipeline import Signature, Signer, diversify, retrieve
+from sceneprint.pipeline import PairMatch, Signature, Signer, associate, diversify, retrieve
 from sceneprint.store.frame_queries import placed_frames
 from sceneprint.types import Geometry, Patches
 from sceneprint_client.api import Counts, Localization, Prior, Query

@@ -16,7 +16,7 @@ from sceneprint.geometry.registration.overlap import (
     plane_weights,
 )
 from sceneprint.geometry.rigid import difference, inverse, inverses, moved
-from sceneprint.geometry.validation.ambiguity import (
+from sceneprint.geometry.validation.acceptance import (
     AmbiguityParameters,
     best_alternative,
     far_from,

@@ -20,9 +20,8 @@ from sceneprint.geometry.registration.plan_search import (
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.rigid import difference, distinct, inverse, moved
 from sceneprint.lab.synth import synthesise_survey
-from sceneprint.matches import associate
 from sceneprint.models import Model, read_model
-from sceneprint.pipeline import geometry_of, validate
+from sceneprint.pipeline import associate, geometry_of, validate
 from sceneprint.signing import see
 from sceneprint.types import Cloud, Floats, Sphere, Surface
 

@@ -28,9 +28,8 @@ from sceneprint.geometry.validation.validation import (
 )
 from sceneprint.lab.synth import KINECT, symmetric_box, take, trajectory
 from sceneprint.lab.synth.dataset import room_and_rng
-from sceneprint.lab.synth.mesh import box, join
+from sceneprint.lab.synth.mesh import Ceiling, box, join, shell, walls_of
 from sceneprint.lab.synth.rooms import Room
-from sceneprint.lab.synth.walls import Ceiling, shell, walls_of
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see

@@ -39,8 +39,8 @@ from sceneprint.geometry.session_join import (
     verdicts,
     votes_of,
 )
-from sceneprint.matches import PairMatch, associate
 from sceneprint.models import Model
+from sceneprint.pipeline import PairMatch, associate
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import PathFrame, stops_of
 from sceneprint.store.frames import frames_of

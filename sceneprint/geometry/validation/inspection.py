@@ -29,7 +29,7 @@ from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches,
 
 #: What becomes of a point: nothing to compare it with, or beside the surface; on it; before it.
 NEITHER, AGREES, VIOLATES = 0, 1, 2
-#: And how far it is from the surface, as `sceneprint.formats.points.web` tells it.
+#: And how far it is from the surface, as `sceneprint.formats.export` tells it.
 TOLERANCE, OUTSIDE, VIOLATION = 250, 253, 254
 
 Verdicts = NDArray[np.uint8]

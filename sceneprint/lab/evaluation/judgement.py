@@ -48,8 +48,7 @@ from sceneprint.localization import (
     rival_rows,
     views_of_rows,
 )
-from sceneprint.matches import PairMatch, associate, searched
-from sceneprint.pipeline import validate
+from sceneprint.pipeline import PairMatch, associate, searched, validate
 from sceneprint.types import Bytes, Floats, Geometry
 
 

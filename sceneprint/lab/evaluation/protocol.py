@@ -28,8 +28,11 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.retrieval.distance import Metric
 from sceneprint.geometry.rigid import difference, moved
 from sceneprint.geometry.validation.acceptance import Strength
-from sceneprint.geometry.validation.match_ranking import preferred
-from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
+from sceneprint.geometry.validation.validation import (
+    PairValidation,
+    ValidationParameters,
+    preferred,
+)
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, open_signer, prepare
 from sceneprint.types import (

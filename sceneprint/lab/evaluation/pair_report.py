@@ -24,7 +24,7 @@ from sceneprint.lab.evaluation.measures import (
     upper_bound,
     validation_of,
 )
-from sceneprint.lab.evaluation.pairs.pair_run import BINS, METHODS, PairEvaluation, Tried, points_of
+from sceneprint.lab.evaluation.pair_run import BINS, METHODS, PairEvaluation, Tried, points_of
 from sceneprint.lab.evaluation.plots import (
     RIGHT,
     UNDECIDED,
@@ -44,10 +44,6 @@ from sceneprint.types import AnyFrame, Bytes, Cloud, DepthFrame, Floats
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-# The figures of pairs as lines to read in a terminal.
-#
-# figures  --pair_table-->  lines
 
 _COLUMNS = ("within_5cm_5deg", "right")
 _LIMITS = "within 5 cm / right"
