@@ -9,13 +9,12 @@ import numpy as np
 
 from sceneprint.errors import MissingDependency
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.signature.fisher_vector import quantise, statistics_of_counts
-from sceneprint.geometry.signature.pair_table import count_pairs
+from sceneprint.fusion import open3d
+from sceneprint.geometry.signature.fisher_vector import quantise, statistics_of_counts, whiten
+from sceneprint.geometry.signature.pair_features import count_pairs
 from sceneprint.geometry.signature.segmentation import hierarchy, patch_weights, segment
-from sceneprint.geometry.signature.whitening import whiten
 from sceneprint.geometry.surface.depth_image import inverse_depth, surface
-from sceneprint.lab.evaluation.pairs.pair_run import FEATURES, NORMALS, VOXEL, Clock, points_of
-from sceneprint.open3d_loader import open3d
+from sceneprint.lab.evaluation.pair_run import FEATURES, NORMALS, VOXEL, Clock, points_of
 from sceneprint.pipeline import Signer, geometry_of, sign
 from sceneprint.signing import float_signature, see
 from sceneprint.types import DepthFrame, Floats

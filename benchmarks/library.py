@@ -11,8 +11,16 @@ from benchmarks.encode import Clock
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.localization import PoseEstimate, QueryFrame, localize, views_of_rows
-from sceneprint.matches import PairMatch, associate, searched
-from sceneprint.pipeline import Signature, diversify, open_signer, prepare, retrieve
+from sceneprint.pipeline import (
+    PairMatch,
+    Signature,
+    associate,
+    diversify,
+    open_signer,
+    prepare,
+    retrieve,
+    searched,
+)
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Answer
 

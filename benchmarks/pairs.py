@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.rigid import inverse
 from sceneprint.lab.evaluation.protocol import overlap, view_of
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.types import DepthFrame, Floats

@@ -22,8 +22,8 @@ import numpy as np
 from tqdm import tqdm
 
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.geometry.pose.rigid import difference, inverse
-from sceneprint.lab.evaluation.pairs.pair_run import (
+from sceneprint.geometry.rigid import difference, inverse
+from sceneprint.lab.evaluation.pair_run import (
     BINS,
     inside,
     peer_points,

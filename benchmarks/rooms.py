@@ -19,7 +19,7 @@ from sqlalchemy import insert, select
 
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import write_depth_png
-from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.formats.export import write_ply
 from sceneprint.lab.synth import KINECT, symmetric_box, synthesise_room, synthesise_survey, take
 from sceneprint.lab.synth.trajectories import pose
 from sceneprint.settings import Settings

@@ -25,11 +25,12 @@ if TYPE_CHECKING:
     from sceneprint.formats.points import decode_cloud
     from sceneprint.geometry.validation.validation import PairValidation
     from sceneprint.localization import PoseEstimate, QueryFrame, localize, views_of_rows
-    from sceneprint.matches import PairMatch, associate
     from sceneprint.models import Model, read_model
     from sceneprint.pipeline import (
+        PairMatch,
         Signature,
         Signer,
+        associate,
         distance,
         diversify,
         open_signer,
@@ -82,12 +83,12 @@ _HOME = {
     "Intrinsics": "types",
     "PoseEstimate": "localization",
     "QueryFrame": "localization",
-    "PairMatch": "matches",
+    "PairMatch": "pipeline",
     "Model": "models",
     "Signature": "pipeline",
     "Signer": "pipeline",
     "PairValidation": "geometry.validation.validation",
-    "associate": "matches",
+    "associate": "pipeline",
     "decode_cloud": "formats.points",
     "distance": "pipeline",
     "diversify": "pipeline",

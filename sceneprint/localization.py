@@ -17,11 +17,10 @@ from typing import Literal
 
 import numpy as np
 
-from sceneprint.geometry.pose.average import PoseAverage, average_poses
-from sceneprint.geometry.pose.rigid import inverse
-from sceneprint.geometry.registration.covariance import error_of, place_covariance, transported
+from sceneprint.geometry.registration.icp import error_of, place_covariance, transported
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.rigid import PoseAverage, average_poses, inverse
 from sceneprint.geometry.validation.acceptance import Strength
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
@@ -36,8 +35,8 @@ from sceneprint.geometry.validation.map_verification import (
     starts_about,
     view_separations,
 )
-from sceneprint.geometry.validation.match_ranking import preferred
-from sceneprint.matches import PairMatch
+from sceneprint.geometry.validation.validation import preferred
+from sceneprint.pipeline import PairMatch
 from sceneprint.types import Floats, Geometry
 
 LocalizationStatus = Literal["found", "ambiguous", "not_found"]

@@ -1,23 +1,38 @@
-"""What the geometry sees of a frame, as a picture.
+"""Frames as pictures: what the geometry sees of one as a figure, and small ones, by view.
 
 Frame  --save_picture-->  PNG: depth, normals, patches of each level
+Surface, labels  --depth_view | normals_view | patches_view-->  colours  --picture-->  PNG
 """
 
 from __future__ import annotations
 
+import io
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.atomic_files import write_whole
-from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.rigid import moved
 from sceneprint.geometry.surface.depth_image import inverse_depth, surface
 from sceneprint.models import Model
 from sceneprint.signing import describe
-from sceneprint.types import Bytes, DepthFrame, Floats, Floats32, Ints32, Surface
+from sceneprint.types import (
+    Bytes,
+    DepthFrame,
+    Floats,
+    Floats32,
+    Intrinsics,
+    Ints32,
+    Sphere,
+    Surface,
+)
+from sceneprint_client.api.results import WIDTHS
 
 #: Colour where nothing is known: dark grey, which no normal and no depth has.
 UNKNOWN = 40
@@ -176,3 +191,294 @@ def save_overlay(
     buffer = BytesIO()
     figure.savefig(buffer, dpi=110, format="png", metadata={"Software": None})
     write_whole(path, buffer.getvalue())
+
+
+# A frame as a small picture, by view.
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+#: Pixels along the longer side of a view from above, by the number of points.
+_LEAST, _MOST = 16, 320
+_OPTICAL = "x right, y down, z forward"
+_AXES = "the x, y and z of its own axes"
+
+
+@dataclass(frozen=True, eq=False)
+class Vista:
+    """An image of a surface.
+
+    Parameters
+    ----------
+    pixels : (h, w) int32, index of the point that a pixel shows; -1 for none
+    distances : (N,) float64, metres, of each point
+    what : those are: "depth" along a camera's axis, "range" from a viewpoint, or "height"
+    axes : of the normals, in words
+    """
+
+    pixels: Ints32
+    distances: Floats
+    what: Literal["depth", "range", "height"]
+    axes: str
+
+    def of(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
+        """(h, w, ...) values of the points that are shown; whatever where none is."""
+        chosen: NDArray[Scalar] = values[self.pixels]
+        return chosen
+
+    @property
+    def shown(self) -> NDArray[np.bool_]:
+        """(h, w): whether a pixel shows a point."""
+        return self.pixels >= 0
+
+
+def vista_of(surface: Surface) -> Vista:
+    """How to draw a surface: as its camera saw it, as one looks about its viewpoint, or, of points
+    in no order, from the side of their least extent, which is above in a building.
+
+    Parameters
+    ----------
+    surface : (h, w) points, metres
+    """
+    points = surface.points.reshape(-1, 3).astype(np.float64)
+    count = np.arange(len(points), dtype=np.int32).reshape(surface.valid.shape)
+    pixels = np.where(surface.valid, count, np.int32(-1))
+    if isinstance(surface.camera, Intrinsics):
+        return Vista(pixels, points[:, 2], "depth", _OPTICAL)
+    if isinstance(surface.camera, Sphere):
+        # azimuth counts to the left of who has the pole above; an optical frame's y points down
+        turned = pixels[::-1] if surface.camera.pole == 1 else pixels[:, ::-1]
+        return Vista(turned, np.linalg.norm(points, axis=1), "range", _AXES)
+    return _from_above(points, surface.valid.ravel())
+
+
+def onto(vista: Vista, surface: Surface, points: Floats32, labels: Ints32) -> Ints32:
+    """Labels of points in no order, as the pixels of another picture of the same show them.
+
+    Parameters
+    ----------
+    vista : of `surface`
+    surface : what is drawn
+    points : (N, 3) metres, in its coordinates
+    labels : (N,) of each point, -1 for none
+
+    Returns
+    -------
+    labels : (h, w) of the nearest point to what a pixel shows; -1 for none
+    """
+    from scipy.spatial import KDTree
+
+    drawn: Ints32 = np.full(vista.pixels.shape, -1, np.int32)
+    _, nearest = KDTree(points).query(surface.points.reshape(-1, 3)[vista.pixels[vista.shown]])
+    drawn[vista.shown] = labels[nearest]
+    return drawn
+
+
+def _from_above(points: Floats, valid: NDArray[np.bool_]) -> Vista:
+    """Of all points that lie on a pixel the highest is shown."""
+    seen = np.flatnonzero(valid)
+    if not seen.size:
+        return Vista(np.full((1, 1), -1, np.int32), np.zeros(len(points)), "height", _AXES)
+    centred = points - points[seen].mean(axis=0)
+    _, axes = np.linalg.eigh(centred[seen].T @ centred[seen])
+    for i in (0, 2):  # of the two senses the one towards which the axis nearest to it points
+        axes[:, i] *= np.sign(axes[np.argmax(np.abs(axes[:, i])), i])
+    above, right = axes[:, 0], axes[:, 2]
+    heights = centred @ above
+    flat = np.stack([centred @ np.cross(right, above), centred @ right], axis=1)  # down, right
+    low = flat[seen].min(axis=0)
+    size = np.maximum(flat[seen].max(axis=0) - low, 1e-6)
+    longer = min(max(math.isqrt(len(seen)), _LEAST), _MOST)
+    cell = size.max() / (longer - 1)
+    rows, columns = np.rint((flat[seen] - low) / cell).astype(np.intp).T
+    pixels: Ints32 = np.full((rows.max() + 1, columns.max() + 1), -1, np.int32)
+    order = np.argsort(heights[seen], kind="stable")  # the highest is written last
+    pixels[rows[order], columns[order]] = seen[order]
+    return Vista(pixels, heights, "height", _AXES)
+
+
+#: Most rows: a picture that would be higher is made narrower.
+MOST_ROWS = 2560
+
+#: Percentiles of depth that are called near and far: a stray sample must not darken all others.
+_RANGE = (1.0, 99.0)
+#: matplotlib's viridis at equal steps: between them it is straight to 6 of 255. The library
+#: itself takes a third of a second to load.
+_VIRIDIS = np.array(
+    [
+        (68, 1, 84), (72, 24, 106), (71, 45, 123), (66, 64, 134), (59, 82, 139), (51, 99, 141),
+        (44, 114, 142), (38, 130, 142), (33, 145, 140), (31, 160, 136), (40, 174, 128),
+        (63, 188, 115), (94, 201, 98), (132, 212, 75), (173, 220, 48), (216, 226, 25),
+        (253, 231, 37),
+    ],
+    np.float64,
+)  # fmt: skip
+#: Colours to choose from beyond one for each patch, so that the last ones have a choice too.
+_SPARE = 64
+#: Oklab to linear sRGB: to the cone responses' cube roots, then to the primaries.
+_TO_CONES = np.array(
+    [(1, 0.3963377774, 0.2158037573), (1, -0.1055613458, -0.0638541728),
+     (1, -0.0894841775, -1.2914855480)]
+)  # fmt: skip
+_TO_PRIMARIES = np.array(
+    [(4.0767416621, -3.3077115913, 0.2309699292), (-1.2684380046, 2.6097574011, -0.3413193965),
+     (-0.0041960863, -0.7034186147, 1.7076147010)]
+)  # fmt: skip
+
+
+def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
+    """Depth by a colour map of equal steps to the eye: near is yellow, far is violet. Of a cloud
+    its range, or seen from above its height: high is yellow.
+
+    Parameters
+    ----------
+    surface : (h, w) points, metres
+
+    Returns
+    -------
+    colours : (h', w', 3) uint8, as `vista_of` has the pixels; dark grey where nothing is known
+    meaning : `near_m` and `far_m`, the depths or ranges of the ends of the colour map; of heights
+        `low_m` and `high_m`, from their mean
+    """
+    vista = vista_of(surface)
+    z, shown = vista.of(vista.distances), vista.shown
+    seen = z[shown]
+    near, far = np.percentile(seen, _RANGE).tolist() if seen.size else (0.0, 0.0)
+    share = (far - z) / max(far - near, 1e-9)
+    mixed = viridis(1.0 - share if vista.what == "height" else share)
+    ends, words = ("near_m", "far_m"), (f"{near:.2f} m or nearer", f"{far:.2f} m or farther")
+    if vista.what == "height":
+        ends, words = ("low_m", "high_m"), (f"{far:.2f} m or higher", f"{near:.2f} m or lower")
+    meaning = {
+        **dict(zip(ends, (f"{near:.4f}", f"{far:.4f}"), strict=True)),
+        "Description": f"{vista.what}: yellow {words[0]}, violet {words[1]}, dark grey unknown",
+    }
+    return np.where(shown[..., None], mixed, UNKNOWN), meaning
+
+
+def viridis(shares: Floats) -> Bytes:
+    """Colours (..., 3) of shares: violet at 0 and below, yellow at 1 and above."""
+    place = np.clip(shares, 0.0, 1.0) * (len(_VIRIDIS) - 1)
+    steps = np.arange(len(_VIRIDIS))
+    mixed = np.stack([np.interp(place, steps, _VIRIDIS[:, c]) for c in range(3)], axis=-1)
+    return np.rint(mixed).astype(np.uint8)
+
+
+def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
+    """Unit normals in the sensor's axes: red, green, blue are 127.5 (1 + x, y, z).
+
+    Parameters
+    ----------
+    surface : (h, w) normals
+
+    Returns
+    -------
+    colours : (h', w', 3) uint8, as `vista_of` has the pixels; dark grey where nothing is known
+    meaning : in words
+    """
+    vista = vista_of(surface)
+    frame = "optical frame" if vista.what == "depth" else "sensor's frame"
+    text = (
+        f"normals in the {frame}: red, green, blue are 127.5 (1 + n) of {vista.axes}; dark grey "
+        "unknown"
+    )
+    normals = vista.of(surface.normals.reshape(-1, 3))
+    return normal_colours(normals, vista.shown), {"Description": text}
+
+
+def patches_view(labels: Ints32) -> tuple[Bytes, dict[str, str]]:
+    """Patches, each in a colour of its own that is unlike those of its neighbours.
+
+    Parameters
+    ----------
+    labels : (h, w) index of each pixel's patch, -1 for none
+
+    Returns
+    -------
+    colours : (h, w, 3) uint8; dark grey where there is no patch. The same for the same labels
+    meaning : in words
+    """
+    count = int(labels.max(initial=-1)) + 1
+    palette = np.concatenate([_colours_of(labels, count), np.full((1, 3), UNKNOWN, np.uint8)])
+    text = f"{count} patches of the finest level, each a colour; dark grey none"
+    return palette[labels], {"patches": str(count), "Description": text}
+
+
+def picture(colours: Bytes, width: int, text: Mapping[str, str]) -> bytes:
+    """Colours as a PNG of a width; pixels are repeated or left out, never mixed.
+
+    Parameters
+    ----------
+    colours : (h, w, 3) uint8
+    width : columns; fewer where there would be more than MOST_ROWS rows
+    text : kept in the file's tEXt chunks
+
+    Raises
+    ------
+    ValueError : a width beyond WIDTHS.
+    """
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    if not WIDTHS[0] <= width <= WIDTHS[1]:
+        raise ValueError(f"width {width}: from {WIDTHS[0]} to {WIDTHS[1]}")
+    scale = min(width / colours.shape[1], MOST_ROWS / colours.shape[0])
+    rows, columns = (_chosen(n, max(round(n * scale), 1)) for n in colours.shape[:2])
+    info = PngInfo()
+    for name, value in text.items():
+        info.add_text(name, value)
+    buffer = io.BytesIO()
+    Image.fromarray(colours[rows[:, None], columns]).save(buffer, "PNG", pnginfo=info)
+    return buffer.getvalue()
+
+
+def _chosen(n: int, wanted: int) -> NDArray[np.intp]:
+    """Which of `n` pixels lie under the centres of so many."""
+    return ((np.arange(wanted) + 0.5) * n / wanted).astype(np.intp)
+
+
+def _colours_of(labels: Ints32, count: int) -> Bytes:
+    """A colour for each patch: of those left, the one most unlike its neighbours' so far."""
+    lab = _palette(count + _SPARE)
+    squares = (lab**2).sum(axis=1)[:, None]
+    neighbours = _neighbours(labels, count)
+    free = np.ones(len(lab), np.bool_)
+    chosen = np.full(count, -1, np.intp)
+    for patch in range(count):
+        beside = chosen[neighbours[patch]]
+        beside = beside[beside >= 0]
+        if len(beside):
+            apart = (squares - 2.0 * lab @ lab[beside].T + squares[beside, 0]).min(axis=1)
+            chosen[patch] = np.argmax(np.where(free, apart, -1.0))
+        else:
+            chosen[patch] = np.argmax(free)
+        free[chosen[patch]] = False
+    return _displayed(lab[chosen])
+
+
+def _neighbours(labels: Ints32, count: int) -> list[NDArray[np.intp]]:
+    """Patches that share an edge of pixels with each patch."""
+    across = np.stack([labels[:, :-1].ravel(), labels[:, 1:].ravel()], axis=1)
+    down = np.stack([labels[:-1].ravel(), labels[1:].ravel()], axis=1)
+    pairs = np.concatenate([across, down])
+    pairs = pairs[(pairs[:, 0] != pairs[:, 1]) & (pairs.min(axis=1) >= 0)]
+    pairs = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
+    ends = np.searchsorted(pairs[:, 0], np.arange(count + 1))
+    return [pairs[ends[i] : ends[i + 1], 1].astype(np.intp) for i in range(count)]
+
+
+def _palette(count: int) -> Floats:
+    """So many colours (count, 3) in Oklab, spread evenly over hues and lightnesses."""
+    n = np.arange(1, count + 1)
+    # the plastic number's powers: no two points of the square come near (Roberts 2018)
+    plastic = 1.32471795724474602596
+    lightness = 0.48 + 0.4 * ((0.5 + n / plastic) % 1.0)
+    hue = 2.0 * math.pi * ((0.5 + n / plastic**2) % 1.0)
+    return np.stack([lightness, 0.11 * np.cos(hue), 0.11 * np.sin(hue)], axis=1)
+
+
+def _displayed(lab: Floats) -> Bytes:
+    """Oklab (n, 3) as sRGB."""
+    linear = np.clip(((lab @ _TO_CONES.T) ** 3) @ _TO_PRIMARIES.T, 0.0, 1.0)
+    curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    colours: Bytes = np.rint(255.0 * curved).astype(np.uint8)
+    return colours

@@ -20,12 +20,22 @@ from sceneprint.geometry.signature.fisher_vector import (
     signature,
     statistics_of_counts,
     statistics_of_features,
+    whiten,
 )
-from sceneprint.geometry.signature.pair_features import neighbour_pairs, pair_properties, project
-from sceneprint.geometry.signature.pair_table import PairTable, count_pairs
-from sceneprint.geometry.signature.segmentation import hierarchy, patch_weights, patches_of, segment
-from sceneprint.geometry.signature.supervoxels import supervoxels
-from sceneprint.geometry.signature.whitening import whiten
+from sceneprint.geometry.signature.pair_features import (
+    PairTable,
+    count_pairs,
+    neighbour_pairs,
+    pair_properties,
+    project,
+)
+from sceneprint.geometry.signature.segmentation import (
+    hierarchy,
+    patch_weights,
+    patches_of,
+    segment,
+    supervoxels,
+)
 from sceneprint.geometry.surface.depth_image import inverse_depth, surface
 from sceneprint.geometry.surface.voxels import Voxels, voxels
 from sceneprint.models import (

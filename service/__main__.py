@@ -8,7 +8,7 @@ import sys
 from pydantic import ValidationError
 
 from sceneprint.errors import SceneprintError
-from sceneprint.logs import log_as_json
+from sceneprint.process import log_as_json
 from sceneprint.settings import Settings
 from service.server import run
 

@@ -28,7 +28,7 @@ from sceneprint.errors import (
     UnsupportedType,
     UnusableStore,
 )
-from sceneprint.formats.image.depth_file import size_of
+from sceneprint.formats.depth_file import size_of
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint_client.api import FrameMeta
 from sceneprint_client.api.frames import (

@@ -23,7 +23,7 @@ from starlette.types import Message, Scope
 from threadpoolctl import threadpool_limits
 
 from sceneprint.engine import Engine
-from sceneprint.maintenance.snapshot.catalog import LONGEST_S, SNAPSHOT, snapshot_handler
+from sceneprint.maintenance.snapshot.creation import LONGEST_S, SNAPSHOT, snapshot_handler
 from sceneprint.settings import Settings
 from service.app import create_app
 

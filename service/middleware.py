@@ -13,7 +13,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from sceneprint.errors import Busy, RateLimited, SceneprintError
-from sceneprint.logs import name_request
+from sceneprint.process import name_request
 from sceneprint.settings import Settings
 from service.audit import note
 from service.body_limits import Broken, RequestBody, too_large

@@ -22,7 +22,7 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from sceneprint.errors import UnusableStore
-from sceneprint.process_limits import raise_descriptors
+from sceneprint.process import raise_descriptors
 from sceneprint.settings import Settings
 from sceneprint.store import open_store
 from sceneprint.store.startup_retry import open_patiently

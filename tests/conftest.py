@@ -31,11 +31,10 @@ from sceneprint.geometry.registration.patch_descriptors import (
     Compression,
     PatchDescriptorParameters,
 )
+from sceneprint.geometry.signature.fisher_vector import Whitening
 from sceneprint.geometry.signature.mixture import Mixture
-from sceneprint.geometry.signature.pair_features import Projection
-from sceneprint.geometry.signature.pair_table import TableLayout
+from sceneprint.geometry.signature.pair_features import Projection, TableLayout
 from sceneprint.geometry.signature.segmentation import HierarchyParameters, SegmentationParameters
-from sceneprint.geometry.signature.whitening import Whitening
 from sceneprint.lab.synth import KINECT, SynthRoom, synthesise_room
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer

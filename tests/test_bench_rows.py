@@ -24,11 +24,11 @@ from benchmarks.pairs import FramePair, pairs_among, real_pairs, synthetic_pairs
 from sceneprint.errors import MissingDependency
 from sceneprint.formats.artifact import write_geometry
 from sceneprint.formats.dataset import Camera, find_sequences, write_depth_png, write_intrinsics
+from sceneprint.fusion import open3d
 from sceneprint.geometry.retrieval.distance import distances, pairwise_distances, rank
 from sceneprint.geometry.retrieval.dpp import diversify
-from sceneprint.lab.evaluation.pairs.pair_run import register
+from sceneprint.lab.evaluation.pair_run import register
 from sceneprint.models import Model
-from sceneprint.open3d_loader import open3d
 from sceneprint.pipeline import open_signer, prepare
 from sceneprint.types import DepthFrame, Floats, Intrinsics
 

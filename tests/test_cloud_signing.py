@@ -16,8 +16,8 @@ from tqdm import tqdm
 
 from sceneprint.errors import UselessFrame
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.geometry.pose.rigid import rotation_angle
 from sceneprint.geometry.retrieval.distance import Metric, distances
+from sceneprint.geometry.rigid import rotation_angle
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters
 from sceneprint.geometry.surface.voxels import Voxels

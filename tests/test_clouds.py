@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.formats.points.ply_export import points_of, write_ply
+from sceneprint.formats.export import points_of, write_ply
 from sceneprint.types import Intrinsics, Surface
 
 _CODES = {"float": "f", "uchar": "B", "int": "i"}

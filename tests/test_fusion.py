@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import InvalidRequest, UselessFrame
-from sceneprint.fusion import FusionParameters, fuse, within
-from sceneprint.geometry.pose.average import levelling
+from sceneprint.fusion import (
+    PALETTE,
+    FusionParameters,
+    fuse,
+    reconstruction_picture,
+    rendered,
+    viewpoint,
+    within,
+)
+from sceneprint.geometry.rigid import levelling
 from sceneprint.geometry.surface.coverage import (
     TriangleMesh,
     added_areas,
@@ -17,7 +25,6 @@ from sceneprint.geometry.surface.coverage import (
     of_views,
     share_seen,
 )
-from sceneprint.rendering import PALETTE, reconstruction_picture, rendered, viewpoint
 from sceneprint.types import DepthFrame, Intrinsics
 
 #: Half the room's width, height and depth, metres: x right, y down, z forward; its centre at 0.
@@ -218,7 +225,7 @@ class Without:
             raise ImportError("libX11.so.6: cannot open shared object file")
 sys.meta_path.insert(0, Without())
 import sceneprint.cli, sceneprint_client.client, sceneprint.fusion, service.app, worker.loop
-from sceneprint.open3d_loader import open3d
+from sceneprint.fusion import open3d
 from sceneprint.errors import MissingDependency
 try:
     open3d("A reconstruction")

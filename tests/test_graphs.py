@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.formats.pose_graph import PoseEdge, g2o, information_of
-from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.formats.export import PoseEdge, g2o, information_of
+from sceneprint.geometry.rigid import inverse
 from sceneprint.types import Floats
 
 

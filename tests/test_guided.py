@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.geometry.pose.rigid import difference, inverse
 from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.geometry.validation.validation import ValidationParameters, validate_guided
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.localization import QueryFrame, localize
-from sceneprint.matches import PairMatch, associate, searched
-from sceneprint.pipeline import open_signer, prepare
+from sceneprint.pipeline import PairMatch, associate, open_signer, prepare, searched
 from sceneprint.types import Floats, Geometry
 
 Room = tuple[list[Geometry], list[Floats]]

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
     MapViews,
@@ -39,8 +39,7 @@ from sceneprint.localization import (
     unconfirmed,
     views_of_rows,
 )
-from sceneprint.matches import PairMatch, associate
-from sceneprint.pipeline import Signer, open_signer, prepare, retrieve
+from sceneprint.pipeline import PairMatch, Signer, associate, open_signer, prepare, retrieve
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics, Patches, Surface
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.lookalikes import Told, ask_site, prior_about, table
-from sceneprint.geometry.pose.rigid import difference
+from sceneprint.geometry.rigid import difference
 from sceneprint.lab.evaluation.measures import upper_bound
 from sceneprint.lab.evaluation.protocol import Error, JudgedAnswer
 from sceneprint.models import read_model

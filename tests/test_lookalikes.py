@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from benchmarks.pairs import pairs_among
 from sceneprint.formats.dataset import FrameReference, find_sequences
-from sceneprint.geometry.pose.rigid import difference, inverse
+from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.lab.synth import KINECT, Room, corridor, symmetric_box, synthesise_survey, take
 from sceneprint.lab.synth.sensors import Spinning, scan
 from sceneprint.models import Model, read_model

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.formats.points.web import encode_points, thinned
+from sceneprint.formats.export import encode_points, thinned
 
 
 def decoded(data: bytes) -> tuple[dict[str, Any], list[dict[str, Any]]]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprint.previews import (
+from sceneprint.pictures import (
     MOST_ROWS,
     UNKNOWN,
     depth_view,

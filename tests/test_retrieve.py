@@ -13,16 +13,16 @@ from sceneprint.geometry.registration.patch_descriptors import compress, patch_d
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.retrieval.dpp import diversify as select
 from sceneprint.geometry.signature.segmentation import patches_of, segment
-from sceneprint.geometry.validation.match_ranking import expected_error, preferred
-from sceneprint.geometry.validation.validation import PairValidation
+from sceneprint.geometry.validation.validation import PairValidation, expected_error, preferred
 from sceneprint.lab.evaluation.judgement import voters
 from sceneprint.lab.synth import KINECT, take, trajectory
 from sceneprint.lab.synth.dataset import room_and_rng
-from sceneprint.matches import PairMatch, associate
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import (
+    PairMatch,
     Signature,
     Signer,
+    associate,
     diversify,
     geometry_of,
     prepare,

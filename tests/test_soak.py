@@ -134,7 +134,7 @@ def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
 def test_errors_of_any_log_are_seen(tmp_path: Path) -> None:
     import logging
 
-    from sceneprint.logs import JsonFormatter
+    from sceneprint.process import JsonFormatter
 
     def line(level: int, message: str) -> str:
         return JsonFormatter().format(logging.LogRecord("x", level, "", 0, message, None, None))

@@ -10,15 +10,15 @@ import pytest
 
 from sceneprint.errors import TrainingError
 from sceneprint.geometry.registration.patch_descriptors import patch_descriptors
+from sceneprint.geometry.signature.fisher_vector import WhiteningParameters
 from sceneprint.geometry.signature.mixture import MixtureParameters
-from sceneprint.geometry.signature.pair_table import TableLayout
+from sceneprint.geometry.signature.pair_features import TableLayout
 from sceneprint.geometry.signature.segmentation import (
     HierarchyParameters,
     SegmentationParameters,
     patches_of,
     segment,
 )
-from sceneprint.geometry.signature.whitening import WhiteningParameters
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.lab.training import TrainingParameters, preset_parameters, preset_whitening, train
 from sceneprint.models import Model, ModelParameters

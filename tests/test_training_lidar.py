@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.signature.mixture import MixtureParameters
-from sceneprint.geometry.signature.pair_table import TableLayout
+from sceneprint.geometry.signature.pair_features import TableLayout
 from sceneprint.lab.synth import Spinning, synthesise_survey
 from sceneprint.lab.training import TrainingParameters, preset_parameters, preset_scenes, train
 from sceneprint.models import Model, ModelParameters, read_model

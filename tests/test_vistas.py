@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from sceneprint.previews import depth_view, normals_view, onto, vista_of
+from sceneprint.pictures import depth_view, normals_view, onto, vista_of
 from sceneprint.types import Floats, Intrinsics, Sphere, Surface
 
 

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from sceneprint.engine.engine import open_engine
 from sceneprint.errors import SceneprintError
-from sceneprint.logs import log_as_json
+from sceneprint.process import log_as_json
 from sceneprint.settings import Settings
 from worker.supervisor import run
 

@@ -12,10 +12,9 @@ import time
 from sceneprint.engine import Engine
 from sceneprint.engine.engine import open_engine
 from sceneprint.errors import SceneprintError, StoreAway
-from sceneprint.logs import log_as_json, of_request
-from sceneprint.maintenance.snapshot.catalog import LONGEST_S as SNAPSHOT_S
-from sceneprint.maintenance.snapshot.catalog import SNAPSHOT, snapshot_handler
-from sceneprint.process_limits import StopSignal, limit_memory, raise_descriptors
+from sceneprint.maintenance.snapshot.creation import LONGEST_S as SNAPSHOT_S
+from sceneprint.maintenance.snapshot.creation import SNAPSHOT, snapshot_handler
+from sceneprint.process import StopSignal, limit_memory, log_as_json, of_request, raise_descriptors
 from sceneprint.settings import Settings
 from sceneprint.store.wakeup import Listening, process_name
 from worker.crash_traces import Trace

@@ -414,7 +414,7 @@ def _sqlite_version() -> Check:
 
 
 def _kernels() -> Check:
-    from sceneprint.geometry.signature.pair_table import compiled_at
+    from sceneprint.geometry.signature.pair_features import compiled_at
 
     folder, compiled = compiled_at()
     if compiled:
@@ -432,7 +432,7 @@ def _kernels() -> Check:
 
 def _tables(cache_dir: Path) -> Iterator[Check]:
     from sceneprint.models import PRESETS, read_model
-    from sceneprint.models.table_cache import CACHE_VERSION
+    from sceneprint.models.model_file import CACHE_VERSION
 
     for preset in PRESETS:
         subject, model = f"table {preset}", read_model(preset)

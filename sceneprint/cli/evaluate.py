@@ -270,7 +270,7 @@ def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
 
 def _baselines(names: list[str] | None) -> tuple[str, ...]:
     """The baselines to ask, in the order of BASELINES."""
-    from sceneprint.lab.evaluation.baselines.baseline import BASELINES
+    from sceneprint.lab.evaluation.baselines import BASELINES
 
     if names is None:
         return ()
@@ -420,8 +420,8 @@ def _limit(text: str) -> float:
 
 def run_evaluate_pairs(options: argparse.Namespace) -> int:
     """Evaluate, print, and write what was asked for."""
-    from sceneprint.lab.evaluation.pairs.pair_report import pair_figures, pair_table
-    from sceneprint.lab.evaluation.pairs.pair_run import Drawing, PairSettings, evaluate_pairs
+    from sceneprint.lab.evaluation.pair_report import pair_figures, pair_table
+    from sceneprint.lab.evaluation.pair_run import Drawing, PairSettings, evaluate_pairs
     from sceneprint.lab.evaluation.protocol import FrameStore
     from sceneprint.lab.evaluation.report import to_json
 
@@ -449,7 +449,7 @@ def run_evaluate_pairs(options: argparse.Namespace) -> int:
         print(f"model {signer.model.label}: {_pair_counts(found)}")
         print("\n".join(pair_table(found)))
         if options.out is not None:
-            from sceneprint.lab.evaluation.pairs.pair_report import save_pair_pictures
+            from sceneprint.lab.evaluation.pair_report import save_pair_pictures
 
             for path in save_pair_pictures(options.out, evaluation, found, store):
                 print(f"picture: {path}")

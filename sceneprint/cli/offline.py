@@ -32,7 +32,7 @@ from sceneprint.formats.dataset import (
     write_intrinsics,
     write_pose,
 )
-from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.formats.export import write_ply
 from sceneprint.models import PRESETS, ModelParameters, read_model, save_model
 from sceneprint.pipeline import Signature, Signer, sign
 from sceneprint.settings import Settings

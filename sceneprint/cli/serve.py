@@ -95,7 +95,7 @@ def settings_of(options: argparse.Namespace) -> Settings:
 def run_serve(options: argparse.Namespace) -> int:
     """Serve until told to stop."""
     gc.disable()  # until all is imported: a twelfth of the start would go to it
-    from sceneprint.logs import log_as_json
+    from sceneprint.process import log_as_json
     from service.server import run as serve
 
     settings = settings_of(options)
@@ -159,7 +159,7 @@ def run_work(options: argparse.Namespace) -> int:
     """Work until told to stop."""
     from sceneprint.cli.options import prepare_presets
     from sceneprint.engine.engine import open_engine
-    from sceneprint.logs import log_as_json
+    from sceneprint.process import log_as_json
     from worker.supervisor import run as work
 
     settings = settings_of(options)

@@ -292,7 +292,7 @@ def run_associate(options: argparse.Namespace) -> int:
             graph = client.graph(options.map, told.association_id, kind, odometry=options.odometry)
             write_whole(options.out, graph.encode())
         if stream is not None and told.state is JobState.SUCCEEDED:
-            from sceneprint.scenes.association_scene import association_scene
+            from sceneprint.scenes.answer_scene import association_scene
 
             text = "\n".join(association_lines(told))
             stream.write(association_scene(client, told, text, options.map_frames))
@@ -412,7 +412,7 @@ def _difference_ply(client: Client, told: Difference) -> bytes:
     """The cells of both sessions as a PLY file."""
     import numpy as np
 
-    from sceneprint.formats.points.ply_export import write_ply
+    from sceneprint.formats.export import write_ply
 
     found = client.difference_points(told.map, told.difference_id)
     colours = np.array(_DIFFERENCE_COLOURS, np.uint8)[found.patches]

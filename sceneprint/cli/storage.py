@@ -392,7 +392,7 @@ def named_database(options: argparse.Namespace) -> Settings:
 
 def _shelved(settings: Settings) -> int:
     """Take a snapshot to where those of the service are; returns 1 where blobs were lost."""
-    from sceneprint.maintenance.snapshot.catalog import SnapshotCatalog, new_snapshot_id
+    from sceneprint.maintenance.snapshot.creation import SnapshotCatalog, new_snapshot_id
 
     start = time.perf_counter()
     with ended_by_signals(), byte_progress("snapshot") as progress:
@@ -530,7 +530,7 @@ def run_restore(options: argparse.Namespace) -> int:
 @contextmanager
 def _archive(options: argparse.Namespace, settings: Settings) -> Iterator[Path]:
     """The archive as a file; what is none may be the id of a snapshot that a service has taken."""
-    from sceneprint.maintenance.snapshot.catalog import SnapshotCatalog, is_snapshot_id
+    from sceneprint.maintenance.snapshot.creation import SnapshotCatalog, is_snapshot_id
 
     named: Path = options.archive
     if named.exists() or not is_snapshot_id(str(named)):

@@ -35,7 +35,7 @@ from sceneprint.errors import (
     UnknownFrame,
     UnknownMap,
 )
-from sceneprint.formats.archive.entries import is_archive
+from sceneprint.formats.archive import is_archive
 from sceneprint.formats.dataset import FrameReference, FrameSequence, find_sequences
 from sceneprint.models import PRESETS
 from sceneprint_client.api.base import checked
@@ -391,7 +391,7 @@ def _sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameS
     ------
     DatasetError : nothing is found at a path, or two places share the name of their poses' frame.
     """
-    from sceneprint.formats.dataset.upload_metadata import numbered_sequences
+    from sceneprint.formats.dataset.frame_reference import numbered_sequences
 
     places: dict[str, Path] = {}
     sequences = []
@@ -455,7 +455,7 @@ def _send_all(
 def _send(
     client: Client, options: argparse.Namespace, sequence: FrameSequence, reference: FrameReference
 ) -> tuple[Added, bool]:
-    from sceneprint.formats.dataset.upload_metadata import parent_frame_of, session_of
+    from sceneprint.formats.dataset.frame_reference import parent_frame_of, session_of
     from sceneprint_client.frame_files import meta_of
 
     meta = meta_of(

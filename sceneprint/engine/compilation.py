@@ -21,13 +21,13 @@ from pathlib import Path
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES, cached_at, runs_here
 from sceneprint.geometry.registration import icp
-from sceneprint.geometry.signature import pair_table
+from sceneprint.geometry.signature import pair_features
 from sceneprint.geometry.surface import cloud
 from sceneprint.models import PRESETS, read_model
 
 #: A kernel of each part that is among the last to be compiled: where it is, so are the others.
 _LAST = {
-    "signing": pair_table._count,
+    "signing": pair_features._count,
     "validation": icp.refine_in_place,
     "clouds": cloud._gather,
 }

@@ -48,7 +48,7 @@ from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
 from sceneprint.engine.upkeep.purge import Purging
 from sceneprint.errors import ModelError
-from sceneprint.geometry.core_pool import Cores
+from sceneprint.geometry.execution import Cores
 from sceneprint.models import Model
 from sceneprint.settings import Settings
 from sceneprint.store import frames as stored_frames

@@ -32,13 +32,19 @@ from sceneprint.errors import (
     UselessFrame,
 )
 from sceneprint.formats.artifact import read_geometry
-from sceneprint.formats.points.ply_export import write_ply
-from sceneprint.fusion import BAND, FusionParameters, fuse, within
-from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.formats.export import write_ply
+from sceneprint.fusion import (
+    BAND,
+    PALETTE,
+    FusionParameters,
+    fuse,
+    open3d,
+    reconstruction_picture,
+    within,
+)
+from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.surface.coverage import added_areas, observed_volume, of_views, share_seen
 from sceneprint.geometry.surface.depth_image import doubled
-from sceneprint.open3d_loader import open3d
-from sceneprint.rendering import PALETTE, reconstruction_picture
 from sceneprint.store import Store, queue
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map

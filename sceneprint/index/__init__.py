@@ -5,13 +5,21 @@
 
 A generation is numbered and never changes: the signatures of the map, in a FAISS file that all
 processes of a machine share in memory. A search compares all of them; only a map of more than
-`publication.FLAT_BYTES` has an inverted file, which chooses what is compared. The database is the
+`generation.FLAT_BYTES` has an inverted file, which chooses what is compared. The database is the
 truth: deleting the folder loses nothing but the time to publish it again.
 """
 
-from sceneprint.index.generation import Generation, SearchHits, Tail, newest, search, signatures_of
+from sceneprint.index.generation import (
+    Generation,
+    SearchHits,
+    Tail,
+    clear,
+    newest,
+    publish,
+    search,
+    signatures_of,
+)
 from sceneprint.index.generation_files import manifests, newest_number, scrub
-from sceneprint.index.publication import clear, publish
 
 __all__ = [
     "Generation",

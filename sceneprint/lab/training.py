@@ -22,8 +22,15 @@ from sceneprint.errors import FrameError, TrainingError
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.geometry.registration.patch_descriptors import fit_compression, patch_descriptors
 from sceneprint.geometry.retrieval.distance import Metric, pairwise_distances
-from sceneprint.geometry.scale import scaled
-from sceneprint.geometry.signature.fisher_vector import quantise
+from sceneprint.geometry.signature.fisher_vector import (
+    UNITS,
+    Ints16,
+    WhiteningParameters,
+    fit_whitening,
+    psi_units,
+    quantise,
+    whiten,
+)
 from sceneprint.geometry.signature.mixture import MixtureParameters, fit_mixture
 from sceneprint.geometry.signature.pair_features import (
     fit_projection,
@@ -32,17 +39,10 @@ from sceneprint.geometry.signature.pair_features import (
     project,
 )
 from sceneprint.geometry.signature.segmentation import HierarchyParameters, patch_weights
-from sceneprint.geometry.signature.whitening import (
-    UNITS,
-    Ints16,
-    WhiteningParameters,
-    fit_whitening,
-    psi_units,
-    whiten,
-)
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
 from sceneprint.lab.synth import synthesise_room, synthesise_survey
 from sceneprint.models import Model, ModelParameters
+from sceneprint.models.model import scaled
 from sceneprint.signing import (
     Signer,
     float_signature,

@@ -1,8 +1,16 @@
 """Models: what they consist of, their files, and their tables on disk."""
 
 from sceneprint.models.model import SCHEMA_VERSION, Model, ModelParameters
-from sceneprint.models.model_file import PRESETS, parse_model, read_model, save_model, write_model
-from sceneprint.models.table_cache import build_table, default_cache_dir, open_table
+from sceneprint.models.model_file import (
+    PRESETS,
+    build_table,
+    default_cache_dir,
+    open_table,
+    parse_model,
+    read_model,
+    save_model,
+    write_model,
+)
 
 __all__ = [
     "PRESETS",

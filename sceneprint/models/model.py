@@ -1,4 +1,10 @@
-"""A model: all that decides what signatures and artifacts look like, named by its content."""
+"""A model: all that decides what signatures and artifacts look like, named by its content.
+
+Parameters of a larger or smaller world are its own with every length times one factor (`scaled`).
+A cloud times s, under parameters scaled by s, signs the same, and validates to the same transforms
+with translations times s. Depth images do not, quite: the gate of their plane fit
+(`NormalParameters.plane_gate`) is a share of 1/z and 1/metres at once.
+"""
 
 from __future__ import annotations
 
@@ -13,22 +19,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableModel
+from sceneprint.geometry.registration.alignment import AlignmentParameters
+from sceneprint.geometry.registration.consensus import ConsensusParameters
+from sceneprint.geometry.registration.icp import CovarianceParameters, RefinementParameters
+from sceneprint.geometry.registration.overlap import OverlapParameters, PlaneParameters
 from sceneprint.geometry.registration.patch_descriptors import (
     Compression,
     PatchDescriptorParameters,
 )
+from sceneprint.geometry.registration.plan_search import PlanParameters
+from sceneprint.geometry.registration.sequence_alignment import SequenceParameters
 from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.geometry.signature.fisher_vector import Ints8, Whitening
 from sceneprint.geometry.signature.mixture import Mixture
-from sceneprint.geometry.signature.pair_features import Projection, PropertyParameters
-from sceneprint.geometry.signature.pair_table import TableLayout
+from sceneprint.geometry.signature.pair_features import Projection, PropertyParameters, TableLayout
 from sceneprint.geometry.signature.segmentation import (
     HierarchyParameters,
     SegmentationParameters,
     WeightParameters,
 )
-from sceneprint.geometry.signature.whitening import Ints8, Whitening
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters, NormalParameters
+from sceneprint.geometry.validation.acceptance import AcceptanceParameters, AmbiguityParameters
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.types import Floats32
 
@@ -285,3 +297,71 @@ def _number(kind: Any, value: Any, where: str) -> Any:
             "Fetch or train it again."
         )
     return kind(value)
+
+
+# Parameters of a larger or smaller world.
+
+#: Numbers that are not bare: the power of a metre in each.
+POWERS: dict[type, dict[str, int]] = {
+    DepthParameters: {"minimum_depth": 1, "maximum_depth": 1},
+    CloudParameters: {
+        "minimum_range": 1,
+        "maximum_range": 1,
+        "voxel_size": 1,
+        "noise_gate": -1,
+    },
+    PropertyParameters: {"radius": 1},
+    PatchDescriptorParameters: {"near_radius": 1, "middle_radius": 1, "far_radius": 1},
+    AcceptanceParameters: {"residual_m": 1},
+    OverlapParameters: {
+        "surface_tolerance": 1,
+        "point_tolerance": 1,
+        "free_space_margin": 1,
+        "reference_depth": 1,
+        "nearest": 1,
+    },
+    AlignmentParameters: {"same_m": 1, "lever": 1},
+    ConsensusParameters: {
+        "distance_tolerance": 1,
+        "minimum_distance": 1,
+        "normal_weight": 2,
+        "inlier_distance": 1,
+    },
+    CovarianceParameters: {"least_square": 2, "most": 1, "lever": 1},
+    PlaneParameters: {"same_plane": 1},
+    PlanParameters: {"cell": 1, "voxel": 1, "height_step": 1, "height_range": 1},
+    RefinementParameters: {
+        "first_gate": 1,
+        "last_gate": 1,
+        "reference_depth": 1,
+        "weight_depth": 1,
+        "nearest": 1,
+        "reach": 1,
+    },
+    AmbiguityParameters: {"shift": 1, "rival_m": 1},
+    SequenceParameters: {
+        "opposite_distance": 1,
+        "minimum_distance": 1,
+        "radius": 1,
+        "length_scale": 1,
+    },
+}
+
+
+def scaled(parameters: T, factor: float) -> T:
+    """A record of parameters with every length in it, and in its groups, times a factor.
+
+    Parameters
+    ----------
+    parameters : a frozen record, such as ModelParameters
+    factor : above 0; areas take its square
+    """
+    powers = POWERS.get(type(parameters), {})
+    changed: dict[str, Any] = {}
+    for one in fields(parameters):  # type: ignore[arg-type]
+        value = getattr(parameters, one.name)
+        if is_dataclass(value):
+            changed[one.name] = scaled(value, factor)
+        elif one.name in powers:
+            changed[one.name] = value * factor ** powers[one.name]
+    return replace(parameters, **changed)  # type: ignore[type-var]

@@ -15,17 +15,10 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.errors import NotFound, NotIndexed
-from sceneprint.geometry.pose.rigid import moved
-from sceneprint.scenes.appearance import (
+from sceneprint.geometry.rigid import moved
+from sceneprint.scenes.scene import (
     MAP_POINT_M,
     TRACK,
-    height_colours,
-    point_size,
-    sensor_outline,
-    small_outline,
-    up_of_sensors,
-)
-from sceneprint.scenes.scene import (
     EntityPath,
     LineSet,
     Moment,
@@ -33,6 +26,11 @@ from sceneprint.scenes.scene import (
     PointSet,
     SceneEntity,
     UpAxis,
+    height_colours,
+    point_size,
+    sensor_outline,
+    small_outline,
+    up_of_sensors,
 )
 from sceneprint.types import Floats
 from sceneprint_client import Client

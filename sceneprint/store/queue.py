@@ -49,7 +49,7 @@ from sqlalchemy import (
 )
 
 from sceneprint.errors import JobOver, LostLease, UnknownJob
-from sceneprint.logs import request_id
+from sceneprint.process import request_id
 from sceneprint.store.tables import (
     JobRow,
     count_rows,

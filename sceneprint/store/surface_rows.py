@@ -25,7 +25,7 @@ from sqlalchemy import (
     update,
 )
 
-from sceneprint.geometry.surface.cell_fusion import FACTOR, TilePlace
+from sceneprint.geometry.cells import FACTOR, TilePlace
 from sceneprint.store.deletion import doom
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import (

@@ -17,7 +17,7 @@ from sceneprint.engine.admin import operations
 from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.maps import reencoding
 from sceneprint.errors import InvalidRequest, UnsupportedType
-from sceneprint.maintenance.snapshot.catalog import SNAPSHOT, SnapshotCatalog
+from sceneprint.maintenance.snapshot.creation import SNAPSHOT, SnapshotCatalog
 from sceneprint.store.events import newest_number
 from sceneprint_client.api import Job, JobState, Map, Page
 from sceneprint_client.api.admin import (

@@ -9,7 +9,7 @@ from anyio import to_thread
 from fastapi import Depends, Query, Request, Response
 
 from sceneprint.errors import DamagedBlob
-from sceneprint.formats.points.web import MEDIA_TYPE
+from sceneprint.formats.export import MEDIA_TYPE
 from sceneprint_client.api import Page
 from sceneprint_client.api.differences import Difference, NewDifference
 from service.auth import may_read, may_write, v1_router

@@ -19,7 +19,7 @@ from sceneprint.engine.maps.map_frames import (
     upload_type,
 )
 from sceneprint.errors import DamagedBlob
-from sceneprint.formats.points.web import LIMIT, MEDIA_TYPE, MOST
+from sceneprint.formats.export import LIMIT, MEDIA_TYPE, MOST
 from sceneprint_client.api.results import (
     WIDTH,
     WIDTHS,
@@ -173,7 +173,7 @@ def _upload(request: Request, here: Context, found: Output[bytes], frame_id: str
     raise DamagedBlob(f"The upload of frame {frame_id} was restored just now. Try again.")
 
 
-# Points as bytes that a page draws as they are; `sceneprint.formats.points.web` says what they
+# Points as bytes that a page draws as they are; `sceneprint.formats.export` says what they
 # mean.
 
 points_router = v1_router()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sceneprint.formats.dataset import write_pose
-from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.formats.export import write_ply
 from sceneprint.types import DepthFrame
 
 Run = Callable[..., Any]

@@ -12,7 +12,7 @@ from sqlalchemy import update
 
 from sceneprint.cli import main
 from sceneprint.engine import Engine
-from sceneprint.index import Generation, Tail, faiss_index, newest, publication, search
+from sceneprint.index import Generation, Tail, faiss_index, newest, publish, search
 from sceneprint.index.generation_files import draw
 from sceneprint.maintenance.fsck import indexes
 from sceneprint.settings import Settings
@@ -87,8 +87,8 @@ def test_rebuild_stats_and_verify(data: Path, capsys: pytest.CaptureFixture[str]
 def test_recall_counts_what_an_inverted_file_misses(
     data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(publication.publish, "__kwdefaults__",
-                        publication.publish.__kwdefaults__ | {"flat_bytes": 0})  # fmt: skip
+    monkeypatch.setattr(publish, "__kwdefaults__",
+                        publish.__kwdefaults__ | {"flat_bytes": 0})  # fmt: skip
     monkeypatch.setattr(faiss_index, "ENOUGH", 0.1)  # so that it does miss some
     told(capsys, "rebuild", "hall", "--data", data)
     with Engine(Settings(data_dir=data)) as engine:

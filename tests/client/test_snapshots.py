@@ -11,7 +11,7 @@ import pytest
 from sceneprint.errors import SnapshotError, UnknownSnapshot
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.maintenance.fsck.check import fsck
-from sceneprint.maintenance.snapshot.catalog import SnapshotCatalog
+from sceneprint.maintenance.snapshot.creation import SnapshotCatalog
 from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 from sceneprint.settings import Settings
 from sceneprint_client import Client

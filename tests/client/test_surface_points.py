@@ -9,7 +9,7 @@ import pytest
 
 from sceneprint.errors import InvalidRequest, NotIndexed, Refused
 from sceneprint.formats.dataset import FrameReference
-from sceneprint.formats.points.web import encode_points
+from sceneprint.formats.export import encode_points
 from sceneprint_client import Client
 from sceneprint_client.surface_points import decode_points
 

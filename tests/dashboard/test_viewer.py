@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page
 
-from sceneprint.formats.points.web import encode_points
+from sceneprint.formats.export import encode_points
 from sceneprint.geometry.validation.inspection import STEP_COLOURS
 
 #: Of the canvas, CSS pixels, and pixels of an angle whose tangent is 1.

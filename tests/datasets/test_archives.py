@@ -23,10 +23,9 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import SceneprintError, UnreadableArchive
-from sceneprint.formats.archive import archive as archives
-from sceneprint.formats.archive import entries as inflating
-from sceneprint.formats.archive.archive import Archive, open_archive
-from sceneprint.formats.archive.entries import Inflater, is_archive
+from sceneprint.formats import archive as archives
+from sceneprint.formats import archive as inflating
+from sceneprint.formats.archive import Archive, Inflater, is_archive, open_archive
 from sceneprint.formats.dataset import (
     Camera,
     FrameReference,
@@ -48,7 +47,7 @@ PACKERS: dict[str, Callable[[bytes], bytes]] = {
 FULL = """
 import subprocess, sys
 from pathlib import Path
-from sceneprint.formats.archive.archive import open_archive
+from sceneprint.formats.archive import open_archive
 
 archive, folder = map(Path, sys.argv[1:])
 subprocess.run(["mount", "-t", "tmpfs", "-o", "nr_inodes=12", "none", folder], check=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import DatasetError, UnreadableCloud
-from sceneprint.formats.archive.archive import open_archive
+from sceneprint.formats.archive import open_archive
 from sceneprint.formats.dataset import (
     CloudSource,
     FrameReference,
@@ -19,7 +19,7 @@ from sceneprint.formats.dataset import (
     write_depth_png,
     write_pose,
 )
-from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.formats.export import write_ply
 from sceneprint.types import Cloud
 
 POINTS = np.arange(36, dtype=np.float32).reshape(12, 3) / 8

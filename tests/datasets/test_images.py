@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import InvalidIntrinsics, InvalidPose, UnreadableFrame, UselessFrame
+from sceneprint.formats import depth_file
 from sceneprint.formats.dataset import decode_png, make_frame, read_frame, write_depth_png
-from sceneprint.formats.image import depth_file
 from sceneprint.types import Intrinsics
 
 CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)

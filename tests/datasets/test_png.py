@@ -13,7 +13,7 @@ from PIL import Image, ImageFile
 
 from sceneprint.errors import FrameError, UnreadableFrame
 from sceneprint.formats.dataset import decode_frame, decode_png, make_frame
-from sceneprint.formats.image.depth_file import PNG_SIGNATURE, encode_png, size_of
+from sceneprint.formats.depth_file import PNG_SIGNATURE, encode_png, size_of
 from sceneprint.types import MAXIMUM_SAMPLES, DepthFrame, Intrinsics
 
 CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)

@@ -18,7 +18,7 @@ from sceneprint.formats.dataset import (
     write_intrinsics,
     write_pose,
 )
-from sceneprint.formats.dataset.upload_metadata import numbered_sequences
+from sceneprint.formats.dataset.frame_reference import numbered_sequences
 from sceneprint.types import Intrinsics
 
 CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)

@@ -14,7 +14,7 @@ from sqlalchemy import select, update
 from sceneprint.engine import Engine
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.formats.dataset import decode_frame, write_depth_png
-from sceneprint.geometry.signature.whitening import Whitening
+from sceneprint.geometry.signature.fisher_vector import Whitening
 from sceneprint.lab.synth import SynthRoom
 from sceneprint.models import Model
 from sceneprint.pipeline import Signature, Signer, open_signer, prepare

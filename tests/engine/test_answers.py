@@ -14,8 +14,7 @@ import pytest
 from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
 from sceneprint.localization import QueryFrame, localize, views_of_rows
-from sceneprint.matches import associate
-from sceneprint.pipeline import Signature, Signer, diversify, retrieve
+from sceneprint.pipeline import Signature, Signer, associate, diversify, retrieve
 from sceneprint.types import Geometry
 from sceneprint_client.api import Answer, NewMap, Query
 

@@ -21,7 +21,7 @@ from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.sessions import associations
 from sceneprint.engine.sessions.association_job import Associating
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
-from sceneprint.geometry.pose.rigid import difference, inverse
+from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.settings import Settings
 from sceneprint.store.tables import events, frames, job_items, jobs

@@ -12,7 +12,7 @@ import numpy as np
 
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.geometry.pose.rigid import difference, inverse
+from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.types import Floats
 from sceneprint_client.api import FrameMeta
 from sceneprint_client.api.sessions import NewAssociation

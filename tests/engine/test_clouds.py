@@ -16,7 +16,7 @@ from sceneprint.engine.ingest.frame_decoder import content_id, read_upload
 from sceneprint.engine.reconstruction import JobView, fused
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.errors import UnreadableCloud
-from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.formats.export import write_ply
 from sceneprint.geometry.validation.acceptance import Evidence, belief, objection
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.pipeline import open_signer, sign

@@ -19,7 +19,7 @@ from sceneprint.engine.jobs.lifecycle import cancel, list_jobs
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import LostLease, UnknownMap, UnusableStore
-from sceneprint.formats.archive.archive import Archive
+from sceneprint.formats.archive import Archive
 from sceneprint.store.queue import files_of
 from sceneprint.store.tables import jobs
 from sceneprint_client.api import Job, JobState, NewMap

@@ -12,9 +12,9 @@ import pytest
 from sceneprint.engine import Engine
 from sceneprint.engine.serializers import transform
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
-from sceneprint.formats.points.ply_export import points_of
-from sceneprint.geometry.pose.rigid import difference
-from sceneprint.geometry.registration.covariance import adjoint
+from sceneprint.formats.export import points_of
+from sceneprint.geometry.registration.icp import adjoint
+from sceneprint.geometry.rigid import difference
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.pipeline import Signature, distance, validate
 from sceneprint.store.frames import find_frame

@@ -12,7 +12,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.search.query import check_localizes, localization_of
 from sceneprint.engine.search.response import uncertainty_record
 from sceneprint.errors import InvalidRequest, UnknownFrame
-from sceneprint.geometry.registration.covariance import PAIR_METHOD
+from sceneprint.geometry.registration.icp import PAIR_METHOD
 from sceneprint.models import read_model
 from sceneprint.pipeline import Signature, distance, validate
 from sceneprint.types import Geometry

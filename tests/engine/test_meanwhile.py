@@ -18,8 +18,8 @@ from sceneprint.engine.search import local_index, map_view, verification
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import DamagedBlob, UnknownMap
-from sceneprint.geometry.pose.rigid import difference
-from sceneprint.matches import associate
+from sceneprint.geometry.rigid import difference
+from sceneprint.pipeline import associate
 from sceneprint.store.tables import frames, signatures
 from sceneprint_client.api import NewMap, Query
 

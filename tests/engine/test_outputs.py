@@ -26,8 +26,8 @@ from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnknownFrame, UnknownMap
 from sceneprint.formats.dataset import read_trajectory
 from sceneprint.lab.synth.dataset import room_and_rng
+from sceneprint.pictures import depth_view, normals_view, picture
 from sceneprint.pipeline import Signature, Signer
-from sceneprint.previews import depth_view, normals_view, picture
 from sceneprint.signing import describe
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map

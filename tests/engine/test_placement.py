@@ -16,7 +16,7 @@ from sceneprint.engine.search.answer_status import Outcome, answer_status
 from sceneprint.engine.search.query import localization_of
 from sceneprint.engine.search.verification import Validated
 from sceneprint.errors import InvalidPose, InvalidRequest
-from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.localization import (
     AlternativePose,
@@ -26,8 +26,7 @@ from sceneprint.localization import (
     localize,
     views_of_rows,
 )
-from sceneprint.matches import PairMatch, associate
-from sceneprint.pipeline import Signature, Signer, diversify, retrieve
+from sceneprint.pipeline import PairMatch, Signature, Signer, associate, diversify, retrieve
 from sceneprint.store.frame_queries import placed_frames
 from sceneprint.types import Geometry, Patches
 from sceneprint_client.api import Counts, Localization, Prior, Query

@@ -10,8 +10,8 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
-from sceneprint.formats.points.ply_export import points_of
-from sceneprint.geometry.pose.rigid import moved
+from sceneprint.formats.export import points_of
+from sceneprint.geometry.rigid import moved
 from sceneprint.geometry.validation.inspection import STEP_COLOURS, patches_at
 from sceneprint.pipeline import Signature
 from sceneprint.types import Geometry

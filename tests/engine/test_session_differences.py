@@ -14,7 +14,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.sessions.session_differences import DifferenceHandler
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
-from sceneprint.geometry.pose.rigid import inverse, moved
+from sceneprint.geometry.rigid import inverse, moved
 from sceneprint_client.api import JobState
 from sceneprint_client.api.differences import GONE, NEW, Difference, NewDifference
 from sceneprint_client.surface_points import SurfacePoints, decode_points

@@ -20,7 +20,7 @@ from sceneprint.engine.maps import map_surface, surface_job
 from sceneprint.engine.maps.map_surface import SurfaceUpkeep
 from sceneprint.engine.maps.surface_job import surface_points
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotFound
-from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.rigid import moved
 from sceneprint.settings import Settings
 from sceneprint.store.frame_queries import numbers_of_runs, stops_of
 from sceneprint.store.frames import find_frame, refers_to, write_frame

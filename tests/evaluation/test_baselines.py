@@ -12,16 +12,19 @@ import pytest
 
 from sceneprint.cli import main
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.lab.evaluation.baselines.baseline import BASELINES
-from sceneprint.lab.evaluation.baselines.fpfh import FpfhVlad, features, vlad
-from sceneprint.lab.evaluation.baselines.rings import (
+from sceneprint.lab.evaluation.baselines import (
+    BASELINES,
+    FpfhVlad,
     Rings,
+    Thumbnails,
+    features,
     ring_descriptor,
     ring_distance,
     ring_distances,
+    thumbnail,
+    vlad,
 )
-from sceneprint.lab.evaluation.baselines.thumbnails import Thumbnails, thumbnail
-from sceneprint.lab.evaluation.diversity import points_of
+from sceneprint.lab.evaluation.measures import points_of
 from sceneprint.models import Model, save_model
 from sceneprint.types import Cloud, DepthFrame, Floats, Floats32
 

@@ -14,7 +14,7 @@ from PIL import Image
 
 import sceneprint as sp
 from sceneprint.cli import main
-from sceneprint.geometry.pose.rigid import difference
+from sceneprint.geometry.rigid import difference
 from sceneprint.models import Model, save_model
 
 ROW = {"within_5cm_5deg", "within_10cm_10deg", "median_translation_m", "median_rotation_deg"}

@@ -12,12 +12,12 @@ import pytest
 from PIL import Image
 
 from sceneprint.cli import main
-from sceneprint.formats.points.ply_export import write_ply
-from sceneprint.geometry.pose.rigid import difference
-from sceneprint.lab.evaluation.pairs.pair_run import BINS, METHODS, points_of, register
+from sceneprint.formats.export import write_ply
+from sceneprint.fusion import open3d
+from sceneprint.geometry.rigid import difference
+from sceneprint.lab.evaluation.pair_run import BINS, METHODS, points_of, register
 from sceneprint.lab.evaluation.protocol import every_frame
 from sceneprint.models import Model, save_model
-from sceneprint.open3d_loader import open3d
 from sceneprint.types import Floats
 
 

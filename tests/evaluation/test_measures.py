@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.lab.evaluation.diversity import diversity, voxels
 from sceneprint.lab.evaluation.judgement import views_to_average
 from sceneprint.lab.evaluation.measures import (
     PLACES,
@@ -19,12 +18,14 @@ from sceneprint.lab.evaluation.measures import (
     accuracy,
     answers,
     bound,
+    diversity,
     lost,
     oracle_and_random,
     place_of,
     rows,
     upper_bound,
     validation,
+    voxels,
 )
 from sceneprint.lab.evaluation.protocol import (
     Error,

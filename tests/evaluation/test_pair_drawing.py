@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.lab.evaluation.pairs.pair_run import BINS, Drawing, Drawn, FrameOrigin, draw, inside
+from sceneprint.lab.evaluation.pair_run import BINS, Drawing, Drawn, FrameOrigin, draw, inside
 from sceneprint.lab.evaluation.protocol import Overlaps
 from sceneprint.types import Floats
 

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
-from sceneprint.lab.evaluation.pairs.pair_report import (
+from sceneprint.lab.evaluation.pair_report import (
     curves,
     evidence,
     pair_figures,
     pair_table,
     residual,
 )
-from sceneprint.lab.evaluation.pairs.pair_run import BINS, Drawn, Other, PairEvaluation, Tried
+from sceneprint.lab.evaluation.pair_run import BINS, Drawn, Other, PairEvaluation, Tried
 from sceneprint.lab.evaluation.protocol import RIGHT, Error, SignedFrame, ValidatedPair
 from sceneprint.lab.evaluation.report import to_json
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.lab.evaluation.pairs.pair_report import some_of_each
+from sceneprint.lab.evaluation.pair_report import some_of_each
 from sceneprint.lab.evaluation.plots import cloud_figure, contact_sheet, merged, save_figure
 from sceneprint.lab.evaluation.protocol import QueryOutcome, ValidatedPair
 from sceneprint.types import DepthFrame, Intrinsics

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.pose.rigid import difference, inverse, inverses, moved
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
     explained,
     plane_view,
     plane_weights,
 )
-from sceneprint.geometry.validation.ambiguity import (
+from sceneprint.geometry.rigid import difference, inverse, inverses, moved
+from sceneprint.geometry.validation.acceptance import (
     AmbiguityParameters,
     best_alternative,
     far_from,

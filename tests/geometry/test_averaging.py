@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.pose import average as module
-from sceneprint.geometry.pose.average import AveragingParameters, average_poses
+from sceneprint.geometry import rigid as module
+from sceneprint.geometry.rigid import AveragingParameters, average_poses
 from sceneprint.types import Floats
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.geometry.surface.cell_fusion import (
+from sceneprint.geometry.cells import (
     CELL_SUM,
     MOST_TILES,
     TimeScale,

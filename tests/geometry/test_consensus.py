@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.pose.rigid import difference, inverse, moved
 from sceneprint.geometry.registration import consensus as module
 from sceneprint.geometry.registration.consensus import ConsensusParameters, consensus
+from sceneprint.geometry.rigid import difference, inverse, moved
 from sceneprint.types import Floats, Ints32, Patches
 
 P = ConsensusParameters()

@@ -11,20 +11,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from sceneprint.geometry.pose.average import average_poses
-from sceneprint.geometry.pose.rigid import inverse
-from sceneprint.geometry.registration.covariance import (
+from sceneprint.geometry.registration.icp import (
+    FINE,
     CovarianceParameters,
     Free,
+    Refined,
     adjoint,
     error_of,
     free_directions,
     pair_covariance,
     place_covariance,
+    refine,
     transported,
 )
-from sceneprint.geometry.registration.icp import FINE, Refined, refine
 from sceneprint.geometry.registration.overlap import sampled
+from sceneprint.geometry.rigid import average_poses, inverse
 from sceneprint.lab.synth import KINECT, KINECT_V1, take, trajectory
 from sceneprint.lab.synth.dataset import own_sensor, room_and_rng
 from sceneprint.models import Model, read_model

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.pose.loop_consistency import (
+from sceneprint.geometry.rigid import difference, inverse
+from sceneprint.geometry.session_join import (
     CycleParameters,
     LoopEdges,
     RobotPath,
     run_of,
     verdicts,
 )
-from sceneprint.geometry.pose.rigid import difference, inverse
 from sceneprint.types import Floats
 
 

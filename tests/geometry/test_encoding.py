@@ -22,7 +22,7 @@ from sceneprint.geometry.signature.fisher_vector import (
     statistics_of_features,
 )
 from sceneprint.geometry.signature.mixture import Mixture, posteriors
-from sceneprint.geometry.signature.pair_table import LEADING, PairCounts, PairTable, pack
+from sceneprint.geometry.signature.pair_features import LEADING, PairCounts, PairTable, pack
 from sceneprint.types import Floats, Ints32
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sceneprint.geometry.frame_cache import cached_per_frame
+from sceneprint.geometry.execution import cached_per_frame
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
     PlaneParameters,
@@ -16,7 +16,7 @@ from sceneprint.geometry.registration.overlap import (
     plane_view,
     sampled,
 )
-from sceneprint.geometry.validation.ambiguity import AmbiguityParameters, symmetries
+from sceneprint.geometry.validation.acceptance import AmbiguityParameters, symmetries
 from sceneprint.pipeline import open_signer, prepare
 from sceneprint.types import DepthFrame
 

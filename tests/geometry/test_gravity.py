@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.pose.average import mean_direction
-from sceneprint.geometry.pose.rigid import difference, inverse, inverses
-from sceneprint.geometry.registration.gravity import (
+from sceneprint.geometry.registration.alignment import (
     NO_UPS,
     GravityParameters,
     are_level,
@@ -27,7 +25,8 @@ from sceneprint.geometry.registration.patch_descriptors import (
     SlopeGate,
     correspondences,
 )
-from sceneprint.geometry.validation.ambiguity import AmbiguityParameters, best_alternative
+from sceneprint.geometry.rigid import difference, inverse, inverses, mean_direction
+from sceneprint.geometry.validation.acceptance import AmbiguityParameters, best_alternative
 from sceneprint.geometry.validation.validation import validate, validate_without_up
 from sceneprint.lab.synth import KINECT, symmetric_box, take, trajectory
 from sceneprint.lab.synth.dataset import room_and_rng

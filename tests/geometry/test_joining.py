@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.pose.loop_consistency import Votes, votes_of
-from sceneprint.geometry.pose.rigid import difference, inverse, inverses
-from sceneprint.geometry.pose.session_join import JoiningParameters, join
+from sceneprint.geometry.rigid import difference, inverse, inverses
+from sceneprint.geometry.session_join import JoiningParameters, Votes, join, votes_of
 from sceneprint.types import Floats
 
 

@@ -13,7 +13,7 @@ from numba.core.registry import cpu_target
 
 from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES
 from sceneprint.geometry.kernel_cache import runs_on
-from sceneprint.geometry.signature.pair_table import _count
+from sceneprint.geometry.signature.pair_features import _count
 
 #: What numba compiles for: its words for the system, the processor and its features.
 HOST = cpu_target.target_context.codegen().magic_tuple()

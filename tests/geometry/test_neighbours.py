@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.surface.cloud import mixed
-from sceneprint.geometry.surface.planes import Links, least_axis, linked, plane_facing, plane_seen
+from sceneprint.geometry.surface.voxels import Links, least_axis, linked, plane_facing, plane_seen
 from sceneprint.types import Floats
 
 

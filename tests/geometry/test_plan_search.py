@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.pose.rigid import difference, distinct, inverse, moved
 from sceneprint.geometry.registration.plan_search import (
     PlanParameters,
     _lifts,
@@ -19,10 +18,10 @@ from sceneprint.geometry.registration.plan_search import (
     up_of,
 )
 from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.rigid import difference, distinct, inverse, moved
 from sceneprint.lab.synth import synthesise_survey
-from sceneprint.matches import associate
 from sceneprint.models import Model, read_model
-from sceneprint.pipeline import geometry_of, validate
+from sceneprint.pipeline import associate, geometry_of, validate
 from sceneprint.signing import see
 from sceneprint.types import Cloud, Floats, Sphere, Surface
 

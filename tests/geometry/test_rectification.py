@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from sceneprint.geometry.surface import rectification
-from sceneprint.geometry.surface.rectification import ray_to_axis, undistort
+from sceneprint.geometry.surface import camera as module
+from sceneprint.geometry.surface.camera import ray_to_axis, undistort
 from sceneprint.types import Intrinsics
 
 LENS = (-0.28, 0.09, 0.0015, -0.0022, -0.012)  # every term of the model is at work
@@ -212,9 +212,9 @@ def test_a_camera_is_prepared_once() -> None:
     camera = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, LENS)
     image = np.ones((480, 640), np.float32)
     undistort(ray_to_axis(image, camera), camera)
-    before = rectification._sources.cache_info().misses, rectification._cosines.cache_info().misses
+    before = module._sources.cache_info().misses, module._cosines.cache_info().misses
     undistort(ray_to_axis(image, camera), camera)
-    after = rectification._sources.cache_info().misses, rectification._cosines.cache_info().misses
+    after = module._sources.cache_info().misses, module._cosines.cache_info().misses
     assert after == before
 
 

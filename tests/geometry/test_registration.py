@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.pose.rigid import difference
 from sceneprint.geometry.registration import icp as module
 from sceneprint.geometry.registration.icp import COARSE, FINE, RefinementParameters, refine
 from sceneprint.geometry.registration.overlap import sampled
+from sceneprint.geometry.rigid import difference
 from sceneprint.lab.synth import KINECT, render, trajectory
 from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.models import Model

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.pose import rigid
-from sceneprint.geometry.pose.rigid import (
+from sceneprint.geometry import rigid
+from sceneprint.geometry.rigid import (
     difference,
     inverse,
     moved,

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.geometry.scale import POWERS, scaled
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.models import ModelParameters
+from sceneprint.models.model import POWERS, scaled
 from sceneprint.pipeline import Signer, prepare, validate
 from sceneprint.types import Cloud
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.geometry.pose.rigid import difference, inverse, moved
 from sceneprint.geometry.registration.alignment import AlignmentParameters
 from sceneprint.geometry.registration.sequence_alignment import (
     SequenceParameters,
@@ -18,6 +17,7 @@ from sceneprint.geometry.registration.sequence_alignment import (
     neighbour_sequences,
     sequence_correspondences,
 )
+from sceneprint.geometry.rigid import difference, inverse, moved
 from sceneprint.geometry.validation.validation import ValidationParameters, validate
 from sceneprint.lab.synth import KINECT, take, trajectory
 from sceneprint.lab.synth.dataset import room_and_rng

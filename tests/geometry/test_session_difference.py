@@ -6,21 +6,22 @@ from types import ModuleType
 
 import numpy as np
 
-from sceneprint.geometry.pose.rigid import moved
-from sceneprint.geometry.registration.overlap import OverlapParameters
-from sceneprint.geometry.registration.session_difference import (
+from sceneprint.geometry.cells import (
     CHANGED,
     SAME,
     UNSEEN,
     SessionCells,
+    ViewStamp,
     add_views,
     cell_positions,
     cell_states,
     count_cells,
     frame_verdicts,
     no_verdicts,
+    seen_cells,
 )
-from sceneprint.geometry.surface.cell_fusion import ViewStamp, seen_cells
+from sceneprint.geometry.registration.overlap import OverlapParameters
+from sceneprint.geometry.rigid import moved
 from sceneprint.types import Bytes, Floats, Intrinsics, Surface
 from sceneprint_client.surface_tiles import NO_SESSION
 

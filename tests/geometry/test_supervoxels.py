@@ -9,8 +9,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sceneprint.geometry.signature.segmentation import SegmentationParameters, patches_of
-from sceneprint.geometry.signature.supervoxels import supervoxels
+from sceneprint.geometry.signature.segmentation import (
+    SegmentationParameters,
+    patches_of,
+    supervoxels,
+)
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.voxels import Voxels, voxels
 from sceneprint.types import Cloud, Ints32

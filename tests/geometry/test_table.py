@@ -12,20 +12,18 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.signature.mixture import Mixture, posteriors
 from sceneprint.geometry.signature.pair_features import (
-    Projection,
-    PropertyParameters,
-    invariants,
-    neighbour_pairs,
-    project,
-    properties,
-)
-from sceneprint.geometry.signature.pair_table import (
     LEADING,
     LEAST,
+    Projection,
+    PropertyParameters,
     TableLayout,
     bin_centres,
     count_pairs,
+    invariants,
+    neighbour_pairs,
     part,
+    project,
+    properties,
 )
 from sceneprint.types import Floats, Ints32, Patches
 

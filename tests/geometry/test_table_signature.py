@@ -19,14 +19,17 @@ from sceneprint.geometry.signature.fisher_vector import (
 )
 from sceneprint.geometry.signature.mixture import Mixture, MixtureParameters, fit_mixture
 from sceneprint.geometry.signature.pair_features import (
+    PairTable,
     Projection,
     PropertyParameters,
+    TableLayout,
+    count_pairs,
     fit_projection,
     neighbour_pairs,
     pair_properties,
+    part,
     project,
 )
-from sceneprint.geometry.signature.pair_table import PairTable, TableLayout, count_pairs, part
 from sceneprint.types import Floats, Patches
 
 LAYOUT = TableLayout(distance_bins=36, angle_bins=25, dihedral_bins=36, distance_exponent=1.3)

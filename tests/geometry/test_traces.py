@@ -8,8 +8,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.registration.overlap import OverlapParameters, overlap_counts, sampled
+from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.inspection import (
     AGREES,
     NEITHER,

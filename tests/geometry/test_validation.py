@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from sceneprint import pipeline
 from sceneprint.errors import ModelMismatch
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.pose.rigid import difference, inverse
 from sceneprint.geometry.registration.alignment import align, samples_of
 from sceneprint.geometry.registration.overlap import explained, overlap_counts, sampled
+from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
 from sceneprint.geometry.validation.validation import (
     PairValidation,
@@ -28,9 +28,8 @@ from sceneprint.geometry.validation.validation import (
 )
 from sceneprint.lab.synth import KINECT, symmetric_box, take, trajectory
 from sceneprint.lab.synth.dataset import room_and_rng
-from sceneprint.lab.synth.mesh import box, join
+from sceneprint.lab.synth.mesh import Ceiling, box, join, shell, walls_of
 from sceneprint.lab.synth.rooms import Room
-from sceneprint.lab.synth.walls import Ceiling, shell, walls_of
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see

@@ -12,7 +12,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.pose.rigid import difference, inverse, moved
 from sceneprint.geometry.registration.icp import FINE, refine
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
@@ -20,7 +19,7 @@ from sceneprint.geometry.registration.overlap import (
     looked_up,
     sampled,
 )
-from sceneprint.geometry.scale import scaled
+from sceneprint.geometry.rigid import difference, inverse, moved
 from sceneprint.geometry.validation.acceptance import (
     AcceptanceParameters,
     Evidence,
@@ -33,6 +32,7 @@ from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.lab.synth.rooms import Room
 from sceneprint.lab.synth.trajectories import pose as looking
 from sceneprint.models import Model, read_model
+from sceneprint.models.model import scaled
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
 from sceneprint.types import Cloud, DepthFrame, Floats, Floats32, Geometry, Sphere

@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sceneprint.geometry.pose import average, rigid
+from sceneprint.geometry import rigid
 from sceneprint.geometry.registration import consensus, icp, overlap
 from sceneprint.geometry.surface import camera
 
@@ -179,22 +179,20 @@ AVERAGING = [
 ]
 
 CHECKS = {
-    rigid: ("check_rigid",),
+    rigid: ("check_rigid", "check_averaging"),
     camera: ("check_projecting",),
     overlap: ("check_targets", "check_agreement", "check_sampling", "check_agreement_of_clouds"),
     icp: ("check_registration", "check_registration_of_clouds"),
     consensus: ("check_consensus",),
-    average: ("check_averaging",),
 }
 CASES = [
     (module, line, wrong)
     for module, mutations in (
-        (rigid, RIGID),
+        (rigid, RIGID + AVERAGING),
         (camera, PROJECTING),
         (overlap, TARGETS + AGREEMENT),
         (icp, REGISTRATION),
         (consensus, CONSENSUS),
-        (average, AVERAGING),
     )
     for line, wrong in mutations
 ]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.retrieval.distance import distances
-from sceneprint.geometry.signature.whitening import (
+from sceneprint.geometry.signature.fisher_vector import (
     UNITS,
     Whitening,
     WhiteningParameters,

@@ -20,7 +20,6 @@ from sceneprint.index import (
     faiss_index,
     newest,
     newest_number,
-    publication,
     publish,
 )
 from sceneprint.index.generation_files import Block, building
@@ -100,7 +99,7 @@ def test_appending_gives_the_bytes_of_publishing_at_once(
     walk: Walk, published: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
 ) -> None:
     """Whatever came when, in blocks of whatever size."""
-    monkeypatch.setattr(publication, "BLOCK_BYTES", step * LENGTH)
+    monkeypatch.setattr("sceneprint.index.generation.BLOCK_BYTES", step * LENGTH)
     signatures, again = walk(120), walk(30, seed=5)
     first = published(np.arange(99, -1, -1), signatures[99::-1])
     keys = np.concatenate([np.arange(10, 40), np.arange(100, 120)])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprint.geometry.signature.pair_table import PairTable
+from sceneprint.geometry.signature.pair_features import PairTable
 from sceneprint.models import Model, build_table, open_table
 
 

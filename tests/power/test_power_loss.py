@@ -18,7 +18,7 @@ from sqlalchemy import Connection, event
 
 from sceneprint import atomic_files
 from sceneprint.engine import Engine
-from sceneprint.index import Generation, newest, publication, publish
+from sceneprint.index import Generation, generation, newest, publish
 from sceneprint.index.generation_files import GenerationManifest
 from sceneprint.settings import Settings
 from sceneprint.store import FolderBlobs
@@ -276,14 +276,14 @@ def test_who_does_not_sync_an_index_is_found_out(
 def test_old_generations_removed_too_early_are_found_out(
     lost_generations: Callable[..., set[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write = publication.write_manifest
+    write = generation.write_manifest
 
     def remove_first(folder: Path, manifest: GenerationManifest) -> Path:
         for path in folder.glob("*.json"):
             path.unlink()
         return write(folder, manifest)
 
-    monkeypatch.setattr(publication, "write_manifest", remove_first)
+    monkeypatch.setattr(generation, "write_manifest", remove_first)
     assert any(one.startswith("none after 1") for one in lost_generations(steps=2))
 
 

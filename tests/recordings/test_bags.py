@@ -14,7 +14,7 @@ import pytest
 
 from sceneprint.errors import DatasetError, InvalidIntrinsics, UnreadableFrame
 from sceneprint.formats.dataset import FrameSequence, Layout, find_sequences
-from sceneprint.formats.dataset.upload_metadata import session_of
+from sceneprint.formats.dataset.frame_reference import session_of
 from sceneprint.formats.recording import RecordingOptions, bag_outline
 from sceneprint.types import Cloud, DepthFrame, Floats
 from sceneprint_client.frame_files import meta_of

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import UnreadableCloud
+from sceneprint.formats.export import write_ply
 from sceneprint.formats.points import decode_cloud, decode_scan
-from sceneprint.formats.points.ply_export import write_ply
 
 Write = Callable[..., bytes]
 

@@ -9,9 +9,17 @@ import pytest
 
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.scenes.answer_scene import MANY, ONE, AnswerScene, short_name, space_name
-from sceneprint.scenes.appearance import QUERY, STRONG, UNSURE
 from sceneprint.scenes.map_scene import evenly_taken, listed_runs, map_runs
-from sceneprint.scenes.scene import Moment, Placement, SceneEntity, SceneStream, TextPage
+from sceneprint.scenes.scene import (
+    QUERY,
+    STRONG,
+    UNSURE,
+    Moment,
+    Placement,
+    SceneEntity,
+    SceneStream,
+    TextPage,
+)
 from sceneprint_client import Client, meta_of
 from sceneprint_client.api import Alternative, Answer
 

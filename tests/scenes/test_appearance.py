@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.scenes.appearance import (
+from sceneprint.scenes.scene import (
     AXES_M,
     FRUSTUM_M,
     SMALL_M,

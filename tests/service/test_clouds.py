@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.formats.export import write_ply
 from sceneprint.types import DepthFrame, Floats
 
 WAIT = {"Prefer": "wait=60"}

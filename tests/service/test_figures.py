@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from sceneprint import process_limits
+from sceneprint import process
 from sceneprint.engine import Engine
-from sceneprint.logs import JsonFormatter, name_request, of_request, request_id
+from sceneprint.process import JsonFormatter, name_request, of_request, request_id
 from sceneprint.settings import Settings
 from sceneprint.store import database
 from sceneprint.store.store_counts import samples_since
@@ -188,7 +188,7 @@ def test_lines_name_the_request_that_is_worked_on():
 
 CHILD = """
 import resource
-from sceneprint.process_limits import raise_descriptors
+from sceneprint.process import raise_descriptors
 resource.setrlimit(resource.RLIMIT_NOFILE, (64, 256))
 told = raise_descriptors()
 files = [open("/dev/null") for _ in range(200)]
@@ -200,9 +200,7 @@ def test_as_many_files_may_be_open_as_the_system_lets(served):
     done = subprocess.run([sys.executable, "-c", CHILD], capture_output=True, text=True, check=True)
     assert done.stdout == "256 (256, 256)\n"
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    wanted = (
-        process_limits.MOST if hard == resource.RLIM_INFINITY else min(hard, process_limits.MOST)
-    )
+    wanted = process.MOST if hard == resource.RLIM_INFINITY else min(hard, process.MOST)
     for pid in (served.process.pid, *served.workers):
         text = Path(f"/proc/{pid}/limits").read_text()
         (line,) = [one for one in text.splitlines() if one.startswith("Max open files")]

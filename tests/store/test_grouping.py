@@ -11,7 +11,7 @@ import pytest
 from sqlalchemy import Connection, event, func, select
 
 from sceneprint.errors import FrameConflict, LostLease, StoreFull
-from sceneprint.logs import of_request, request_id
+from sceneprint.process import of_request, request_id
 from sceneprint.store import Database, Store
 from sceneprint.store.database import MOST_TOGETHER, Grouping, _Waiting
 from sceneprint.store.events import record_event

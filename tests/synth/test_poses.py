@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 
 from sceneprint.lab.synth import make_room, scattered_poses, trajectory
-from sceneprint.lab.synth.mesh import SyntheticMesh, box
+from sceneprint.lab.synth.mesh import Ceiling, SyntheticMesh, box
 from sceneprint.lab.synth.rooms import Room, inside
 from sceneprint.lab.synth.trajectories import CLEARANCE, HEIGHTS, clear, pose
-from sceneprint.lab.synth.walls import Ceiling
 from sceneprint.types import Floats
 
 SEEDS = (0, 1, 2)

@@ -2,9 +2,19 @@ import numpy as np
 import pytest
 
 from sceneprint.lab.synth import corridor, make_room, symmetric_box
-from sceneprint.lab.synth.mesh import area, face_normals, volume
+from sceneprint.lab.synth.mesh import (
+    Ceiling,
+    Opening,
+    Wall,
+    area,
+    ceiling,
+    face_normals,
+    floor_plan,
+    shell,
+    volume,
+    walls_of,
+)
 from sceneprint.lab.synth.rooms import CELL, Floor, PiecePose, inside
-from sceneprint.lab.synth.walls import Ceiling, Opening, Wall, ceiling, floor_plan, shell, walls_of
 
 L_PLAN = np.array([(0, 0), (4, 0), (4, 2), (2, 2), (2, 3), (0, 3)], float)
 

@@ -24,7 +24,7 @@ def run(code: str, *arguments: str) -> str:
 MEMORY = """
 import sys
 import numpy as np
-from sceneprint.process_limits import limit_memory
+from sceneprint.process import limit_memory
 limit_memory(int(sys.argv[1]))
 small = np.ones(16 << 20, np.uint8)
 mapped = np.memmap(sys.argv[2], np.uint8, mode="r")
@@ -48,7 +48,7 @@ def test_what_is_written_is_limited_and_what_is_mapped_is_not(
 
 STOP = """
 import os, signal, sys
-from sceneprint.process_limits import StopSignal
+from sceneprint.process import StopSignal
 stop = StopSignal()
 print(stop.asked)
 os.kill(os.getpid(), int(sys.argv[1]))

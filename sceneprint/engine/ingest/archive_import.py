@@ -21,11 +21,10 @@ from sceneprint.engine.ingest.uploads import UploadResult as UploadOutcome
 from sceneprint.engine.jobs.lifecycle import get_job
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
-from sceneprint.formats.archive.archive import Archive, open_archive
-from sceneprint.formats.archive.entries import Inflater
+from sceneprint.formats.archive import Archive, Inflater, open_archive
 from sceneprint.formats.dataset import FrameReference
-from sceneprint.formats.dataset.frame_reference import FrameSequence
-from sceneprint.formats.dataset.upload_metadata import (
+from sceneprint.formats.dataset.frame_reference import (
+    FrameSequence,
     numbered_sequences,
     parent_frame_of,
     session_of,

@@ -16,7 +16,7 @@ import numpy as np
 from sceneprint import errors
 from sceneprint.engine.serializers import pose_matrix
 from sceneprint.formats.dataset import decode_frame
-from sceneprint.formats.image.depth_file import has_transport_header
+from sceneprint.formats.depth_file import has_transport_header
 from sceneprint.formats.points import UNSAID, decode_cloud, decode_scan, format_of
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import AnyFrame, Cloud, Floats, Intrinsics

@@ -32,7 +32,7 @@ from sceneprint.errors import (
     UnknownFrame,
     UnreadableGeometry,
 )
-from sceneprint.geometry.pose.rigid import difference
+from sceneprint.geometry.rigid import difference
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import (
     PathFrame,

@@ -19,7 +19,7 @@ from sceneprint.engine.maps.coverage_plan import plan_changes
 from sceneprint.engine.maps.map_frames import Output
 from sceneprint.engine.serializers import job_progress, tag_of, when
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnreadableGeometry
-from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.rigid import moved
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import PathFrame, stops_of
 from sceneprint.store.maps import find_map

@@ -23,9 +23,9 @@ from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
-from sceneprint.formats.points.ply_export import points_of, write_ply
-from sceneprint.geometry.pose.rigid import moved
-from sceneprint.previews import depth_view, normals_view, onto, patches_view, picture, vista_of
+from sceneprint.formats.export import points_of, write_ply
+from sceneprint.geometry.rigid import moved
+from sceneprint.pictures import depth_view, normals_view, onto, patches_view, picture, vista_of
 from sceneprint.signing import hierarchy_of, see
 from sceneprint.store import Store, frame_queries
 from sceneprint.store.frame_queries import (
@@ -474,7 +474,7 @@ class FrameFiles:
     def preview(
         self, map_name: str, frame_id: str, view: View = "depth", width: int = 320
     ) -> Output[bytes]:
-        """A picture of a frame as PNG; see `sceneprint.previews`. Errors as of `cloud`.
+        """A picture of a frame as PNG; see `sceneprint.pictures`. Errors as of `cloud`.
 
         Raises
         ------

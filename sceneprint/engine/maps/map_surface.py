@@ -31,8 +31,8 @@ from sceneprint.errors import (
     UnreadableGeometry,
 )
 from sceneprint.formats.artifact import read_geometry
-from sceneprint.geometry.pose.rigid import moved
-from sceneprint.geometry.surface.cell_fusion import FACTOR, TilePlace
+from sceneprint.geometry.cells import FACTOR, TilePlace
+from sceneprint.geometry.rigid import moved
 from sceneprint.store import Store, queue
 from sceneprint.store import surface_rows as stored
 from sceneprint.store.maps import find_map, map_of

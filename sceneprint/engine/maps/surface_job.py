@@ -24,8 +24,7 @@ from sceneprint.engine.serializers import tag_of
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
 from sceneprint.formats.artifact import read_geometry
-from sceneprint.geometry.pose.rigid import moved
-from sceneprint.geometry.surface.cell_fusion import (
+from sceneprint.geometry.cells import (
     CELL_SUM,
     FACTOR,
     Cells,
@@ -41,6 +40,7 @@ from sceneprint.geometry.surface.cell_fusion import (
     time_scale,
     without,
 )
+from sceneprint.geometry.rigid import moved
 from sceneprint.store import Store
 from sceneprint.store import surface_rows as stored
 from sceneprint.store.deletion import doom

@@ -18,7 +18,7 @@ from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, PreparedQuery, check_taken
 from sceneprint.errors import DamagedSignature, InvalidRequest, NotIndexed, UnknownFrame
 from sceneprint.formats.artifact import read_geometry
-from sceneprint.previews import depth_view, normals_view, picture
+from sceneprint.pictures import depth_view, normals_view, picture
 from sceneprint.store import Store
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
@@ -52,7 +52,7 @@ class Rerun:
         )
 
     def preview(self, query_id: str, view: View = "depth", width: int = 320) -> bytes:
-        """A picture of what the query saw as PNG; see `sceneprint.previews`.
+        """A picture of what the query saw as PNG; see `sceneprint.pictures`.
 
         Raises
         ------

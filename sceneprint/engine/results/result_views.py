@@ -25,13 +25,12 @@ from sceneprint.engine.serializers import query_sensor, sensor_of, tag_of, trans
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.formats.artifact import read_geometry
-from sceneprint.formats.points.ply_export import points_of, write_ply
-from sceneprint.formats.points.web import LIMIT, encode_points, thinned
-from sceneprint.geometry.pose.rigid import inverse, moved
-from sceneprint.geometry.registration.covariance import PAIR_METHOD
-from sceneprint.geometry.registration.gravity import NO_UPS, Ups
+from sceneprint.formats.export import LIMIT, encode_points, points_of, thinned, write_ply
+from sceneprint.geometry.registration.alignment import NO_UPS, Ups
+from sceneprint.geometry.registration.icp import PAIR_METHOD
 from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.geometry.retrieval.distance import pairwise_distances, similarity
+from sceneprint.geometry.rigid import inverse, moved
 from sceneprint.geometry.validation.inspection import (
     AGREES,
     VIOLATES,
@@ -404,7 +403,7 @@ def _triples(rows: Floats) -> list[Triple]:
 
 
 # Points of frames, queries and matches as bytes that a page draws; see
-# `sceneprint.formats.points.web`.
+# `sceneprint.formats.export`.
 #
 # frame | query | match  --PointClouds-->  Output
 

@@ -42,8 +42,8 @@ from sceneprint.geometry.retrieval.distance import Ints64, pairwise_distances
 from sceneprint.geometry.retrieval.dpp import DiversityParameters, Selection, diversify
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.localization import PoseEstimate, PosePrior, QueryFrame, unconfirmed
-from sceneprint.matches import PairMatch, searched
 from sceneprint.models import Model
+from sceneprint.pipeline import PairMatch, searched
 from sceneprint.store import Store
 from sceneprint.store.frames import frames_of
 from sceneprint.store.postgres.replica import behind_s

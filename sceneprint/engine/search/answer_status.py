@@ -14,7 +14,7 @@ from sceneprint.engine.search.verification import Validated
 from sceneprint.geometry.registration.overlap import PlaneParameters, plane_weights
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.localization import PoseEstimate
-from sceneprint.matches import PairMatch
+from sceneprint.pipeline import PairMatch
 from sceneprint.types import Geometry
 from sceneprint_client.api import AnswerStatus, Counts, Query
 from sceneprint_client.api.query import Cause

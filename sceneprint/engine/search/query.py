@@ -24,10 +24,10 @@ from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import model_label, sensor_frame, transform
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import Busy, InvalidRequest, ModelMismatch, SceneprintError, UnknownMap
-from sceneprint.geometry.core_pool import Cores
-from sceneprint.geometry.pose.rigid import inverse
-from sceneprint.geometry.registration.covariance import PAIR_METHOD
+from sceneprint.geometry.execution import Cores
+from sceneprint.geometry.registration.icp import PAIR_METHOD
 from sceneprint.geometry.retrieval.distance import distances, similarity
+from sceneprint.geometry.rigid import inverse
 from sceneprint.models import PRESETS, read_model
 from sceneprint.pipeline import Signer, validate
 from sceneprint.store import Store

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.engine.serializers import sensor_of, transform
-from sceneprint.geometry.pose.rigid import inverse
-from sceneprint.geometry.registration.covariance import (
+from sceneprint.geometry.registration.icp import (
     PAIR_METHOD,
     PLACE_METHOD,
     CovarianceParameters,
@@ -19,9 +18,10 @@ from sceneprint.geometry.registration.covariance import (
 )
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.retrieval.dpp import Selection
+from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.localization import PoseEstimate
-from sceneprint.matches import PairMatch
+from sceneprint.pipeline import PairMatch
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats
 from sceneprint_client.api import Alternative as ToldAlternative

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.geometry.pose.average import mean_direction
+from sceneprint.geometry.rigid import mean_direction
 from sceneprint.store.frame_queries import FrameUp, frame_ups
 from sceneprint.types import Floats
 

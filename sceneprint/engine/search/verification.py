@@ -33,7 +33,7 @@ from sceneprint.localization import (
     localize,
     rival_rows,
 )
-from sceneprint.matches import PairMatch, associate
+from sceneprint.pipeline import PairMatch, associate
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import (
     FrameViewpoint,

@@ -23,15 +23,6 @@ from sceneprint.engine.sessions.associations import Plan, eligible, runs_of
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
-from sceneprint.geometry.pose.loop_consistency import (
-    LoopEdges,
-    RobotPath,
-    Verdicts,
-    run_of,
-    verdicts,
-    votes_of,
-)
-from sceneprint.geometry.pose.session_join import join
 from sceneprint.geometry.retrieval.distance import (
     Ranking,
     pairwise_distances,
@@ -39,8 +30,17 @@ from sceneprint.geometry.retrieval.distance import (
     similarity,
 )
 from sceneprint.geometry.retrieval.dpp import diversify
-from sceneprint.matches import PairMatch, associate
+from sceneprint.geometry.session_join import (
+    LoopEdges,
+    RobotPath,
+    Verdicts,
+    join,
+    run_of,
+    verdicts,
+    votes_of,
+)
 from sceneprint.models import Model
+from sceneprint.pipeline import PairMatch, associate
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import PathFrame, stops_of
 from sceneprint.store.frames import frames_of

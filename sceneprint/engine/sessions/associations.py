@@ -17,8 +17,8 @@ from sceneprint.engine.jobs.tasks import Tasks
 from sceneprint.engine.serializers import job_progress, sensor_frame, transform, when
 from sceneprint.errors import InvalidRequest, NotIndexed
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
-from sceneprint.formats.pose_graph import PoseEdge, g2o, information_of
-from sceneprint.geometry.pose.rigid import inverse, rotation_angle
+from sceneprint.formats.export import PoseEdge, g2o, information_of
+from sceneprint.geometry.rigid import inverse, rotation_angle
 from sceneprint.index.generation_files import Keys
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import (

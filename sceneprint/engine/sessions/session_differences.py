@@ -33,23 +33,25 @@ from sceneprint.errors import (
     UnreadableGeometry,
 )
 from sceneprint.formats.artifact import read_geometry
-from sceneprint.formats.points.web import MEDIA_TYPE, encode_points
-from sceneprint.geometry.pose.rigid import moved
-from sceneprint.geometry.registration.overlap import OverlapParameters
-from sceneprint.geometry.registration.session_difference import (
+from sceneprint.formats.export import MEDIA_TYPE, encode_points
+from sceneprint.geometry.cells import (
+    CELL_SUM,
     CHANGED,
     SAME,
     UNSEEN,
     SessionCells,
     VerdictCounts,
+    ViewStamp,
     add_views,
     cell_positions,
     cell_states,
     count_cells,
     frame_verdicts,
     no_verdicts,
+    seen_cells,
 )
-from sceneprint.geometry.surface.cell_fusion import CELL_SUM, ViewStamp, seen_cells
+from sceneprint.geometry.registration.overlap import OverlapParameters
+from sceneprint.geometry.rigid import moved
 from sceneprint.store import Store, queue
 from sceneprint.store.frame_queries import (
     any_gone,

@@ -4,13 +4,6 @@ path  --find_sequences-->  FrameSequence  --FrameReference.read-->  Frame
 bytes  --decode_frame-->  Frame
 """
 
-from sceneprint.formats.dataset.export import (
-    trajectory_row,
-    trajectory_text,
-    write_depth_png,
-    write_intrinsics,
-    write_pose,
-)
 from sceneprint.formats.dataset.frame_reference import (
     FrameReference,
     FrameSequence,
@@ -19,8 +12,16 @@ from sceneprint.formats.dataset.frame_reference import (
     read_cloud,
     read_trajectory,
 )
-from sceneprint.formats.dataset.sequences import find_recordings, find_sequences
-from sceneprint.formats.image.depth_file import (
+from sceneprint.formats.dataset.sequences import (
+    find_recordings,
+    find_sequences,
+    trajectory_row,
+    trajectory_text,
+    write_depth_png,
+    write_intrinsics,
+    write_pose,
+)
+from sceneprint.formats.depth_file import (
     decode_frame,
     decode_npy,
     decode_png,

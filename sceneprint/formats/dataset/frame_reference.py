@@ -1,7 +1,8 @@
-"""What a sequence of frames is, before any of its frames is read."""
+"""What a sequence of frames is, before any of its frames is read, and its metadata in uploads."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.errors import DatasetError, InvalidPose, UnreadableCloud, naming
-from sceneprint.formats.image.depth_file import decode_frame
+from sceneprint.formats.depth_file import decode_frame
 from sceneprint.formats.points import SUFFIXES, Scan, decode_scan
 from sceneprint.types import AnyFrame, DepthFrame, Floats
 from sceneprint_client.file_formats import MAXIMUM_CLOUD_BYTES
@@ -18,10 +19,6 @@ from sceneprint_client.files import data_lines, read_bytes, read_text
 from sceneprint_client.frame_files import FrameFile
 from sceneprint_client.sidecars import CloudSource
 from sceneprint_client.trajectories import SensorTrajectory
-
-# Trajectories with time stamps.
-#
-# text  --read_trajectory-->  SensorTrajectory
 
 _TOLERANCE = 1e-2  #: how far a written quaternion may be from a true one
 _MAXIMUM_TRAJECTORY_BYTES = 2**26  # an hour at 200 Hz
@@ -182,3 +179,54 @@ class FrameSequence:
         if self.layout is Layout.RECORDING or self.parent_frame == self.name:
             return self.folder
         return self.folder.parent
+
+
+# What a sequence is called, as it is sent with the uploads of its frames.
+
+
+def session_of(sequence: FrameSequence) -> str:
+    """Name of a sequence, the same whether its own folder was named or the scene's."""
+    if sequence.layout is Layout.RECORDING or sequence.parent_frame == sequence.name:
+        return sequence.name
+    return f"{sequence.parent_frame}/{sequence.folder.name}"
+
+
+def parent_frame_of(sequence: FrameSequence, robot: str | None) -> str:
+    """What poses lead to: folders of two robots may share a name, and their poses no frame."""
+    own = sequence.parent_frame
+    return own if robot is None else f"{robot}/{own}"
+
+
+def numbered_sequences(
+    sequences: Iterable[FrameSequence], session: str | None
+) -> list[FrameSequence]:
+    """Sequences with the places of their frames within the sessions that they are sent to.
+
+    Several sequences of one session are numbered one after the other, so that their frames do not
+    mix; frames of one folder that were named one by one keep the folder's numbers, or are numbered
+    as they were named.
+
+    Parameters
+    ----------
+    sequences : in the order in which they follow each other
+    session : of all of them; None: each has its own
+    """
+    told, found = list(sequences), []
+    names = [session or session_of(one) for one in told]
+    alone = {name for name in names if names.count(name) == 1}
+    first: dict[tuple[str, Path], int] = {}
+    free: dict[str, int] = {}  # the next number of each session
+    for name, one in zip(names, told, strict=True):
+        if name in alone:
+            found.append(one)
+            continue
+        offset = first.setdefault((name, one.folder), free.get(name, 0))
+        frames = []
+        for frame in one.frames:
+            place = free.get(name, 0)
+            if frame.sequence is not None:
+                place = offset + frame.sequence
+            frames.append(replace(frame, sequence=place))
+            free[name] = max(free.get(name, 0), place + 1)
+        found.append(replace(one, frames=tuple(frames)))
+    return found

@@ -1,6 +1,9 @@
 """The door for points: the bytes of a file in, a `Cloud` out.
 
 bytes  --decode_scan-->  Scan: the cloud, and how it was read
+bytes  --read_kitti | read_npy | read_pointcloud2-->  FilePoints
+
+Plain arrays are read here: KITTI's .bin, NPY, and a serialised sensor_msgs/PointCloud2 of ROS 2.
 """
 
 from __future__ import annotations
@@ -13,21 +16,87 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableCloud, UselessFrame, naming
-from sceneprint.formats.points.float_rows import FilePoints
 from sceneprint.formats.points.las import read_las
-from sceneprint.formats.points.npy_points import read_kitti, read_npy
 from sceneprint.formats.points.pcd import read_pcd
 from sceneprint.formats.points.ply import read_ply
-from sceneprint.formats.points.pointcloud2 import read_pointcloud2
+from sceneprint.formats.points.rows import FilePoints, check_count, steps
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Cloud, Floats, Floats32
 from sceneprint_client.api.frames import CloudFormat
-from sceneprint_client.file_formats import MAXIMUM_CLOUD_BYTES, format_of
+from sceneprint_client.cdr import read_point_cloud
+from sceneprint_client.file_formats import MAXIMUM_CLOUD_BYTES, NPY_SIGNATURE, format_of, npy_header
+from sceneprint_client.ros_messages import cloud_blocks, cloud_table
 from sceneprint_client.sidecars import UNSAID, Position, Unsaid, rigid_transform
 
-# Fewer points, one to a voxel.
-#
-# points (N, 3)  --thinned-->  points (n, 3), edge of the voxels
+# Plain arrays: KITTI's .bin, and NPY.
+
+_KITTI_ROW = 16  #: bytes: x, y, z, intensity
+
+
+def read_kitti(data: bytes) -> FilePoints:
+    """The points of a KITTI scan: x, y, z, intensity as float32, little-endian, and nothing else.
+
+    Raises
+    ------
+    UnreadableCloud : it is no whole number of points.
+    """
+    count, rest = divmod(len(data), _KITTI_ROW)
+    if rest or not count:
+        raise UnreadableCloud(
+            f"The file has {len(data)} bytes, and each point of a KITTI scan has {_KITTI_ROW}: "
+            "x, y, z and intensity as float32. Copy the file again, or say its true format."
+        )
+    check_count(count)
+    rows = np.frombuffer(data, "<f4").reshape(count, 4)
+    return FilePoints(count, (rows[i : i + n, :3].astype(np.float64) for i, n in steps(count)))
+
+
+def read_npy(data: bytes) -> FilePoints:
+    """The points of an NPY file of shape (N, 3), or (N, 4) whose fourth column is passed over.
+
+    Raises
+    ------
+    UnreadableCloud : it is none, of another type or shape, or its size contradicts its header.
+    """
+    if not data.startswith(NPY_SIGNATURE):
+        raise UnreadableCloud("This is no NPY file. Write the points with numpy.save.")
+    shapes = (
+        "The shape of the NPY array is not that of points, (N, 3) or (N, 4). "
+        "Write x, y and z of each point in a row."
+    )
+    advice = "points are float32 in metres (float64 and float16 are taken too). Convert it."
+    header = npy_header(data, UnreadableCloud, advice, shapes)
+    count, width = header.shape
+    if width not in (3, 4):
+        raise UnreadableCloud(shapes)
+    check_count(count)
+    expected = count * width * header.dtype.itemsize
+    if len(data) - header.start != expected:
+        raise UnreadableCloud(
+            f"The NPY header announces {count} points of {width} values, and "
+            f"{len(data) - header.start} of {expected} bytes follow. Copy or write the file again."
+        )
+    numbers = np.frombuffer(data, header.dtype, offset=header.start)
+    rows = numbers.reshape((count, width), order=header.order)
+    return FilePoints(count, (rows[i : i + n, :3].astype(np.float64) for i, n in steps(count)))
+
+
+# Points as ROS 2 sends them.
+
+
+def read_pointcloud2(data: bytes) -> FilePoints:
+    """The points of a serialised PointCloud2, those exactly at the sensor missing.
+
+    Raises
+    ------
+    UnreadableCloud : the bytes are no such message or damaged, it has no x, y and z, or its sizes
+        contradict each other.
+    """
+    table = cloud_table(read_point_cloud(data))
+    return FilePoints(table.size, cloud_blocks(table))
+
+
+# The door.
 
 #: Edge of the smallest voxels, metres: 2^21 of them are more than 20 km.
 _FINEST = 0.01

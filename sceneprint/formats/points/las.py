@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import MissingDependency, UnreadableCloud
-from sceneprint.formats.points.float_rows import FilePoints, check_count, steps
+from sceneprint.formats.points.rows import FilePoints, check_count, steps
 from sceneprint.types import Floats
 from sceneprint_client.file_formats import LAS_SIGNATURE
 

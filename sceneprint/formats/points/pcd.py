@@ -13,14 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.errors import UnreadableCloud
-from sceneprint.formats.points.float_rows import (
+from sceneprint.formats.points.rows import (
     MAXIMUM_INFLATED,
     FilePoints,
     check_count,
+    check_room,
     columns,
+    parse_blocks,
     steps,
 )
-from sceneprint.formats.points.text_rows import check_room, parse_blocks
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Bytes, Floats
 from sceneprint_client.file_formats import is_pcd

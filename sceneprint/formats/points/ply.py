@@ -14,8 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableCloud
-from sceneprint.formats.points.float_rows import FilePoints, check_count, columns, steps
-from sceneprint.formats.points.text_rows import check_room, parse_blocks, skip_lines
+from sceneprint.formats.points.rows import (
+    FilePoints,
+    check_count,
+    check_room,
+    columns,
+    parse_blocks,
+    skip_lines,
+    steps,
+)
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Bytes, Floats
 

@@ -2,15 +2,22 @@
 
 path, RecordingOptions  --recording_sequence-->  FrameSequence
 Bag  --bag_outline-->  BagOutline: what would be taken, for `sceneprint bag info`
+stamps, poses  --keyframes-->  places of those far enough from the last, or long enough after it
+Image | CompressedImage  --depth_file-->  bytes of a PNG or NPY file
+PointCloud2  --cloud_file-->  bytes of an NPY file (N, 3)
 """
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sceneprint.errors import (
     DatasetError,
@@ -21,18 +28,19 @@ from sceneprint.errors import (
     naming,
 )
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
+from sceneprint.formats.depth_file import decode_png, encode_png, inverse_depth
 from sceneprint.formats.recording.bag import (
     CAMERA,
     COMPRESSED,
     IMAGE,
     POINTS,
     Bag,
+    BagScan,
     BagTopic,
+    Progress,
+    scan_bag,
     shared_bag,
 )
-from sceneprint.formats.recording.frame_bytes import cloud_file, depth_file
-from sceneprint.formats.recording.keyframes import keyframes
-from sceneprint.formats.recording.scan import BagScan, Progress, scan_bag
 from sceneprint.types import Floats
 from sceneprint_client.api.base import checked
 from sceneprint_client.api.frames import GivenBase
@@ -40,12 +48,96 @@ from sceneprint_client.errors import printable
 from sceneprint_client.ros_messages import (
     DEPTH_SCALE,
     camera_intrinsics,
+    cloud_points,
+    compressed_depth,
+    depth_samples,
     image_encoding,
     is_rectified,
     topic_without_transport,
 )
 from sceneprint_client.sidecars import Camera, CloudSource, find_camera
 from sceneprint_client.transform_tree import frame_name
+
+# Which frames are taken: far enough from the last one, or long enough after it.
+
+
+def keyframes(
+    stamps_ns: Sequence[int], poses: Sequence[Floats] | None, metres: float, radians: float,
+    seconds: float,
+) -> list[int]:  # fmt: skip
+    """Return the places of the frames to take; the first is always one.
+
+    Parameters
+    ----------
+    stamps_ns : N times, in order
+    poses : N times T_parent_sensor (4, 4); None where they are not known
+    metres, radians : a frame is taken that lies as far from the last one taken, or is turned by
+        as much; 0 takes every frame
+    seconds : without poses a frame is taken that came as long after the last one taken
+    """
+    taken: list[int] = []
+    for place, stamp in enumerate(stamps_ns):
+        if not taken:
+            taken.append(place)
+        elif poses is None:
+            if stamp - stamps_ns[taken[-1]] >= round(seconds * 1e9):
+                taken.append(place)
+        else:
+            distance, angle = _relative_motion(poses[taken[-1]], poses[place])
+            if distance >= metres or angle >= radians:
+                taken.append(place)
+    return taken
+
+
+def _relative_motion(a: Floats, b: Floats) -> tuple[float, float]:
+    """Metres and radians between two poses."""
+    turn = a[:3, :3].T @ b[:3, :3]
+    cosine = (float(np.trace(turn)) - 1.0) / 2.0
+    sine = math.hypot(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]) / 2
+    return float(np.linalg.norm(b[:3, 3] - a[:3, 3])), math.atan2(sine, cosine)
+
+
+# Messages of ROS as the bytes of a frame.
+
+
+def depth_file(message: Any, *, compressed: bool) -> bytes:
+    """Return the bytes of a PNG or NPY file with the samples of a depth image.
+
+    Parameters
+    ----------
+    message : sensor_msgs Image, or CompressedImage of compressed_depth_image_transport
+    compressed : which of them
+
+    Returns
+    -------
+    data : a 16-bit PNG of millimetres, or an NPY array of float32 metres
+
+    Raises
+    ------
+    UnreadableFrame : the message is of another encoding, or its sizes contradict each other.
+    """
+    if compressed:
+        found = compressed_depth(message)
+        if found.inverse is None:
+            return found.png
+        return _npy_file(inverse_depth(decode_png(found.png), *found.inverse))
+    samples = depth_samples(message)
+    return _npy_file(samples) if samples.dtype.kind == "f" else encode_png(samples)
+
+
+def cloud_file(message: Any) -> bytes:
+    """Return the bytes of an NPY file with the points of a PointCloud2; see `cloud_points`."""
+    return _npy_file(cloud_points(message))
+
+
+def _npy_file(samples: NDArray[Any]) -> bytes:
+    """Bytes of an NPY file."""
+    file = io.BytesIO()
+    np.save(file, np.ascontiguousarray(samples))
+    return file.getvalue()
+
+
+# Which topics, at which poses.
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import disjoint_kernel, kernel
-from sceneprint.geometry.pose.rigid import rotation_of_covariance
+from sceneprint.geometry.rigid import rotation_of_covariance
 from sceneprint.types import Floats, Ints32, Patches
 
 

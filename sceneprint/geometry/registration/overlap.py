@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sceneprint.geometry.frame_cache import cached_per_frame
+from sceneprint.geometry.execution import cached_per_frame
 from sceneprint.geometry.kernel import disjoint_kernel, kernel
-from sceneprint.geometry.pose.rigid import inverses
+from sceneprint.geometry.rigid import inverses
 from sceneprint.geometry.surface.camera import (
     BLOCK,
     camera_of,

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.pose.rigid import distinct
 from sceneprint.geometry.registration.overlap import one_of_each
+from sceneprint.geometry.rigid import distinct
 from sceneprint.types import Floats, Floats32, Ints32, Sphere, Surface
 
 #: Normals this near a candidate speak for it as up; twice as much as one across it.

@@ -1,14 +1,16 @@
-"""Sec. III-A, "Geometric property set extraction": patch pairs to 13-D properties.
+"""Sec. III-A, "Geometric property set extraction": patch pairs to 13-D properties, by a table.
 
     Patches (P), pairs (M, 2)  --invariants-->  (M, 4)  --properties-->  f' (M, 13)
+    layout  --bin_centres-->  invariants (B, 4)
+    layout  --bin_edges-->    edges, in coordinates that are cheap to compute
 
 Symbols follow the paper: mu is the reference patch, alpha its neighbour, r the vector from
 mu to alpha, <u, v, w> the Gram-Schmidt basis of (r, n_mu) with w = u x v.
 
 A pair of oriented points has four degrees of freedom under rigid motion: the length of r,
 the angles of both normals to it, and the dihedral angle between the normals about it. All
-thirteen properties are functions of these four, which is what makes the table of
-`pair_table.py` possible.
+thirteen properties are functions of these four, so pairs are counted in the bins of a grid over
+them, and a table holds what the mixture makes of each bin.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import TrainingError
-from sceneprint.types import Floats, Patches
+from sceneprint.geometry.kernel import cached_at, disjoint_kernel, kernel
+from sceneprint.geometry.signature.mixture import Mixture
+from sceneprint.types import Floats, Floats32, Ints32, Patches
 
 PROPERTY_DIMENSION = 13  #: length of f', Eq. (1)
 
@@ -243,3 +247,361 @@ def fit_projection(
     return Projection(
         mean, matrix * np.sign(components[np.arange(FEATURE_DIMENSION), largest])[:, None]
     )
+
+
+# The grid over the four invariants of a pair, and the table over its bins.
+
+
+@dataclass(frozen=True)
+class TableLayout:
+    """The grid over the four invariants of a pair.
+
+    Angular bins are centred on right angles (and the dihedral ones on 0 and 180 degrees):
+    buildings are full of these, and they must not fall on the edge between two bins. With 27
+    of them the tolerance of 10 degrees in Eq. (1) is an edge, so that no bin straddles the jump
+    of the robust sign; a third of the bins then serve as well as a finer grid without that.
+    """
+
+    distance_bins: int = 20
+    angle_bins: int = 27  #: of each normal's angle to r; odd, so that one is centred on 90
+    dihedral_bins: int = 20  #: a multiple of 4, offset by half a bin
+    distance_exponent: float = 1.3  #: distance edges are radius * (i / bins)^exponent
+
+    @property
+    def n_bins(self) -> int:
+        """B, the number of bins."""
+        return self.distance_bins * self.angle_bins**2 * self.dihedral_bins
+
+
+def bin_centres(layout: TableLayout, first: int, last: int, p: PropertyParameters) -> Floats:
+    """The four invariants at the centres of bins `first` to `last` - 1.
+
+    Returns
+    -------
+    (last - first, 4) : as `pair_features.invariants`: metres, rad
+    """
+    shape = (layout.distance_bins, layout.angle_bins, layout.angle_bins, layout.dihedral_bins)
+    i, j, k, m = np.unravel_index(np.arange(first, last), shape)
+    d = p.radius * ((i + 0.5) / layout.distance_bins) ** layout.distance_exponent
+    theta = np.pi * (np.stack([j, k]) + 0.5) / layout.angle_bins
+    phi = 2 * np.pi * m / layout.dihedral_bins
+    return np.column_stack([d, theta[0], theta[1], np.where(phi > np.pi, phi - 2 * np.pi, phi)])
+
+
+def _diamond(x: Floats, y: Floats) -> Floats:
+    """Monotone stand-in for the angle atan2(y, x), in [0, 4): a division, no arctangent."""
+    t = y / (np.abs(x) + np.abs(y))
+    diamond: Floats = np.where(x < 0, 2.0 - t, np.where(y < 0, 4.0 + t, t))
+    return diamond
+
+
+def bin_edges(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Floats, Floats]:
+    """Upper edges of the bins, in the coordinates in which `count_pairs` looks them up.
+
+    Returns
+    -------
+    distance : (distance_bins,) metres
+    angle : (angle_bins,) minus the cosine of the angle, rising from -1; the last is infinite
+    dihedral : (dihedral_bins + 1,) diamond angle in [0, 4]; the last bin is the first's half
+    """
+    distance = p.radius * (np.arange(1, layout.distance_bins + 1) / layout.distance_bins) ** (
+        layout.distance_exponent
+    )
+    angle = -np.cos(np.pi * np.arange(1, layout.angle_bins + 1) / layout.angle_bins)
+    angle[-1] = np.inf  # a cosine may exceed 1 by a rounding
+    phi = 2 * np.pi * (np.arange(layout.dihedral_bins) + 0.5) / layout.dihedral_bins
+    dihedral = np.append(_diamond(np.cos(phi), np.sin(phi)), 4.0)
+    return distance, angle, dihedral
+
+
+def hints(edges: Floats, origin: float, extent: float, n: int = 4096) -> Ints32:
+    """Where to begin the search for a bin: for each of `n` equal cells, its first bin.
+
+    Parameters
+    ----------
+    edges : upper edges of the bins
+    origin, extent : of the coordinate
+    n : cells; each must be narrower than any bin
+
+    Raises
+    ------
+    ValueError : a bin is narrower than a cell.
+    """
+    if n * np.diff(edges, prepend=origin).min() <= extent:
+        raise ValueError("bins are finer than the look-up allows: use fewer")
+    starts = origin + extent * np.arange(n) / n
+    return np.minimum(np.searchsorted(edges, starts, side="right"), len(edges) - 1).astype(np.int32)
+
+
+# The 4-D pair table: what a pair of patches contributes to Eq. (2), looked up.
+#
+# Model  --part-->  PairTable (B bins: feature, leading posteriors)
+#
+# A pair has only the four invariants of `pair_features.py`. Projection and posteriors are
+# evaluated once for each bin of a grid over these four, instead of once for each pair.
+
+LEADING = 8  #: posteriors kept per bin
+LEAST = 1e-3  #: and of these, those that are no smaller; what is kept sums to 1
+#: Floats of one bin: feature, posteriors, and the components as pairs of int16.
+WIDTH = FEATURE_DIMENSION + LEADING + LEADING // 2
+
+
+@dataclass(frozen=True, eq=False)
+class PairTable:
+    """What every bin contributes, 96 bytes in one place each: two cache lines a look-up.
+
+    Parameters
+    ----------
+    packed : (B, 24) float32, C-contiguous; its columns are the properties below
+    """
+
+    packed: Floats32
+
+    @property
+    def features(self) -> Floats32:
+        """(B, 12) float32, f of the bin's centre."""
+        return self.packed[:, :FEATURE_DIMENSION]
+
+    @property
+    def posteriors(self) -> Floats32:
+        """(B, 8) float32, falling, of sum 1; 0 from the first below 1e-3 on."""
+        return self.packed[:, FEATURE_DIMENSION : FEATURE_DIMENSION + LEADING]
+
+    @property
+    def components(self) -> NDArray[np.int16]:
+        """(B, 8) int16, the mixture components whose posteriors these are."""
+        return self.packed.view(np.int16)[:, 2 * (FEATURE_DIMENSION + LEADING) :]
+
+
+def pack(features: Floats32, posteriors: Floats32, components: NDArray[np.int16]) -> PairTable:
+    """A table from its three parts.
+
+    Parameters
+    ----------
+    features : (B, 12)
+    posteriors, components : (B, 8)
+    """
+    packed = np.empty((len(features), WIDTH), np.float32)
+    table = PairTable(packed)
+    table.features[:], table.posteriors[:], table.components[:] = features, posteriors, components
+    return table
+
+
+@kernel
+def _leading(
+    features: Floats32, constants: Floats32, means: Floats32, precisions: Floats32,
+    components: NDArray[np.int16], posteriors: Floats32,
+) -> None:  # fmt: skip
+    """Keep the largest posteriors of each feature. means, precisions: (12, G)."""
+    n, dimension = features.shape
+    n_components, n_leading = len(constants), components.shape[1]
+    logits = np.empty(n_components, np.float32)
+    half = np.float32(0.5)
+    for i in range(n):
+        logits[:] = constants
+        for d in range(dimension):
+            x, mu, precision = features[i, d], means[d], precisions[d]
+            for g in range(n_components):
+                difference = x - mu[g]
+                logits[g] -= half * precision[g] * difference * difference
+        found = 0
+        for g in range(n_components):
+            value = logits[g]
+            if found == n_leading and value <= logits[components[i, found - 1]]:
+                continue
+            at = found if found < n_leading else n_leading - 1
+            while at > 0 and logits[components[i, at - 1]] < value:
+                components[i, at] = components[i, at - 1]
+                at -= 1
+            components[i, at] = g
+            found = min(found + 1, n_leading)
+        highest, total = logits[components[i, 0]], np.float32(0.0)
+        for k in range(found):
+            posteriors[i, k] = np.exp(logits[components[i, k]] - highest)
+            total += posteriors[i, k]
+        kept = np.float32(0.0)
+        for k in range(found):
+            posteriors[i, k] /= total
+            if posteriors[i, k] < np.float32(LEAST):
+                posteriors[i, k] = np.float32(0.0)
+            kept += posteriors[i, k]
+        for k in range(found):
+            posteriors[i, k] /= kept
+
+
+def part(
+    first: int, last: int,
+    layout: TableLayout, p: PropertyParameters, projection: Projection, mixture: Mixture,
+) -> PairTable:  # fmt: skip
+    """Bins `first` to `last` - 1 of the table.
+
+    Parameters
+    ----------
+    first, last : bins
+    layout, p, projection, mixture : of the model
+    """
+    invariant = bin_centres(layout, first, last, p)
+    features = project(properties(invariant, p), projection).astype(np.float32)
+    constants = np.log(mixture.weights) - 0.5 * np.log(mixture.variances).sum(axis=1)
+    components = np.zeros((last - first, LEADING), np.int16)
+    posteriors = np.zeros((last - first, LEADING), np.float32)
+    _leading(
+        features, constants.astype(np.float32),
+        np.ascontiguousarray(mixture.means.T, np.float32),
+        np.ascontiguousarray(1.0 / mixture.variances.T, np.float32),
+        components, posteriors,
+    )  # fmt: skip
+    return pack(features, posteriors, components)
+
+
+# All ordered pairs of patches, counted by their four invariants.
+#
+# Patches (P)  --count_pairs-->  PairCounts (B bins)
+#
+# All pairs are used: a sample of them would make the signature of one frame differ from itself
+# (docs/paper.md, R11). The inner loops run over all later patches, which lets the compiler work on
+# several at a time.
+
+
+@disjoint_kernel
+def _invariants(
+    points: Floats, normals: Floats, i: int, d: Floats, i_u: Floats, j_u: Floats, turn: Floats
+) -> None:
+    """Of patch i and each later one, with u from i to j: their distance, n_i . u, n_j . u, and the
+    diamond angle, as `_diamond`, of the dihedral angle about u from n_i to n_j.
+    """
+    x, y, z, nx, ny, nz = points[0], points[1], points[2], normals[0], normals[1], normals[2]
+    ix, iy, iz, ax, ay, az = x[i], y[i], z[i], nx[i], ny[i], nz[i]
+    for j in range(i + 1, len(d)):
+        rx, ry, rz = x[j] - ix, y[j] - iy, z[j] - iz
+        length = np.sqrt(rx * rx + ry * ry + rz * rz)
+        inverse = 1.0 / (length + 1e-300)  # pairs in one place are left out by their distance
+        along_i = (rx * ax + ry * ay + rz * az) * inverse
+        along_j = (rx * nx[j] + ry * ny[j] + rz * nz[j]) * inverse
+        cx, cy, cz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
+        sine = (cx * nx[j] + cy * ny[j] + cz * nz[j]) * inverse
+        cosine = ax * nx[j] + ay * ny[j] + az * nz[j] - along_i * along_j
+        t = sine / (abs(cosine) + abs(sine) + 1e-300)
+        right = 4.0 + t if sine < 0.0 else t
+        turn[j] = 2.0 - t if cosine < 0.0 else right
+        d[j], i_u[j], j_u[j] = length, along_i, along_j
+
+
+@disjoint_kernel
+def _bin(value: float, edges: Floats, hints: Ints32, origin: float, per_unit: float) -> int:
+    """Index of the first edge above a value. Cells of hints are narrower than bins."""
+    cell = min(max((value - origin) * per_unit, 0.0), len(hints) - 1.0)
+    b = hints[np.uint64(np.int32(cell))]
+    found: int = b + 1 if value >= edges[np.uint64(b)] else b
+    return found
+
+
+@disjoint_kernel
+def _pair_bins(
+    d: Floats, i_u: Floats, j_u: Floats, turn: Floats, i: int, radius: float, colinearity: float,
+    distance: Floats, angle: Floats, dihedral: Floats, of_distance: Ints32, of_angle: Ints32,
+    of_dihedral: Ints32, n_angles: int, n_dihedrals: int, there: Ints32, back: Ints32,
+) -> None:  # fmt: skip
+    """Bins of the pairs (i, j) and (j, i); -1 of a pair that is none."""
+    per_metre, per_cosine = len(of_distance) / radius, len(of_angle) / 2.0
+    per_turn = len(of_dihedral) / 4.0
+    for j in range(i + 1, len(d)):
+        row = _bin(d[j], distance, of_distance, 0.0, per_metre)
+        mu = _bin(-i_u[j], angle, of_angle, -1.0, per_cosine)
+        alpha = _bin(-j_u[j], angle, of_angle, -1.0, per_cosine)
+        phi = _bin(turn[j], dihedral, of_dihedral, 0.0, per_turn)
+        last = phi if phi < n_dihedrals else 0
+        near = (d[j] < radius) & (d[j] > 0.0)
+        # (i, j): angles of n_i and n_j to u
+        bin_ij = ((row * n_angles + mu) * n_angles + alpha) * n_dihedrals + last
+        there[j] = np.int32(bin_ij if near & (abs(i_u[j]) <= colinearity) else -1)
+        # (j, i): u turns round, the normals change places
+        mu, alpha = n_angles - 1 - alpha, n_angles - 1 - mu
+        bin_ji = ((row * n_angles + mu) * n_angles + alpha) * n_dihedrals + last
+        back[j] = np.int32(bin_ji if near & (abs(j_u[j]) <= colinearity) else -1)
+
+
+@disjoint_kernel
+def _add(
+    there: Ints32, back: Ints32, i: int, weights: Floats32, counts: Floats32, total: float
+) -> tuple[int, float]:
+    """Add the weights of pairs to their bins: number of pairs, and `total` with their weights."""
+    found, own = 0, weights[i]
+    for j in range(i + 1, len(there)):
+        weight = own * weights[j]
+        if there[j] >= 0:
+            counts[np.uint64(there[j])] += weight
+            total += weight
+            found += 1
+        if back[j] >= 0:
+            counts[np.uint64(back[j])] += weight
+            total += weight
+            found += 1
+    return found, total
+
+
+@kernel
+def _count(
+    points: Floats, normals: Floats, radius: float, colinearity: float,
+    distance: Floats, angle: Floats, dihedral: Floats,
+    hints: Ints32, n_angles: int, n_dihedrals: int, weights: Floats32, counts: Floats32,
+) -> tuple[int, float]:  # fmt: skip
+    """Add the weight of both orders of every pair; returns number and weight of all."""
+    n = points.shape[1]
+    d, i_u, j_u, turn = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    there, back = np.empty(n, np.int32), np.empty(n, np.int32)
+    n_pairs, total = 0, 0.0
+    for i in range(n):
+        _invariants(points, normals, i, d, i_u, j_u, turn)
+        _pair_bins(
+            d, i_u, j_u, turn, i, radius, colinearity, distance, angle, dihedral,
+            hints[0], hints[1], hints[2], n_angles, n_dihedrals, there, back,
+        )  # fmt: skip
+        found, total = _add(there, back, i, weights, counts, total)
+        n_pairs += found
+    return n_pairs, total
+
+
+@dataclass(frozen=True, eq=False)
+class PairCounts:
+    """All ordered pairs of one level, by bin.
+
+    Parameters
+    ----------
+    weights : (B,) float32, sum of the weights of the pairs in each bin
+    n_pairs : number of pairs
+    total : sum of all their weights
+    """
+
+    weights: Floats32
+    n_pairs: int
+    total: float
+
+
+def count_pairs(
+    means: Floats, normals: Floats, weights: Floats, layout: TableLayout, p: PropertyParameters
+) -> PairCounts:
+    """Count all ordered pairs of patches by bin, each with the product of its weights.
+
+    Parameters
+    ----------
+    means, normals : (P, 3) float64, metres and unit length
+    weights : (P,) of the patches
+    layout, p : of the model
+    """
+    distance, angle, dihedral = bin_edges(layout, p)
+    starts = np.stack(
+        [hints(distance, 0.0, p.radius), hints(angle, -1.0, 2.0), hints(dihedral, 0.0, 4.0)]
+    )
+    counts = np.zeros(layout.n_bins, np.float32)
+    n_pairs, total = _count(
+        np.ascontiguousarray(means.T), np.ascontiguousarray(normals.T),
+        p.radius, p.colinearity, distance, angle, dihedral,
+        starts, layout.angle_bins, layout.dihedral_bins, weights.astype(np.float32), counts,
+    )  # fmt: skip
+    return PairCounts(counts, n_pairs, total)
+
+
+def compiled_at() -> tuple[str, bool]:
+    """Folder of this code's machine code, and whether it is there."""
+    return cached_at(_count)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.pose.rigid import inverse, moved
+from sceneprint.geometry.rigid import inverse, moved
 from sceneprint.types import Bytes, DepthFrame, Floats, Floats32, Ints32
 
 #: A point is seen by a view that measures its depth within so many metres, and this share of it.

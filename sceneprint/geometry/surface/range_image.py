@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sceneprint.errors import UselessFrame
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.surface.cloud import CloudParameters, within_range
-from sceneprint.geometry.surface.planes import solve
+from sceneprint.geometry.surface.voxels import solve
 from sceneprint.types import Cloud, Floats, Floats32, Sphere, Surface
 
 # The camera of a range image: which pole, how wide, and where its pixels look.

@@ -1,31 +1,360 @@
 """Input of Sec. III, clouds: points to voxels, each a mean of points and the plane it lies on.
 
     Cloud (N)  --voxels-->  Voxels (V), a Surface (1, V)
+    inverse ranges (N), directions (N, 3), Links  --plane_seen-->    planes
+    places (N, 3), Links                          --plane_facing-->  normals, feet
 
 About a viewpoint voxels grow with range, as those of VCCS do for a cloud of one camera (Papon
 2013): a cell is a bin of direction, on the cube, and of the logarithm of range, so that a voxel
 is to a cloud what a pixel is to a depth image. Without a viewpoint all are of one size. The grid
-lies in the cloud's own axes: turning the cloud turns the voxels with it.
+lies in the cloud's own axes: turning the cloud turns the voxels with it. The plane of a voxel goes
+through its neighbours.
 """
 
 from __future__ import annotations
 
 import math
+import secrets
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import UselessFrame
+from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.surface.cloud import (
     CloudParameters,
     centroid,
+    mixed,
     principal_axes,
     thinned,
     within_range,
 )
-from sceneprint.geometry.surface.planes import Links, linked, plane_facing, plane_seen
-from sceneprint.types import Cloud, Floats, Floats32, Surface
+from sceneprint.types import Cloud, Floats, Floats32, Ints32, Surface
+
+# The plane through the neighbours of each point.
+
+Ints64 = NDArray[np.int64]
+
+
+@kernel
+def solve(
+    xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, b: Floats, out: Floats
+) -> float:
+    """out = A^-1 b of a symmetric 3 x 3 matrix A; its determinant, and no `out` where <= 0."""
+    cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    det = xx * cxx + xy * cxy + xz * cxz
+    if det > 0:
+        cyy, cyz, czz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+        out[0] = (cxx * b[0] + cxy * b[1] + cxz * b[2]) / det
+        out[1] = (cxy * b[0] + cyy * b[1] + cyz * b[2]) / det
+        out[2] = (cxz * b[0] + cyz * b[1] + czz * b[2]) / det
+    return det
+
+
+@kernel
+def plane_seen(
+    q: Floats, u: Floats, offsets: Ints64, indices: Ints32, gates: Floats, limits: Floats,
+    planes: Floats,
+) -> None:  # fmt: skip
+    """a of 1/r = a . u among the neighbours of each point; left 0 where nothing fixes it.
+
+    Two passes, as in `range_image.py`: what is near in range, then what is near the plane.
+    """
+    a, b = np.zeros(3), np.zeros(3)
+    for i in range(len(q)):
+        for turn in range(2):
+            n = 1
+            x, y, z, w = u[i, 0], u[i, 1], u[i, 2], q[i]
+            gate = gates[0] * w if turn == 0 else gates[1] + gates[2] * w
+            xx, xy, xz, yy, yz, zz = x * x, x * y, x * z, y * y, y * z, z * z
+            b[0], b[1], b[2] = x * w, y * w, z * w
+            for k in range(offsets[i], offsets[i + 1]):
+                j = indices[k]
+                x, y, z, w = u[j, 0], u[j, 1], u[j, 2], q[j]
+                expected = q[i]
+                if turn == 1:
+                    expected = a[0] * x + a[1] * y + a[2] * z
+                if not abs(w - expected) < gate:
+                    continue
+                n += 1
+                xx += x * x
+                xy += x * y
+                xz += x * z
+                yy += y * y
+                yz += y * z
+                zz += z * z
+                b[0] += x * w
+                b[1] += y * w
+                b[2] += z * w
+            det = solve(xx, xy, xz, yy, yz, zz, b, a)
+            if n < limits[0] or det < limits[1] * float(n) ** 3:
+                break
+            if turn == 1:
+                planes[i] = a
+
+
+@kernel
+def least_axis(m: Floats, values: Floats, axis: Floats) -> None:
+    """Eigenvalues of a symmetric 3 x 3 matrix, by Jacobi, and the eigenvector of the least.
+
+    `m` is used up.
+    """
+    v = np.eye(3)
+    for _ in range(8):
+        for i in range(2):
+            for j in range(i + 1, 3):
+                if m[i, j] == 0.0:
+                    continue
+                theta = (m[j, j] - m[i, i]) / (2.0 * m[i, j])
+                t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
+                if theta < 0:
+                    t = -t
+                c = 1.0 / np.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(3):
+                    one, other = m[k, i], m[k, j]
+                    m[k, i], m[k, j] = c * one - s * other, s * one + c * other
+                for k in range(3):
+                    one, other = m[i, k], m[j, k]
+                    m[i, k], m[j, k] = c * one - s * other, s * one + c * other
+                for k in range(3):
+                    one, other = v[k, i], v[k, j]
+                    v[k, i], v[k, j] = c * one - s * other, s * one + c * other
+    least = 0
+    for d in range(3):
+        values[d] = m[d, d]
+        if m[d, d] < m[least, least]:
+            least = d
+    for d in range(3):
+        axis[d] = v[d, least]
+
+
+@kernel
+def plane_facing(
+    places: Floats, offsets: Ints64, indices: Ints32, gate: float, limits: Floats,
+    normals: Floats, at: Floats,
+) -> None:  # fmt: skip
+    """Principal components of the neighbours of each point, towards the origin.
+
+    `at` becomes the point's foot on the plane. Two passes: all, then what is near the plane.
+    Left 0 where nothing fixes it.
+    """
+    m, values, axis, mean = np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros(3)
+    for i in range(len(places)):
+        for turn in range(2):
+            n = 0
+            first, second = np.zeros(3), np.zeros((3, 3))
+            for k in range(offsets[i] - 1, offsets[i + 1]):
+                j = i if k < offsets[i] else np.int64(indices[k])
+                if turn == 1:
+                    off = 0.0
+                    for d in range(3):
+                        off += axis[d] * (places[j, d] - mean[d])
+                    if not abs(off) < gate:
+                        continue
+                n += 1
+                for d in range(3):  # about the point itself: nothing is lost far from the origin
+                    first[d] += places[j, d] - places[i, d]
+                    for e in range(3):
+                        second[d, e] += (places[j, d] - places[i, d]) * (
+                            places[j, e] - places[i, e]
+                        )
+            if n < limits[0]:
+                break
+            for d in range(3):
+                mean[d] = places[i, d] + first[d] / n
+                for e in range(3):
+                    m[d, e] = second[d, e] / n - first[d] / n * first[e] / n
+            least_axis(m, values, axis)
+            low = min(values[0], values[1], values[2])
+            high = max(values[0], values[1], values[2])
+            middle = values[0] + values[1] + values[2] - low - high
+            if high * middle < limits[1]:
+                break
+            if turn == 1:
+                towards, off = 0.0, 0.0
+                for d in range(3):
+                    towards -= axis[d] * places[i, d]
+                    off += axis[d] * (places[i, d] - mean[d])
+                for d in range(3):
+                    normals[i, d] = axis[d] if towards >= 0 else -axis[d]
+                    at[i, d] = places[i, d] - off * axis[d]
+
+
+# Which points are near which, and which of them touch.
+#
+#     places (N, 3), heights (N)  --linked-->  Links
+#
+# One kind of nearness for all: closer than 1 in place, and closer than 1 in a height besides.
+# Whoever asks divides by the reach. Points are visited cell by cell of a grid, each with all that
+# the cells around it hold.
+
+_REACH = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """Neighbours of N points: those of i are `indices[offsets[i] : offsets[i + 1]]`, i left out.
+
+    Parameters
+    ----------
+    offsets : (N + 1,) int64
+    indices : (M,) int32
+    """
+
+    offsets: Ints64
+    indices: Ints32
+
+    def among(self, keep: NDArray[np.bool_], linked: NDArray[np.bool_]) -> Links:
+        """Those of `linked` (M,) between the points kept (N,), which are numbered anew."""
+        number = np.cumsum(keep) - 1
+        of = np.repeat(keep, np.diff(self.offsets))
+        held = linked & of & keep[self.indices]
+        sums = np.concatenate([[0], np.cumsum(held)])
+        counts = np.diff(sums[self.offsets])[keep]
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        return Links(offsets, number[self.indices[held]].astype(np.int32))
+
+    def touching(
+        self, places: Floats, reach: float, at: Floats, normals: Floats, gaps: Floats
+    ) -> NDArray[np.bool_]:
+        """Which links (M,) are short, and between surfaces that are not one behind the other.
+
+        Parameters
+        ----------
+        places : (N, 3) as `linked` took them
+        reach : in their units
+        at, normals : (N, 3)
+        gaps : (N,) farther than this from the planes of both there is a gap, metres
+        """
+        keep = np.empty(len(self.indices), np.bool_)
+        _touch(places, reach * reach, at, normals, gaps, self.offsets, self.indices, keep)
+        return keep
+
+
+@kernel
+def _grid(cells: Ints64, order: Ints64, secret: int, table: Ints64, starts: Ints64) -> int:
+    """Enter runs of points in one cell (cells sorted by `order`) into a hash table."""
+    mask = len(table) - 1
+    n = 0
+    for i in range(len(order)):
+        key = cells[order[i]]
+        if i > 0 and cells[order[i - 1]] == key:
+            continue
+        starts[n] = i
+        at = mixed(key, secret) & mask
+        while table[at] >= 0:
+            at = (at + 1) & mask
+        table[at] = n
+        n += 1
+    starts[n] = len(order)
+    return n
+
+
+@kernel
+def _link(
+    places: Floats, heights: Floats, cells: Ints64, order: Ints64, secret: int, table: Ints64,
+    starts: Ints64, n_cells: int, counts: Ints64, begins: Ints64,
+) -> Ints32:  # fmt: skip
+    """Neighbours of each point, all in one array: where they begin, and how many they are."""
+    mask = len(table) - 1
+    indices = np.empty(16 * len(order) + 16, np.int32)
+    total = 0
+    around = np.empty(27, np.int64)
+    span = 2 * _REACH
+    for c in range(n_cells):
+        key = cells[order[starts[c]]]
+        found = 0
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                for dz in range(-1, 2):
+                    wanted = key + (dx * span + dy) * span + dz
+                    at = mixed(wanted, secret) & mask
+                    while table[at] >= 0:
+                        if cells[order[starts[table[at]]]] == wanted:
+                            around[found] = table[at]
+                            found += 1
+                            break
+                        at = (at + 1) & mask
+        for k in range(starts[c], starts[c + 1]):
+            i = order[k]
+            x, y, z, h = places[i, 0], places[i, 1], places[i, 2], heights[i]
+            begins[i] = total
+            for f in range(found):
+                a, b = starts[around[f]], starts[around[f] + 1]
+                if total + b - a > len(indices):
+                    longer = np.empty(2 * len(indices) + b - a, np.int32)
+                    longer[:total] = indices[:total]
+                    indices = longer
+                for m in range(a, b):
+                    j = order[m]
+                    dx_, dy_, dz_ = places[j, 0] - x, places[j, 1] - y, places[j, 2] - z
+                    if dx_ * dx_ + dy_ * dy_ + dz_ * dz_ >= 1.0 or j == i:
+                        continue
+                    if abs(heights[j] - h) >= 1.0:
+                        continue
+                    indices[total] = j
+                    total += 1
+            counts[i] = total - begins[i]
+    return indices
+
+
+@kernel
+def _reorder(indices: Ints32, begins: Ints64, offsets: Ints64, out: Ints32) -> None:
+    for i in range(len(begins)):
+        for k in range(offsets[i + 1] - offsets[i]):
+            out[offsets[i] + k] = indices[begins[i] + k]
+
+
+def linked(places: Floats, heights: Floats) -> Links:
+    """All pairs of points that are near each other.
+
+    Parameters
+    ----------
+    places : (N, 3), in units of the reach, within 2^19 of the origin
+    heights : (N,), in units of its gate
+    """
+    n = len(places)
+    cell = np.clip(np.floor(places), -_REACH + 1, _REACH - 2).astype(np.int64) + _REACH
+    cells = (cell[:, 0] * 2 * _REACH + cell[:, 1]) * 2 * _REACH + cell[:, 2]
+    order = np.argsort(cells, kind="stable")
+    table = np.full(1 << max((2 * n - 1).bit_length(), 1), -1, np.int64)
+    starts, secret = np.empty(n + 1, np.int64), secrets.randbits(62)
+    n_cells = _grid(cells, order, secret, table, starts)
+    counts, begins = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    offsets = np.zeros(n + 1, np.int64)
+    found = _link(places, heights, cells, order, secret, table, starts, n_cells, counts, begins)
+    np.cumsum(counts, out=offsets[1:])
+    indices = np.empty(int(offsets[-1]), np.int32)
+    _reorder(found, begins, offsets, indices)
+    return Links(offsets, indices)
+
+
+@kernel
+def _touch(
+    places: Floats, square: float, at: Floats, normals: Floats, gaps: Floats, offsets: Ints64,
+    indices: Ints32, keep: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Whether two are close, and one of them lies on the plane of the other."""
+    for i in range(len(at)):
+        for k in range(offsets[i], offsets[i + 1]):
+            j = indices[k]
+            x, y, z = (
+                places[j, 0] - places[i, 0],
+                places[j, 1] - places[i, 1],
+                places[j, 2] - places[i, 2],
+            )
+            if x * x + y * y + z * z > square:
+                keep[k] = False
+                continue
+            dx, dy, dz = at[j, 0] - at[i, 0], at[j, 1] - at[i, 1], at[j, 2] - at[i, 2]
+            one = abs(dx * normals[i, 0] + dy * normals[i, 1] + dz * normals[i, 2])
+            other = abs(dx * normals[j, 0] + dy * normals[j, 1] + dz * normals[j, 2])
+            keep[k] = min(one, other) <= max(gaps[i], gaps[j])
+
+
+# Points to voxels.
 
 #: Side of a square that has the area of the neighbourhood's disc, in its radii.
 _SQUARE = math.sqrt(math.pi)

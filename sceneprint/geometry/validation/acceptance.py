@@ -1,13 +1,39 @@
-"""Sec. III-E, acceptance: what is known of a transform to whether it is believed.
+"""Sec. III-E, acceptance: what is known of a transform to whether it is believed, and its rivals.
 
-Evidence  --objection-->  why not        Evidence, ambiguity  --belief-->  how far
+    Evidence  --objection-->  why not        Evidence, ambiguity  --belief-->  how far
+    T, hypotheses, planes  --best_alternative-->  ambiguity, T_alternative
+
+A lone box looks the same from its four sides, a corridor the same at every door. Two frames of
+such a place agree perfectly under a wrong transform, and nothing in the residual, the overlap or
+the free space shows it. What does show is that *another* transform is not refuted either. So
+rivals are looked for: the other hypotheses that correspondences voted for, and the transform
+found, turned by quarter turns about the normals of the main planes or shifted along them, which
+is how rooms and what stands in them repeat.
+
+What a rival agrees on counts by planes (`overlap.py`). Where up is known in both frames, what tilts
+against it is no rival.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from sceneprint.geometry.execution import cached_per_frame
+from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.registration.alignment import NO_UPS, Ups, are_level
+from sceneprint.geometry.registration.icp import COARSE, QUICK, RefinementParameters, refined_all
+from sceneprint.geometry.registration.overlap import (
+    OverlapParameters,
+    PlaneParameters,
+    PlaneView,
+    explained,
+)
+from sceneprint.geometry.rigid import are_near, distinct
+from sceneprint.types import Floats, Patches
 
 Status = Literal["accepted", "ambiguous", "rejected"]
 Strength = Literal["strong", "weak"]
@@ -141,3 +167,186 @@ def belief(
 def _two_digits(value: float) -> str:
     """As people write it: 130, and never 1.3e+02."""
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+# Ambiguity: other transforms that would explain the same two frames.
+
+
+@dataclass(frozen=True)
+class AmbiguityParameters:
+    """The numbers of the search for rivals."""
+
+    n_axes: int = 2  #: directions that most surface faces
+    n_planes: int = 3  #: planes across each, by area
+    same_direction: float = math.radians(12.0)  #: normals this near are parallel
+    shift: float = 0.5  #: steps along a corridor, metres: what refinement can bridge
+    n_shifts: int = 6  #: each way
+    least_crossing: float = 0.5  #: sine of the angle between the main families of planes
+    n_proposed: int = 16  #: hypotheses of the plans that are refined as rivals
+    planes: PlaneParameters = field(default_factory=PlaneParameters)
+    first: RefinementParameters = QUICK  #: of all
+    hopeful_share: float = 0.04  #: after it, those that explain less are dropped
+    hopeful_violations: float = 0.15  #: and those that violate more
+    then: RefinementParameters = COARSE  #: of the rest
+    refuted: float = 0.02  #: violations from which on a rival is none, if the transform has fewer
+    rival_m: float = 0.25  #: a rival differs by this, metres
+    rival_rad: float = math.radians(15.0)  #: or by this
+
+
+@cached_per_frame
+def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
+    """Motions that leave main planes of the patches in themselves.
+
+    Turns by 90, 180 and 270 degrees about the middle of each plane; and shifts along the direction
+    in which the two main families of planes both run, as a corridor does.
+
+    Parameters
+    ----------
+    patches : P of one frame
+    p : see AmbiguityParameters
+
+    Returns
+    -------
+    (n, 4, 4) with n at most 3 n_axes n_planes + 2 n_shifts
+    """
+    left = patches.areas.copy()
+    mass = np.empty(len(patches))
+    found: list[Floats] = []
+    axes: list[Floats] = []
+    for _ in range(p.n_axes):
+        _facing(patches.normals, left, math.cos(p.same_direction), mass)
+        most = int(np.argmax(mass))
+        if left[most] <= 0:
+            break
+        cosines = (patches.normals * patches.normals[most]).sum(axis=1)
+        across = np.abs(cosines) > math.cos(p.same_direction)
+        signed = np.sign(cosines) * patches.areas * across
+        axis = (patches.normals * signed[:, None]).sum(axis=0)
+        axis /= np.linalg.norm(axis)
+        axes.append(axis)
+        middles = _middles(patches, axis, np.where(across, left, 0.0), p)
+        found += [_turn(axis, middle, k) for middle in middles for k in (1, 2, 3)]
+        left = np.where(across, 0.0, left)
+    if len(axes) > 1:
+        along = np.cross(axes[0], axes[1])
+        length = float(np.linalg.norm(along))
+        if length > p.least_crossing:
+            steps = p.shift * np.arange(1, p.n_shifts + 1)
+            found += [_shift(along / length * s) for s in np.concatenate([steps, -steps])]
+    return np.array(found).reshape(-1, 4, 4)
+
+
+def _middles(patches: Patches, axis: Floats, area: Floats, p: AmbiguityParameters) -> list[Floats]:
+    """Middles of the largest planes across an axis, of the patches that have an area."""
+    offsets, mass = (patches.means * axis).sum(axis=1), np.empty(len(patches))
+    middles: list[Floats] = []
+    for _ in range(p.n_planes):
+        _level(offsets, area, p.planes.same_plane, mass)
+        best = int(np.argmax(np.where(area > 0, mass, 0.0)))
+        if area[best] <= 0:
+            break
+        on_plane = (np.abs(offsets - offsets[best]) < p.planes.same_plane) & (area > 0)
+        middles.append(np.average(patches.means[on_plane], axis=0, weights=area[on_plane]))
+        area = np.where(on_plane, 0.0, area)
+    return middles
+
+
+@kernel
+def _facing(normals: Floats, areas: Floats, cosine: float, mass: Floats) -> None:
+    """Area of the patches that face the way of each, or away from it."""
+    for i in range(len(normals)):
+        a, b, c = normals[i, 0], normals[i, 1], normals[i, 2]
+        total = 0.0
+        for j in range(len(normals)):
+            if abs(normals[j, 0] * a + normals[j, 1] * b + normals[j, 2] * c) > cosine:
+                total += areas[j]
+        mass[i] = total
+
+
+@kernel
+def _level(offsets: Floats, areas: Floats, apart: float, mass: Floats) -> None:
+    """Area of the patches whose offset is near that of each."""
+    for i in range(len(offsets)):
+        total = 0.0
+        for j in range(len(offsets)):
+            if abs(offsets[j] - offsets[i]) < apart:
+                total += areas[j]
+        mass[i] = total
+
+
+def _shift(by: Floats) -> Floats:
+    result = np.eye(4)
+    result[:3, 3] = by
+    return result
+
+
+def _turn(axis: Floats, middle: Floats, quarters: int) -> Floats:
+    cosine, sine = (0.0, -1.0, 0.0)[quarters - 1], (1.0, 0.0, -1.0)[quarters - 1]
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    result = np.eye(4)
+    result[:3, :3] = cosine * np.eye(3) + sine * cross + (1 - cosine) * np.outer(axis, axis)
+    result[:3, 3] = middle - result[:3, :3] @ middle
+    return result
+
+
+def far_from(T: Floats, others: Floats, p: AmbiguityParameters) -> Floats:
+    """Those of the others (n, 4, 4) that differ from T enough to be another answer."""
+    return others[~are_near(others, T, p.rival_m, p.rival_rad)]
+
+
+class Rival(NamedTuple):
+    """The best rival of a transform.
+
+    Parameters
+    ----------
+    share : that it explains, every plane counting the same, 0 to 1; 0 where there is none
+    T : (4, 4) of it, or None
+    tilted : share that the best of those explains that tilt against `up`, and that nothing else
+        refutes
+    """
+
+    share: float
+    T: Floats | None
+    tilted: float = 0.0
+
+
+def best_alternative(
+    query: PlaneView, match: PlaneView, T: Floats, violations: float, voted: Floats,
+    proposed: Floats, p: AmbiguityParameters, agreement_p: OverlapParameters,
+    ups: Ups = NO_UPS, most_tilt: float = math.inf,
+) -> Rival:  # fmt: skip
+    """How far the best rival of T explains the frames, and that rival: Sec. III-E.
+
+    Parameters
+    ----------
+    query, match : of `plane_view`
+    T : (4, 4) T_match_query
+    violations : of T, with every plane counting the same: free space refutes no rival for what it
+        holds against T as well
+    voted : (n, 4, 4) other hypotheses, refined
+    proposed : (m, 4, 4) hypotheses that were not, best first: of those that differ from T and
+        from each other as rivals do, the best are refined now
+    p, agreement_p : see there
+    ups : of query and match
+    most_tilt : radians against them beyond which a transform is no rival
+    """
+    moved = np.concatenate([symmetries(match.patches, p) @ T, T @ symmetries(query.patches, p)])
+    near = far_from(T, refined_all(query.surface, match.surface, moved, p.first), p)
+    seen = explained(query, match, near, agreement_p)
+    hopeful = near[(seen.share > p.hopeful_share) & (seen.violations < p.hopeful_violations)]
+    proposed = far_from(T, proposed, p)
+    order = -np.arange(len(proposed), dtype=float)
+    chosen = distinct(proposed, order, p.rival_m, p.rival_rad, p.n_proposed)
+    hopeful = np.concatenate([hopeful, proposed[chosen]])
+    rivals = np.concatenate([voted, refined_all(query.surface, match.surface, hopeful, p.then)])
+    rivals = far_from(T, rivals, p)
+    seen = explained(query, match, rivals, agreement_p)
+    share = np.where(seen.violations < max(p.refuted, violations), seen.share, 0.0)
+    level = are_level(rivals, ups, most_tilt)
+    tilted = float(share[~level].max(initial=0.0))
+    share = np.where(level, share, 0.0)
+    if not (share > 0).any():
+        return Rival(0.0, None, tilted)
+    best = int(np.argmax(share))
+    return Rival(float(share[best]), rivals[best], tilted)

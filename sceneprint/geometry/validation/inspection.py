@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.pose.rigid import inverse, moved
 from sceneprint.geometry.registration.consensus import ConsensusParameters
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
@@ -25,11 +24,12 @@ from sceneprint.geometry.registration.overlap import (
     tolerances,
     weigh_overlap,
 )
+from sceneprint.geometry.rigid import inverse, moved
 from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches, Surface
 
 #: What becomes of a point: nothing to compare it with, or beside the surface; on it; before it.
 NEITHER, AGREES, VIOLATES = 0, 1, 2
-#: And how far it is from the surface, as `sceneprint.formats.points.web` tells it.
+#: And how far it is from the surface, as `sceneprint.formats.export` tells it.
 TOLERANCE, OUTSIDE, VIOLATION = 250, 253, 254
 
 Verdicts = NDArray[np.uint8]

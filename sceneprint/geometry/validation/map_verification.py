@@ -18,8 +18,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.pose.average import average_poses
-from sceneprint.geometry.pose.rigid import are_near, distinct, inverse
 from sceneprint.geometry.registration.icp import COARSE, RefinementParameters
 from sceneprint.geometry.registration.overlap import (
     AGREES,
@@ -33,6 +31,7 @@ from sceneprint.geometry.registration.overlap import (
     plane_view,
     tolerances,
 )
+from sceneprint.geometry.rigid import are_near, average_poses, distinct, inverse
 from sceneprint.geometry.validation.validation import refined_at
 from sceneprint.types import Floats, Geometry, Intrinsics
 

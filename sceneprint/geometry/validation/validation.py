@@ -1,6 +1,7 @@
 """Sec. III-E, validation: two frames to a rigid transform, and whether to believe it.
 
     Geometry, Geometry, seed  --validate-->  Validation
+    validations  --preferred-->  C_vld
 
 The transform is estimated both ways, independently. That both agree is the paper's test. By
 itself it believes too much: two estimates from the same two frames may fall into the same wrong
@@ -17,28 +18,29 @@ from typing import Literal
 
 import numpy as np
 
-from sceneprint.geometry.core_pool import both
-from sceneprint.geometry.pose.rigid import (
-    difference,
-    inverse,
-    inverses,
-    nearest_rotation,
-    rotation_angle,
-)
+from sceneprint.geometry.execution import both
 from sceneprint.geometry.registration.alignment import (
+    NO_UPS,
     Alignment,
     AlignmentParameters,
     FrameSamples,
     Search,
+    Ups,
     align,
     align_guided,
     align_scans,
     are_scans,
+    contradiction,
     samples_of,
+    tilt_of,
 )
-from sceneprint.geometry.registration.covariance import CovarianceParameters, pair_covariance
-from sceneprint.geometry.registration.gravity import NO_UPS, Ups, contradiction, tilt_of
-from sceneprint.geometry.registration.icp import FINE, RefinementParameters, refine
+from sceneprint.geometry.registration.icp import (
+    FINE,
+    CovarianceParameters,
+    RefinementParameters,
+    pair_covariance,
+    refine,
+)
 from sceneprint.geometry.registration.overlap import (
     Explained,
     OverlapParameters,
@@ -47,20 +49,25 @@ from sceneprint.geometry.registration.overlap import (
     sampled,
 )
 from sceneprint.geometry.registration.sequence_alignment import Matching
+from sceneprint.geometry.rigid import (
+    difference,
+    inverse,
+    inverses,
+    nearest_rotation,
+    rotation_angle,
+)
 from sceneprint.geometry.surface.camera import kind_of
 from sceneprint.geometry.validation.acceptance import (
     AcceptanceParameters,
+    AmbiguityParameters,
     Evidence,
     Mode,
+    Rival,
     Status,
     Strength,
     belief,
-    objection,
-)
-from sceneprint.geometry.validation.ambiguity import (
-    AmbiguityParameters,
-    Rival,
     best_alternative,
+    objection,
 )
 from sceneprint.types import Floats, Geometry, Sphere
 
@@ -117,7 +124,7 @@ class PairValidation:
         speaks for accepting; elsewhere it is 0
     T_rival : (4, 4) that rival, or None
     seed : of the random choices
-    covariance : (6, 6) of T_match_query where it is accepted, else None; see `covariance.py`
+    covariance : (6, 6) of T_match_query where it is accepted, else None; see `icp.py`
     around : whether both frames see all around their sensors, as spinning scanners do
     planes : how many distinct planes agree, the mean of both frames
     plane_violations : `violations` with every plane counting the same
@@ -477,3 +484,51 @@ def _evidence(
         worst_violations=max((one.violation_share for one in seen), default=0.0),
     )
     return e, inliers
+
+
+# Association: which validated candidates to believe first.
+
+#: Error of a depth camera's transform for each radian between the two views, metres: distortion
+#: and reference poses that drift, of which the covariance of a refinement knows nothing.
+_ERROR_PER_RADIAN = 0.04
+
+
+def preferred(validations: Sequence[PairValidation]) -> list[int]:
+    """Positions of the accepted: strong before weak, and of either the most precise first.
+
+    The paper keeps the order of R. A weak match has a rival that explains the frames nearly as
+    well, so a later strong one goes before it. Of cameras, that with the least expected error
+    comes first. Where all frames see all around, the nearest sensor does.
+
+    Parameters
+    ----------
+    validations : in the order of R
+    """
+    accepted = [i for i, v in enumerate(validations) if v.status == "accepted"]
+    around = all(validations[i].around for i in accepted)
+
+    def rank(i: int) -> tuple[bool, float]:
+        validation = validations[i]
+        off = _away(validation) if around else expected_error(validation)
+        return validation.strength != "strong", off
+
+    return sorted(accepted, key=rank)
+
+
+def expected_error(validation: PairValidation) -> float:
+    """Metres by which a transform of cameras is likely off.
+
+    The deviation of its translation and an error that grows with the angle between the views,
+    added in quadrature; infinite where the covariance is not known.
+    """
+    T, covariance = validation.T_match_query, validation.covariance
+    if T is None or covariance is None:
+        return math.inf
+    variance = max(float(np.trace(covariance[:3, :3])), 0.0)
+    return math.hypot(math.sqrt(variance), _ERROR_PER_RADIAN * rotation_angle(T[:3, :3]))
+
+
+def _away(validation: PairValidation) -> float:
+    """Metres between the two sensors."""
+    T = validation.T_match_query
+    return 0.0 if T is None else float(np.linalg.norm(T[:3, 3]))

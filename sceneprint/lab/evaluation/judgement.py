@@ -13,8 +13,6 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.pose.average import average_poses
-from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.retrieval.distance import (
     Ints64,
@@ -25,6 +23,7 @@ from sceneprint.geometry.retrieval.distance import (
     ranking_size,
 )
 from sceneprint.geometry.retrieval.dpp import diversify
+from sceneprint.geometry.rigid import average_poses, inverse
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.map_verification import looks_ahead
 from sceneprint.geometry.validation.validation import ValidationParameters, refined_at
@@ -49,8 +48,7 @@ from sceneprint.localization import (
     rival_rows,
     views_of_rows,
 )
-from sceneprint.matches import PairMatch, associate, searched
-from sceneprint.pipeline import validate
+from sceneprint.pipeline import PairMatch, associate, searched, validate
 from sceneprint.types import Bytes, Floats, Geometry
 
 

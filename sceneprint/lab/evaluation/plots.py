@@ -17,12 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.atomic_files import write_whole
-from sceneprint.formats.points.ply_export import write_ply
-from sceneprint.geometry.pose.average import levelling
-from sceneprint.geometry.pose.rigid import inverse, moved
+from sceneprint.formats.export import write_ply
 from sceneprint.geometry.retrieval.distance import similarity
-from sceneprint.lab.evaluation.diversity import FARTHEST, coverage, equal_views
-from sceneprint.lab.evaluation.measures import bound_of, first_error
+from sceneprint.geometry.rigid import inverse, levelling, moved
+from sceneprint.lab.evaluation.measures import (
+    FARTHEST,
+    bound_of,
+    coverage,
+    equal_views,
+    first_error,
+)
 from sceneprint.lab.evaluation.protocol import VIEWS, Error, FrameStore, QueryOutcome, ValidatedPair
 from sceneprint.lab.evaluation.run import Evaluation
 from sceneprint.models import Model

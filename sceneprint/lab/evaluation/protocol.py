@@ -25,11 +25,14 @@ from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.formats.dataset import FrameSequence as Run
 from sceneprint.formats.dataset.sequences import natural
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.pose.rigid import difference, moved
 from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.geometry.rigid import difference, moved
 from sceneprint.geometry.validation.acceptance import Strength
-from sceneprint.geometry.validation.match_ranking import preferred
-from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
+from sceneprint.geometry.validation.validation import (
+    PairValidation,
+    ValidationParameters,
+    preferred,
+)
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, open_signer, prepare
 from sceneprint.types import (

@@ -17,8 +17,7 @@ from sceneprint.errors import DatasetError
 from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.retrieval.distance import Metric
 from sceneprint.geometry.validation.acceptance import Mode
-from sceneprint.lab.evaluation.baselines.baseline import open_baselines
-from sceneprint.lab.evaluation.baselines.comparison import Compared, compare, registered
+from sceneprint.lab.evaluation.baselines import Compared, compare, open_baselines, registered
 from sceneprint.lab.evaluation.judgement import (
     Candidate,
     Judged,

@@ -15,7 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sceneprint.lab.synth.mesh import (
+    Ceiling,
+    Opening,
     SyntheticMesh,
+    Wall,
     blob,
     box,
     cone,
@@ -30,7 +33,6 @@ from sceneprint.lab.synth.mesh import (
     tapered_box,
     tube,
 )
-from sceneprint.lab.synth.walls import Ceiling, Opening, Wall
 from sceneprint.types import Floats
 
 # Small things that lie about: each builder returns one object resting on z = 0.

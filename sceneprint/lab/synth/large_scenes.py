@@ -38,7 +38,22 @@ from sceneprint.lab.synth.furniture import (
     vehicle,
     wall_yaw,
 )
-from sceneprint.lab.synth.mesh import SyntheticMesh, box, cylinder, extrude, join, mesh_of, tube
+from sceneprint.lab.synth.mesh import (
+    Ceiling,
+    Opening,
+    SyntheticMesh,
+    Wall,
+    box,
+    cylinder,
+    extrude,
+    floor_plan,
+    join,
+    mesh_of,
+    shell,
+    tube,
+    wall_mesh,
+    walls_of,
+)
 from sceneprint.lab.synth.rooms import (
     Floor,
     Menu,
@@ -51,15 +66,6 @@ from sceneprint.lab.synth.rooms import (
     on_the_floor,
 )
 from sceneprint.lab.synth.sensors import Caster
-from sceneprint.lab.synth.walls import (
-    Ceiling,
-    Opening,
-    Wall,
-    floor_plan,
-    shell,
-    wall_mesh,
-    walls_of,
-)
 from sceneprint.types import Floats
 
 CELL = 0.2  #: metres a cell of the ground's grid

@@ -41,19 +41,22 @@ from sceneprint.lab.synth.furniture import (
     wall_yaw,
 )
 from sceneprint.lab.synth.mesh import (
+    Ceiling,
     SyntheticMesh,
+    Wall,
     blob,
     box,
     cylinder,
     ellipsoid,
     join,
     mesh_of,
+    shell,
     tube,
+    walls_of,
 )
 from sceneprint.lab.synth.rooms import Floor, Maker, PiecePose, Room, make_room
 from sceneprint.lab.synth.sensors import KINECT_V1, KinectNoise
 from sceneprint.lab.synth.trajectories import orbit, scattered_poses
-from sceneprint.lab.synth.walls import Ceiling, Wall, shell, walls_of
 from sceneprint.types import DepthFrame, Floats, Intrinsics
 
 KINDS = ("object", "offices", "unmapped", "kitchens", "opposite", "absent")

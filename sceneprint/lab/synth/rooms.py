@@ -37,9 +37,18 @@ from sceneprint.lab.synth.furniture import (
     table,
     wall_yaw,
 )
-from sceneprint.lab.synth.mesh import SyntheticMesh, box, join
+from sceneprint.lab.synth.mesh import (
+    Ceiling,
+    SyntheticMesh,
+    Wall,
+    box,
+    ceiling,
+    floor_plan,
+    join,
+    shell,
+    walls_of,
+)
 from sceneprint.lab.synth.sensors import Caster
-from sceneprint.lab.synth.walls import Ceiling, Wall, ceiling, floor_plan, shell, walls_of
 from sceneprint.types import Floats, Floats32, Ints32
 
 # Where furniture stands: a grid of the floor keeps pieces inside the room and apart.

@@ -17,16 +17,18 @@ from sqlalchemy.exc import DBAPIError
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.engine.upkeep.repair import PRIORITY, is_known_loss, reason_of_loss
 from sceneprint.errors import StoreError
-from sceneprint.maintenance.fsck.findings import Finding, Folder, each
-from sceneprint.maintenance.fsck.repair_actions import (
+from sceneprint.maintenance.fsck.findings import (
     GONE,
+    Finding,
+    Folder,
+    each,
     quarantine_blob,
     quarantine_bytes,
     sign_from_upload,
     sign_while_indexed,
 )
 from sceneprint.models import Model
-from sceneprint.models.table_cache import is_sound_table
+from sceneprint.models.model_file import is_sound_table
 from sceneprint.store.answer_rows import remove_answers
 from sceneprint.store.blobs.folder import PART, BlobEntry, Condition
 from sceneprint.store.events import record_event

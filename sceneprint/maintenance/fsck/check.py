@@ -35,9 +35,15 @@ from sceneprint.maintenance.fsck.database_checks import (
     check_rows,
     damaged_database,
 )
-from sceneprint.maintenance.fsck.findings import Finding, Folder, Progress, is_of_rows
+from sceneprint.maintenance.fsck.findings import (
+    Finding,
+    Folder,
+    Progress,
+    is_of_rows,
+    opened_blobs,
+    require_folder,
+)
 from sceneprint.maintenance.fsck.indexes import check_indexes
-from sceneprint.maintenance.fsck.repair_actions import opened_blobs, require_folder
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database, Store, open_store
 from sceneprint.store.maps import find_map

@@ -11,8 +11,14 @@ from sqlalchemy import Connection, ForeignKeyConstraint, and_, delete, insert, s
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.engine.upkeep.repair import is_known_loss, without_loss
 from sceneprint.errors import UnreadableModel, UnusableStore
-from sceneprint.maintenance.fsck.findings import Finding, Folder, each, is_of_rows
-from sceneprint.maintenance.fsck.repair_actions import GONE, sign_from_upload
+from sceneprint.maintenance.fsck.findings import (
+    GONE,
+    Finding,
+    Folder,
+    each,
+    is_of_rows,
+    sign_from_upload,
+)
 from sceneprint.maintenance.snapshot.database_copy import Form
 from sceneprint.models import PRESETS, parse_model, read_model, write_model
 from sceneprint.store.maps import counted_usage, list_maps, use_of

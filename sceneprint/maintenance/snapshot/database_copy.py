@@ -33,7 +33,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import ArgumentError
 
 from sceneprint.errors import NewerSchema, SnapshotError, UnusableStore
-from sceneprint.maintenance.snapshot.format import BlobUse
+from sceneprint.maintenance.snapshot.files import BlobUse
 from sceneprint.store.database import Database, known_revisions, open_database
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.read_only import look_at

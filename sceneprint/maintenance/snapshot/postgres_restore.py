@@ -45,8 +45,7 @@ from sceneprint.maintenance.snapshot.database_copy import (
     rows_of_file,
     rows_of_server,
 )
-from sceneprint.maintenance.snapshot.files import full_disk_explained, staging
-from sceneprint.maintenance.snapshot.format import DATABASE
+from sceneprint.maintenance.snapshot.files import DATABASE, full_disk_explained, staging
 from sceneprint.maintenance.snapshot.restoration import blobs_of, unpack
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, open_blobs

@@ -24,23 +24,21 @@ from sceneprint.errors import DamagedSnapshot, SnapshotError
 from sceneprint.maintenance.snapshot import database_copy
 from sceneprint.maintenance.snapshot.creation import Progress, Snapshot
 from sceneprint.maintenance.snapshot.files import (
-    DurableFiles,
-    check_room,
-    full_disk_explained,
-    left_behind,
-    put_new,
-    staging,
-)
-from sceneprint.maintenance.snapshot.format import (
     BLOBS,
     DAMAGED,
     DATABASE,
     LONGEST,
     MANIFEST,
     ArchiveReader,
+    DurableFiles,
     LostBlob,
     SnapshotManifest,
+    check_room,
+    full_disk_explained,
+    left_behind,
+    put_new,
     read_manifest,
+    staging,
 )
 from sceneprint.store.blobs.folder import is_digest
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.formats.image.depth_file import encode_png
+from sceneprint.formats.depth_file import encode_png
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.maintenance.snapshot.restoration import restore_snapshot

@@ -23,8 +23,7 @@ from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
 from sceneprint.errors import DamagedSnapshot, SnapshotError, UnknownSnapshot, UnusableStore
 from sceneprint.maintenance.fsck.check import fsck
-from sceneprint.maintenance.snapshot.catalog import SnapshotCatalog
-from sceneprint.maintenance.snapshot.creation import take_snapshot
+from sceneprint.maintenance.snapshot.creation import SnapshotCatalog, take_snapshot
 from sceneprint.maintenance.snapshot.database_copy import copy_server
 from sceneprint.maintenance.snapshot.postgres_restore import restore_to_fleet
 from sceneprint.maintenance.snapshot.restoration import restore_snapshot

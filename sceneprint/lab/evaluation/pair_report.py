@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sceneprint.geometry.pose.average import levelling
-from sceneprint.geometry.pose.rigid import inverse, moved
+from sceneprint.geometry.rigid import inverse, levelling, moved
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Evidence
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.lab.evaluation.measures import (
@@ -25,7 +24,7 @@ from sceneprint.lab.evaluation.measures import (
     upper_bound,
     validation_of,
 )
-from sceneprint.lab.evaluation.pairs.pair_run import BINS, METHODS, PairEvaluation, Tried, points_of
+from sceneprint.lab.evaluation.pair_run import BINS, METHODS, PairEvaluation, Tried, points_of
 from sceneprint.lab.evaluation.plots import (
     RIGHT,
     UNDECIDED,
@@ -45,10 +44,6 @@ from sceneprint.types import AnyFrame, Bytes, Cloud, DepthFrame, Floats
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-# The figures of pairs as lines to read in a terminal.
-#
-# figures  --pair_table-->  lines
 
 _COLUMNS = ("within_5cm_5deg", "right")
 _LIMITS = "within 5 cm / right"

@@ -20,7 +20,7 @@ from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidIntrinsics, UnreadableFrame, UselessFrame, naming
-from sceneprint.geometry.surface.rectification import ray_to_axis, undistort
+from sceneprint.geometry.surface.camera import ray_to_axis, undistort
 from sceneprint.types import MAXIMUM_SAMPLES, DepthFrame, Floats, Floats32, Intrinsics
 from sceneprint_client.file_formats import (
     MAXIMUM_IMAGE_BYTES,
@@ -32,14 +32,6 @@ from sceneprint_client.file_formats import (
 from sceneprint_client.files import read_bytes
 from sceneprint_client.ros_messages import TRANSPORT_BYTES
 from sceneprint_client.sidecars import rigid_transform
-
-# 16-bit greyscale PNG, read so that no file can surprise.
-#
-#     bytes  --decode_png-->  samples (H, W) uint16
-#
-# Pillow takes a PNG whose data end early as an image with black rows, and does not look at
-# the check sums of the data. So the file is taken apart and checked here, and Pillow undoes
-# filters and interlacing of rows whose number is right.
 
 #: Most bytes a frame may have: all samples as float64, and room for a header.
 _MAXIMUM_CHUNKS = 65_536  # 16 megapixels in pieces of 1 KB; each costs time even if empty

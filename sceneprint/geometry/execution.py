@@ -1,4 +1,8 @@
-"""Two halves of a computation at once, where a core is free for the second.
+"""What saves time and changes no bit of a result: values of one frame kept, halves side by side.
+
+What depends on one frame alone is computed once for as long as the frame is in memory: a query is
+compared with ten frames, and each of these with it on several views. Its samples, the weights of
+its planes and its symmetries are the same each time.
 
     with cores.lent():  both(first, second)  -->  both results
 
@@ -11,11 +15,43 @@ cores: once as many run as there are cores, each does its halves in turn.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TypeVar
+from functools import wraps
+from typing import Concatenate, ParamSpec, TypeVar
+from weakref import WeakKeyDictionary
+
+# Values that depend on one frame alone.
+
+F = TypeVar("F")
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def cached_per_frame(
+    function: Callable[Concatenate[F, P], R],
+) -> Callable[Concatenate[F, P], R]:
+    """Keep what a function returns of a surface, patches, or geometry, until that is freed.
+
+    The first argument is known by its identity and must not change; the others must be hashable.
+    What is returned is shared, so callers must not write into it.
+    """
+    kept: WeakKeyDictionary[F, dict[Hashable, R]] = WeakKeyDictionary()
+
+    @wraps(function)
+    def cached(frame: F, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        own = kept.setdefault(frame, {})
+        key = args, tuple(kwargs.items())
+        if key not in own:  # two threads may both work it out, and get the same
+            own[key] = function(frame, *args, **kwargs)
+        return own[key]
+
+    return cached
+
+
+# Two halves of a computation at once, where a core is free for the second.
 
 A = TypeVar("A")
 B = TypeVar("B")

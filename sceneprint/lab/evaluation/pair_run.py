@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import DatasetError
+from sceneprint.fusion import open3d
 from sceneprint.geometry.registration.alignment import AlignmentParameters
 from sceneprint.geometry.registration.icp import refined_all
 from sceneprint.geometry.registration.sequence_alignment import Matching
@@ -52,14 +53,9 @@ from sceneprint.lab.evaluation.protocol import (
 )
 from sceneprint.lab.evaluation.run import OFF_PLANE, PLANAR, overlaps_of, plane_share
 from sceneprint.models import Model, ModelParameters
-from sceneprint.open3d_loader import open3d
 from sceneprint.pipeline import Signer, geometry_of
 from sceneprint.signing import see
 from sceneprint.types import AnyFrame, Cloud, DepthFrame, Floats, Geometry
-
-# Which pairs of frames are tried: drawn by how much they truly overlap.
-#
-# members, Overlaps, planar  --draw-->  Drawn, ...
 
 #: Edges of the bins of true overlap: the smaller direction, agreement within 10 cm.
 EDGES = (0.1, 0.3, 0.5, 0.7, 1.0)

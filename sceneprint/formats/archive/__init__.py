@@ -1,1 +1,0 @@
-"""Frames in tar and zip files."""

@@ -1,0 +1,267 @@
+"""Points, surfaces and pose graphs as others read them: PLY, bytes for web pages, g2o.
+
+points, normals, colours, faces, edges  --write_ply-->  bytes of a PLY file
+points, normals, patches, residuals  --encode_points-->  bytes that a page draws, 12 a point
+poses, GraphEdge, ...  --g2o-->  VERTEX_SE3:QUAT, EDGE_SE3:QUAT
+
+Bytes for web pages are little-endian. A header of 48 bytes:
+
+    0  4 x u8   "SPPT"
+    4  u16      version, 1
+    6  u16      flags: 1 normals, 2 patches, 4 residuals are told
+    8  u32      points that follow
+    12 u32      bytes of a point, 12
+    16 3 x f32  origin, metres
+    28 3 x f32  extent, metres
+    40 u32      points that there are, before thinning
+    44 f32      metres that a residual of 250 stands for near by, as the model's validation allows
+                (with distance it grows); 0 where none is told
+
+Then, of each point:
+
+    0  3 x u16  position: origin + value / 65535 * extent
+    6  u16      index of its validation patch; 65535 for none
+    8  3 x i8   normal, times 127
+    11 u8       residual, from the surface that another frame saw: 1 to 250; 253 where the other
+                did not look, or beside or behind what it saw; 254 where it saw through; 255 where
+                nothing was compared
+
+Information of g2o is about the right perturbation T exp(xi), xi = (shift in metres, turn in
+radians) in the axes of the edge's second vertex. Its error is the shift and the *vector part of the
+quaternion* of Z^-1 X_i^-1 X_j, and half a small turn is what that part holds: so that its
+information about a turn is four times that about radians, and twice between shift and turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.types import Bytes, Floats, Floats32, Ints32, Surface
+from sceneprint_client.api.results import MOST_DRAWN
+from sceneprint_client.rotations import quaternion_of
+from sceneprint_client.surface_points import (
+    HEADER,
+    MAGIC,
+    NO_PATCH,
+    NORMALS,
+    PATCHES,
+    POINT,
+    RESIDUALS,
+    VERSION,
+)
+
+# PLY files, which every viewer of clouds opens.
+
+Ints = NDArray[np.int32] | NDArray[np.int64]
+
+#: What PLY calls the types that are written.
+_WORDS = {"<f4": "float", "u1": "uchar"}
+
+
+def write_ply(
+    points: Floats | Floats32,
+    normals: Floats | Floats32 | None = None,
+    colours: Bytes | None = None,
+    faces: Ints | None = None,
+    edges: Ints | None = None,
+    comments: Sequence[str] = (),
+) -> bytes:
+    """A PLY file, binary little-endian; the same bytes for the same arrays.
+
+    Parameters
+    ----------
+    points : (N, 3) metres
+    normals : (N, 3) unit length
+    colours : (N, 3) red, green, blue
+    faces : (F, 3) triangles, as indices of points
+    edges : (E, 2) lines, as indices of points
+    comments : of the header, one line each: the coordinate frame belongs there. What is no
+        printable ASCII is escaped
+
+    Raises
+    ------
+    ValueError : arrays of other shapes, or indices of no point.
+    """
+    n = len(points)
+    kinds = [(name, "<f4") for name in "xyz"]
+    columns = [_checked(points, n, 3)]
+    if normals is not None:
+        kinds += [(name, "<f4") for name in ("nx", "ny", "nz")]
+        columns.append(_checked(normals, n, 3))
+    if colours is not None:
+        kinds += [(name, "u1") for name in ("red", "green", "blue")]
+        columns.append(_checked(colours, n, 3))
+    rows = np.empty(n, np.dtype(kinds))
+    for i, (name, _) in enumerate(kinds):
+        rows[name] = columns[i // 3][:, i % 3]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {_one_line(comment)}" for comment in comments]
+    lines += [f"element vertex {n}"]
+    lines += [f"property {_WORDS[kind]} {name}" for name, kind in kinds]
+    parts = [rows.tobytes()]
+    if faces is not None:
+        table = np.empty(len(faces), np.dtype([("count", "u1"), ("points", "<i4", 3)]))
+        table["count"], table["points"] = 3, _indices(faces, 3, n)
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        parts.append(table.tobytes())
+    if edges is not None:
+        lines += [f"element edge {len(edges)}", "property int vertex1", "property int vertex2"]
+        parts.append(_indices(edges, 2, n).astype("<i4").tobytes())
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + b"".join(parts)
+
+
+def points_of(surface: Surface) -> tuple[Floats32, Floats32]:
+    """What a sensor saw as a cloud: points (N, 3) and normals (N, 3) of its valid pixels, row by
+    row, in the sensor's frame.
+    """
+    return surface.points[surface.valid], surface.normals[surface.valid]
+
+
+def _checked(values: Floats | Floats32 | Bytes, n: int, width: int) -> Floats | Floats32 | Bytes:
+    if values.shape != (n, width):
+        raise ValueError(f"an array of shape {values.shape}, not ({n}, {width})")
+    return values
+
+
+def _indices(values: Ints, width: int, n: int) -> Ints:
+    if values.ndim != 2 or values.shape[1] != width:
+        raise ValueError(f"indices of shape {values.shape}, not (any, {width})")
+    if values.size and (values.min() < 0 or values.max() >= n):
+        raise ValueError(f"indices from {values.min()} to {values.max()} of {n} points")
+    return values
+
+
+def _one_line(comment: str) -> str:
+    """Without what would end the line or is not ASCII: a frame may be called anything."""
+    return comment.encode("unicode_escape").decode("ascii")
+
+
+# Points as bytes that a web page draws as they are.
+
+MEDIA_TYPE = "application/vnd.sceneprint.points"
+NOT_COMPARED = 255
+#: Points that are told by default, and at most.
+LIMIT, MOST = MOST_DRAWN, 100_000
+
+Indices = NDArray[np.intp]
+
+
+def encode_points(
+    points: Floats | Floats32,
+    normals: Floats | Floats32 | None = None,
+    patches: Ints32 | None = None,
+    residuals: Bytes | None = None,
+    *,
+    total: int | None = None,
+    scale: float = 0.0,
+) -> bytes:
+    """Points as the module's text says; the same bytes for the same arrays.
+
+    Parameters
+    ----------
+    points : (N, 3) metres
+    normals : (N, 3) unit length
+    patches : (N,) indices; -1, or NO_PATCH or more, for none
+    residuals : (N,) see above
+    total : points before thinning; default: N
+    scale : metres of a residual of 250
+    """
+    n = len(points)
+    at = np.asarray(points, np.float64)
+    low, high = (at.min(axis=0), at.max(axis=0)) if n else (np.zeros(3), np.zeros(3))
+    origin = low.astype(np.float32)
+    extent = (high - origin).clip(0).astype(np.float32)
+    unit = np.where(extent > 0, extent, 1.0).astype(np.float64)
+    rows = np.empty(n, POINT)
+    rows["position"] = np.rint((at - origin) / unit * 65535.0).clip(0, 65535)
+    rows["patch"] = NO_PATCH
+    if patches is not None:
+        rows["patch"] = np.where((patches >= 0) & (patches < NO_PATCH), patches, NO_PATCH)
+    rows["normal"] = 0 if normals is None else np.rint(normals * 127.0).clip(-127, 127)
+    rows["residual"] = NOT_COMPARED if residuals is None else residuals
+    told = ((NORMALS, normals), (PATCHES, patches), (RESIDUALS, residuals))
+    flags = sum(flag for flag, values in told if values is not None)
+    head = HEADER.pack(
+        MAGIC, VERSION, flags, n, POINT.itemsize, *origin.tolist(), *extent.tolist(),
+        n if total is None else total, scale,
+    )  # fmt: skip
+    return head + rows.tobytes()
+
+
+def thinned(count: int, limit: int) -> Indices:
+    """Indices of at most `limit` of so many points, rising: always the same, and in no pattern
+    that rows of an image could show.
+    """
+    if count <= limit:
+        return np.arange(count)
+    keys = np.arange(1, count + 1, dtype=np.uint64)  # SplitMix64
+    keys *= np.uint64(0x9E3779B97F4A7C15)
+    keys = (keys ^ (keys >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    keys = (keys ^ (keys >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.sort(np.argsort(keys, kind="stable")[:limit])
+
+
+# Pose graphs as the text that optimisers read.
+
+#: Of radians to the vector part of a quaternion: xi = _PER_QUATERNION * (shift, vector part).
+_PER_QUATERNION = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEdge:
+    """How one vertex lies to another.
+
+    Parameters
+    ----------
+    first, second : numbers of the vertices
+    T : (4, 4) T_first_second
+    information : (6, 6) of T exp(xi); shift (metres) before turn (radians), in axes of `second`
+    """
+
+    first: int
+    second: int
+    T: Floats
+    information: Floats
+
+
+def g2o(poses: Sequence[Floats], edges: Sequence[PoseEdge]) -> str:
+    """A graph as g2o's text: vertices numbered from 0, then edges.
+
+    No other lines: some readers stop at a comment, or at what fixes a vertex.
+
+    Parameters
+    ----------
+    poses : (4, 4) T_parent_vertex of each
+    edges : between these
+    """
+    lines = [f"VERTEX_SE3:QUAT {i} {_pose(pose)}" for i, pose in enumerate(poses)]
+    upper = np.triu_indices(6)
+    for edge in edges:
+        information = edge.information * np.outer(_PER_QUATERNION, _PER_QUATERNION)
+        numbers = " ".join(f"{value:.9g}" for value in information[upper].tolist())
+        lines.append(f"EDGE_SE3:QUAT {edge.first} {edge.second} {_pose(edge.T)} {numbers}")
+    return "\n".join([*lines, ""])
+
+
+def information_of(covariance: Floats, T: Floats) -> Floats:
+    """The information of an edge: (6, 6) as in `GraphEdge`.
+
+    Parameters
+    ----------
+    covariance : (6, 6) of T as `geometry.covariance` has it: the error is added to the translation
+        and put before the rotation, both along the axes of the edge's first vertex
+    T : (4, 4) T_first_second
+    """
+    # [exp(r) R, t + x] = T exp(xi) where x = R shift and r = R turn
+    axes = np.kron(np.eye(2), T[:3, :3])
+    information: Floats = axes.T @ np.linalg.inv(covariance) @ axes
+    return (information + information.T) / 2.0
+
+
+def _pose(T: Floats) -> str:
+    numbers = [*T[:3, 3].tolist(), *quaternion_of(T[:3, :3]).tolist()]
+    return " ".join(f"{value:.9f}" for value in numbers)

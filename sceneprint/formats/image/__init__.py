@@ -1,1 +1,0 @@
-"""Depth images: PNG and NPY."""

@@ -1,1 +1,0 @@
-"""Rigid transforms: averaging, loops, sessions joined."""

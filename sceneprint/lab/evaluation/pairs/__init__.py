@@ -1,1 +1,0 @@
-"""Pairs of frames, drawn by overlap and judged."""
