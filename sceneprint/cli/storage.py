@@ -783,7 +783,7 @@ def add_reencode(commands: Any) -> None:
 def run_reencode(options: argparse.Namespace) -> int:
     """Begin, watch or give up; returns 2 where waiting was no use."""
     from sceneprint.engine import Engine
-    from sceneprint.engine.maps import reencoding
+    from sceneprint.engine.maps import map_lifecycle
 
     settings = settings_of(options)
     require_database(settings)
@@ -792,7 +792,7 @@ def run_reencode(options: argparse.Namespace) -> int:
             told = engine.reencode(options.map, options.model)
             engine.audit.command("reencode --model", map_name=options.map, model=str(options.model))
         elif options.cancel:
-            told = reencoding.cancel(engine.store, options.map)
+            told = map_lifecycle.cancel_reencoding(engine.store, options.map)
             engine.audit.command("reencode --cancel", map_name=options.map)
         else:
             told = engine.get_map(options.map)

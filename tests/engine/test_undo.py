@@ -10,9 +10,8 @@ from sqlalchemy import update
 
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
-from sceneprint.engine.maps import undo as module
-from sceneprint.engine.maps.selections import delete_selection
-from sceneprint.engine.sessions.session_edits import delete_session
+from sceneprint.engine.maps import selections as module
+from sceneprint.engine.maps.selections import delete_selection, delete_session
 from sceneprint.errors import (
     Conflict,
     InvalidRequest,

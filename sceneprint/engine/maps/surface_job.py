@@ -19,7 +19,7 @@ import numpy as np
 from sqlalchemy import Connection
 
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
-from sceneprint.engine.maps.plan_axes import parent_axes
+from sceneprint.engine.search.up_vectors import parent_axes
 from sceneprint.engine.serializers import tag_of
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import DamagedBlob, UnreadableGeometry

@@ -20,8 +20,8 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.jobs.map_jobs import MapJobs
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Tasks
-from sceneprint.engine.maps.plan_axes import parent_axes
 from sceneprint.engine.maps.surface_job import cell_width, surface_points
+from sceneprint.engine.search.up_vectors import parent_axes
 from sceneprint.engine.serializers import job_progress, when
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import (
