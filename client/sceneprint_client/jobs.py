@@ -47,7 +47,7 @@ from sceneprint_client.requests import (
 )
 
 if TYPE_CHECKING:
-    from sceneprint_client.surface_points import SurfacePoints
+    from sceneprint_client.surface_encoding import SurfacePoints
 
 #: A record of what a job does, with its `state`.
 _Begun = TypeVar("_Begun", Association, MapCoverage, Difference, Reconstruction)
@@ -540,7 +540,7 @@ class JobMethods(ServiceConnection):
         NotIndexed : it is not over, or did not succeed.
         Refused : the service is of another version.
         """
-        from sceneprint_client.surface_points import decode_points  # loads numpy
+        from sceneprint_client.surface_encoding import decode_points  # loads numpy
 
         return decode_points(self._bytes(f"{difference_path(map_name, difference_id)}/points"))
 

@@ -126,7 +126,7 @@ def _content(client: Client, told: MapSurface, options: argparse.Namespace) -> b
 
 def _points(client: Client, map_name: str, parent: SurfaceParent, level: int) -> bytes:
     from sceneprint.formats.points.ply_export import write_ply
-    from sceneprint_client.surface_tiles import decode_tile
+    from sceneprint_client.surface_encoding import decode_tile
 
     own = parent.levels[level]
     tiles = client.surface_tiles(map_name, parent.parent_frame, level)

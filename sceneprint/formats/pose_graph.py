@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.types import Floats
-from sceneprint_client.rotations import quaternion_of
+from sceneprint_client.poses import quaternion_of
 
 #: Of radians to the vector part of a quaternion: xi = _PER_QUATERNION * (shift, vector part).
 _PER_QUATERNION = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])

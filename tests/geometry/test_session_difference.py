@@ -22,7 +22,7 @@ from sceneprint.geometry.registration.session_difference import (
 )
 from sceneprint.geometry.surface.cell_fusion import ViewStamp, seen_cells
 from sceneprint.types import Bytes, Floats, Intrinsics, Surface
-from sceneprint_client.surface_tiles import NO_SESSION
+from sceneprint_client.surface_encoding import NO_SESSION
 
 P = OverlapParameters()
 CAMERA = Intrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)

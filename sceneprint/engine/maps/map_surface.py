@@ -52,7 +52,7 @@ from sceneprint_client.api.surface import (
     SurfaceState,
     SurfaceTile,
 )
-from sceneprint_client.surface_tiles import CELL, SIDE, cell_points
+from sceneprint_client.surface_encoding import CELL, SIDE, cell_points
 
 log = logging.getLogger(__name__)
 

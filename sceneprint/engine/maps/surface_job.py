@@ -49,7 +49,7 @@ from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
 from sceneprint.store.surface_rows import FusedFrame, SurfaceRow, TileRow
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats, Geometry
-from sceneprint_client.surface_tiles import CELL, NO_SESSION, SIDE, STEPS
+from sceneprint_client.surface_encoding import CELL, NO_SESSION, SIDE, STEPS
 
 #: Kind of the jobs, and of the event that tells of their end.
 SURFACE, UPDATED = "surface", "surface.updated"

@@ -65,7 +65,7 @@ from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Page
 from sceneprint_client.api import differences as api
 from sceneprint_client.api.differences import Difference, DifferenceResult, NewDifference
-from sceneprint_client.surface_tiles import NO_SESSION
+from sceneprint_client.surface_encoding import NO_SESSION
 
 #: Kind of the jobs.
 DIFFERENCE = "difference"

@@ -36,7 +36,7 @@ from sceneprint.formats.dataset.frame_reference import (
     FrameSequence,
 )
 from sceneprint.formats.dataset.sequences import find_each, is_of_colour
-from sceneprint_client.file_formats import MAXIMUM_CLOUD_BYTES, MAXIMUM_IMAGE_BYTES, is_cloud
+from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, MAXIMUM_IMAGE_BYTES, is_cloud
 from sceneprint_client.sidecars import CLOUDS_FILE, INTRINSICS_FILE
 
 #: What an archive and its sequence are called where nobody says.

@@ -27,6 +27,7 @@ from sceneprint.formats.image.depth_file import (
     make_frame,
     read_frame,
 )
+from sceneprint_client.poses import SensorTrajectory, interpolate
 from sceneprint_client.sidecars import (
     Camera,
     CloudSource,
@@ -36,7 +37,6 @@ from sceneprint_client.sidecars import (
     read_pose,
     rigid_transform,
 )
-from sceneprint_client.trajectories import SensorTrajectory, interpolate
 
 __all__ = [
     "Camera",

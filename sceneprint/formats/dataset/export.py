@@ -16,7 +16,7 @@ import numpy as np
 
 from sceneprint.atomic_files import write_whole
 from sceneprint.types import Floats, Floats32
-from sceneprint_client.rotations import quaternion_of
+from sceneprint_client.poses import quaternion_of
 from sceneprint_client.sidecars import INTRINSICS_FILE, Camera, rigid_transform
 
 _LARGEST = 65_534  #: stored units; 65535 reads as missing

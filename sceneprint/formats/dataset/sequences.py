@@ -21,11 +21,10 @@ from sceneprint.formats.dataset.frame_reference import (
     Split,
     read_trajectory,
 )
-from sceneprint_client.file_formats import RECORDING_SUFFIXES, is_cloud
-from sceneprint_client.files import data_lines, read_text
+from sceneprint_client.files import RECORDING_SUFFIXES, data_lines, is_cloud, read_text
 from sceneprint_client.frame_files import SEVEN_SCENES, find_frame_file, seven_scenes_number
+from sceneprint_client.poses import interpolate
 from sceneprint_client.sidecars import CLOUDS_FILE, find_camera, find_cloud_source
-from sceneprint_client.trajectories import interpolate
 
 if TYPE_CHECKING:
     from sceneprint.formats.recording import RecordingOptions

@@ -22,7 +22,7 @@ from sceneprint.formats.points.pointcloud2 import read_pointcloud2
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Cloud, Floats, Floats32
 from sceneprint_client.api.frames import CloudFormat
-from sceneprint_client.file_formats import MAXIMUM_CLOUD_BYTES, format_of
+from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, format_of
 from sceneprint_client.sidecars import UNSAID, Position, Unsaid, rigid_transform
 
 # Fewer points, one to a voxel.

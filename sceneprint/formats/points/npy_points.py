@@ -9,7 +9,7 @@ import numpy as np
 
 from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.points.float_rows import FilePoints, check_count, steps
-from sceneprint_client.file_formats import NPY_SIGNATURE, npy_header
+from sceneprint_client.files import NPY_SIGNATURE, npy_header
 
 _KITTI_ROW = 16  #: bytes: x, y, z, intensity
 

@@ -6,7 +6,7 @@ bytes  --read_pointcloud2-->  FilePoints
 from __future__ import annotations
 
 from sceneprint.formats.points.float_rows import FilePoints
-from sceneprint_client.cdr import read_point_cloud
+from sceneprint_client.files import read_point_cloud
 from sceneprint_client.ros_messages import cloud_blocks, cloud_table
 
 

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from sceneprint.types import Bytes, Floats, Floats32, Ints32
 from sceneprint_client.api.results import MOST_DRAWN
-from sceneprint_client.surface_points import (
+from sceneprint_client.surface_encoding import (
     HEADER,
     MAGIC,
     NO_PATCH,

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from sceneprint.errors import DatasetError, MissingDependency, SceneprintError
 from sceneprint_client.errors import printable
-from sceneprint_client.file_formats import RECORDING_SUFFIXES
+from sceneprint_client.files import RECORDING_SUFFIXES
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection

@@ -20,7 +20,7 @@ from sceneprint.formats.recording.bag import (
     BagTopic,
     RawMessage,
 )
-from sceneprint_client.accelerations import Accelerations
+from sceneprint_client.poses import MOST_SAMPLES, Accelerations, TransformTree, frame_name
 from sceneprint_client.ros_messages import (
     is_calibrated,
     pose_row,
@@ -28,7 +28,6 @@ from sceneprint_client.ros_messages import (
     transform_row,
     vector_row,
 )
-from sceneprint_client.transform_tree import MOST_SAMPLES, TransformTree, frame_name
 
 #: What to call when so many of all messages have been read.
 Progress = Callable[[int, int], None]

@@ -29,7 +29,7 @@ from sceneprint.geometry.registration.overlap import (
 )
 from sceneprint.geometry.surface.cell_fusion import CellSums, TilePlace, fused
 from sceneprint.types import Bytes, Floats, Surface
-from sceneprint_client.surface_tiles import SIDE
+from sceneprint_client.surface_encoding import SIDE
 
 #: Cells of a session, by tile; see cell_fusion.
 SessionCells = dict[TilePlace, CellSums]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.types import Floats
-from sceneprint_client.surface_tiles import CELL, NO_SESSION, NO_TIME, SEEN_STEPS, SIDE, STEPS
+from sceneprint_client.surface_encoding import CELL, NO_SESSION, NO_TIME, SEEN_STEPS, SIDE, STEPS
 
 #: Column, row and floor of a tile.
 TilePlace = tuple[int, int, int]
