@@ -16,6 +16,10 @@ from sceneprint_client.api.listing import (
     Clock,
     FrameDeletion,
     FrameListing,
+    FramesDeleted,
+    FramesEdited,
+    FramesRestored,
+    RefusedFrame,
     Run,
     Session,
     SessionChange,
@@ -32,12 +36,6 @@ from sceneprint_client.api.results import (
     FramePatches,
     FrameSignature,
     View,
-)
-from sceneprint_client.api.selections import (
-    FramesDeleted,
-    FramesEdited,
-    FramesRestored,
-    RefusedFrame,
 )
 from sceneprint_client.api.surface import (
     PLAN_WIDTH,

@@ -27,10 +27,9 @@ from sceneprint_client.api import JobState
 if TYPE_CHECKING:
     from sceneprint_client import Client
     from sceneprint_client.api import Answer
-    from sceneprint_client.api.differences import Difference
     from sceneprint_client.api.listing import FrameDeletion, Session
-    from sceneprint_client.api.reconstructions import Coverage, Reconstruction
-    from sceneprint_client.api.sessions import Association, GraphFormat, Join
+    from sceneprint_client.api.sessions import Association, Difference, GraphFormat, Join
+    from sceneprint_client.api.surface import Coverage, Reconstruction
 
 #: What a file is by its name's end.
 _FORMATS: dict[str, GraphFormat] = {".g2o": "g2o", ".txt": "tum", ".tum": "tum", ".json": "json"}
@@ -402,7 +401,7 @@ def difference_lines(told: Difference) -> list[str]:
     ]
 
 
-#: Colours of points in a file, by what they are: see `sceneprint_client.api.differences`.
+#: Colours of points in a file, by what they are: see `sceneprint_client.api.sessions`.
 _DIFFERENCE_COLOURS = (
     (165, 170, 175), (230, 110, 20), (40, 110, 220), (95, 100, 105), (95, 100, 105),
 )  # fmt: skip

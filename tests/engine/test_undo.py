@@ -24,8 +24,7 @@ from sceneprint.store.frames import find_frame, set_state, write_map
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import deletions
 from sceneprint_client.api import Frame, FrameMeta, FrameState, Query
-from sceneprint_client.api.listing import FrameListing
-from sceneprint_client.api.selections import FrameSelection, RestoreOptions
+from sceneprint_client.api.listing import FrameListing, FrameSelection, RestoreOptions
 
 #: What a restored frame has anew.
 FRESH = {"revision", "job_id", "indexed_at", "state"}

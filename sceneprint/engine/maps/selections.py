@@ -61,10 +61,10 @@ from sceneprint.store.undo_rows import (
 )
 from sceneprint_client.api import FrameState, Page
 from sceneprint_client.api.frames import MOST_TAGS
-from sceneprint_client.api.listing import FrameDeletion, SessionChange, SessionEdit
-from sceneprint_client.api.selections import (
+from sceneprint_client.api.listing import (
     MOST_REFUSED,
     MOST_SELECTED,
+    FrameDeletion,
     FramesDeleted,
     FramesEdit,
     FramesEdited,
@@ -72,6 +72,8 @@ from sceneprint_client.api.selections import (
     FramesRestored,
     RefusedFrame,
     RestoreOptions,
+    SessionChange,
+    SessionEdit,
 )
 
 #: Frames written, restored or purged in one transaction: other writers wait for some 20 ms.

@@ -61,7 +61,7 @@ from sceneprint.store.tables import MapRow
 from sceneprint.types import Bytes, Floats, Floats32, Geometry
 from sceneprint_client.api import Answer, FrameState, NamedFrame, Query
 from sceneprint_client.api import Match as ToldMatch
-from sceneprint_client.api.options import FrameName
+from sceneprint_client.api.query import FrameName
 from sceneprint_client.api.results import (
     MOST_POINTS,
     CloudFrame,

@@ -50,8 +50,7 @@ from sceneprint_client.api import Location as ToldLocation
 from sceneprint_client.api import Match as ToldMatch
 from sceneprint_client.api import Validation as ToldValidation
 from sceneprint_client.api.base import Vector
-from sceneprint_client.api.matches import FreeDirection, Lost, Outcome, Uncertainty
-from sceneprint_client.api.options import Stage
+from sceneprint_client.api.query import FreeDirection, Lost, Outcome, Stage, Uncertainty
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,8 +63,8 @@ from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Page
-from sceneprint_client.api import differences as api
-from sceneprint_client.api.differences import Difference, DifferenceResult, NewDifference
+from sceneprint_client.api import sessions as api
+from sceneprint_client.api.sessions import Difference, DifferenceResult, NewDifference
 from sceneprint_client.surface_encoding import NO_SESSION
 
 #: Kind of the jobs.
