@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from sceneprint.cli.numbers import positive, whole_number
+from sceneprint.cli import positive, whole_number
 from sceneprint.engine.compilation import ALL, DEPTH, compile_kernels
 from sceneprint.errors import FrameError, InvalidRequest, UnusableStore
 from sceneprint.models import PRESETS, Model, read_model

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.atomic_files import check_writable, write_whole
+from sceneprint.cli import whole_number
 from sceneprint.cli.bag import add_recording_options, sequences_at
-from sceneprint.cli.numbers import whole_number
 from sceneprint.cli.options import (
     add_asking_options,
     add_prior_option,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sceneprint.atomic_files import check_writable
-from sceneprint.cli.numbers import whole_number
+from sceneprint.cli import whole_number
 from sceneprint.cli.options import ended_by_signals, one_line
 from sceneprint.errors import InvalidRequest
 from sceneprint_client.frame_files import FrameFile

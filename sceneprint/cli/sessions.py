@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
-from sceneprint.cli.numbers import positive, whole_number
+from sceneprint.cli import positive, whole_number
 from sceneprint.cli.options import (
     add_filter_options,
     add_service_options,

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
-from sceneprint.cli.numbers import positive, whole_number
+from sceneprint.cli import positive, whole_number
 from sceneprint.cli.options import ended_by_signals, one_line, open_client, require_database
 from sceneprint.cli.serve import add_data_option, settings_of
 from sceneprint.errors import InvalidRequest
