@@ -14,12 +14,14 @@ from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli import positive, whole_number
 from sceneprint.cli.options import (
     add_filter_options,
+    add_scene_options,
     add_service_options,
+    check_scene,
     filter_of,
     one_line,
     open_client,
+    open_scene,
 )
-from sceneprint.cli.scenes import add_scene_options, check_scene, open_scene
 from sceneprint.errors import DatasetError, InvalidRequest
 from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint_client.api import JobState
