@@ -34,7 +34,7 @@ from sceneprint.localization import PosePrior
 from sceneprint.models import PRESETS, read_model
 from sceneprint.pipeline import Signer, open_signer, prepare
 from sceneprint.types import DepthFrame, Floats, Geometry
-from sceneprint_client.rotations import rotation_of
+from sceneprint_client.poses import rotation_of
 
 #: From this overlap, smaller direction, a frame of the map is enough to answer a query.
 ANSWERABLE = 0.3

@@ -23,7 +23,7 @@ from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.lab.synth import take, trajectory
 from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.types import Floats, Intrinsics
-from sceneprint_client.rotations import quaternion_of
+from sceneprint_client.poses import quaternion_of
 
 CAMERA = Intrinsics(320, 240, 292.5, 292.5, 159.5, 119.5)
 #: The camera sits above the base, and looks ahead and 10 degrees down: x right, y down, z forward.

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidIntrinsics
-from sceneprint_client.sidecars import MAXIMUM_PIXELS, MAXIMUM_SAMPLES, Intrinsics
+from sceneprint_client.files import MAXIMUM_SAMPLES
+from sceneprint_client.sidecars import MAXIMUM_PIXELS, Intrinsics
 
 # How a sensor looks: pixels to directions.
 #

@@ -31,12 +31,17 @@ from sceneprint_client.api import (
 )
 from sceneprint_client.api.admin import NewKey, NewModel
 from sceneprint_client.api.coverage import NewMapCoverage
-from sceneprint_client.api.differences import NewDifference
-from sceneprint_client.api.listing import FrameEdit, MapEdit, SessionEdit
-from sceneprint_client.api.reconstructions import NewReconstruction
+from sceneprint_client.api.listing import (
+    FrameEdit,
+    FramesEdit,
+    FrameSelection,
+    MapEdit,
+    RestoreOptions,
+    SessionEdit,
+)
 from sceneprint_client.api.results import KeepOptions
-from sceneprint_client.api.selections import FramesEdit, FrameSelection, RestoreOptions
-from sceneprint_client.api.sessions import NewAssociation
+from sceneprint_client.api.sessions import NewAssociation, NewDifference
+from sceneprint_client.api.surface import NewReconstruction
 from service import api_docs, dashboard, problems
 from service.browser_security import origins_of
 from service.context import Context, Gate

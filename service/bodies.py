@@ -38,7 +38,7 @@ from sceneprint_client.api.frames import (
     CloudFormat,
     novelty_of,
 )
-from sceneprint_client.file_formats import HEAD, format_of
+from sceneprint_client.files import HEAD, format_of
 from service.auth import Caller
 from service.problems import invalid
 

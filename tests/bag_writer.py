@@ -17,7 +17,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sceneprint.types import Floats
-from sceneprint_client.rotations import quaternion_of, rotation_of
+from sceneprint_client.poses import quaternion_of, rotation_of
 
 #: Of all stamps in seconds: a date, so that frames get `captured_at`.
 START = 1_700_000_000

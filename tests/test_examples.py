@@ -16,7 +16,7 @@ import pytest
 from sceneprint.formats.dataset import find_sequences
 from sceneprint_client import Client
 from sceneprint_client.frame_files import meta_of
-from sceneprint_client.rotations import rotation_of
+from sceneprint_client.poses import rotation_of
 
 ROOT = Path(__file__).resolve().parent.parent
 

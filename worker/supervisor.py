@@ -18,8 +18,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import worker_died
 from sceneprint.errors import SceneprintError
 from sceneprint.settings import Settings
-from worker.crash_traces import Left, Trace
-from worker.loop import work
+from worker.loop import Left, Trace, work
 
 log = logging.getLogger(__name__)
 

@@ -24,7 +24,7 @@ from sceneprint.engine import Engine
 from sceneprint.models import Model, read_model
 from sceneprint.settings import Settings
 from sceneprint_client.api import Answer, NamedFrame, Query
-from sceneprint_client.api.options import Stage
+from sceneprint_client.api.query import Stage
 
 #: Frames that are compared of each ranking, to see what a shortlist missed.
 NEAR = 10

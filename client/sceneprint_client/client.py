@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING
 import httpx
 from pydantic import Field
 
-from sceneprint_client.addresses import DEFAULT_URL
 from sceneprint_client.administration import AdminMethods
 from sceneprint_client.api.base import ApiRecord
 from sceneprint_client.errors import MissingDependency
 from sceneprint_client.http import ServiceConnection
-from sceneprint_client.map_contents import MapMethods
+from sceneprint_client.map_contents import MapMethods, SurfaceMethods
 from sceneprint_client.queries import QueryMethods
-from sceneprint_client.surfaces import SurfaceMethods
+from sceneprint_client.requests import DEFAULT_URL
 from sceneprint_client.uploads import UploadMethods
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from sceneprint_client.errors import (
     UnreadableCloud,
     UnreadableFrame,
 )
-from sceneprint_client.file_formats import (
+from sceneprint_client.files import (
     HEAD,
     MAXIMUM_CLOUD_BYTES,
     MAXIMUM_IMAGE_BYTES,
@@ -35,8 +35,8 @@ from sceneprint_client.file_formats import (
     SUFFIXES,
     format_of,
     is_cloud,
+    read_bytes,
 )
-from sceneprint_client.files import read_bytes
 from sceneprint_client.sidecars import (
     CLOUDS_FILE,
     Camera,

@@ -22,10 +22,9 @@ import httpx
 from pydantic import BaseModel, ValidationError
 
 from sceneprint_client import __version__, errors
-from sceneprint_client.addresses import is_loopback
 from sceneprint_client.api import Page, Problem
 from sceneprint_client.api.admin import Event
-from sceneprint_client.requests import given
+from sceneprint_client.requests import given, is_loopback
 
 Record = TypeVar("Record", bound=BaseModel)
 Item = TypeVar("Item")

@@ -29,10 +29,16 @@ from sceneprint_client.api.coverage import (
     MapCoverage,
     NewMapCoverage,
 )
-from sceneprint_client.api.differences import Difference, NewDifference
 from sceneprint_client.api.frames import ImportItem, ImportOptions
-from sceneprint_client.api.reconstructions import NewReconstruction, Reconstruction
-from sceneprint_client.api.sessions import Association, Edge, GraphFormat, NewAssociation
+from sceneprint_client.api.sessions import (
+    Association,
+    Difference,
+    Edge,
+    GraphFormat,
+    NewAssociation,
+    NewDifference,
+)
+from sceneprint_client.api.surface import NewReconstruction, Reconstruction
 from sceneprint_client.errors import InvalidRequest, UnreadableArchive
 from sceneprint_client.http import ServiceConnection, error_of, read_record
 from sceneprint_client.requests import (
@@ -47,7 +53,7 @@ from sceneprint_client.requests import (
 )
 
 if TYPE_CHECKING:
-    from sceneprint_client.surface_points import SurfacePoints
+    from sceneprint_client.surface_encoding import SurfacePoints
 
 #: A record of what a job does, with its `state`.
 _Begun = TypeVar("_Begun", Association, MapCoverage, Difference, Reconstruction)
@@ -532,7 +538,7 @@ class JobMethods(ServiceConnection):
 
     def difference_points(self, map_name: str, difference_id: str) -> SurfacePoints:
         """Cells of both sessions as points. `patches` says what each is: SAME, GONE, NEW,
-        UNSEEN_AFTER or UNSEEN_BEFORE of `sceneprint_client.api.differences`.
+        UNSEEN_AFTER or UNSEEN_BEFORE of `sceneprint_client.api.sessions`.
 
         Raises
         ------
@@ -540,7 +546,7 @@ class JobMethods(ServiceConnection):
         NotIndexed : it is not over, or did not succeed.
         Refused : the service is of another version.
         """
-        from sceneprint_client.surface_points import decode_points  # loads numpy
+        from sceneprint_client.surface_encoding import decode_points  # loads numpy
 
         return decode_points(self._bytes(f"{difference_path(map_name, difference_id)}/points"))
 

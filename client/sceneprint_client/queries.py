@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from sceneprint_client.requests import FrameInput, MetaInput
-    from sceneprint_client.surface_points import SurfacePoints
+    from sceneprint_client.surface_encoding import SurfacePoints
 
 #: Most frames of a ranking that are compared with each other.
 _MOST_ALIKE = 200
@@ -277,7 +277,7 @@ class QueryMethods(ServiceConnection):
 
     def query_points(self, query_id: str, limit: int = MOST_DRAWN) -> SurfacePoints:
         """The points of `query_cloud` as arrays, at most so many. Errors as of `query_cloud`."""
-        from sceneprint_client.surface_points import decode_points  # it takes numpy
+        from sceneprint_client.surface_encoding import decode_points  # it takes numpy
 
         path = f"{query_path(query_id)}/points"
         return decode_points(self._bytes(path, params={"limit": limit}))

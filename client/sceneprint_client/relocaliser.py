@@ -17,9 +17,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sceneprint_client.accelerations import WINDOW_S, Accelerations
 from sceneprint_client.api.frames import CameraIntrinsics
 from sceneprint_client.errors import SceneprintError
+from sceneprint_client.poses import (
+    WINDOW_S,
+    Accelerations,
+    Floats,
+    TransformTree,
+    frame_name,
+    quaternion_of,
+)
 from sceneprint_client.ros_messages import (
     camera_intrinsics,
     cloud_points,
@@ -31,10 +38,8 @@ from sceneprint_client.ros_messages import (
     transform_row,
     vector_row,
 )
-from sceneprint_client.rotations import Floats, quaternion_of
 from sceneprint_client.tracker import AsyncTracker, State, Tracker
 from sceneprint_client.tracker_core import inverse, shifted_covariance
-from sceneprint_client.transform_tree import TransformTree, frame_name
 
 if TYPE_CHECKING:
     from sceneprint_client.requests import FrameInput

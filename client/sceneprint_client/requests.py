@@ -1,4 +1,4 @@
-"""Requests as they are sent: paths, frames as forms, queries as JSON.
+"""Requests as they are sent: addresses, paths, frames as forms, queries as JSON.
 
 frame, options  --named_or_sent, query_of-->  QueryFrame, Query
 QueryFrame, Query  --query_form, query_json-->  arguments of a request
@@ -6,6 +6,7 @@ QueryFrame, Query  --query_form, query_json-->  arguments of a request
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import re
 from collections.abc import Iterable, Sequence
@@ -47,8 +48,20 @@ if TYPE_CHECKING:
     #: (fx, fy, cx, cy), pixels.
     MetaInput = FrameMeta | CameraIntrinsics | Sequence[float] | NDArray[np.generic]
 
+#: Where `sceneprint serve` listens unless told otherwise.
+DEFAULT_URL = "http://127.0.0.1:8008"
 #: A frame that is stored, or one at hand: its bytes and what is known of it.
 QueryFrame = NamedFrame | tuple[bytes, FrameMeta]
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a name or address, without port or brackets, is only ever this machine."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def given(**parameters: Any) -> dict[str, Any]:

@@ -25,9 +25,9 @@ from sceneprint_client.errors import (
     UnreadableFrame,
     printable,
 )
-from sceneprint_client.file_formats import PNG_SIGNATURE
-from sceneprint_client.rotations import Floats
-from sceneprint_client.sidecars import MAXIMUM_SAMPLES, Intrinsics
+from sceneprint_client.files import MAXIMUM_SAMPLES, PNG_SIGNATURE
+from sceneprint_client.poses import Floats
+from sceneprint_client.sidecars import Intrinsics
 
 # Depth images.
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sceneprint_client.api.frames import CloudFormat
 from sceneprint_client.errors import DatasetError, InvalidIntrinsics, InvalidPose, naming
-from sceneprint_client.files import read_object, read_text
+from sceneprint_client.files import MAXIMUM_SAMPLES, read_object, read_text
 
 #: A place, metres, or a direction.
 Position = tuple[float, float, float]
@@ -33,8 +33,6 @@ _MAXIMUM_BYTES = 65_536
 
 # The camera.
 
-#: Most samples a depth image may have (an 8-megapixel sensor); more is refused unread.
-MAXIMUM_SAMPLES = 8_388_608
 
 #: Longest focal length and farthest principal point that are believed, pixels.
 MAXIMUM_PIXELS = 1e7

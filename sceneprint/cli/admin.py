@@ -8,7 +8,7 @@ import sys
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
-from sceneprint.cli.numbers import whole_number
+from sceneprint.cli import whole_number
 from sceneprint.cli.options import one_line, require_database
 from sceneprint.cli.serve import add_data_option, settings_of
 from sceneprint_client.api.admin import EVERY, SCOPES

@@ -1,9 +1,20 @@
-"""What `sceneprint doctor` has found by one look."""
+"""What `sceneprint doctor` has found by one look, and what it says of a running service."""
 
 from __future__ import annotations
 
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+from sceneprint import __version__
+from sceneprint.errors import Forbidden, KeyRequired, SceneprintError
+
+if TYPE_CHECKING:
+    from sceneprint_client import Client, Status
+    from sceneprint_client.api import Map
+    from sceneprint_client.api.admin import ModelInfo, Stats
 
 Verdict = Literal["ok", "note", "WRONG"]
 
@@ -53,3 +64,144 @@ def seconds_apart(before: float, there: float, after: float) -> float:
     there : what the other one said
     """
     return max(before - there, there - after, 0.0)
+
+
+# Checks of a running service: what the service itself tells.
+
+#: Age of a job that nobody does at which workers are missed, seconds.
+LONGEST_S = 60.0
+#: Most names that a line has.
+_MOST_NAMES = 5
+
+
+def service_checks(client: Client, url: str) -> Iterator[Check]:
+    """Ask a service that answers for all that it tells.
+
+    Parameters
+    ----------
+    client : of the service
+    url : its address, for people
+
+    Raises
+    ------
+    SceneprintError : it ceased to answer.
+    """
+    try:
+        status = client.status()
+    except KeyRequired as error:  # one that is not known
+        yield Check("WRONG", "service", f"{url}: {error}")
+        return
+    except SceneprintError as error:
+        yield Check("WRONG", "service", f"{url} answers, but is not ready: {error}")
+        return
+    yield version_check(url, status)
+    yield ready_check(status)
+    before = time.time()
+    try:
+        stats = client.stats(minutes=1)
+    except KeyRequired:
+        text = f"{url} requires a key; pass one with --key to see workers, queue and disk"
+        yield Check("note", "workers", text)
+        return
+    except Forbidden:
+        text = "the service shows them only to a key for all maps; pass one with --key"
+        yield Check("note", "workers", text)
+    else:
+        yield clock_check(before, stats.at.timestamp(), time.time())
+        yield store_check(stats)
+        if stats.bytes.free is not None:
+            yield disk_check("service disk", stats.bytes.free)
+        yield worker_check(stats, read_only=status.read_only)
+        yield queue_check(stats)
+    yield model_check(list(client.maps()), client.models())
+
+
+def version_check(url: str, status: Status) -> Check:
+    """Whether the service is of the version of this command."""
+    text = f"{url} answers, version {status.version}"
+    if status.frames is not None:
+        text += f", {sum(status.frames.values())} frames"
+    if status.version == __version__:
+        return Check("ok", "service", text)
+    return Check("note", "service", f"{text}; this is version {__version__}")
+
+
+def ready_check(status: Status) -> Check:
+    """Whether it takes uploads, and what it reads."""
+    replica = "" if status.replica is None else f"; {status.replica}"
+    if status.read_only:
+        text = "read-only: it answers queries and rejects uploads. Make its data folder writable"
+        return Check("note", "ready", f"{text}{replica}.")
+    return Check("ok", "ready", f"takes uploads and answers queries{replica}")
+
+
+def clock_check(before: float, there: float, after: float) -> Check:
+    """The clocks of this machine and of the service, as far as the answer's way can tell."""
+    apart = seconds_apart(before, there, after)
+    text = f"the service's clock differs from this machine's by {apart:.1f} s"
+    if apart > APART_S:
+        text += ": times that robots send are wrong. Synchronize both with a time server."
+        return Check("note", "service clock", text)
+    return Check("ok", "service clock", text)
+
+
+def store_check(stats: Stats) -> Check:
+    """What the service keeps, and where."""
+    sizes = stats.bytes
+    place = "PostgreSQL" if sizes.database is None else f"SQLite of {sizes.database / 1e6:.1f} MB"
+    text = f"{place}, blobs of {sizes.blobs / 1e6:.1f} MB, indexes of {sizes.index / 1e6:.1f} MB"
+    if stats.replica is not None and not stats.replica.used:
+        return Check("note", "store", f"{text}; the replica is not in use: see the service's log")
+    return Check("ok", "store", text)
+
+
+def worker_check(stats: Stats, *, read_only: bool) -> Check:
+    """Whether anybody signs."""
+    workers = stats.workers or []
+    busy = sum(one.job_id is not None for one in workers)
+    if workers or read_only:
+        run = "1 worker runs" if len(workers) == 1 else f"{len(workers)} workers run"
+        return Check("ok", "workers", f"{run}, {busy} at a job")
+    text = "none runs, so frames are stored, but not signed. Start some with `sceneprint work`"
+    if (stats.oldest_waiting_s or 0.0) > LONGEST_S:
+        return Check("WRONG", "workers", f"{text}, and see their log.")
+    return Check("note", "workers", f"{text}, or wait if the service has just started.")
+
+
+def queue_check(stats: Stats) -> Check:
+    """What waits, and what failed for good."""
+    jobs = "1 job" if stats.waiting == 1 else f"{stats.waiting} jobs"
+    text = f"{jobs} waiting, {stats.jobs.get('running', 0)} running"
+    if stats.oldest_waiting_s is not None:
+        text += f", the oldest for {stats.oldest_waiting_s:.0f} s"
+    dead = stats.jobs.get("dead", 0)
+    if dead:
+        text += f"; {dead} failed for good: `sceneprint jobs --state dead` says why"
+    return Check("note" if dead else "ok", "queue", text)
+
+
+def model_check(maps: Iterable[Map], models: Iterable[ModelInfo]) -> Check:
+    """What maps are signed with; an older model of a preset's name is told."""
+    presets = {one.name: one for one in models if one.preset}
+    by_model: dict[str, list[str]] = defaultdict(list)
+    older = []
+    for one in maps:
+        by_model[one.model].append(one.name)
+        preset = presets.get(one.model.rpartition("-")[0])
+        if preset is not None and preset.model_id != one.model_id and one.reencoding is None:
+            older.append((one.name, preset))
+    told = [f"{model}: {_listed(names)}" for model, names in sorted(by_model.items())]
+    text = "; ".join(told) or "no maps yet"
+    if older:
+        name, preset = older[0]
+        count = "1 map has" if len(older) == 1 else f"{len(older)} maps have"
+        text += (
+            f"; {count} an older model than this version brings: `sceneprint reencode {name} "
+            f"--model {preset.name}` changes it"
+        )
+    return Check("note" if older else "ok", "models", text)
+
+
+def _listed(names: list[str]) -> str:
+    rest = len(names) - _MOST_NAMES
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {rest} more" if rest > 0 else "")

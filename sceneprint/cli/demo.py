@@ -23,7 +23,7 @@ from typing import IO, Any
 import numpy as np
 from tqdm import tqdm
 
-from sceneprint.cli.numbers import positive
+from sceneprint.cli import positive
 from sceneprint.cli.options import ended_by_signals
 from sceneprint.engine.search.verification import CANDIDATES
 from sceneprint.errors import DatasetError, FrameConflict, FrameError, ServiceError, Unreachable

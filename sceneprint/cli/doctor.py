@@ -18,12 +18,19 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from sceneprint import __version__
-from sceneprint.cli.checks import APART_S, Check, Verdict, disk_check, seconds_apart
+from sceneprint.cli.checks import (
+    APART_S,
+    Check,
+    Verdict,
+    disk_check,
+    seconds_apart,
+    service_checks,
+    version_check,
+)
 from sceneprint.cli.options import add_service_options, one_line
 from sceneprint.cli.serve import add_data_option, settings_of
-from sceneprint.cli.service_checks import service_checks, version_check
 from sceneprint.errors import SceneprintError
-from sceneprint_client.addresses import DEFAULT_URL
+from sceneprint_client.requests import DEFAULT_URL
 
 if TYPE_CHECKING:
     from sqlalchemy import URL, Engine

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
+from sceneprint.cli import positive, whole_number
 from sceneprint.cli.bag import add_recording_options, sequences_at
-from sceneprint.cli.numbers import positive, whole_number
 from sceneprint.cli.options import add_judging_options, add_model_options, open_for
 from sceneprint.errors import DatasetError
 from sceneprint.settings import Settings

@@ -14,9 +14,17 @@ import numpy as np
 from pydantic_core import from_json
 
 from sceneprint.atomic_files import write_whole
-from sceneprint.cli.numbers import positive, whole_number
-from sceneprint.cli.options import add_service_options, one_line, open_client, up_of
-from sceneprint.cli.scenes import add_scene_options, check_scene, open_scene, wants_scene
+from sceneprint.cli import positive, whole_number
+from sceneprint.cli.options import (
+    add_scene_options,
+    add_service_options,
+    check_scene,
+    one_line,
+    open_client,
+    open_scene,
+    up_of,
+    wants_scene,
+)
 from sceneprint.errors import InvalidRequest
 from sceneprint.models import PRESETS
 from sceneprint_client.api.base import FrameState, JobState

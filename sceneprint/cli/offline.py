@@ -20,8 +20,8 @@ from typing import Any
 from tqdm import tqdm
 
 from sceneprint.atomic_files import write_whole
+from sceneprint.cli import metres, positive, whole_number
 from sceneprint.cli.bag import add_recording_options, sequences_at
-from sceneprint.cli.numbers import metres, positive, whole_number
 from sceneprint.cli.options import add_model_options, open_for
 from sceneprint.errors import DatasetError, FrameError, TrainingError
 from sceneprint.formats.dataset import (

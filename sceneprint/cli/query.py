@@ -12,26 +12,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.atomic_files import check_writable, write_whole
+from sceneprint.cli import whole_number
 from sceneprint.cli.bag import add_recording_options, sequences_at
-from sceneprint.cli.numbers import whole_number
 from sceneprint.cli.options import (
     add_asking_options,
     add_prior_option,
+    add_scene_options,
     add_service_options,
     add_up_option,
+    check_kept,
+    check_scene,
     explained_lines,
     frame_label,
     one_line,
     open_client,
+    open_scene,
     options_of,
     setting,
     settings_of,
-)
-from sceneprint.cli.scenes import (
-    add_scene_options,
-    check_kept,
-    check_scene,
-    open_scene,
     stamps_of,
 )
 from sceneprint.errors import DatasetError, FrameError, MissingDependency, TooLarge, UnknownFrame

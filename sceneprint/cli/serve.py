@@ -10,7 +10,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sceneprint.cli.numbers import whole_number
+from sceneprint.cli import whole_number
 
 if TYPE_CHECKING:
     from sceneprint.settings import Settings

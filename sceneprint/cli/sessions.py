@@ -11,15 +11,17 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
-from sceneprint.cli.numbers import positive, whole_number
+from sceneprint.cli import positive, whole_number
 from sceneprint.cli.options import (
     add_filter_options,
+    add_scene_options,
     add_service_options,
+    check_scene,
     filter_of,
     one_line,
     open_client,
+    open_scene,
 )
-from sceneprint.cli.scenes import add_scene_options, check_scene, open_scene
 from sceneprint.errors import DatasetError, InvalidRequest
 from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint_client.api import JobState
@@ -27,10 +29,9 @@ from sceneprint_client.api import JobState
 if TYPE_CHECKING:
     from sceneprint_client import Client
     from sceneprint_client.api import Answer
-    from sceneprint_client.api.differences import Difference
     from sceneprint_client.api.listing import FrameDeletion, Session
-    from sceneprint_client.api.reconstructions import Coverage, Reconstruction
-    from sceneprint_client.api.sessions import Association, GraphFormat, Join
+    from sceneprint_client.api.sessions import Association, Difference, GraphFormat, Join
+    from sceneprint_client.api.surface import Coverage, Reconstruction
 
 #: What a file is by its name's end.
 _FORMATS: dict[str, GraphFormat] = {".g2o": "g2o", ".txt": "tum", ".tum": "tum", ".json": "json"}
@@ -402,7 +403,7 @@ def difference_lines(told: Difference) -> list[str]:
     ]
 
 
-#: Colours of points in a file, by what they are: see `sceneprint_client.api.differences`.
+#: Colours of points in a file, by what they are: see `sceneprint_client.api.sessions`.
 _DIFFERENCE_COLOURS = (
     (165, 170, 175), (230, 110, 20), (40, 110, 220), (95, 100, 105), (95, 100, 105),
 )  # fmt: skip

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
-from sceneprint.cli.numbers import positive, whole_number
+from sceneprint.cli import positive, whole_number
 from sceneprint.cli.options import ended_by_signals, one_line, open_client, require_database
 from sceneprint.cli.serve import add_data_option, settings_of
 from sceneprint.errors import InvalidRequest
@@ -783,7 +783,7 @@ def add_reencode(commands: Any) -> None:
 def run_reencode(options: argparse.Namespace) -> int:
     """Begin, watch or give up; returns 2 where waiting was no use."""
     from sceneprint.engine import Engine
-    from sceneprint.engine.maps import reencoding
+    from sceneprint.engine.maps import map_lifecycle
 
     settings = settings_of(options)
     require_database(settings)
@@ -792,7 +792,7 @@ def run_reencode(options: argparse.Namespace) -> int:
             told = engine.reencode(options.map, options.model)
             engine.audit.command("reencode --model", map_name=options.map, model=str(options.model))
         elif options.cancel:
-            told = reencoding.cancel(engine.store, options.map)
+            told = map_lifecycle.cancel_reencoding(engine.store, options.map)
             engine.audit.command("reencode --cancel", map_name=options.map)
         else:
             told = engine.get_map(options.map)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from sceneprint.cli import positive
 from sceneprint.cli.bag import add_recording_options, recording_options, tell
-from sceneprint.cli.numbers import positive
 from sceneprint.cli.options import (
     add_service_options,
     add_up_option,

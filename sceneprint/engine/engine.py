@@ -17,19 +17,17 @@ from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.jobs.lifecycle import Work, put_back
 from sceneprint.engine.jobs.tasks import LongJob, Tasks
-from sceneprint.engine.maps import map_lifecycle, reencoding
-from sceneprint.engine.maps.coverage_job import COVERAGE, CoverageHandler
-from sceneprint.engine.maps.map_coverage import CoverageJobs
+from sceneprint.engine.maps import map_lifecycle
+from sceneprint.engine.maps.map_coverage import COVERAGE, CoverageHandler, CoverageJobs
 from sceneprint.engine.maps.map_frames import FrameFiles, list_frames
+from sceneprint.engine.maps.map_lifecycle import Reencodings
 from sceneprint.engine.maps.map_surface import MapSurfaces, SurfaceUpkeep
-from sceneprint.engine.maps.reencoding import Reencodings
+from sceneprint.engine.maps.selections import FrameUndo
 from sceneprint.engine.maps.surface_job import SURFACE, SurfaceHandler
-from sceneprint.engine.maps.undo import FrameUndo
 from sceneprint.engine.reconstruction import ReconstructionJobs
 from sceneprint.engine.results.kept_answers import KeptAnswers
 from sceneprint.engine.results.query_history import QueryHistory
-from sceneprint.engine.results.rerun import Rerun
-from sceneprint.engine.results.result_views import Inspection, PointClouds
+from sceneprint.engine.results.result_views import Inspection, PointClouds, Rerun
 from sceneprint.engine.results.stored_results import ResultValidity, open_results
 from sceneprint.engine.search.local_index import Readers
 from sceneprint.engine.search.map_view import IndexView
@@ -195,9 +193,9 @@ class Engine:
 
     def reencode(self, name: str, model: str | Path | Model) -> Map:
         """Have a map signed with another model, to which it then switches; see
-        `reencoding.begin`.
+        `map_lifecycle.begin_reencoding`.
         """
-        told = reencoding.begin(self.store, name, model)
+        told = map_lifecycle.begin_reencoding(self.store, name, model)
         self.bell.ring()
         return told
 

@@ -52,7 +52,7 @@ from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import JobRow
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics
 from sceneprint_client.api import JobState, Match
-from sceneprint_client.api.reconstructions import (
+from sceneprint_client.api.surface import (
     MOST_VIEWS,
     Coverage,
     FusedView,

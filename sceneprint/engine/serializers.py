@@ -36,7 +36,7 @@ from sceneprint_client.api import (
 )
 from sceneprint_client.api.base import Direction
 from sceneprint_client.api.frames import GivenTransform, Kind
-from sceneprint_client.rotations import quaternion_of, rotation_of
+from sceneprint_client.poses import quaternion_of, rotation_of
 
 # Entity tags: short texts that change when what they stand for does.
 

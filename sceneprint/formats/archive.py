@@ -37,7 +37,7 @@ from typing import IO, Any, BinaryIO, Literal, Protocol, cast
 from sceneprint.errors import DatasetError, SceneprintError, UnreadableArchive
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence
 from sceneprint.formats.dataset.sequences import find_each, is_of_colour
-from sceneprint_client.file_formats import MAXIMUM_CLOUD_BYTES, MAXIMUM_IMAGE_BYTES, is_cloud
+from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, MAXIMUM_IMAGE_BYTES, is_cloud
 from sceneprint_client.sidecars import CLOUDS_FILE, INTRINSICS_FILE
 
 # Members of a tar or a zip, by the standard library behind guards.

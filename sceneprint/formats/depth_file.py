@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 from sceneprint.errors import InvalidIntrinsics, UnreadableFrame, UselessFrame, naming
 from sceneprint.geometry.surface.camera import ray_to_axis, undistort
 from sceneprint.types import MAXIMUM_SAMPLES, DepthFrame, Floats, Floats32, Intrinsics
-from sceneprint_client.file_formats import (
+from sceneprint_client.files import (
     MAXIMUM_IMAGE_BYTES,
     NPY_SIGNATURE,
     PNG_SIGNATURE,
     NpyHeader,
     npy_header,
+    read_bytes,
 )
-from sceneprint_client.files import read_bytes
 from sceneprint_client.ros_messages import TRANSPORT_BYTES
 from sceneprint_client.sidecars import rigid_transform
 
@@ -494,7 +494,7 @@ def size_of(head: bytes) -> tuple[int, int] | None:
 
     Parameters
     ----------
-    head : first HEAD bytes of the file (sceneprint_client.file_formats): of a PNG 24 are enough
+    head : first HEAD bytes of the file (sceneprint_client.files): of a PNG 24 are enough
     """
     if has_transport_header(head):
         head = head[TRANSPORT_BYTES:]

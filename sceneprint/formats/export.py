@@ -42,8 +42,8 @@ from numpy.typing import NDArray
 
 from sceneprint.types import Bytes, Floats, Floats32, Ints32, Surface
 from sceneprint_client.api.results import MOST_DRAWN
-from sceneprint_client.rotations import quaternion_of
-from sceneprint_client.surface_points import (
+from sceneprint_client.poses import quaternion_of
+from sceneprint_client.surface_encoding import (
     HEADER,
     MAGIC,
     NO_PATCH,

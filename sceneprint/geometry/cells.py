@@ -37,7 +37,7 @@ from sceneprint.geometry.registration.overlap import (
 )
 from sceneprint.geometry.rigid import inverse
 from sceneprint.types import Bytes, Floats, Surface
-from sceneprint_client.surface_tiles import CELL, NO_SESSION, NO_TIME, SEEN_STEPS, SIDE, STEPS
+from sceneprint_client.surface_encoding import CELL, NO_SESSION, NO_TIME, SEEN_STEPS, SIDE, STEPS
 
 #: Column, row and floor of a tile.
 TilePlace = tuple[int, int, int]

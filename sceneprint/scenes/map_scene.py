@@ -37,7 +37,7 @@ from sceneprint_client import Client
 from sceneprint_client.api import Frame, FrameState
 from sceneprint_client.api.listing import Session
 from sceneprint_client.api.results import MOST_DRAWN
-from sceneprint_client.rotations import rotation_of
+from sceneprint_client.poses import rotation_of
 
 #: Frames of a map whose points are drawn, unless another number is asked for.
 MAP_FRAMES = 120

@@ -33,7 +33,7 @@ from sceneprint.scenes.scene import (
     space_of,
 )
 from sceneprint.types import Floats
-from sceneprint_client.rotations import quaternion_of
+from sceneprint_client.poses import quaternion_of
 
 if TYPE_CHECKING:
     from foxglove.messages import (

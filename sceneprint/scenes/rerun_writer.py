@@ -34,7 +34,7 @@ from sceneprint.scenes.scene import (
     UpAxis,
     space_of,
 )
-from sceneprint_client.rotations import quaternion_of
+from sceneprint_client.poses import quaternion_of
 
 if TYPE_CHECKING:
     import rerun as rr

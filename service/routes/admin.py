@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field, ValidationError
 from sceneprint import __version__
 from sceneprint.engine.admin import operations
 from sceneprint.engine.jobs import lifecycle
-from sceneprint.engine.maps import reencoding
+from sceneprint.engine.maps import map_lifecycle
 from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint.maintenance.snapshot.creation import SNAPSHOT, SnapshotCatalog
 from sceneprint.store.events import newest_number
@@ -278,7 +278,7 @@ async def reencode(map_name: str, request: Request, here: Here, asking: Asking) 
 )
 def cancel_reencoding(map_name: str, here: Here) -> Map:
     """Let a map keep the model that it has; what was made for the other is removed."""
-    return reencoding.cancel(here.engine.store, map_name)
+    return map_lifecycle.cancel_reencoding(here.engine.store, map_name)
 
 
 def _wanted(given: object) -> NewModel:

@@ -11,7 +11,7 @@ from fastapi import Depends, Query, Request, Response
 from sceneprint.errors import DamagedBlob
 from sceneprint.formats.export import MEDIA_TYPE
 from sceneprint_client.api import Page
-from sceneprint_client.api.differences import Difference, NewDifference
+from sceneprint_client.api.sessions import Difference, NewDifference
 from service.auth import may_read, may_write, v1_router
 from service.bodies import read_record
 from service.context import Here

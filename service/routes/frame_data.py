@@ -30,7 +30,7 @@ from sceneprint_client.api.results import (
     PointsSide,
     View,
 )
-from sceneprint_client.file_formats import HEAD
+from sceneprint_client.files import HEAD
 from service.auth import Asking, may_read, v1_router
 from service.context import Context, Here
 from service.responses import (

@@ -12,7 +12,7 @@ from sceneprint.engine.reconstruction import MEDIA_TYPES, MESH, PICTURE
 from sceneprint.engine.results.stored_results import StoredResult, unknown_query
 from sceneprint.errors import DamagedBlob
 from sceneprint.store.queue import unknown_job
-from sceneprint_client.api.reconstructions import NewReconstruction, Reconstruction
+from sceneprint_client.api.surface import NewReconstruction, Reconstruction
 from service.auth import Asking, Caller, v1_router
 from service.bodies import read_record
 from service.context import Context, Here

@@ -9,8 +9,8 @@ from fastapi import Depends, Query, Request
 
 from sceneprint.engine.maps.selections import delete_selection, edit_selection
 from sceneprint_client.api import Frame, Page
-from sceneprint_client.api.listing import FrameDeletion
-from sceneprint_client.api.selections import (
+from sceneprint_client.api.listing import (
+    FrameDeletion,
     FramesDeleted,
     FramesEdit,
     FramesEdited,

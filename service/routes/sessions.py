@@ -9,8 +9,8 @@ from anyio import to_thread
 from fastapi import Depends, Query, Request, Response
 
 from sceneprint.engine.maps.map_frames import growth, list_sessions, trajectory, trajectory_file
+from sceneprint.engine.maps.selections import delete_session, edit_session
 from sceneprint.engine.sessions.associations import MEDIA_TYPES
-from sceneprint.engine.sessions.session_edits import delete_session, edit_session
 from sceneprint_client.api import Page
 from sceneprint_client.api.base import Label
 from sceneprint_client.api.listing import Run, Session, SessionChange, SessionEdit, Trajectory

@@ -15,9 +15,8 @@ from pydantic import SecretStr
 
 from sceneprint import __version__
 from sceneprint.cli import checks, doctor
-from sceneprint.cli.checks import Check
-from sceneprint.cli.options import prepare_presets
-from sceneprint.cli.service_checks import (
+from sceneprint.cli.checks import (
+    Check,
     clock_check,
     model_check,
     queue_check,
@@ -26,6 +25,7 @@ from sceneprint.cli.service_checks import (
     version_check,
     worker_check,
 )
+from sceneprint.cli.options import prepare_presets
 from sceneprint.engine import compilation
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.geometry.signature import pair_features

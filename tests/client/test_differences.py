@@ -17,7 +17,7 @@ from sceneprint.formats.dataset import write_depth_png
 from sceneprint.lab.synth import synthesise_room
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
-from sceneprint_client.api.differences import SAME
+from sceneprint_client.api.sessions import SAME
 
 MAP = "changed"
 

@@ -22,7 +22,7 @@ from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.surface import SurfaceTile
 from sceneprint_client.errors import Refused
-from sceneprint_client.surface_tiles import decode_tile
+from sceneprint_client.surface_encoding import decode_tile
 
 MAP, PLAIN = "fused", "poseless"
 PATH = f"/v1/maps/{MAP}/surface"

@@ -11,7 +11,7 @@ from sceneprint.errors import InvalidRequest, NotIndexed, Refused
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.formats.export import encode_points
 from sceneprint_client import Client
-from sceneprint_client.surface_points import decode_points
+from sceneprint_client.surface_encoding import decode_points
 
 #: All of these are numbers of 32 bits, so corners of a box of them are told exactly.
 CORNERS = np.array([[x, y, z] for x in (-1.5, 2.25) for y in (0.0, 8.0) for z in (0.125, 0.5)])

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Page
 
-from sceneprint_client.surface_points import HEADER, POINT
+from sceneprint_client.surface_encoding import HEADER, POINT
 
 
 def ask(station: Any, frame: int, **more: object) -> dict[str, Any]:

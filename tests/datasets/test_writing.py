@@ -15,7 +15,7 @@ from sceneprint.formats.dataset import (
     write_depth_png,
     write_pose,
 )
-from sceneprint_client.rotations import rotation_of
+from sceneprint_client.poses import rotation_of
 
 
 def test_depth_by_hand(tmp_path: Path) -> None:

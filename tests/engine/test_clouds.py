@@ -23,8 +23,8 @@ from sceneprint.pipeline import open_signer, sign
 from sceneprint.store.tables import frames
 from sceneprint.types import DepthFrame, Floats
 from sceneprint_client.api import FrameMeta, JobState, Query
-from sceneprint_client.api.options import ValidationOptions
-from sceneprint_client.api.reconstructions import NewReconstruction
+from sceneprint_client.api.query import ValidationOptions
+from sceneprint_client.api.surface import NewReconstruction
 
 WorkOff = Callable[[Engine], list[JobState | None]]
 #: Where clouds were seen from, metres in their own coordinates.

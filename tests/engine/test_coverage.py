@@ -19,8 +19,8 @@ from sqlalchemy import select
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import Work, cancel
 from sceneprint.engine.jobs.tasks import LongJob
-from sceneprint.engine.maps.coverage_job import CoverageHandler, frames_to_query
-from sceneprint.engine.maps.coverage_picture import COLOURS, FOOTER, WIDTH
+from sceneprint.engine.maps.map_coverage import CoverageHandler, frames_to_query
+from sceneprint.engine.maps.map_plans import COLOURS, FOOTER, WIDTH
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.settings import Settings

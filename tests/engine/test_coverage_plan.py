@@ -7,16 +7,17 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sceneprint.engine.maps.coverage_picture import cell_outcome, coverage_picture
-from sceneprint.engine.maps.coverage_plan import (
+from sceneprint.engine.maps.map_plans import (
     MOST_CELLS,
     QueriedPosition,
+    cell_outcome,
     cell_width,
+    coverage_picture,
     coverage_plans,
     localisability,
     plan_changes,
 )
-from sceneprint.engine.maps.plan_axes import PlanAxes, plan_axes, upright
+from sceneprint.engine.search.up_vectors import PlanAxes, plan_axes, upright
 from sceneprint_client.api.coverage import (
     CoverageCell,
     CoverageOutcome,

@@ -35,7 +35,7 @@ from sceneprint.types import Geometry
 from sceneprint_client.api import FrameMeta, NewMap
 from sceneprint_client.api.listing import Run
 from sceneprint_client.api.results import View
-from sceneprint_client.rotations import rotation_of
+from sceneprint_client.poses import rotation_of
 
 Ids = Callable[[Engine], list[str]]
 Prepared = list[tuple[Signature, Geometry]]

@@ -12,7 +12,7 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.engine.maps.map_lifecycle import edit_frame
-from sceneprint.engine.search.answer_status import Outcome, answer_status
+from sceneprint.engine.search.answer import Outcome, answer_status
 from sceneprint.engine.search.query import localization_of
 from sceneprint.engine.search.verification import Validated
 from sceneprint.errors import InvalidPose, InvalidRequest

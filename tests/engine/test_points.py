@@ -16,7 +16,7 @@ from sceneprint.geometry.validation.inspection import STEP_COLOURS, patches_at
 from sceneprint.pipeline import Signature
 from sceneprint.types import Geometry
 from sceneprint_client.api import Answer, Query
-from sceneprint_client.surface_points import HEADER, POINT
+from sceneprint_client.surface_encoding import HEADER, POINT
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]

@@ -30,8 +30,8 @@ from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.postgres.vectors import table_of
 from sceneprint.store.signatures import geometry_blobs, stored_vector
 from sceneprint_client.api import NewMap, Query
-from sceneprint_client.api.reconstructions import NewReconstruction
 from sceneprint_client.api.results import KeepOptions
+from sceneprint_client.api.surface import NewReconstruction
 
 #: Where PostgreSQL keeps the vectors of signatures.
 VECTORS = table_of(read_model("depth").signature_bytes)

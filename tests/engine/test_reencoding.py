@@ -14,7 +14,7 @@ import pytest
 from sqlalchemy import select
 
 from sceneprint.engine import Engine
-from sceneprint.engine.maps import reencoding
+from sceneprint.engine.maps import map_lifecycle
 from sceneprint.errors import Conflict, InvalidRequest, UnknownMap, UnreadableModel
 from sceneprint.geometry.retrieval.distance import Metric
 from sceneprint.lab.synth import synthesise_room
@@ -272,7 +272,7 @@ def test_what_is_given_up_leaves_nothing(
         assert full.run(claimed) == JobState.SUCCEEDED
     held = full.claim("w")
     assert held is not None
-    assert reencoding.cancel(full.store, "hall") == before
+    assert map_lifecycle.cancel_reencoding(full.store, "hall") == before
     assert full.run(held) is None
     assert full.claim("w") is None
     assert models_of(full) == {before.model_id: 12}
@@ -295,7 +295,7 @@ def test_what_cannot_be_begun(full: Engine, short_sighted: Path) -> None:
     with pytest.raises(Conflict, match=r"is already signed with depth-.*\. There is nothing to do"):
         full.reencode("hall", "depth")
     with pytest.raises(Conflict, match="not switching to another model"):
-        reencoding.cancel(full.store, "hall")
+        map_lifecycle.cancel_reencoding(full.store, "hall")
     full.reencode("hall", short_sighted)
     assert full.reencode("hall", short_sighted).reencoding is not None  # the same again
     assert len(queued(full)) == 12

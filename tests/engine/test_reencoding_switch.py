@@ -18,7 +18,7 @@ from sqlalchemy import select
 
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs import signature_job as working
-from sceneprint.engine.maps import reencoding
+from sceneprint.engine.maps import map_lifecycle
 from sceneprint.engine.search import local_index, query
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.search.retrieval import Deadline
@@ -437,7 +437,7 @@ def test_a_frame_is_signed_again_by_a_model_that_the_map_goes_back_to(
     """What the first model made of it is there still, as removing it takes a while."""
     name = ids(full)[3]
     with monkeypatch.context() as patch:
-        patch.setattr(reencoding, "_tidy", lambda *_, **__: False)
+        patch.setattr(map_lifecycle, "_tidy", lambda *_, **__: False)
         original, first = working.prepare, full.get_map("hall").model
 
         def refuse(frame: Any, signer: Any) -> Any:

@@ -13,8 +13,7 @@ from sceneprint.engine.maps.selections import delete_selection, edit_selection
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
 from sceneprint.store.undo_rows import NO_UNDO
 from sceneprint_client.api import FrameMeta
-from sceneprint_client.api.listing import FrameListing
-from sceneprint_client.api.selections import FramesEdit, FrameSelection, RestoreOptions
+from sceneprint_client.api.listing import FrameListing, FramesEdit, FrameSelection, RestoreOptions
 
 #: Session, robot and tags of each of twelve uploads.
 TAKEN = [("a", "r1", ["x"])] * 5 + [("b", "r2", ["x", "y"])] * 4 + [(None, None, [])] * 3

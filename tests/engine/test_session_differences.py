@@ -16,8 +16,8 @@ from sceneprint.engine.sessions.session_differences import DifferenceHandler
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
 from sceneprint.geometry.rigid import inverse, moved
 from sceneprint_client.api import JobState
-from sceneprint_client.api.differences import GONE, NEW, Difference, NewDifference
-from sceneprint_client.surface_points import SurfacePoints, decode_points
+from sceneprint_client.api.sessions import GONE, NEW, Difference, NewDifference
+from sceneprint_client.surface_encoding import SurfacePoints, decode_points
 
 WorkOff = Callable[[Engine], list[JobState | None]]
 #: Of the box's front, before the cameras; and the pixels that it fills there.

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from sceneprint.engine import Engine
+from sceneprint.engine.maps import selections
 from sceneprint.engine.maps.map_frames import list_sessions
-from sceneprint.engine.sessions import session_edits
-from sceneprint.engine.sessions.session_edits import delete_session, edit_session
+from sceneprint.engine.maps.selections import delete_session, edit_session
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap, UnknownSession
 from sceneprint_client.api import Frame, FrameMeta
 from sceneprint_client.api.listing import FrameListing, SessionEdit
@@ -20,7 +20,7 @@ TAKEN = [("a", "r1")] * 5 + [("a", "r2")] * 3 + [("a/..", "r1")] * 2 + [(None, "
 
 @pytest.fixture(autouse=True)
 def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session_edits, "AT_ONCE", 2)
+    monkeypatch.setattr(selections, "AT_ONCE", 2)
 
 
 @pytest.fixture

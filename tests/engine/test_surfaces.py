@@ -36,7 +36,7 @@ from sceneprint.store.tables import (
 )
 from sceneprint.types import Floats
 from sceneprint_client.api import JobState
-from sceneprint_client.surface_tiles import SurfaceCells, decode_tile
+from sceneprint_client.surface_encoding import SurfaceCells, decode_tile
 
 WorkOff = Callable[[Engine], list[JobState | None]]
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC).timestamp()

@@ -10,9 +10,8 @@ from sqlalchemy import update
 
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
-from sceneprint.engine.maps import undo as module
-from sceneprint.engine.maps.selections import delete_selection
-from sceneprint.engine.sessions.session_edits import delete_session
+from sceneprint.engine.maps import selections as module
+from sceneprint.engine.maps.selections import delete_selection, delete_session
 from sceneprint.errors import (
     Conflict,
     InvalidRequest,
@@ -25,8 +24,7 @@ from sceneprint.store.frames import find_frame, set_state, write_map
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import deletions
 from sceneprint_client.api import Frame, FrameMeta, FrameState, Query
-from sceneprint_client.api.listing import FrameListing
-from sceneprint_client.api.selections import FrameSelection, RestoreOptions
+from sceneprint_client.api.listing import FrameListing, FrameSelection, RestoreOptions
 
 #: What a restored frame has anew.
 FRESH = {"revision", "job_id", "indexed_at", "state"}

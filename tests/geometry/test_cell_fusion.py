@@ -20,7 +20,7 @@ from sceneprint.geometry.cells import (
     time_scale,
     without,
 )
-from sceneprint_client.surface_tiles import NO_SESSION, NO_TIME
+from sceneprint_client.surface_encoding import NO_SESSION, NO_TIME
 
 CELL_M = 0.05
 #: A tile is 3.2 m wide.

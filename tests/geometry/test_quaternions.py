@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.types import Floats
-from sceneprint_client.rotations import quaternion_of, rotation_of
+from sceneprint_client.poses import quaternion_of, rotation_of
 
 AXES = [np.array(a, float) for a in itertools.product((-1, 0, 1), repeat=3) if any(a)]
 

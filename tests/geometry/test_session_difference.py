@@ -23,7 +23,7 @@ from sceneprint.geometry.cells import (
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.rigid import moved
 from sceneprint.types import Bytes, Floats, Intrinsics, Surface
-from sceneprint_client.surface_tiles import NO_SESSION
+from sceneprint_client.surface_encoding import NO_SESSION
 
 P = OverlapParameters()
 CAMERA = Intrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)

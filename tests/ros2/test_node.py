@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sceneprint_client.poses import rotation_of
 from sceneprint_client.relocaliser import RelocaliserParameters
-from sceneprint_client.rotations import rotation_of
 from sceneprint_client.tracker import TrackerParameters, replay
 from sceneprint_client.tracker_core import difference
 

@@ -12,6 +12,7 @@ import pytest
 
 from sceneprint_client import Client, Tracker
 from sceneprint_client.api import Localization
+from sceneprint_client.poses import quaternion_of, rotation_of
 from sceneprint_client.relocaliser import (
     Level,
     Relocaliser,
@@ -22,7 +23,6 @@ from sceneprint_client.relocaliser import (
     write_stamp,
     write_transform,
 )
-from sceneprint_client.rotations import quaternion_of, rotation_of
 from sceneprint_client.tracker_core import difference
 
 KINDS = ("depth", "metres", "compressed_depth", "compressed_metres", "points")

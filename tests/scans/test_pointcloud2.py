@@ -13,7 +13,7 @@ import pytest
 
 from sceneprint.errors import FrameError, UnreadableCloud, UselessFrame
 from sceneprint.formats.points import decode_scan, format_of
-from sceneprint_client.cdr import is_point_cloud, read_point_cloud
+from sceneprint_client.files import is_point_cloud, read_point_cloud
 from sceneprint_client.ros_messages import cloud_points
 
 NAME = "sensor_msgs/msg/PointCloud2"

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sceneprint.cli import main
-from sceneprint.cli.scenes import stamps_of
+from sceneprint.cli.options import stamps_of
 from sceneprint.formats.dataset import Camera, FrameReference
 from sceneprint.types import Intrinsics
 from sceneprint_client import Client

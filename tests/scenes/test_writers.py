@@ -32,7 +32,7 @@ from sceneprint.scenes.scene import (
     TextPage,
     UpAxis,
 )
-from sceneprint_client.rotations import rotation_of
+from sceneprint_client.poses import rotation_of
 
 from .conftest import Logged, mcap_rows, rrd_rows
 

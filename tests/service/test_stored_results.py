@@ -14,7 +14,7 @@ from sceneprint.settings import Settings
 from sceneprint.store.frames import add_frame
 from sceneprint.store.maps import find_map
 from sceneprint_client.api import Answer, Counts, NewMap, Query
-from sceneprint_client.api.options import FrameName
+from sceneprint_client.api.query import FrameName
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from sceneprint.errors import LostLease
-from worker.crash_traces import HEAD, KEPT, Trace
+from worker.loop import HEAD, KEPT, Trace
 
 
 def run(code: str, *arguments: str) -> str:
@@ -105,7 +105,7 @@ def test_a_crash_of_no_job_is_not_mistaken_for_one() -> None:
 
 TIMEOUT = """
 import ctypes, sys
-from worker.crash_traces import Trace
+from worker.loop import Trace
 trace = Trace()
 import os
 os.dup2(int(sys.argv[1]), trace._descriptor)

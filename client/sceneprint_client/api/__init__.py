@@ -16,25 +16,27 @@ from sceneprint_client.api.base import (
 from sceneprint_client.api.frames import Added, CameraIntrinsics, Frame, FrameMeta, GivenPose
 from sceneprint_client.api.listing import Filter, Region
 from sceneprint_client.api.maps import Map, NewMap, Reencoding
-from sceneprint_client.api.matches import (
-    Alternative,
-    ExplainedFrame,
-    Explanation,
-    Location,
-    Match,
-    Residual,
-    Validation,
-)
-from sceneprint_client.api.options import Diversity, FrameName, NamedFrame, Stage, ValidationOptions
 from sceneprint_client.api.query import (
+    Alternative,
     Answer,
     AnswerStatus,
     Counts,
+    Diversity,
+    ExplainedFrame,
+    Explanation,
+    FrameName,
     Localization,
+    Location,
+    Match,
+    NamedFrame,
     OfMap,
     Prior,
     Query,
+    Residual,
     SeveralQuery,
+    Stage,
+    Validation,
+    ValidationOptions,
 )
 from sceneprint_client.api.results import Comparison, Similarity
 

@@ -10,8 +10,14 @@ from pydantic import AwareDatetime, Field
 from sceneprint_client.api.base import ApiRecord, Given, Note, Quaternion, Transform, Vector
 from sceneprint_client.api.frames import Kind
 from sceneprint_client.api.maps import Preset
-from sceneprint_client.api.matches import Uncertainty, Validation
-from sceneprint_client.api.options import FrameName, JsonText, NamedFrame, ValidationOptions
+from sceneprint_client.api.query import (
+    FrameName,
+    JsonText,
+    NamedFrame,
+    Uncertainty,
+    Validation,
+    ValidationOptions,
+)
 
 # How a query was asked, as JSON: so that it can be understood, and asked again.
 

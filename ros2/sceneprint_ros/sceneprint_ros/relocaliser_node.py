@@ -24,7 +24,6 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from sceneprint_client import Client, Tracker
-from sceneprint_client.addresses import DEFAULT_URL
 from sceneprint_client.errors import InvalidRequest, SceneprintError
 from sceneprint_client.relocaliser import (
     Relocaliser,
@@ -34,6 +33,7 @@ from sceneprint_client.relocaliser import (
     write_stamp,
     write_transform,
 )
+from sceneprint_client.requests import DEFAULT_URL
 from sceneprint_client.ros_messages import is_rectified, topic_without_transport
 from sceneprint_client.tracker import TrackerParameters
 

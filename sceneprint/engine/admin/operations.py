@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from sqlalchemy import Connection
 
 from sceneprint.engine.admin.statistics import Statistics, anchors
-from sceneprint.engine.maps.model_catalogue import Catalogue
+from sceneprint.engine.maps.map_lifecycle import Catalogue
 from sceneprint.engine.serializers import when
 from sceneprint.errors import InvalidRequest, SceneprintError
 from sceneprint.settings import Settings

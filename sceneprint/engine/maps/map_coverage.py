@@ -1,36 +1,68 @@
-"""Coverage of maps: jobs begun, listed, read, drawn, compared and removed."""
+"""Coverage of maps: jobs begun, done in slices, listed, read, drawn, compared and removed.
+
+    frames, in the order of runs  -->  an item each  --coverage_plans-->  plans, counts
+
+A frame that is queried finds neither itself nor, as asked, the frames taken around it or its whole
+session. The answers are those that a robot would get; none is kept.
+"""
 
 from __future__ import annotations
 
+import math
+import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection
 
 from sceneprint.engine.jobs.map_jobs import MapJobs
-from sceneprint.engine.jobs.tasks import Tasks
-from sceneprint.engine.maps.coverage_job import COVERAGE, PRIORITY, frames_to_query
-from sceneprint.engine.maps.coverage_picture import DrawnFrame, coverage_picture
-from sceneprint.engine.maps.coverage_plan import plan_changes
+from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Tasks
 from sceneprint.engine.maps.map_frames import Output
-from sceneprint.engine.serializers import job_progress, tag_of, when
-from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnreadableGeometry
-from sceneprint.geometry.rigid import moved
+from sceneprint.engine.maps.map_plans import (
+    DrawnFrame,
+    QueriedPosition,
+    coverage_picture,
+    coverage_plans,
+    plan_changes,
+)
+from sceneprint.engine.search.query import Queries, steadily
+from sceneprint.engine.search.retrieval import Deadline, prepare_stored
+from sceneprint.engine.search.up_vectors import parent_axes
+from sceneprint.engine.serializers import job_progress, model_label, tag_of, when
+from sceneprint.engine.signers import Signers
+from sceneprint.errors import (
+    DamagedBlob,
+    DamagedSignature,
+    InvalidRequest,
+    NotIndexed,
+    UnknownFrame,
+    UnreadableGeometry,
+)
+from sceneprint.geometry.rigid import difference, moved
 from sceneprint.store import Store
-from sceneprint.store.frame_queries import PathFrame, stops_of
-from sceneprint.store.maps import find_map
+from sceneprint.store.frame_queries import (
+    PathFrame,
+    QueryOrigin,
+    numbers_of_runs,
+    positions_of_map,
+    stops_of,
+)
+from sceneprint.store.frames import count_states, living_frame
+from sceneprint.store.maps import find_map, living_map, model_names
 from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.queue import items_of
+from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
 from sceneprint.store.signatures import geometry_blobs
-from sceneprint.store.tables import JobRow
+from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats
-from sceneprint_client.api import JobState, Page, Progress, Vector
+from sceneprint_client.api import Answer, Filter, JobState, Page, Progress, Query, Transform, Vector
 from sceneprint_client.api.coverage import (
     CELL_TRENDS,
+    COVERAGE_OUTCOMES,
     CoverageChanges,
     CoverageFrame,
     CoverageOutcome,
@@ -329,3 +361,238 @@ def _drawn_frame(
             if other.pose is not None and other.parent == plan.parent_frame
         ),
     )  # fmt: skip
+
+
+# Frames of a map queried against the rest of it, one by one: a job in slices.
+
+#: Kind of the jobs.
+COVERAGE = "coverage"
+#: Below that of every frame and of reencodings: a worker does a slice when nothing else waits.
+PRIORITY = REENCODING_PRIORITY - 1
+#: Seconds of a slice, at most: so long a frame that has just come waits for a worker.
+SLICE_S = 3.0
+#: Parent frames that get a plan: those of most queried frames.
+MOST_PLANS = 20
+#: Longer than any session, seconds.
+_FOREVER_S = 1e12
+#: What costs a frame, and not the job: it was deleted or edited meanwhile, or is damaged.
+_SKIPPED = (UnknownFrame, InvalidRequest, DamagedBlob, DamagedSignature, UnreadableGeometry)
+
+
+def frames_to_query(connection: Connection, row: MapRow, asked: NewMapCoverage) -> list[int]:
+    """Numbers of the frames that a coverage job queries, in its order.
+
+    Raises
+    ------
+    InvalidRequest : there is none.
+    """
+    numbers = numbers_of_runs(connection, row.number, asked.session, asked.robot)[:: asked.every]
+    if not numbers:
+        whose = "".join(
+            f" of {what} {name!r:.80}"
+            for what, name in (("session", asked.session), ("robot", asked.robot))
+            if name is not None
+        )
+        raise InvalidRequest(
+            f"Map {row.name!r} has no indexed frame{whose}. See GET /v1/maps/{row.name}/sessions.",
+            (("session", "no indexed frame"),) if whose else (),
+        )
+    if len(numbers) <= asked.most:
+        return numbers
+    chosen = np.arange(asked.most) * len(numbers) // asked.most
+    return [numbers[place] for place in chosen.tolist()]
+
+
+class CoverageHandler:
+    """Does the jobs."""
+
+    def __init__(self, store: Store, signers: Signers, queries: Queries) -> None:
+        self._store, self._signers, self._queries = store, signers, queries
+
+    def __call__(self, task: LongJob, until: float) -> SliceResult:
+        """A slice: at least one frame, or the conclusion."""
+        asked = NewMapCoverage.model_validate(task.data)
+        until = min(until, time.monotonic() + SLICE_S)
+        progress = dict(task.progress) or self._begin(task, asked)
+        items: list[dict[str, Any]] = []
+        while progress["done"] < progress["total"]:
+            item = self._item(task.of_map, progress["frames"][progress["done"]], asked)
+            if item is None:
+                progress["skipped"] += 1
+            else:
+                items.append(item)
+            progress["done"] += 1
+            if time.monotonic() >= until:
+                return SliceResult(False, progress, items)
+        return self._conclude(task, asked, progress, items)
+
+    def _begin(self, task: LongJob, asked: NewMapCoverage) -> dict[str, Any]:
+        with self._store.database.read() as connection:
+            row = living_map(connection, task.of_map)
+            numbers = frames_to_query(connection, row, asked)
+        return {
+            "done": 0, "total": len(numbers), "skipped": 0, "frames": numbers,
+            "revision": row.revision,
+        }  # fmt: skip
+
+    def _item(self, row: MapRow, number: int, asked: NewMapCoverage) -> dict[str, Any] | None:
+        """What became of one frame; None where it cannot be queried."""
+        with self._store.database.read() as connection:
+            stop = stops_of(connection, [number]).get(number)
+        if stop is None:
+            return None
+        try:
+            answer = self._answer(row, stop, asked)
+        except _SKIPPED:
+            return None
+        told = outcome_of(answer, stop, asked)
+        with self._store.database.read() as connection:
+            found = [living_frame(connection, row.number, one) for one in told["look_alikes"]]
+        told["look_alikes"] = [frame.number for frame in found if frame is not None]
+        return {"frame": number} | told
+
+    def _answer(self, row: MapRow, stop: PathFrame, asked: NewMapCoverage) -> Answer:
+        """What a robot would be answered that sees what the frame shows, without the frames that
+        are left out. One core does it: the others are for those who wait.
+        """
+        plain = Query(seed=asked.seed, keep=False)
+        taken = QueryOrigin(stop.robot, stop.session, stop.captured_at)
+        left_out_s = asked.not_within_s
+        if asked.other_sessions:  # whole sessions, also of frames without a time
+            taken, left_out_s = replace(taken, captured_at=stop.captured_at or 0.0), _FOREVER_S
+        query = plain
+        if left_out_s > 0 and taken.session is not None and taken.captured_at is not None:
+            query = plain.model_copy(update={"filter": Filter(not_within_s=left_out_s)})
+
+        def ask(rows: list[MapRow]) -> Answer:
+            self._signers(rows[0].model_id)  # while no connection is held
+            ready = prepare_stored(self._store, row.name, stop.id, plain)
+            if ready.frame is None or ready.frame[0] != stop.number:
+                raise UnknownFrame(f"Frame {stop.id} was deleted, and a new frame has its id.")
+            ready = replace(ready, taken=taken)
+            return self._queries.answer(rows, ready, query, Deadline(None))
+
+        return steadily(self._store, [row.name], ask)
+
+    def _conclude(
+        self, task: LongJob, asked: NewMapCoverage, progress: dict[str, Any],
+        items: list[dict[str, Any]],
+    ) -> SliceResult:  # fmt: skip
+        """Plans and counts of all frames; the plans are items behind those of the frames."""
+        with self._store.database.read() as connection:
+            row = living_map(connection, task.of_map)
+            found = items_of(connection, task.job.number) + items
+            plans, cell_m = plans_of(connection, row, found, asked.cell_m)
+            states = count_states(connection, row.number)
+            label = model_label(model_names(connection)[row.model_id], row.model_id)
+        counts = Counter(item["outcome"] for item in found)
+        result = CoverageResult(
+            **{name: counts[name] for name in COVERAGE_OUTCOMES},
+            frames=len(found), skipped=progress["skipped"],
+            unchecked=sum(
+                item["outcome"] == "found" and item["error_m"] is None for item in found
+            ),
+            model=label, revision=progress["revision"], last_revision=row.revision,
+            map_frames=states.get("indexed", 0), cell_m=cell_m,
+        )  # fmt: skip
+        return SliceResult(
+            True, progress, items + [plan.model_dump(mode="json") for plan in plans],
+            result=result.model_dump(mode="json"), event="coverage.measured",
+        )  # fmt: skip
+
+
+# One answer judged.
+
+
+def outcome_of(answer: Answer, stop: PathFrame, asked: NewMapCoverage) -> dict[str, Any]:
+    """What became of a queried frame, as an item; its look-alikes by id.
+
+    Parameters
+    ----------
+    answer : to the frame, without those that are left out
+    stop : the frame, with its own pose where that is known
+    asked : with what counts as right
+    """
+    own = None if stop.pose is None else np.array(stop.pose)
+    there = None if answer.location is None else answer.location.pose
+    off = _difference(there, own, stop.parent)
+    outcome: CoverageOutcome = "not_found"
+    if answer.status == "found":
+        outcome = "found" if off is None or _is_within(off, asked) else "wrong"
+    elif answer.status == "ambiguous":
+        outcome = "ambiguous"
+    poses = [one.pose for one in answer.alternatives]
+    if outcome == "wrong" and there is not None:
+        poses = [there]
+    elsewhere = [
+        pose
+        for pose in poses
+        if (apart := _difference(pose, own, stop.parent)) is None or not _is_within(apart, asked)
+    ]
+    return {
+        "outcome": outcome, "reason": answer.reason, "cause": answer.cause,
+        "parent": stop.parent if own is not None else None,
+        "at": None if own is None else own[:3, 3].tolist(),
+        "error_m": None if off is None else off[0],
+        "error_deg": None if off is None else math.degrees(off[1]),
+        "look_alikes": _look_alikes(answer, elsewhere),
+    }  # fmt: skip
+
+
+def _difference(
+    pose: Transform | None, own: Floats | None, parent: str | None
+) -> tuple[float, float] | None:
+    """Metres and radians between a pose that was found and a frame's own; None where they cannot
+    be compared.
+    """
+    if pose is None or own is None or pose.parent_frame != parent:
+        return None
+    return difference(np.array(pose.matrix), own)
+
+
+def _is_within(off: tuple[float, float], asked: NewMapCoverage) -> bool:
+    return off[0] <= asked.tolerance_m and math.degrees(off[1]) <= asked.tolerance_deg
+
+
+#: How far the pose that a match suggests may be from one that an answer names, metres.
+_SAME_POSE_M = 1.0
+
+
+def _look_alikes(answer: Answer, poses: Sequence[Transform]) -> list[str]:
+    """Of each pose the match that suggests it: ids, each once."""
+    found: list[str] = []
+    for pose in poses:
+        near = [
+            (off[0], one.frame_id)
+            for one in answer.matches
+            if one.pose_in_map is not None
+            and (off := _difference(pose, np.array(one.pose_in_map.matrix),
+                                    one.pose_in_map.parent_frame)) is not None
+            and off[0] <= _SAME_POSE_M
+        ]  # fmt: skip
+        if near:
+            found.append(min(near)[1])
+    return list(dict.fromkeys(found))
+
+
+# All items together: plans.
+
+
+def plans_of(
+    connection: Connection, row: MapRow, items: Sequence[dict[str, Any]], cell_m: float | None
+) -> tuple[list[CoveragePlan], float]:
+    """Plans of the queried frames that have poses, and the width of their cells, metres."""
+    by_parent: dict[str, list[dict[str, Any]]] = {}
+    for item in items:
+        if item["at"] is not None:
+            by_parent.setdefault(item["parent"], []).append(item)
+    names = sorted(by_parent, key=lambda name: (-len(by_parent[name]), name))[:MOST_PLANS]
+    queried = {
+        name: [QueriedPosition(np.array(one["at"]), one["outcome"]) for one in by_parent[name]]
+        for name in names
+    }
+    axes = {
+        name: parent_axes(connection, row, [item["frame"] for item in by_parent[name]])
+        for name in names
+    }
+    return coverage_plans(queried, positions_of_map(connection, row.number), axes, cell_m)

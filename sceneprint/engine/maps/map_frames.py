@@ -48,7 +48,7 @@ from sceneprint_client.api.frames import MOST_SEQUENCE
 from sceneprint_client.api.listing import FrameListing, Run, Session, Trajectory
 from sceneprint_client.api.maps import By, Grown, Growth
 from sceneprint_client.api.results import CloudFrame, FramePatches, FrameSignature, PatchLevel, View
-from sceneprint_client.cdr import is_point_cloud
+from sceneprint_client.files import is_point_cloud
 
 # An indexed frame as it was found, with what its map's model made of it.
 

@@ -13,6 +13,7 @@ import numpy as np
 from sqlalchemy import Connection
 
 from sceneprint.engine.maps.map_frames import Output
+from sceneprint.engine.maps.map_plans import PlanFrame, plan_frame, surface_picture
 from sceneprint.engine.maps.surface_job import (
     PRIORITY,
     SURFACE,
@@ -20,7 +21,6 @@ from sceneprint.engine.maps.surface_job import (
     surface_points,
     tile_cells,
 )
-from sceneprint.engine.maps.surface_picture import PlanFrame, plan_frame, surface_picture
 from sceneprint.engine.serializers import tag_of, when
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import (
@@ -52,7 +52,7 @@ from sceneprint_client.api.surface import (
     SurfaceState,
     SurfaceTile,
 )
-from sceneprint_client.surface_tiles import CELL, SIDE, cell_points
+from sceneprint_client.surface_encoding import CELL, SIDE, cell_points
 
 log = logging.getLogger(__name__)
 

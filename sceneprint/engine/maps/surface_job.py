@@ -19,7 +19,7 @@ import numpy as np
 from sqlalchemy import Connection
 
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
-from sceneprint.engine.maps.plan_axes import parent_axes
+from sceneprint.engine.search.up_vectors import parent_axes
 from sceneprint.engine.serializers import tag_of
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
@@ -49,7 +49,7 @@ from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
 from sceneprint.store.surface_rows import FusedFrame, SurfaceRow, TileRow
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats, Geometry
-from sceneprint_client.surface_tiles import CELL, NO_SESSION, SIDE, STEPS
+from sceneprint_client.surface_encoding import CELL, NO_SESSION, SIDE, STEPS
 
 #: Kind of the jobs, and of the event that tells of their end.
 SURFACE, UPDATED = "surface", "surface.updated"

@@ -46,8 +46,7 @@ from sceneprint_client.api import (
     SeveralQuery,
     Similarity,
 )
-from sceneprint_client.api.options import MOST_MAPS
-from sceneprint_client.api.query import MOST_OF_SEQUENCE, LocalizationStatus
+from sceneprint_client.api.query import MOST_MAPS, MOST_OF_SEQUENCE, LocalizationStatus
 
 # Queries that meet a map's switch to another model: answered wholly with one, or asked again.
 

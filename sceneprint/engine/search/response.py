@@ -1,14 +1,22 @@
-"""Matches as JSON tells them."""
+"""Matches as JSON, and why one frame is, or is not, among them.
+
+Candidates, Validated  --match_records | explain-->  Match | Explanation of each
+frame id, Searched, Validated  --why-->  ExplainedFrame
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from sceneprint.engine.search import retrieval
+from sceneprint.engine.search.up_vectors import known_ups
+from sceneprint.engine.search.verification import NOT_ASKED, Validated, thresholds
 from sceneprint.engine.serializers import sensor_of, transform
+from sceneprint.errors import DamagedBlob, UnknownFrame, UnreadableGeometry
 from sceneprint.geometry.registration.icp import (
     PAIR_METHOD,
     PLACE_METHOD,
@@ -16,21 +24,32 @@ from sceneprint.geometry.registration.icp import (
     Method,
     free_directions,
 )
-from sceneprint.geometry.retrieval.distance import Ranking
-from sceneprint.geometry.retrieval.dpp import Selection
+from sceneprint.geometry.retrieval.distance import Ints64, Ranking, distances, similarity
+from sceneprint.geometry.retrieval.dpp import DUPLICATE, DiversityParameters, Selection, remaining
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.localization import PoseEstimate
-from sceneprint.pipeline import PairMatch
+from sceneprint.models import Model
+from sceneprint.pipeline import PairMatch, validate
+from sceneprint.store import Store
+from sceneprint.store.frames import find_frame
+from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats
 from sceneprint_client.api import Alternative as ToldAlternative
+from sceneprint_client.api import (
+    ExplainedFrame,
+    Explanation,
+    FrameState,
+    Query,
+    Residual,
+    Transform,
+)
 from sceneprint_client.api import Location as ToldLocation
 from sceneprint_client.api import Match as ToldMatch
-from sceneprint_client.api import Residual, Transform
 from sceneprint_client.api import Validation as ToldValidation
 from sceneprint_client.api.base import Vector
-from sceneprint_client.api.matches import FreeDirection, Uncertainty
+from sceneprint_client.api.query import FreeDirection, Lost, Outcome, Stage, Uncertainty
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,3 +244,269 @@ def validation_record(v: PairValidation) -> ToldValidation:
         directions=list(v.directions),
         tilt_deg=None if v.tilt_rad is None else math.degrees(v.tilt_rad),
     )
+
+
+# Why each frame of a ranking came as far as it did.
+#
+# Found, Validated  --explain-->  Explanations
+
+
+def explain(
+    found: Candidates, tried: Validated, among: Ints64 | None, p: DiversityParameters | None
+) -> list[Explanation]:
+    """How far each frame of R came, and why.
+
+    Parameters
+    ----------
+    found : with the rows of all of R
+    tried : what came of the candidates
+    among : (R, R) distances within R; None where diversification was not asked for
+    p : that the selection was made with
+    """
+    left = None
+    if among is not None and len(found.ranking):
+        left = remaining(among, np.asarray(tried.chosen, np.intp), p)
+    told = {match.index: validation_record(match.validation) for match in tried.matches}
+    return list(_each(found, tried, told, among, left))
+
+
+def figures(v: ToldValidation) -> str:
+    """What a validation found, in one line: its reason, and the numbers it rests on."""
+    if v.residual is None:
+        return f"{v.status}: {v.reason}"
+    share = v.free_space_violations
+    violations = "unknown" if share is None else f"{share:.3g}"
+    return (
+        f"{v.status}: {v.reason} (the directions disagree by {v.residual.translation_m:.3g} m, "
+        f"{v.residual.rotation_deg:.3g} deg; overlap {v.overlap:.3g}, by planes "
+        f"{v.plane_overlap:.3g}; violations {violations}; ambiguity "
+        f"{v.ambiguity:.3g})"
+    )
+
+
+def _each(
+    found: Candidates, tried: Validated, told: dict[int, ToldValidation], among: Ints64 | None,
+    left: np.ndarray | None,
+) -> Iterator[Explanation]:  # fmt: skip
+    chosen = set(tried.chosen)
+    for position, number in enumerate(found.ranking.indices.tolist()):
+        if number not in found.rows:  # deleted in the meantime
+            continue
+        stage: Stage = "retrieve"
+        outcome: Outcome = "not_selected"
+        if number in told:
+            stage, outcome = "validate", told[number].status
+            reason = figures(told[number])
+        elif position in chosen:
+            stage = "retrieve" if found.selection is None else "diversify"
+            asked = tried.untried != NOT_ASKED
+            outcome = "skipped" if asked else "ranked"
+            reason = tried.unreadable.get(number, tried.untried)
+        elif among is not None and left is not None:
+            reason = _not_selected(found, tried, among, position, float(left[position]))
+        else:
+            reason = f"not among the first {len(chosen)} of the ranking, which were the candidates"
+        yield Explanation(
+            frame_id=found.rows[number].id,
+            map=found.maps[found.rows[number].map_number],
+            name=found.rows[number].name,
+            rank=position + 1,
+            distance=int(found.ranking.distances[position]),
+            similarity=float(found.ranking.similarities[position]),
+            stage=stage,
+            outcome=outcome,
+            reason=reason,
+        )
+
+
+def _not_selected(
+    found: Candidates, tried: Validated, among: Ints64, position: int, gain: float
+) -> str:
+    """Whom of the selection it is like, and what it would have brought."""
+    own = among[position, list(tried.chosen)]
+    nearest = tried.chosen[int(np.argmin(own))]
+    row = found.rows.get(int(found.ranking.indices[nearest]))
+    name = "a frame deleted since" if row is None else f"frame {row.id}"
+    if gain <= DUPLICATE:
+        return f"a duplicate of the selected {name}"
+    return (
+        f"most similar to the selected {name} (distance {int(own.min())}); it would add a gain "
+        f"of {gain:.2g}"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ExplainedQuery:
+    """A query that was answered, as far as one frame is asked about.
+
+    Parameters
+    ----------
+    store : see Store
+    searched, asked, query, found, tried : of the query
+    model : of the maps
+    deadline : no frame is validated for this after it
+    """
+
+    store: Store
+    searched: retrieval.Searched
+    asked: retrieval.PreparedQuery
+    query: Query
+    found: Candidates
+    tried: Validated
+    model: Model
+    deadline: retrieval.Deadline
+
+
+def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
+    """Where a frame was lost, and what would have come of it.
+
+    Raises
+    ------
+    UnknownFrame : no map that is asked has one of that id.
+    """
+    part, row = _locate_frame(asking, frame_id)
+    absent = _absent(asking, part, row)
+    name = part.place.row.name
+    if absent is not None:
+        return ExplainedFrame(
+            frame_id=row.id, map=name, name=row.name, state=row.state, passes_filter=None,
+            distance=None, similarity=None, rank=None, of=None, shortlisted=None, ranked=None,
+            selected=None, validation=None, transform=None, lost_at=absent[0], reason=absent[1],
+        )  # fmt: skip
+    view, number = part.place.view, np.array([row.number], np.int64)
+    stored = view.signatures(number)
+    distance = distances(asking.asked.vector, stored, view.metric)
+    rank = retrieval.rank_among_all(asking.searched, asking.asked, row.number, int(distance[0]))
+    at = np.flatnonzero(asking.searched.ranking.indices == row.number).tolist()
+    passes = part.among is None or row.number in part.among
+    # an approximate index cannot be asked what it compared: what it should have ranked, it did not
+    missed = not at and passes and not asking.searched.exact and rank <= asking.searched.size
+    selected = bool(at) and at[0] in asking.tried.chosen
+    validation, T = _aligned(asking, part, row)
+    if missed:
+        index = "the index" if view.kind == "local" else "pgvector in the database"
+        lost: Lost | None = "shortlist"
+        reason = f"{index} missed it, although its rank is {rank}; query with `exact`"
+    else:
+        lost, reason = _lost(asking, row, rank, passes, bool(at), selected)
+    early = lost not in (None, "validation")
+    if early and validation is not None and validation.status != "skipped":
+        reason += f"; aligned only for this explanation, it is {figures(validation)}"
+    return ExplainedFrame(
+        frame_id=row.id,
+        map=name,
+        name=row.name,
+        state=row.state,
+        passes_filter=passes,
+        distance=int(distance[0]),
+        similarity=float(similarity(distance, asking.model.unrelated_distance)[0]),
+        rank=rank,
+        of=sum(one.passed for one in asking.searched.parts),
+        shortlisted=not missed,
+        ranked=bool(at),
+        selected=selected,
+        validation=validation,
+        transform=(
+            None if T is None
+            else transform(T, sensor_of(row), asking.found.query_frame)
+        ),
+        lost_at=lost,
+        reason=reason,
+    )  # fmt: skip
+
+
+def _locate_frame(asking: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapSearch, FrameRow]:
+    """The frame, and what is searched of its map: the first that has one which can be found."""
+    parts, own = asking.searched.parts, asking.asked.frame
+    held, missing = [], None
+    with asking.store.queried.read() as connection:
+        for part in parts:
+            try:
+                held.append((part, find_frame(connection, part.place.row, frame_id)))
+            except UnknownFrame as error:
+                missing = error
+    if missing is not None and not held:
+        raise missing
+    # another map may have had one of that id, or have the query itself under it
+    return min(
+        held,
+        key=lambda one: (
+            one[1].state != FrameState.INDEXED,
+            own is not None and one[1].number == own[0],
+        ),
+    )
+
+
+def _absent(
+    asking: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
+) -> tuple[Lost, str] | None:
+    """Why a frame is not searched at all."""
+    view, asked = part.place.view, asking.asked
+    if asked.frame is not None and asked.frame[0] == row.number:
+        return "query", "it is the query itself, which queries exclude"
+    if row.state != FrameState.INDEXED:
+        return "state", f"it is {row.state}: {row.state.sentence}"
+    if row.number in view.damaged:
+        return "state", "its signature is damaged and is being rebuilt from its upload"
+    number = np.array([row.number], np.int64)
+    if not view.has(number)[0]:
+        return "state", "it was indexed during the query. Send the query again"
+    return None
+
+
+def _lost(
+    asking: ExplainedQuery, row: FrameRow, rank: int, passes: bool, ranked: bool, selected: bool
+) -> tuple[Lost | None, str]:
+    """Where, and why in words."""
+    size, tried = len(asking.searched.ranking), asking.tried
+    if not passes:
+        return "filter", "it does not pass the filter"
+    if not ranked:
+        return "ranking", f"its rank is {rank}, and only {size} frames are ranked"
+    if not selected:
+        return "selection", (
+            f"its rank is {rank}, and it is not among the {len(tried.chosen)} candidates; query "
+            "with more `candidates`, or with `explain` to see which candidate it resembles"
+        )
+    status = {match.index: match.validation for match in tried.matches}.get(row.number)
+    if status is not None and status.status == "accepted":
+        return None, f"it is a match, {figures(validation_record(status))}"
+    if status is not None:
+        return "validation", figures(validation_record(status))
+    if "validate" not in asking.query.stages:
+        return None, f"it is a match with rank {rank}; validation was not requested"
+    if row.number in tried.unreadable:
+        return "validation", tried.unreadable[row.number]
+    return "deadline" if tried.late else "turn", tried.untried
+
+
+def _aligned(
+    asking: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
+) -> tuple[ToldValidation | None, np.ndarray | None]:
+    """What aligning the query with a frame comes to, whether or not the query did."""
+    geometry = asking.asked.geometry
+    if geometry is None:
+        return None, None
+    known: dict[int, PairValidation] = {one.index: one.validation for one in asking.tried.matches}
+    made = known.get(row.number)
+    if made is None:
+        if not asking.deadline.allows():
+            return ToldValidation(
+                status="skipped", reason="the deadline passed before it was validated"
+            ), None
+        model_id = part.place.row.model_id
+        with asking.store.queried.read() as connection:
+            blob = geometry_blobs(connection, [row.number], model_id).get(row.number)
+            ranked = asking.searched.ranking.indices.tolist()
+            up = known_ups(connection, [*ranked, row.number]).get(row.number)
+        if blob is None:
+            return ToldValidation(status="skipped", reason="it was deleted during the query"), None
+        try:
+            own = asking.store.geometries.read(blob)
+        except (DamagedBlob, UnreadableGeometry) as error:
+            return ToldValidation(status="skipped", reason=str(error)), None
+        query = asking.query
+        p = asking.model.parameters.validation
+        options = thresholds(query.validation, p)
+        made = validate(geometry, own, query.seed, *options, ups=(asking.asked.up, up))
+    return validation_record(made), made.T_match_query

@@ -20,8 +20,8 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.jobs.map_jobs import MapJobs
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Tasks
-from sceneprint.engine.maps.plan_axes import parent_axes
 from sceneprint.engine.maps.surface_job import cell_width, surface_points
+from sceneprint.engine.search.up_vectors import parent_axes
 from sceneprint.engine.serializers import job_progress, when
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import (
@@ -65,9 +65,9 @@ from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Page
-from sceneprint_client.api import differences as api
-from sceneprint_client.api.differences import Difference, DifferenceResult, NewDifference
-from sceneprint_client.surface_tiles import NO_SESSION
+from sceneprint_client.api import sessions as api
+from sceneprint_client.api.sessions import Difference, DifferenceResult, NewDifference
+from sceneprint_client.surface_encoding import NO_SESSION
 
 #: Kind of the jobs.
 DIFFERENCE = "difference"

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sceneprint.engine.maps.undo import FrameUndo
+from sceneprint.engine.maps.selections import FrameUndo
 from sceneprint.engine.reconstruction import ReconstructionJobs
 from sceneprint.engine.results.kept_answers import KeptAnswers
 from sceneprint.engine.results.stored_results import ResultValidity, StoredResults

@@ -28,6 +28,7 @@ from sceneprint.formats.depth_file import (
     make_frame,
     read_frame,
 )
+from sceneprint_client.poses import SensorTrajectory, interpolate
 from sceneprint_client.sidecars import (
     Camera,
     CloudSource,
@@ -37,7 +38,6 @@ from sceneprint_client.sidecars import (
     read_pose,
     rigid_transform,
 )
-from sceneprint_client.trajectories import SensorTrajectory, interpolate
 
 __all__ = [
     "Camera",

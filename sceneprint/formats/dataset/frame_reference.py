@@ -14,11 +14,10 @@ from sceneprint.errors import DatasetError, InvalidPose, UnreadableCloud, naming
 from sceneprint.formats.depth_file import decode_frame
 from sceneprint.formats.points import SUFFIXES, Scan, decode_scan
 from sceneprint.types import AnyFrame, DepthFrame, Floats
-from sceneprint_client.file_formats import MAXIMUM_CLOUD_BYTES
-from sceneprint_client.files import data_lines, read_bytes, read_text
+from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, data_lines, read_bytes, read_text
 from sceneprint_client.frame_files import FrameFile
+from sceneprint_client.poses import SensorTrajectory
 from sceneprint_client.sidecars import CloudSource
-from sceneprint_client.trajectories import SensorTrajectory
 
 _TOLERANCE = 1e-2  #: how far a written quaternion may be from a true one
 _MAXIMUM_TRAJECTORY_BYTES = 2**26  # an hour at 200 Hz

@@ -29,10 +29,9 @@ from sceneprint.formats.dataset.frame_reference import (
     read_trajectory,
 )
 from sceneprint.types import Floats, Floats32
-from sceneprint_client.file_formats import RECORDING_SUFFIXES, is_cloud
-from sceneprint_client.files import data_lines, read_text
+from sceneprint_client.files import RECORDING_SUFFIXES, data_lines, is_cloud, read_text
 from sceneprint_client.frame_files import SEVEN_SCENES, find_frame_file, seven_scenes_number
-from sceneprint_client.rotations import quaternion_of
+from sceneprint_client.poses import interpolate, quaternion_of
 from sceneprint_client.sidecars import (
     CLOUDS_FILE,
     INTRINSICS_FILE,
@@ -41,7 +40,6 @@ from sceneprint_client.sidecars import (
     find_cloud_source,
     rigid_transform,
 )
-from sceneprint_client.trajectories import interpolate
 
 if TYPE_CHECKING:
     from sceneprint.formats.recording import RecordingOptions

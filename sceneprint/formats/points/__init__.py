@@ -8,7 +8,7 @@ from sceneprint.formats.points.cloud import (
     decode_cloud,
     decode_scan,
 )
-from sceneprint_client.file_formats import SUFFIXES, format_of
+from sceneprint_client.files import SUFFIXES, format_of
 from sceneprint_client.sidecars import UNSAID, Unsaid
 
 __all__ = [

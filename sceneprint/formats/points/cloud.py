@@ -23,8 +23,13 @@ from sceneprint.formats.points.rows import FilePoints, check_count, steps
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Cloud, Floats, Floats32
 from sceneprint_client.api.frames import CloudFormat
-from sceneprint_client.cdr import read_point_cloud
-from sceneprint_client.file_formats import MAXIMUM_CLOUD_BYTES, NPY_SIGNATURE, format_of, npy_header
+from sceneprint_client.files import (
+    MAXIMUM_CLOUD_BYTES,
+    NPY_SIGNATURE,
+    format_of,
+    npy_header,
+    read_point_cloud,
+)
 from sceneprint_client.ros_messages import cloud_blocks, cloud_table
 from sceneprint_client.sidecars import UNSAID, Position, Unsaid, rigid_transform
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sceneprint.errors import MissingDependency, UnreadableCloud
 from sceneprint.formats.points.rows import FilePoints, check_count, steps
 from sceneprint.types import Floats
-from sceneprint_client.file_formats import LAS_SIGNATURE
+from sceneprint_client.files import LAS_SIGNATURE
 
 # The compressed points of LAZ files, by lazrs (Rust), which is an extra.
 #

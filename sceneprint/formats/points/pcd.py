@@ -24,7 +24,7 @@ from sceneprint.formats.points.rows import (
 )
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Bytes, Floats
-from sceneprint_client.file_formats import is_pcd
+from sceneprint_client.files import is_pcd
 from sceneprint_client.sidecars import Position
 
 # LZF, which binary_compressed PCD files are packed with (M. Lehmann's liblzf 3.6).

@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.errors import DatasetError, MissingDependency, SceneprintError, naming
-from sceneprint_client.accelerations import Accelerations
 from sceneprint_client.errors import printable
-from sceneprint_client.file_formats import RECORDING_SUFFIXES
+from sceneprint_client.files import RECORDING_SUFFIXES
+from sceneprint_client.poses import MOST_SAMPLES, Accelerations, TransformTree, frame_name
 from sceneprint_client.ros_messages import (
     is_calibrated,
     pose_row,
@@ -31,7 +31,6 @@ from sceneprint_client.ros_messages import (
     transform_row,
     vector_row,
 )
-from sceneprint_client.transform_tree import MOST_SAMPLES, TransformTree, frame_name
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection

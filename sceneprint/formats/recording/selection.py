@@ -45,6 +45,7 @@ from sceneprint.types import Floats
 from sceneprint_client.api.base import checked
 from sceneprint_client.api.frames import GivenBase
 from sceneprint_client.errors import printable
+from sceneprint_client.poses import frame_name
 from sceneprint_client.ros_messages import (
     DEPTH_SCALE,
     camera_intrinsics,
@@ -56,7 +57,6 @@ from sceneprint_client.ros_messages import (
     topic_without_transport,
 )
 from sceneprint_client.sidecars import Camera, CloudSource, find_camera
-from sceneprint_client.transform_tree import frame_name
 
 # Which frames are taken: far enough from the last one, or long enough after it.
 

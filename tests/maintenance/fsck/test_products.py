@@ -19,7 +19,7 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.queue import JobFile, add_files, files_of, find_job
 from sceneprint.store.surface_rows import add_surface, find_surface, tiles_to_rebuild, write_tile
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, NewMap
-from sceneprint_client.api.selections import RestoreOptions
+from sceneprint_client.api.listing import RestoreOptions
 
 
 @pytest.fixture

@@ -1,5 +1,5 @@
 // A parent frame seen from above: which way is up, and where a point of it lies on the plan.
-// As the service has it (sceneprint/engine/maps/plan_axes.py), so that pictures of both agree.
+// As the service has it (sceneprint/engine/search/up_vectors.py), so that pictures of both agree.
 import { cross, dot } from "../viewer/matrix.js";
 
 /** Half an axis of the ellipse that holds 95 % of a normal error in a plane, in deviations. */
