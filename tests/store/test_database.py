@@ -30,6 +30,7 @@ TABLES = [
     "frames", "idempotency", "job_files", "job_items", "jobs", "kept_answer_frames",
     "kept_answer_maps", "kept_answers", "keys", "maps", "models", "query_records", "samples",
     "secrets", "signatures", "surface_frames", "surface_tiles", "surface_touches", "surfaces",
+    "tenants",
 ]  # fmt: skip
 
 
