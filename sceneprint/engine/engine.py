@@ -243,10 +243,10 @@ class Engine:
 
     def create_key(
         self, name: str, grants: Mapping[str, Scope] | None = None,
-        expires_at: datetime | None = None,
+        expires_at: datetime | None = None, tenant: str | None = None,
     ) -> MadeKey:  # fmt: skip
         """Make a key, and show its secret; see `operations.create_key`."""
-        return operations.create_key(self.store, name, grants, expires_at)
+        return operations.create_key(self.store, name, grants, expires_at, tenant)
 
     def revoke_key(self, name: str) -> None:
         """Let a key open nothing any more, and remove the records of its queries; UnknownKey."""
