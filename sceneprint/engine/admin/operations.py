@@ -19,9 +19,8 @@ from sceneprint.engine.maps.model_catalogue import Catalogue
 from sceneprint.engine.serializers import when
 from sceneprint.errors import InvalidRequest, SceneprintError
 from sceneprint.settings import Settings
-from sceneprint.store import Database, Store
+from sceneprint.store import Database, Store, tenants
 from sceneprint.store import keys as stored
-from sceneprint.store import tenants
 from sceneprint.store.deletion import remove_in_blocks
 from sceneprint.store.events import (
     EventRow,
