@@ -78,10 +78,8 @@ class RequestMiddleware:
         body = RequestBody(receive, self._limit(scope), self._body_s)
         at_answer: list[Callable[[], None]] = []
         at_end: list[Callable[[], None]] = [body.close]
-        state.update(
-            request_id=request_id, headers=own, forwarded=forwarded(headers), body=body,
-            at_answer=at_answer, at_end=at_end,
-        )  # fmt: skip
+        state.update(request_id=request_id, headers=own, forwarded=forwarded(headers))
+        state.update(body=body, at_answer=at_answer, at_end=at_end)
         status, start = 0, time.perf_counter()
 
         async def answered(message: Message) -> None:
@@ -119,8 +117,7 @@ class RequestMiddleware:
             raise
         finally:
             self._at_once -= 1
-            _call(at_answer)
-            _call(at_end)
+            _call(at_answer + at_end)
         if body.fault is not None and status == 0:
             fault, body.fault = body.fault, None
             await _refusal(request_id, fault)(scope, receive, answered)
