@@ -359,7 +359,7 @@ def _first_of_few(connection: Connection, *due: ColumnElement[bool]) -> _Place |
     return min((_place(row, _latest(row.served, row.kept)) for row in rows), default=None)
 
 
-def _place(row: Row[Any], turn: int) -> _Place:
+def _place(row: Row[*tuple[Any, ...]], turn: int) -> _Place:
     return _Place(
         _is_upkeep(row.tenant, row.priority), turn, row.tenant, -row.priority, row.attempts,
         row.number,
