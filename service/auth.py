@@ -167,7 +167,8 @@ async def _admit(request: Request, here: Context, tenant: str) -> None:
     request.state.at_end.append(request.state.place)
     if not is_import(request.scope):  # which is written where it stays
         length = request.headers.get("content-length", "")
-        here.spool.require_room(tenant, int(length) if length.isdigit() else 0)
+        known = length.isascii() and length.isdigit()
+        here.spool.require_room(tenant, int(length) if known else 0)
         request.state.body.charge(here.spool, tenant)
     endpoint = getattr(request.scope.get("route"), "endpoint", None)
     if not iscoroutinefunction(endpoint):
