@@ -24,7 +24,7 @@ help:
 	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
 	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
 	@echo "make soak    200 kills, and a crowd of writers and readers; rewrites its part of docs/reliability.md"
-	@echo "make siege   broken uploads, every operation fuzzed, ten times too many requests; likewise"
+	@echo "make siege   broken uploads, fuzzing, ten times too many requests, noisy neighbours; likewise"
 	@echo "make fleet   robots, services, workers and PostgreSQL with a standby, parts killed; likewise"
 	@echo "make models  train the presets that ship with the package (minutes)"
 	@echo "make lock    resolve the dependencies anew into requirements.txt"

@@ -11,6 +11,7 @@ They are the same classes: `except sceneprint.errors.UnknownMap` catches what a 
 """
 
 from sceneprint_client.errors import (
+    AmbiguousKey,
     Busy,
     CannotRetry,
     Conflict,
@@ -59,6 +60,7 @@ from sceneprint_client.errors import (
     UnknownQuery,
     UnknownSession,
     UnknownSnapshot,
+    UnknownTenant,
     Unreachable,
     UnreadableArchive,
     UnreadableCloud,
@@ -73,6 +75,7 @@ from sceneprint_client.errors import (
 )
 
 __all__ = [
+    "AmbiguousKey",
     "Busy",
     "BusyIndex",
     "CannotRetry",
@@ -125,6 +128,7 @@ __all__ = [
     "UnknownQuery",
     "UnknownSession",
     "UnknownSnapshot",
+    "UnknownTenant",
     "Unreachable",
     "UnreadableArchive",
     "UnreadableCloud",

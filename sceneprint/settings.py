@@ -80,7 +80,7 @@ class Settings(BaseSettings):
     body_s: float = Field(default=30.0, ge=1, le=3600)
     #: Ask callers for a key on a loopback address as well, as behind a proxy.
     require_keys: bool = False
-    #: Requests a second of each key, over five seconds; 0 for no limit.
+    #: Requests a second of each tenant, weighted by work, over five seconds; 0 for no limit.
     requests_per_s: float = Field(default=200.0, ge=0, le=1e6)
     #: Wrong keys a minute from each address; 0 for no limit.
     failed_keys_per_minute: float = Field(default=60.0, ge=0, le=1e6)

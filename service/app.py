@@ -44,8 +44,9 @@ from sceneprint_client.api.sessions import NewAssociation, NewDifference
 from sceneprint_client.api.surface import NewReconstruction
 from service import api_docs, dashboard, problems
 from service.browser_security import origins_of
-from service.context import Context, Gate
+from service.context import Context
 from service.event_stream import Feed
+from service.gate import Gate
 from service.metrics import Metrics, housekeeping
 from service.middleware import RequestMiddleware
 from service.rate_limits import RateLimits
@@ -181,11 +182,15 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
             gate = Gate(settings.concurrency, settings.waiting, settings.wait_s)
             # they mostly wait for the disk: the engine sees to how many are decoded at once
             uploads = Gate(max(UPLOADS, settings.concurrency), settings.waiting, settings.wait_s)
+            places = settings.concurrency + settings.waiting
+            # more than the requests of one tenant hold, so that others find a thread
+            to_thread.current_default_thread_limiter().total_tokens += places
             feed = Feed(engine.store.database, settings.event_streams, settings.events_kept)
             limits = RateLimits(settings.requests_per_s, settings.failed_keys_per_minute)
             app.state.context = Context(
-                engine, gate, uploads, figures, settings.asks_for_keys, feed=feed, limits=limits
-            )
+                engine, gate, uploads, figures, settings.asks_for_keys, feed=feed, limits=limits,
+                places=places, wait_s=settings.wait_s,
+            )  # fmt: skip
             loading = warming(engine) if warm else nullcontext()
             async with housekeeping(engine, figures.sampler), loading:
                 yield

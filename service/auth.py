@@ -8,10 +8,13 @@ What a caller may not read is not there: the same answer, word for word, as wher
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import partial
+from inspect import iscoroutinefunction
 from typing import Annotated
 
 from anyio import to_thread
@@ -21,10 +24,19 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from sceneprint.errors import Forbidden, KeyRequired
 from sceneprint.store.maps import unknown_map
 from sceneprint.store.queue import unknown_job
+from sceneprint.store.tenants import NOBODY, set_tenant
 from sceneprint_client.api import Job
 from sceneprint_client.api.admin import EVERY, Scope, allows
-from service.context import Here
-from service.rate_limits import enforce_rate_limit, network_of
+from service.body_limits import is_import
+from service.context import Context, Here
+from service.gate import share, take_turn, too_many_requests
+from service.rate_limits import (
+    ROWS_PER_COST,
+    enforce_rate_limit,
+    network_of,
+    page_rows,
+    request_cost,
+)
 
 _bearer = HTTPBearer(auto_error=False, description="A key made by `sceneprint keys`.")
 
@@ -39,6 +51,7 @@ class Caller:
     grants : scope by name of a map, `*` for all
     expires_at : of the key, seconds since 1970; None: never
     key_id : of the key; None where none is asked for
+    tenant : of the key; NOBODY where none is asked for
     changed : maps of which more than reading was asked, for the audit log
     """
 
@@ -46,6 +59,7 @@ class Caller:
     grants: Mapping[str, Scope]
     expires_at: float | None = None
     key_id: str | None = None
+    tenant: str = NOBODY
     changed: set[str] = field(default_factory=set, compare=False)
 
     def may(self, scope: Scope, map_name: str = EVERY) -> bool:
@@ -124,6 +138,7 @@ async def caller(
     Raises
     ------
     KeyRequired : none was shown, or an unknown one, or one that has expired.
+    RateLimited, Busy : its tenant asks too often, or too much at once.
     """
     if not requires_key(request, here):
         found = anybody()
@@ -131,15 +146,57 @@ async def caller(
         return found
     if given is None:
         raise KeyRequired(_why(request, here))
-    key = await to_thread.run_sync(here.engine.find_key, given.credentials)
+    key = await to_thread.run_sync(here.engine.find_key, given.credentials, limiter=here.lookups)
     if key is None or (key.expires_at is not None and key.expires_at <= time.time()):
         enforce_rate_limit(request, here.limits.failed_keys, network_of(address_of(request)))
         raise KeyRequired(_why(request, here) if key is None else _EXPIRED)
     request.state.caller = key.name
-    found = Caller(key.name, key.grants, key.expires_at, key.id)
+    found = Caller(key.name, key.grants, key.expires_at, key.id, key.tenant)
     request.state.changed = found.changed
-    enforce_rate_limit(request, here.limits.requests, key.name)
+    await _admit(request, here, key.tenant)
     return found
+
+
+async def _admit(request: Request, here: Context, tenant: str) -> None:
+    """Count a request for its tenant, before its body is read, until it is answered."""
+    set_tenant(tenant)
+    enforce_rate_limit(request, here.limits.requests, tenant, request_cost(request))
+    if not here.requests.take(tenant, 1, here.places):
+        raise too_many_requests(share(here.places))
+    request.state.place = partial(here.requests.give, tenant, 1)
+    request.state.at_end.append(request.state.place)
+    if not is_import(request.scope):  # which is written where it stays
+        length = request.headers.get("content-length", "")
+        known = length.isascii() and length.isdigit()
+        here.spool.require_room(tenant, int(length) if known else 0)
+        request.state.body.charge(here.spool, tenant)
+    endpoint = getattr(request.scope.get("route"), "endpoint", None)
+    if not iscoroutinefunction(endpoint):
+        await hold_read(request, here, tenant)
+
+
+def release_place(request: Request) -> None:
+    """Count a request no more as one in progress: it goes on for as long as somebody listens."""
+    place = getattr(request.state, "place", None)
+    if place is not None:
+        request.state.at_end.remove(place)
+        place()
+
+
+async def hold_read(request: Request, here: Context, tenant: str) -> None:
+    """Wait for a turn of the shared threads, held until the answer begins; Busy.
+
+    Parameters
+    ----------
+    request : a page of many rows takes several turns
+    here : of the service
+    tenant : that asks; where no key is asked for there is nobody to share with
+    """
+    if tenant == NOBODY:
+        return
+    weight = max(math.ceil(page_rows(request) / ROWS_PER_COST), 1)
+    held = await take_turn(here.reads, tenant, here.wait_s, weight)
+    request.state.at_answer.append(partial(here.reads.release, tenant, held))
 
 
 def v1_router(

@@ -40,6 +40,7 @@ from sceneprint_client.api.frames import (
 )
 from sceneprint_client.files import HEAD, format_of
 from service.auth import Caller
+from service.body_limits import IN_MEMORY
 from service.problems import invalid
 
 _Record = TypeVar("_Record", bound=BaseModel)
@@ -54,8 +55,6 @@ TYPES = (
     "image/png", "application/x-npy", "application/ply", "application/x-ros-pointcloud2",
     "application/octet-stream",
 )  # fmt: skip
-#: Bytes of a body that are kept in memory until they are read; the rest waits on disk.
-_IN_MEMORY = 1 << 20
 
 _CAMERA = ("fx", "fy", "cx", "cy", "width", "height", "distortion")
 _PLAIN = (
@@ -137,7 +136,7 @@ async def received(
     StoreFull, UnusableStore : the machine cannot keep the body until it is read.
     """
     given = query_parameters(request, ("meta", *_CAMERA, *_PLAIN, *_OTHERS, *fields))
-    spooled = tempfile.SpooledTemporaryFile(max_size=_IN_MEMORY)  # noqa: SIM115  (the caller's)
+    spooled = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY)  # noqa: SIM115  (the caller's)
     file = UploadFile(cast(BinaryIO, spooled), size=0)
     try:
         try:

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import math
+import os
+import re
+import tempfile
 import time
 
-from starlette.types import Message, Receive
+from starlette.types import Message, Receive, Scope
 
-from sceneprint.errors import SceneprintError, SlowBody, TooLarge
+from sceneprint.errors import RateLimited, SceneprintError, SlowBody, TooLarge
+from service.gate import Holdings, share
 
 #: Longest silence within a body, seconds.
 IDLE_S = 10.0
@@ -15,8 +20,49 @@ IDLE_S = 10.0
 S_PER_MIB = 4.0
 
 
+_IMPORTS = re.compile(r"/v1/maps/[^/]+/imports")
+#: Bytes of a body that are kept in memory until they are read; the rest waits on disk. Also
+#: those by which tenants are charged for that.
+IN_MEMORY = 1 << 20
+
+
 class Broken(Exception):
     """Stops the reading of a body; nobody but `RequestMiddleware` sees it."""
+
+
+class Spool:
+    """The temporary folder, where bodies wait to be read, and what each tenant holds of it."""
+
+    def __init__(self) -> None:
+        self._held = Holdings()
+
+    def require_room(self, tenant: str, size: int) -> None:
+        """See that a tenant may have a body of so many bytes here; RateLimited."""
+        if size > IN_MEMORY and not self._held.allows(tenant, size - IN_MEMORY, self._room()):
+            raise self._full(self._room())
+
+    def take(self, tenant: str, size: int) -> None:
+        """Charge a tenant for bytes that are about to be written; RateLimited beyond its share."""
+        room = self._room()
+        if not self._held.take(tenant, size, room):
+            raise self._full(room)
+
+    def give(self, tenant: str, size: int) -> None:
+        """Take them off its account: they are removed."""
+        self._held.give(tenant, size)
+
+    def _room(self) -> int:
+        """Bytes that all bodies together may have."""
+        found = os.statvfs(tempfile.gettempdir())
+        return found.f_bavail * found.f_frsize + self._held.total
+
+    @staticmethod
+    def _full(room: int) -> RateLimited:
+        return RateLimited(
+            f"Bodies of this key's tenant would take more than {share(room) >> 20} MiB of the "
+            "service's temporary folder, which is its share. Wait for their answers, or send "
+            "smaller bodies."
+        )
 
 
 class RequestBody:
@@ -37,6 +83,18 @@ class RequestBody:
         self._waited_s, self._bytes, self._whole = 0.0, 0, False
         #: Why no more of it is read.
         self.fault: SceneprintError | None = None
+        self._spool: Spool | None = None
+        self._tenant, self._charged = "", 0
+
+    def charge(self, spool: Spool, tenant: str) -> None:
+        """Charge a tenant for what is written of it to disk, before it is."""
+        self._spool, self._tenant = spool, tenant
+
+    def close(self) -> None:
+        """Give back what it took: it was read, or is read no more."""
+        if self._spool is not None and self._charged:
+            self._spool.give(self._tenant, self._charged)
+            self._charged = 0
 
     @property
     def received(self) -> int:
@@ -66,7 +124,20 @@ class RequestBody:
         if self._bytes > self._most:
             self.fault = too_large(self._most)
             raise Broken
+        if self._spool is not None:
+            self._pay(self._spool)
         return message
+
+    def _pay(self, spool: Spool) -> None:
+        more = IN_MEMORY * math.ceil(self._bytes / IN_MEMORY - 1) - self._charged
+        if more <= 0:
+            return
+        try:
+            spool.take(self._tenant, more)
+        except RateLimited as error:
+            self.fault = error
+            raise Broken from None
+        self._charged += more
 
     def _slow(self, left: float) -> SlowBody:
         why = (
@@ -77,6 +148,11 @@ class RequestBody:
             f"{self._body_s:g} s plus {S_PER_MIB:g} s for each MiB. Send less at once, or use a "
             "faster link."
         )
+
+
+def is_import(scope: Scope) -> bool:
+    """Whether the body of a request is an archive, which is written where it stays."""
+    return scope["method"] == "POST" and _IMPORTS.fullmatch(scope["path"]) is not None
 
 
 def too_large(most: int) -> TooLarge:

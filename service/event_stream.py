@@ -22,11 +22,13 @@ from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
 from sceneprint.engine.admin.operations import begin, missed, next_events
-from sceneprint.errors import Busy, SceneprintError
+from sceneprint.errors import Busy, RateLimited, SceneprintError
 from sceneprint.store import Database
 from sceneprint.store.events import EventRow, Wanted, list_events, newest_number
+from sceneprint.store.tenants import NOBODY
 from sceneprint_client.api.admin import Event
 from service.body_limits import Broken
+from service.gate import Holdings, share
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +52,7 @@ class Feed:
 
     def __init__(self, database: Database, most: int, kept: int) -> None:
         self._database, self._most, self._kept = database, most, kept
-        self._streams = 0
+        self._streams = Holdings()
         self._closed = False
         self._poller: asyncio.Task[None] | None = None
         self._held: deque[EventRow] = deque()
@@ -66,26 +68,31 @@ class Feed:
     @property
     def streams(self) -> int:
         """How many there are."""
-        return self._streams
+        return self._streams.total
 
-    def join(self) -> None:
+    def join(self, tenant: str = NOBODY) -> None:
         """Take a place, to be given back by `leave`.
 
         Raises
         ------
         Busy : as many listen as may.
+        RateLimited : as many of the tenant do.
         """
-        if self._closed or self._streams >= self._most:
+        if self._closed or self._streams.total >= self._most:
             raise Busy(
                 "The service has reached its limit of open event streams. Close one, request a "
                 "page of events instead, or retry later."
             )
-        self._streams += 1
+        if not self._streams.take(tenant, 1, self._most):
+            raise RateLimited(
+                f"{share(self._most)} event streams of this key's tenant are open, which is the "
+                "limit. Close one, or request a page of events instead."
+            )
 
-    def leave(self) -> None:
+    def leave(self, tenant: str = NOBODY) -> None:
         """Give the place back; the last one who leaves stops the poller."""
-        self._streams -= 1
-        if self._streams == 0 and self._poller is not None:
+        self._streams.give(tenant, 1)
+        if self._streams.total == 0 and self._poller is not None:
             self._poller.cancel()
             self._poller = None
             self._since = None

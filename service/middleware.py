@@ -6,17 +6,18 @@ import logging
 import re
 import time
 import uuid
-from collections import Counter
+from collections.abc import Callable
 
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from sceneprint.errors import Busy, RateLimited, SceneprintError
+from sceneprint.errors import AmbiguousKey, Busy, SceneprintError
 from sceneprint.process import name_request
 from sceneprint.settings import Settings
+from sceneprint.store.tenants import NOBODY, set_tenant
 from service.audit import note
-from service.body_limits import Broken, RequestBody, too_large
+from service.body_limits import Broken, RequestBody, is_import, too_large
 from service.browser_security import (
     Headers,
     Origins,
@@ -33,8 +34,6 @@ from service.rate_limits import RateState
 log = logging.getLogger(__name__)
 
 _ID = re.compile(rb"[\w.-]{1,64}")
-#: Requests whose body is an archive.
-_IMPORTS = re.compile(r"/v1/maps/[^/]+/imports")
 #: What is counted by its name: a caller may invent others without end.
 _METHODS = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"))
 #: As noted where the caller hung up before there was an answer.
@@ -62,9 +61,6 @@ class RequestMiddleware:
         self._most_of_import = settings.import_bytes
         self._alone = not settings.asks_for_keys
         self._at_once = 0
-        # a caller that holds its bodies back must not take every place in the gates
-        self._most_of_key = max(3 * (settings.concurrency + settings.waiting) // 4, 1)
-        self._of_key: Counter[bytes] = Counter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One request."""
@@ -75,11 +71,15 @@ class RequestMiddleware:
         given = headers.get(b"x-request-id", b"")
         request_id = given.decode() if _ID.fullmatch(given) else uuid.uuid4().hex
         name_request(request_id)
+        set_tenant(NOBODY)  # until its key is known: see `auth.caller`
         own: Headers = [(b"x-request-id", request_id.encode())]
         own += self._origins.headers(headers.get(b"origin"))
         state = scope.setdefault("state", {})
-        state.update(request_id=request_id, headers=own, forwarded=forwarded(headers))
         body = RequestBody(receive, self._limit(scope), self._body_s)
+        at_answer: list[Callable[[], None]] = []
+        at_end: list[Callable[[], None]] = [body.close]
+        state.update(request_id=request_id, headers=own, forwarded=forwarded(headers))
+        state.update(body=body, at_answer=at_answer, at_end=at_end)
         status, start = 0, time.perf_counter()
 
         async def answered(message: Message) -> None:
@@ -96,11 +96,10 @@ class RequestMiddleware:
                 ]
                 message["headers"] = said + security_headers(said)
                 await note(scope, status, said)
+                _call(at_answer)
             await send(message)
 
-        key = b"" if self._alone else _key_of(headers)
         self._at_once += 1
-        self._of_key[key] += 1
         try:
             early = self._early(scope, headers)
             if isinstance(early, SceneprintError):
@@ -118,9 +117,7 @@ class RequestMiddleware:
             raise
         finally:
             self._at_once -= 1
-            self._of_key[key] -= 1
-            if not self._of_key[key]:
-                del self._of_key[key]  # who makes keys up must not fill the memory
+            _call(at_answer + at_end)
         if body.fault is not None and status == 0:
             fault, body.fault = body.fault, None
             await _refusal(request_id, fault)(scope, receive, answered)
@@ -142,11 +139,10 @@ class RequestMiddleware:
             return Busy(
                 "The service has reached its limit of concurrent requests. Retry in a second."
             )
-        key = b"" if self._alone else _key_of(headers)
-        if key and self._of_key[key] > self._most_of_key:
-            return RateLimited(
-                f"{self._most_of_key} requests with this key are in progress, which is the "
-                "limit. Wait for their answers."
+        if sum(name == b"authorization" for name, _ in scope["headers"]) > 1:
+            return AmbiguousKey(
+                "The request has more than one Authorization header, so it is not clear whose it "
+                "is. Send one."
             )
         most = self._limit(scope)
         if length.isdigit() and (len(length) > 18 or int(length) > most):
@@ -155,8 +151,7 @@ class RequestMiddleware:
 
     def _limit(self, scope: Scope) -> int:
         """Most bytes of the body: whole archives go to disk as they come."""
-        is_import = scope["method"] == "POST" and _IMPORTS.fullmatch(scope["path"])
-        return self._most_of_import if is_import else self._most
+        return self._most_of_import if is_import(scope) else self._most
 
     def _note(
         self, scope: Scope, request_id: str, status: int, seconds: float, received: int
@@ -198,9 +193,10 @@ class RequestMiddleware:
         )
 
 
-def _key_of(headers: dict[bytes, bytes]) -> bytes:
-    """The key that is shown, be it one or not; however its scheme is written."""
-    return headers.get(b"authorization", b"").partition(b" ")[2].strip()
+def _call(whats: list[Callable[[], None]]) -> None:
+    """Call each, once."""
+    while whats:
+        whats.pop()()
 
 
 def _refusal(request_id: str, error: SceneprintError) -> Response:

@@ -30,6 +30,7 @@ STATUSES: dict[type[errors.SceneprintError], int] = {
     errors.UnsupportedType: 415,
     errors.TooLarge: 413,
     errors.SlowBody: 408,
+    errors.AmbiguousKey: 400,
     errors.PreconditionFailed: 412,
     errors.KeyRequired: 401,
     errors.Forbidden: 403,
@@ -114,7 +115,7 @@ def declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"description": phrase(status), "content": content}
-        for status in (*statuses, 401, 403, 408, 421, 429, 500, 503, 507)
+        for status in (*statuses, 400, 401, 403, 408, 421, 429, 500, 503, 507)
     }
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ipaddress
 import math
+import re
 import threading
 import time
 from collections import OrderedDict
@@ -17,6 +18,13 @@ from dataclasses import dataclass
 from starlette.requests import Request
 
 from sceneprint.errors import RateLimited
+from sceneprint_client.api import Page
+
+#: Requests that a query counts for, and rows of a list that count for one more.
+QUERY_COST, ROWS_PER_COST = 5.0, 50
+#: Rows of a list that is asked for without a limit.
+_USUAL_ROWS = 100
+_QUERIES = re.compile(r"/(queries|localize|localize/sequence|similarity)$")
 
 
 @dataclass(frozen=True)
@@ -69,16 +77,17 @@ class TokenBucket:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def take(self, caller: str) -> RateState | None:
-        """Take a token, if there is one; None where nothing is limited."""
+    def take(self, caller: str, cost: float = 1.0) -> RateState | None:
+        """Take so many tokens, if they are there; None where nothing is limited."""
         if self._per_s <= 0:
             return None
         with self._lock:
             now = self._clock()
             tokens, seen = self._buckets.pop(caller, (self._burst, now))
             tokens = min(tokens + (now - seen) * self._per_s, self._burst)
-            allowed = tokens >= 1
-            tokens -= allowed
+            cost = min(cost, self._burst)
+            allowed = tokens >= cost
+            tokens -= cost * allowed
             self._buckets[caller] = (tokens, now)
             if len(self._buckets) > self._most:
                 self._buckets.popitem(last=False)
@@ -87,7 +96,7 @@ class TokenBucket:
             int(self._burst),
             math.ceil(self._burst / self._per_s),
             int(tokens),
-            math.ceil((1 - tokens % 1) / self._per_s),
+            math.ceil(((1 - tokens % 1) if allowed else (cost - tokens)) / self._per_s),
             allowed,
         )
 
@@ -105,7 +114,7 @@ class RateLimits:
 
     Parameters
     ----------
-    requests_per_s : of each key; it may make those of five seconds at once
+    requests_per_s : of each tenant; it may make those of five seconds at once
     failed_per_minute : wrong keys from each address
     """
 
@@ -114,9 +123,27 @@ class RateLimits:
         self.failed_keys = TokenBucket("wrong-keys", failed_per_minute / 60, failed_per_minute)
 
 
-def enforce_rate_limit(request: Request, bucket: TokenBucket, whose: str) -> None:
+def page_rows(request: Request) -> int:
+    """Rows that a request asks for; 0 where its answer is no page."""
+    model = getattr(request.scope.get("route"), "response_model", None)
+    if not (isinstance(model, type) and issubclass(model, Page)):
+        return 0
+    given = request.query_params.get("limit", "")
+    return int(given) if re.fullmatch(r"[0-9]{1,4}", given, re.ASCII) else _USUAL_ROWS
+
+
+def request_cost(request: Request) -> float:
+    """What a request counts for: 1, a query more, and a list by the rows that it asks for."""
+    if request.method == "POST" and _QUERIES.search(request.url.path):
+        return QUERY_COST
+    return 1 + page_rows(request) / ROWS_PER_COST
+
+
+def enforce_rate_limit(
+    request: Request, bucket: TokenBucket, whose: str, cost: float = 1.0
+) -> None:
     """Count a request, before its body is read; RateLimited where there are too many."""
-    state = bucket.take(whose)
+    state = bucket.take(whose, cost)
     request.state.rate = state
     if state is not None and not state.allowed:
         raise RateLimited(

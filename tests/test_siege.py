@@ -8,9 +8,23 @@ from pathlib import Path
 import pytest
 
 from benchmarks.pages import put_between
-from benchmarks.siege.__main__ import ASKED_OF, BEGIN, END, besieged, known_of, table
+from benchmarks.siege.__main__ import (
+    ASKED_OF,
+    BEGIN,
+    END,
+    besieged,
+    known_of,
+    neighbours,
+    table,
+)
 from benchmarks.siege.contract import ContractFigures, try_contract
 from benchmarks.siege.mutations import MutationFigures, besiege, mutated
+from benchmarks.siege.neighbours import (
+    ATTACKS,
+    NeighbourFigures,
+    VictimFigures,
+    neighbour_table,
+)
 from benchmarks.siege.overload import OverloadFigures, overload
 from benchmarks.soak.load import Shot, shots
 
@@ -43,6 +57,31 @@ def test_broken_uploads_and_every_operation_are_answered(every: list[Shot], tmp_
         assert tried.sound, tried.report[-4000:]
         assert tried.operations >= 40
         assert tried.requests > tried.operations
+
+
+@pytest.mark.parametrize(
+    "attacks",
+    [
+        ("event streams", "queue at priority 10"),
+        pytest.param(tuple(ATTACKS), marks=pytest.mark.thorough),
+    ],
+)
+def test_a_tenant_is_refused_nothing_while_another_does_its_worst(
+    every: list[Shot], tmp_path: Path, attacks: tuple[str, ...]
+) -> None:
+    found = neighbours(tmp_path / "data", every[:2], 1.0, counts=(2,), attacks=attacks)
+    assert [(one.attack, one.keys) for one in found] == [(name, 2) for name in attacks]
+    assert [one.under.refused for one in found] == [0] * len(attacks)
+    assert all(one.sent > 0 and len(one.under.signed_s) > 0 for one in found)
+    assert found[0].attack != "event streams" or found[0].refused > 0
+
+
+def test_the_table_of_neighbours_tells_the_99th_percentile() -> None:
+    calm = VictimFigures([0.01] * 99 + [0.02], [0.5])
+    found = [NeighbourFigures("x", 2, calm, VictimFigures([0.03], [1.5], 4), 9, 7)]
+    assert neighbour_table(found)[2] == (
+        "| x | 2 | 10 ms | 30 ms | 500 ms | 1500 ms | **4** | 9 | 7 |"
+    )
 
 
 @pytest.mark.thorough

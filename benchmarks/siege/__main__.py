@@ -1,4 +1,4 @@
-"""`make siege`: broken uploads, every operation fuzzed, and ten times too many requests.
+"""`make siege`: broken uploads, every operation fuzzed, too many requests, noisy neighbours.
 
 `python -m benchmarks.siege --page docs/reliability.md` puts the figures into the page.
 """
@@ -10,18 +10,28 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+
+import httpx
 
 from benchmarks.machine import describe_machine
 from benchmarks.pages import put_between
 from benchmarks.siege.contract import ContractFigures, try_contract
 from benchmarks.siege.mutations import MutationFigures, besiege
+from benchmarks.siege.neighbours import (
+    ATTACKS,
+    NeighbourFigures,
+    besiege_neighbour,
+    neighbour_table,
+    work_as_victim,
+)
 from benchmarks.siege.overload import OverloadFigures, overload
 from benchmarks.soak.load import MODEL, Part, Shot, free_port, service, shots
 from sceneprint.engine import Engine
+from sceneprint.engine.admin.operations import create_tenant
 from sceneprint.settings import Settings
 from sceneprint_client import Client
 
@@ -113,6 +123,31 @@ def contracts(folder: Path, frames: list[Shot], examples: int, seed: int) -> lis
     return found
 
 
+def neighbours(
+    folder: Path, frames: list[Shot], seconds: float, counts: Sequence[int] = (1, 2, 10),
+    attacks: Iterable[str] = tuple(ATTACKS), database_url: str | None = None,
+) -> list[NeighbourFigures]:  # fmt: skip
+    """Every attack, with so many keys of one tenant each, while another tenant works."""
+    folder.mkdir()
+    where = {} if database_url is None else {"database_url": database_url}
+    with Engine(Settings.model_validate({"data_dir": folder, "database_url": database_url})) as e:
+        every, victim = (e.create_key(name).secret for name in ("operator", "victim"))
+        create_tenant(e.store, "noisy")
+        noisy = [
+            e.create_key(f"noisy-{i}", {"noisy": "admin"}, tenant="noisy").secret
+            for i in range(max(counts))
+        ]
+    maps = ("noisy", "victim")
+    with besieged(folder, frames, maps, every, host="0.0.0.0", **where) as (url, _):
+        work_as_victim(httpx.URL(url), victim, frames, 0.0)  # what is loaded once
+        calm = work_as_victim(httpx.URL(url), victim, frames, seconds)
+        return [
+            besiege_neighbour(url, name, noisy[:count], victim, frames, seconds, calm)
+            for name in attacks
+            for count in counts
+        ]
+
+
 def table(
     mutations: MutationFigures, contracts: list[ContractFigures], overloaded: OverloadFigures
 ) -> list[str]:
@@ -162,10 +197,25 @@ def main() -> int:
     parser.add_argument("--examples", type=int, default=20, help="requests of each operation")
     parser.add_argument("--seconds", type=float, default=120, help="of too many requests")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--neighbours", type=float, default=15, help="seconds of each attack of a neighbour"
+    )
+    parser.add_argument(
+        "--only-neighbours", action="store_true", help="print the table of noisy neighbours alone"
+    )
+    parser.add_argument("--database-url", help="of noisy neighbours; default: SQLite")
     parser.add_argument("--page", type=Path, help="whose figures to replace")
     options = parser.parse_args()
     load = os.getloadavg()[1]  # of what else there is to do
     every = shots(160)
+    if options.only_neighbours:
+        with tempfile.TemporaryDirectory(prefix="sceneprint-siege-") as name:
+            met = neighbours(
+                Path(name) / "data", every[:8], options.neighbours,
+                database_url=options.database_url,
+            )  # fmt: skip
+        print("\n".join(neighbour_table(met)))
+        return int(any(one.under.refused for one in met))
     with tempfile.TemporaryDirectory(prefix="sceneprint-siege-") as name:
         folder = Path(name)
         with besieged(folder / "overload", every[:40]) as (url, _):
@@ -175,6 +225,9 @@ def main() -> int:
             mutations = besiege(url, [part], every, options.uploads, options.seed)
         print(mutations)
         tried = contracts(folder, every[:4], options.examples, options.seed)
+        met = neighbours(
+            folder / "neighbours", every[:8], options.neighbours, database_url=options.database_url
+        )
     for line in (*mutations.failed[:20], *(one.report for one in tried if not one.sound)):
         print(line, file=sys.stderr)
     machine = describe_machine()
@@ -188,11 +241,13 @@ def main() -> int:
             "wanted a processor on average."
         )
     lines = ["", when, "", *table(mutations, tried, overloaded)]
+    lines += ["### One tenant attacks while another works", "", *neighbour_table(met), ""]
     print("\n".join(lines))
     if options.page is not None:
         put_between(options.page, BEGIN, END, lines)
     unanswered = overloaded.statuses.get(0, 0) + overloaded.lost
     wrong = len(mutations.failed) + mutations.crashed + unanswered
+    wrong += sum(one.under.refused for one in met)
     return int(bool(wrong) or not all(one.sound for one in tried))
 
 

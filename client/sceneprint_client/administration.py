@@ -42,8 +42,9 @@ class AdminMethods(JobMethods):
     """Keys, events, figures, models and snapshots of a service."""
 
     def create_key(
-        self, name: str, grants: Mapping[str, Scope], expires_at: datetime | None = None
-    ) -> MadeKey:
+        self, name: str, grants: Mapping[str, Scope], expires_at: datetime | None = None,
+        tenant: str | None = None,
+    ) -> MadeKey:  # fmt: skip
         """Make a key; only what is returned has its secret.
 
         Parameters
@@ -51,14 +52,19 @@ class AdminMethods(JobMethods):
         name : who it is for; unique
         grants : `read`, `write` or `admin` by name of a map, `*` for all
         expires_at : when it opens nothing any more, with a zone; default: never
+        tenant : whom it belongs to, which must be there; default: one of the key's name
 
         Raises
         ------
         InvalidRequest : a name or grant that is none.
         Conflict : there is a key of that name.
+        UnknownTenant : there is no such tenant.
         Forbidden : the key of this client is not for `admin` of all.
         """
-        new = checked(NewKey, "The key", name=name, grants=dict(grants), expires_at=expires_at)
+        new = checked(
+            NewKey, "The key", name=name, grants=dict(grants), expires_at=expires_at,
+            tenant=tenant,
+        )  # fmt: skip
         return self._ask(MadeKey, "POST", "/v1/keys", json=new.model_dump(mode="json"))
 
     def keys(self) -> list[Key]:

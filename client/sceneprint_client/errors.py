@@ -16,6 +16,7 @@
       x NotFound                there is no such map, frame or job
         - UnknownMap, UnknownFrame, UnknownSession, UnknownJob, UnknownQuery, UnknownSnapshot
         - UnknownKey            there is no key of that name
+        - UnknownTenant         there is no tenant of that name
         - UnknownDeletion       there is no deletion that could be undone
       x Conflict                the request contradicts what is there
         - MapExists             a map of that name, made otherwise
@@ -28,6 +29,7 @@
         - UnsupportedType       its body is of a type that is not read
         - TooLarge              its body is larger than the service takes
         - SlowBody              its body came too slowly
+        - AmbiguousKey          it has more than one Authorization header
         - IdempotencyConflict   its Idempotency-Key was used for something else
       x PreconditionFailed      what is to be edited has been edited meanwhile
       x KeyRequired             the service asks for a key, and none or an unknown one was given
@@ -159,6 +161,10 @@ class UnknownKey(NotFound):
     """There is no key of that name."""
 
 
+class UnknownTenant(NotFound):
+    """There is no tenant of that name."""
+
+
 class UnknownQuery(NotFound):
     """There is no answer of that id, or no longer."""
 
@@ -227,6 +233,10 @@ class TooLarge(InvalidRequest):
 
 class SlowBody(InvalidRequest):
     """The body of a request came too slowly."""
+
+
+class AmbiguousKey(InvalidRequest):
+    """The request has more than one Authorization header."""
 
 
 class IdempotencyConflict(InvalidRequest):

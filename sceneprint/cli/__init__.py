@@ -23,6 +23,7 @@ COMMANDS = {
     "serve": "serve",
     "work": "serve",
     "keys": "admin",
+    "tenants": "admin",
     "audit": "admin",
     "maps": "inventory",
     "upload": "upload",

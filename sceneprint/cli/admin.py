@@ -1,4 +1,4 @@
-"""`sceneprint keys`: keys for a service that listens beyond its own machine."""
+"""`sceneprint keys`, `tenants` and `audit`: who may ask a service, who pays, who changed what."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def add_keys(commands: Any) -> None:
     what.add_argument(
         "--list",
         action="store_true",
-        help="list keys with their creation time, name, scope and expiry",
+        help="list keys with their creation time, name, scope, tenant and expiry",
     )
     what.add_argument("--revoke", metavar="NAME", help="revoke a key")
     command.add_argument("--scope", choices=SCOPES, help="scope of the new key (default: admin)")
@@ -45,6 +45,11 @@ def add_keys(commands: Any) -> None:
             "map that the key is valid for; repeatable (default: all maps and everything "
             "outside of maps)"
         ),
+    )
+    command.add_argument(
+        "--tenant",
+        metavar="TENANT",
+        help="tenant that the new key belongs to (default: one with the name of the key)",
     )
     command.add_argument(
         "--expires",
@@ -62,7 +67,8 @@ def run_keys(options: argparse.Namespace) -> int:
     from sceneprint.engine.admin.operations import list_keys
     from sceneprint.errors import InvalidRequest
 
-    given = [name for name in ("scope", "map", "expires") if getattr(options, name) is not None]
+    own = ("scope", "map", "tenant", "expires")
+    given = [name for name in own if getattr(options, name) is not None]
     if given and options.create is None:
         raise InvalidRequest(f"--{given[0]} applies to a new key only. Use it with --create.")
     with Engine(settings_of(options)) as engine:
@@ -83,7 +89,7 @@ def run_keys(options: argparse.Namespace) -> int:
             scope: Scope = options.scope or "admin"
             grants = dict.fromkeys(options.map or [EVERY], scope)
             until = None if options.expires is None else datetime.now(UTC) + options.expires
-            made = engine.create_key(options.create, grants, until)
+            made = engine.create_key(options.create, grants, until, options.tenant)
             engine.audit.command("keys --create", target=made.name)
             print(made.secret)
             print(
@@ -97,6 +103,8 @@ def _key_line(key: Key) -> str:
         f"{scope} of {'all' if name == EVERY else name}" for name, scope in key.grants.items()
     )
     text = f"{key.created_at:%Y-%m-%dT%H:%M:%SZ}  {one_line(key.name)}  {grants}"
+    if key.tenant != key.name:
+        text += f", tenant {one_line(key.tenant)}"
     if key.expires_at is None:
         return text
     ends = "expired" if key.expires_at <= datetime.now(UTC) else "until"
@@ -108,6 +116,56 @@ def _duration(text: str) -> timedelta:
     if found is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a duration such as 12h, 30d or 8w")
     return timedelta(seconds=int(found[1]) * _SECONDS[found[2]])
+
+
+# `sceneprint tenants`: whom keys belong to.
+
+
+def add_tenants(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "tenants",
+        help="create, list and delete the tenants that API keys belong to",
+        description="Create, list or delete tenants. What the keys of a tenant ask at once and "
+        "per second is counted together, and tenants take turns at the workers. A key that is "
+        "created without --tenant belongs to a tenant of its own name.",
+    )
+    what = command.add_mutually_exclusive_group(required=True)
+    what.add_argument("--create", metavar="NAME", help="create a tenant without keys")
+    what.add_argument(
+        "--list",
+        action="store_true",
+        help="list tenants with their creation time, name and number of keys",
+    )
+    what.add_argument("--delete", metavar="NAME", help="delete a tenant that has no key")
+    add_data_option(command)
+    command.set_defaults(run=run_tenants)
+
+
+def run_tenants(options: argparse.Namespace) -> int:
+    """Do what was asked for with the tenants of the data folder."""
+    from sceneprint.engine import Engine
+    from sceneprint.engine.admin.operations import create_tenant
+    from sceneprint.store.tenants import delete_tenant, list_tenants
+
+    with Engine(settings_of(options)) as engine:
+        if options.list:
+            with engine.store.database.read() as connection:
+                found = list_tenants(connection)
+            for one in found:
+                at = datetime.fromtimestamp(one.created_at, UTC)
+                count = f"{one.keys} key{'s' * (one.keys != 1)}"
+                print(f"{at:%Y-%m-%dT%H:%M:%SZ}  {one_line(one.name)}  {count}")
+        elif options.delete is not None:
+            with engine.store.database.write() as connection:
+                delete_tenant(connection, options.delete)
+            engine.audit.command("tenants --delete", target=options.delete)
+            print(f"tenant {one_line(options.delete)} is deleted")
+        else:
+            create_tenant(engine.store, options.create)
+            engine.audit.command("tenants --create", target=options.create)
+            print(f"tenant {one_line(options.create)} is created")
+    return 0
 
 
 # `sceneprint audit`: who changed what.

@@ -57,6 +57,7 @@ from sceneprint.store.deletion import remove_map
 from sceneprint.store.reencoding_rows import models_of
 from sceneprint.store.startup_retry import PATIENCE_S, open_patiently
 from sceneprint.store.tables import MapRow
+from sceneprint.store.tenants import work_of
 from sceneprint.store.undo_rows import UndoLimits
 from sceneprint.store.wakeup import Notices, Wakeup
 from sceneprint_client.api import (
@@ -240,10 +241,10 @@ class Engine:
 
     def create_key(
         self, name: str, grants: Mapping[str, Scope] | None = None,
-        expires_at: datetime | None = None,
+        expires_at: datetime | None = None, tenant: str | None = None,
     ) -> MadeKey:  # fmt: skip
         """Make a key, and show its secret; see `operations.create_key`."""
-        return operations.create_key(self.store, name, grants, expires_at)
+        return operations.create_key(self.store, name, grants, expires_at, tenant)
 
     def revoke_key(self, name: str) -> None:
         """Let a key open nothing any more, and remove the records of its queries; UnknownKey."""
@@ -348,12 +349,13 @@ class Engine:
 
     def run(self, work: Work | LongJob, broke: Callable[[], None] | None = None) -> JobState | None:
         """Do a claimed job, or a slice of a long one; see `signature_job.run` and `Tasks.run`."""
-        if isinstance(work, LongJob):
-            return self.tasks.run(work, self.settings.lease_s, self.settings.job_s, broke)
-        return working.run(
-            self.store, self.signers, self._readers, work, self.settings.lease_s,
-            self.settings.job_s, broke,
-        )  # fmt: skip
+        with work_of(work.job.tenant):  # so are jobs that it queues
+            if isinstance(work, LongJob):
+                return self.tasks.run(work, self.settings.lease_s, self.settings.job_s, broke)
+            return working.run(
+                self.store, self.signers, self._readers, work, self.settings.lease_s,
+                self.settings.job_s, broke,
+            )  # fmt: skip
 
     def put_back(self, work: Work | LongJob) -> None:
         """Return a claimed job undone."""

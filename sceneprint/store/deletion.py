@@ -54,6 +54,7 @@ from sceneprint.store.tables import (
     surface_touches,
     surfaces,
 )
+from sceneprint.store.tenants import keep_turns
 from sceneprint.store.undo_rows import Deletion, remember_frames
 from sceneprint_client.api import FrameState
 
@@ -151,6 +152,7 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
         connection.execute(delete(of_surface).where(of_surface.c.map_number == row.number))
     for made in (job_items, job_files):
         connection.execute(delete(made).where(made.c.job_number.in_(of_map)))
+    keep_turns(connection)
     connection.execute(delete(jobs).where(jobs.c.map_number == row.number))
     # a tombstone has the blob of its upload still, so those that could be restored are among them
     connection.execute(delete(deleted_frames).where(deleted_frames.c.frame_number.in_(own)))

@@ -15,6 +15,7 @@ from sqlalchemy import Connection, Select, String, delete, insert, select
 from sceneprint.errors import Conflict, IdempotencyConflict, UnknownKey
 from sceneprint.store.events import record_event
 from sceneprint.store.tables import audit, idempotency, keys
+from sceneprint.store.tenants import join_tenant, leave_tenant
 from sceneprint_client.api.admin import Scope
 
 #: So that a key is known for one where it should not be, such as in a public file.
@@ -31,6 +32,7 @@ class KeyRow:
     name : unique
     grants : scope by name of a map, `*` for all
     created_at, expires_at : None: it does not expire
+    tenant : whom it belongs to
     """
 
     id: str
@@ -38,17 +40,21 @@ class KeyRow:
     grants: dict[str, Scope]
     created_at: float
     expires_at: float | None
+    tenant: str
 
 
 def create_key(
     connection: Connection, name: str, grants: Mapping[str, Scope],
-    expires_at: float | None = None,
+    expires_at: float | None = None, tenant: str | None = None,
 ) -> str:  # fmt: skip
     """Make a key and return its secret, which is stored nowhere; for the rest see KeyRow.
+
+    Without `tenant` it belongs to one of its own name.
 
     Raises
     ------
     Conflict : there is a key of that name.
+    UnknownTenant : there is no such tenant.
     """
     if connection.execute(select(keys.c.id).where(keys.c.name == name)).first() is not None:
         raise Conflict(f"There is a key named {name!r}. Choose another name.")
@@ -57,6 +63,7 @@ def create_key(
         insert(keys).values(
             id=uuid.uuid4().hex, name=name, digest=_digest(secret), grants=dict(grants),
             created_at=time.time(), expires_at=expires_at,
+            tenant=join_tenant(connection, name, tenant),
         )
     )  # fmt: skip
     record_event(connection, "key.created", name=name)
@@ -87,15 +94,19 @@ def revoke_key(connection: Connection, name: str) -> None:
     ------
     UnknownKey : there is none of that name.
     """
-    if connection.execute(delete(keys).where(keys.c.name == name)).rowcount != 1:
+    gone = delete(keys).where(keys.c.name == name).returning(keys.c.tenant)
+    tenant = connection.execute(gone).scalar()
+    if tenant is None:
         raise UnknownKey(
             f"There is no key named {name!r:.80}. List them with `sceneprint keys --list`."
         )
+    leave_tenant(connection, name, tenant)
     record_event(connection, "key.revoked", name=name)
 
 
-def _select_keys() -> Select[tuple[str, str, dict[str, Scope], float, float | None]]:
-    return select(keys.c.id, keys.c.name, keys.c.grants, keys.c.created_at, keys.c.expires_at)
+def _select_keys() -> Select[tuple[str, str, dict[str, Scope], float, float | None, str]]:
+    own = keys.c
+    return select(own.id, own.name, own.grants, own.created_at, own.expires_at, own.tenant)
 
 
 def _digest(secret: str) -> str:

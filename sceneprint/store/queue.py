@@ -2,6 +2,11 @@
 
     enqueue  -->  queued  --claim-->  running  --finish | fail-->  over, or queued again
 
+Tenants take turns: a claim goes to the tenant that was served the longest ago of those that have
+a job due, and takes its first by priority. Between two turns of one, each other has at most one,
+for each worker that claims at the same moment. What nobody asked for, such as the re-encoding of
+a map, waits while anybody has a job.
+
 A claim is a lease: who does not renew it in time loses the job to another worker. Each claim has
 a token greater than the last; a worker that comes back late holds an old one, and what it brings
 is refused. So a job may run twice, but takes effect once.
@@ -30,12 +35,14 @@ import time
 import uuid
 from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import (
     ColumnElement,
     Connection,
     Float,
+    Label,
+    Row,
     and_,
     cast,
     delete,
@@ -60,7 +67,9 @@ from sceneprint.store.tables import (
     jobs,
     maps,
     rows_among,
+    tenants,
 )
+from sceneprint.store.tenants import NOBODY, current_tenant, keep_turns
 from sceneprint_client.api import JobState
 
 # Jobs, one by one and as a list.
@@ -213,6 +222,8 @@ MAXIMUM_FAILURES = 3
 #: Tries in all before it is. More, as a worker that fell silent or was killed may have died of
 #: something else: a machine that is restarted again and again must not cost a frame.
 MAXIMUM_ATTEMPTS = 10
+#: Priority of upkeep, and of whatever else nobody asked for that has no more.
+UPKEEP = -10
 #: Seconds before the second try; each further one waits four times as long.
 BACKOFF_S = 2.0
 
@@ -251,7 +262,7 @@ def job_values(
     return {
         "id": uuid.uuid4().hex, "kind": kind, "model_id": model_id, "data": data,
         "state": JobState.QUEUED, "priority": priority, "attempts": 0, "failures": 0, "token": 0,
-        "run_after": made, "created_at": made,
+        "run_after": made, "created_at": made, "tenant": current_tenant(),
     }  # fmt: skip
 
 
@@ -286,42 +297,135 @@ def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
     # "+ 0.0" keeps SQLite to the index that has the order: it would sort all that is due
     waiting = jobs.c.state == JobState.QUEUED, jobs.c.run_after + 0.0 <= at
     silent = jobs.c.state == JobState.RUNNING, jobs.c.leased_until < at
+    found = None
+    for tenant, turn in _tenants_due(connection, *waiting):  # the first's may all be locked
+        found = _lock_first(connection, turn, *waiting, jobs.c.tenant == tenant)
+        if found is not None:
+            break
     # of those that fell silent, which are few, one is locked only where its turn is before
-    found, other = _first(connection, *waiting, locked=True), _first(connection, *silent)
+    other = _first_of_few(connection, *silent)
     if other is not None and (found is None or other < found):
-        found = _first(connection, *silent, jobs.c.number == other[-1], locked=True) or found
+        own = jobs.c.number == other.number
+        found = _lock_first(connection, other.turn, *silent, own) or found
     if found is None:
         return None
     row = connection.execute(
         update(jobs)
-        .where(jobs.c.number == found[-1])
+        .where(jobs.c.number == found.number)
         .values(
             state=JobState.RUNNING, attempts=jobs.c.attempts + 1, token=jobs.c.token + 1,
             leased_until=at + lease_s, worker=worker, started_at=at,
+            turn=_last_turn(connection) + 1,
         )
         .returning(jobs)
     ).mappings().one()  # fmt: skip
     return job_row(row)
 
 
-def _first(
-    connection: Connection, *due: ColumnElement[bool], locked: bool = False
-) -> tuple[int, int, int] | None:
-    """The first to be claimed of some jobs that are due: its place in the order, and its number.
+class _Place(NamedTuple):
+    """Where a job stands in the order of claims: the least is next."""
+
+    upkeep: bool
+    turn: int  # of its tenant, the latest
+    tenant: str
+    later: int  # its priority, negated
+    attempts: int
+    number: int
+
+
+def _lock_first(connection: Connection, turn: int, *due: ColumnElement[bool]) -> _Place | None:
+    """The first to be claimed of the due jobs of one tenant, locked; others may have locked all.
 
     What was tried before goes behind what was not: a frame that kills its worker, or a machine
     that dies again and again, must not hold up or use up the same job.
     """
     asked = (
-        select(jobs.c.priority, jobs.c.attempts, jobs.c.number)
+        select(jobs.c.priority, jobs.c.attempts, jobs.c.number, jobs.c.tenant)
         .where(*due, jobs.c.attempts < MAXIMUM_ATTEMPTS)
         .order_by(jobs.c.priority.desc(), jobs.c.attempts, jobs.c.number)
         .limit(1)
+        .with_for_update(skip_locked=True)
     )
-    if locked:
-        asked = asked.with_for_update(skip_locked=True)
     found = connection.execute(asked).first()
-    return None if found is None else (-found.priority, found.attempts, found.number)
+    return None if found is None else _place(found, turn)
+
+
+def _first_of_few(connection: Connection, *due: ColumnElement[bool]) -> _Place | None:
+    """The first to be claimed of the due jobs of all tenants, each of which is looked at."""
+    asked = select(
+        jobs.c.priority, jobs.c.attempts, jobs.c.number, jobs.c.tenant, *_turns_of(jobs.c.tenant)
+    ).where(*due, jobs.c.attempts < MAXIMUM_ATTEMPTS)
+    rows = connection.execute(asked).all()
+    return min((_place(row, _latest(row.served, row.kept)) for row in rows), default=None)
+
+
+def _place(row: Row[*tuple[Any, ...]], turn: int) -> _Place:
+    return _Place(
+        _is_upkeep(row.tenant, row.priority), turn, row.tenant, -row.priority, row.attempts,
+        row.number,
+    )  # fmt: skip
+
+
+def _latest(*turns: int | None) -> int:
+    return max(one or 0 for one in turns)
+
+
+def _is_upkeep(tenant: str, priority: int) -> bool:
+    """Whether a job waits for all that somebody asked for."""
+    return tenant == NOBODY and priority <= UPKEEP
+
+
+def _turns_of(tenant: ColumnElement[str]) -> tuple[Label[int | None], Label[int | None]]:
+    """The latest turn of a tenant: of its jobs, and of those that were removed."""
+    other = jobs.alias()
+    served = select(func.max(other.c.turn)).where(other.c.tenant == tenant)
+    kept = select(tenants.c.turn).where(tenants.c.name == tenant)
+    return served.scalar_subquery().label("served"), kept.scalar_subquery().label("kept")
+
+
+def _tenants_due(connection: Connection, *due: ColumnElement[bool]) -> list[tuple[str, int]]:
+    """Tenants that have a queued job due, and their latest turns, in the order of the next.
+
+    The index is asked once for each tenant with a queued job, however many jobs there are.
+    """
+    first, later = jobs.alias(), jobs.alias()
+    names = (
+        select(func.min(first.c.tenant).label("tenant"))
+        .where(first.c.state == JobState.QUEUED)
+        .cte("names", recursive=True)
+    )
+    following = (
+        select(func.min(later.c.tenant))
+        .where(later.c.state == JobState.QUEUED, later.c.tenant > names.c.tenant)
+        .correlate(names)
+        .scalar_subquery()
+    )
+    names = names.union_all(select(following).where(names.c.tenant.is_not(None)))
+    best = (
+        select(jobs.c.priority)
+        .where(*due, jobs.c.attempts < MAXIMUM_ATTEMPTS, jobs.c.tenant == names.c.tenant)
+        .order_by(jobs.c.priority.desc(), jobs.c.attempts, jobs.c.number)
+        .limit(1)
+        .correlate(names)
+        .scalar_subquery()
+        .label("best")
+    )
+    asked = select(names.c.tenant, best, *_turns_of(names.c.tenant)).where(
+        names.c.tenant.is_not(None)
+    )
+    rows = (row for row in connection.execute(asked) if row.best is not None)
+    ordered = sorted(
+        (_is_upkeep(row.tenant, row.best), _latest(row.served, row.kept), row.tenant)
+        for row in rows
+    )
+    return [(tenant, turn) for _, turn, tenant in ordered]
+
+
+def _last_turn(connection: Connection) -> int:
+    """The latest turn of any tenant."""
+    of_jobs, kept = select(func.max(jobs.c.turn)), select(func.max(tenants.c.turn))
+    asked = select(of_jobs.scalar_subquery(), kept.scalar_subquery())
+    return _latest(*connection.execute(asked).one())
 
 
 def renew(connection: Connection, held: JobRow, lease_s: float) -> None:
@@ -676,5 +780,6 @@ def remove_job(connection: Connection, job: JobRow) -> list[str]:
     blobs : that it referred to: sweep them when this is committed
     """
     blobs = remove_parts(connection, job.number)
+    keep_turns(connection)
     connection.execute(delete(jobs).where(jobs.c.number == job.number))
     return blobs

@@ -14,14 +14,14 @@ from sqlalchemy import ColumnElement, Connection, and_, exists, func, insert, se
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import next_revision
-from sceneprint.store.queue import PENDING, enqueue, read_clock
+from sceneprint.store.queue import PENDING, UPKEEP, enqueue, read_clock
 from sceneprint.store.tables import MapRow, frames, jobs, maps, signatures
 from sceneprint_client.api import FrameState, JobState
 
 #: Kind of the jobs that sign an indexed frame once more.
 REENCODE = "reencode"
 #: After what robots send, and after what heals.
-PRIORITY = -10
+PRIORITY = UPKEEP
 #: Rows that one transaction handles, so that writers wait for tenths of a second at most.
 QUEUED_AT_ONCE, REMOVED_AT_ONCE = 2000, 50
 

@@ -199,13 +199,20 @@ jobs = Table(
     Column("created_at", Float, nullable=False),
     Column("started_at", Float),
     Column("finished_at", Float),
+    Column("tenant", _string(128), nullable=False, server_default=""),  # who asked; "": nobody
+    Column("turn", WHOLE),  # number of its latest claim: each is greater than those before
     Index(None, "state", "run_after"),
     Index(None, "frame_number"),
     Index(None, "map_number", "number"),
+    Index(None, "turn"),
+    Index(None, "tenant", "turn"),
     sqlite_autoincrement=True,
 )
-#: The order in which jobs are claimed.
-Index("ix_jobs_claimed", jobs.c.state, jobs.c.priority.desc(), jobs.c.attempts, jobs.c.number)
+#: The order in which the jobs of a tenant are claimed.
+Index(
+    "ix_jobs_claimed", jobs.c.state, jobs.c.tenant, jobs.c.priority.desc(), jobs.c.attempts,
+    jobs.c.number,
+)  # fmt: skip
 
 #: What a long job found, appended slice by slice.
 job_items = Table(
@@ -237,6 +244,17 @@ keys = Table(
     Column("grants", JSON, nullable=False),  # scope by name of a map, "*" for all
     Column("created_at", Float, nullable=False),
     Column("expires_at", Float),
+    Column("tenant", _string(128), nullable=False, server_default=""),
+    Index(None, "tenant"),
+)
+
+#: Who pays: keys belong to tenants.
+tenants = Table(
+    "tenants",
+    metadata,
+    Column("name", _string(128), primary_key=True),
+    Column("created_at", Float, nullable=False),
+    Column("turn", WHOLE, nullable=False, server_default="0"),  # the latest of jobs removed since
 )
 
 events = Table(
@@ -625,6 +643,8 @@ class JobRow:
     created_at: float
     started_at: float | None
     finished_at: float | None
+    tenant: str
+    turn: int | None
 
     @property
     def frame(self) -> int:

@@ -131,7 +131,7 @@ Limit = Annotated[int, Query(ge=1, le=1000)]
 @keys_router.post(
     "/keys",
     status_code=201,
-    responses=declared(400, 409, 413, 415, 422),
+    responses=declared(400, 404, 409, 413, 415, 422),
     openapi_extra={"requestBody": KEY_BODY},
     dependencies=[Depends(administers)],
 )
@@ -143,9 +143,10 @@ async def create_key(request: Request, here: Here, response: Response) -> MadeKe
             "application/json."
         )
     new = _new(await read_json(request))
-    made = await to_thread.run_sync(here.engine.create_key, new.name, new.grants, new.expires_at)
+    make = partial(here.engine.create_key, new.name, new.grants, new.expires_at, new.tenant)
+    made = await to_thread.run_sync(make)
     response.headers["Location"] = f"/v1/keys/{quote(made.name, safe='')}"
-    request.state.audited = made.model_dump(mode="json", include={"grants", "expires_at"})
+    request.state.audited = made.model_dump(mode="json", include={"grants", "expires_at", "tenant"})
     return made
 
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Literal
 
 from anyio import to_thread
@@ -17,7 +18,7 @@ from sceneprint.store.events import Wanted
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint_client.api import Job, JobState, Page
 from sceneprint_client.api.admin import EventPage, RetriedJobs
-from service.auth import Asking, Caller, v1_router
+from service.auth import Asking, Caller, hold_read, release_place, v1_router
 from service.context import Context, Here
 from service.event_stream import BEGIN, MEDIA_TYPE, EventStream, Feed, alive, message
 from service.problems import declared
@@ -173,9 +174,11 @@ async def events(
 
     wanted, number = await to_thread.run_sync(asked)
     if MEDIA_TYPE in request.headers.get("accept", ""):
-        here.feed.join()
+        here.feed.join(asking.tenant)
+        release_place(request)
         told = _told(here.feed, seals, wanted, number, _still(request, here, asking))
-        return EventStream(told, here.feed.leave)
+        return EventStream(told, partial(here.feed.leave, asking.tenant))
+    await hold_read(request, here, asking.tenant)
     newest_first = order == "newest" or (order is None and last is None)
     return await to_thread.run_sync(
         lambda: here.engine.operations.events(

@@ -81,7 +81,7 @@ def test_every_refusal_is_a_problem(document):
 )  # fmt: skip
 def test_an_operation_declares_what_it_answers(document, method, path, statuses):
     declared = operations(document)[method, path]["responses"]
-    always = {401, 403, 408, 421, 429, 500, 503, 507}
+    always = {400, 401, 403, 408, 421, 429, 500, 503, 507}
     assert {int(status) for status in declared} == statuses | always
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
+from types import SimpleNamespace
 
-from service.rate_limits import RateState, TokenBucket, network_of
+import pytest
+from starlette.requests import Request
+
+from sceneprint_client.api import Frame, Page
+from service.rate_limits import RateState, TokenBucket, network_of, request_cost
 
 
 class Clock:
@@ -83,6 +87,36 @@ def test_a_crowd_of_addresses_takes_no_more_room_and_frees_none_that_was_just_se
         limit.take(f"10.0.{number // 256}.{number % 256}")
         assert len(limit) <= 50
         assert not limit.take("busy").allowed  # kept in mind, as it goes on asking
+
+
+def test_what_costs_more_takes_more_and_is_refused_until_it_is_there():
+    clock = Clock()
+    limit = TokenBucket("key", per_s=2.0, burst=10, clock=clock)
+    assert [limit.take("a", 5.0).allowed for _ in range(2)] == [True, True]
+    told = limit.take("a", 5.0)
+    assert (told.allowed, told.wait_s) == (False, 3)
+    clock.now += 2.5
+    assert limit.take("a", 5.0).allowed
+    clock.now += 5.0
+    assert limit.take("a", 99.0).allowed  # never more than a rested caller has
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "query", "model", "cost"),
+    [
+        ("GET", "/v1/keys/me", b"", None, 1.0),
+        ("POST", "/v1/maps/hall/queries", b"", None, 5.0),
+        ("POST", "/v1/maps/hall/localize/sequence", b"", None, 5.0),
+        ("GET", "/v1/maps/hall/frames", b"", Page[Frame], 3.0),
+        ("GET", "/v1/maps/hall/frames", b"limit=1000", Page[Frame], 21.0),
+        ("GET", "/v1/maps/hall/frames", b"limit=x", Page[Frame], 3.0),
+    ],
+)
+def test_a_request_counts_by_its_work(method, path, query, model, cost):
+    route = SimpleNamespace(response_model=model)
+    scope = {"type": "http", "method": method, "path": path, "query_string": query,
+             "headers": [], "route": route, "server": ("here", 80), "scheme": "http"}  # fmt: skip
+    assert request_cost(Request(scope)) == cost
 
 
 def test_it_is_told_as_the_draft_has_it():

@@ -215,7 +215,9 @@ def test_one_key_does_not_take_every_place(walled, refused, until):
             wire.sendall(head)
         until(lambda: walled.ask("reader", "GET", "/v1/keys/me").status_code == 429)
         answer = walled.ask("reader", "GET", "/v1/keys/me", headers={"X-Request-Id": "late"})
-        refused(answer, 429, "rate-limited", f"{most} requests with this key are in progress")
+        refused(
+            answer, 429, "rate-limited", f"{most} requests of this key's tenant are in progress"
+        )
         other = walled.ask("keeper", "POST", "/v1/maps/bravo/queries", json={"frame_id": "none"})
         assert other.status_code == 404
     until(lambda: walled.ask("reader", "GET", "/v1/keys/me").status_code == 200)

@@ -7,12 +7,13 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from sqlalchemy import event, select
+from sqlalchemy import event, select, update
 
 from sceneprint.errors import LostLease, UnknownJob
 from sceneprint.store import Store, queue
 from sceneprint.store.signatures import StoredSignature, index_frame
-from sceneprint.store.tables import FrameRow, JobRow, MapRow, signatures
+from sceneprint.store.tables import FrameRow, JobRow, MapRow, jobs, signatures
+from sceneprint.store.tenants import create_tenant, work_of
 from sceneprint_client.api import JobState
 
 Queued = Callable[..., JobRow]
@@ -138,18 +139,111 @@ def test_renewing_extends_the_lease_and_nothing_else(
 
 
 @pytest.mark.sqlite_only("its query plans")
-def test_a_claim_is_looked_up_and_not_sorted(store: Store) -> None:
+def test_a_claim_is_looked_up_and_not_sorted(store: Store, hall: MapRow) -> None:
     """100,000 jobs wait while a map is signed again, and a claim holds all writers up."""
+    queue_jobs(store, hall, "many", 50)
     with store.database.write() as connection:
         said: list[str] = []
 
         def listen(_: Any, _cursor: Any, statement: str, parameters: Any, *_more: Any) -> None:
-            if statement.startswith("SELECT jobs.priority"):
+            if statement.startswith(("SELECT", "WITH")):
                 plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", parameters)
-                said.extend(row[3] for row in plan)
+                said.extend(row[3] for row in plan if row[3].startswith(("SEARCH", "SCAN", "USE")))
 
         event.listen(connection, "before_cursor_execute", listen)
-        assert queue.claim(connection, "w", 60) is None
-    assert len(said) == 2
-    assert all("USING INDEX ix_jobs_claimed" in one for one in said)
+        assert queue.claim(connection, "w", 60) is not None
+    of_jobs = [one for one in said if "jobs" in one]
+    assert len(of_jobs) == 8  # names, the next, best and turn of each; first; silent, turn; last
+    assert all(one.startswith("SEARCH") and "INDEX ix_jobs_" in one for one in of_jobs), of_jobs
     assert not any("TEMP B-TREE" in one for one in said)
+
+
+# Tenants take turns.
+
+
+def queue_jobs(store: Store, hall: MapRow, tenant: str, count: int, priority: int = 0) -> None:
+    with store.database.write() as connection, work_of(tenant):
+        for _ in range(count):
+            queue.enqueue(connection, "import", None, priority, map_number=hall.number)
+
+
+def test_a_thousand_jobs_of_priority_10_delay_another_tenant_by_one_turn(
+    store: Store, hand: Any, hall: MapRow
+) -> None:
+    queue_jobs(store, hall, "noisy", 1000, 10)
+    assert [hand.taken().tenant for _ in range(3)] == ["noisy"] * 3
+    queue_jobs(store, hall, "quiet", 1, -10)
+    assert "quiet" in [hand.taken().tenant for _ in range(2)]
+    queue_jobs(store, hall, "quiet", 1)
+    assert "quiet" in [hand.taken().tenant for _ in range(2)]
+    assert hand.taken().tenant == "noisy"  # who waits alone waits for nobody
+
+
+def test_between_two_turns_of_a_tenant_each_other_has_at_most_one(
+    store: Store, hand: Any, hall: MapRow
+) -> None:
+    for tenant, count in (("a", 6), ("b", 4), ("c", 2)):
+        queue_jobs(store, hall, tenant, count, priority={"a": 10, "b": 0, "c": -10}[tenant])
+    order = "".join(hand.taken().tenant for _ in range(12))
+    assert order == "abcabcababaa"
+    queue_jobs(store, hall, "c", 3)  # who was away for long has saved nothing up
+    queue_jobs(store, hall, "a", 3)
+    assert "".join(hand.taken().tenant for _ in range(6)) == "cacaca"
+
+
+def test_priority_decides_within_a_tenant(store: Store, hand: Any, hall: MapRow) -> None:
+    for tenant in ("a", "b"):
+        for priority in (0, 10, -10):
+            queue_jobs(store, hall, tenant, 1, priority)
+    taken = [hand.taken() for _ in range(6)]
+    assert [(job.tenant, job.priority) for job in taken] == [
+        ("a", 10), ("b", 10), ("a", 0), ("b", 0), ("a", -10), ("b", -10),
+    ]  # fmt: skip
+
+
+def test_upkeep_waits_for_what_was_asked_and_what_no_key_asked_takes_turns(
+    store: Store, hand: Any, hall: MapRow
+) -> None:
+    queue_jobs(store, hall, "", 2, queue.UPKEEP)
+    queue_jobs(store, hall, "", 1, queue.UPKEEP + 1)
+    queue_jobs(store, hall, "a", 2, queue.UPKEEP)
+    taken = [hand.taken() for _ in range(5)]
+    assert [(job.tenant, job.priority) for job in taken] == [
+        ("", -9), ("a", -10), ("a", -10), ("", -10), ("", -10),
+    ]  # fmt: skip
+
+
+def test_what_fell_silent_has_its_tenants_turn(
+    store: Store, hand: Any, hall: MapRow, turned: Turned
+) -> None:
+    queue_jobs(store, hall, "a", 2)
+    silent = hand.taken("dead", -1.0)
+    queue_jobs(store, hall, "b", 1)
+    taken = [hand.taken() for _ in range(3)]
+    assert [job.tenant for job in taken] == ["b", "a", "a"]
+    assert silent.number == taken[2].number  # tried before: behind the tenant's other
+
+
+def test_deleted_jobs_give_no_turn_back(store: Store, hand: Any, hall: MapRow) -> None:
+    with store.database.write() as connection:
+        for name in ("a", "b"):
+            create_tenant(connection, name)
+    queue_jobs(store, hall, "b", 3)
+    queue_jobs(store, hall, "a", 2)
+    first = hand.taken()
+    with store.database.write() as connection:
+        queue.remove_job(connection, first)
+    assert (first.tenant, hand.taken().tenant, hand.taken().tenant) == ("a", "b", "a")
+
+
+def test_a_clock_set_back_changes_no_turn(
+    store: Store, hand: Any, hall: MapRow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queue_jobs(store, hall, "b", 2)
+    queue_jobs(store, hall, "a", 2)
+    with store.database.write() as connection:
+        connection.execute(update(jobs).values(run_after=0.0))
+    assert hand.taken().tenant == "a"
+    if store.database.is_sqlite:
+        monkeypatch.setattr(time, "time", lambda: 1e9)
+    assert [hand.taken().tenant for _ in range(3)] == ["b", "a", "b"]

@@ -50,6 +50,10 @@ class NewKey(Given):
     expires_at: AwareDatetime | None = Field(
         default=None, description="When it opens nothing any more; null: never."
     )
+    tenant: Label | None = Field(
+        default=None,
+        description="Whom it belongs to, which must be there; null: a tenant of the key's name.",
+    )
 
 
 class Key(ApiRecord):
@@ -59,6 +63,7 @@ class Key(ApiRecord):
     grants: dict[str, Scope] = Field(description="What it may do, by map; `*` for all.")
     created_at: datetime
     expires_at: datetime | None = Field(description="Null: it does not expire.")
+    tenant: str = Field(description="Whom it belongs to: what its keys ask is counted together.")
 
 
 class MadeKey(Key):

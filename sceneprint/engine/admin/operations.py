@@ -19,7 +19,7 @@ from sceneprint.engine.maps.map_lifecycle import Catalogue
 from sceneprint.engine.serializers import when
 from sceneprint.errors import InvalidRequest, SceneprintError
 from sceneprint.settings import Settings
-from sceneprint.store import Database, Store
+from sceneprint.store import Database, Store, tenants
 from sceneprint.store import keys as stored
 from sceneprint.store.deletion import remove_in_blocks
 from sceneprint.store.events import (
@@ -288,7 +288,7 @@ def _audit_record(change: KeyChange) -> Audited:
 
 def create_key(
     store: Store, name: str, grants: Mapping[str, Scope] | None = None,
-    expires_at: datetime | None = None,
+    expires_at: datetime | None = None, tenant: str | None = None,
 ) -> MadeKey:  # fmt: skip
     """Make a key; its secret is shown this once.
 
@@ -298,19 +298,16 @@ def create_key(
     name : of the key
     grants : scope by name of a map, `*` for all; default: admin of all
     expires_at : when it opens nothing any more, with a zone; default: never
+    tenant : whom it belongs to; default: one of the key's name
 
     Raises
     ------
     InvalidRequest : the name is empty, too long, not printable or taken by us; or a name of a map
         that none can have; or `expires_at` is beyond what a date can say.
     Conflict : there is a key of that name.
+    UnknownTenant : there is no such tenant.
     """
-    if not (0 < len(name) <= 128 and name.isprintable()) or name == COMMAND:
-        raise InvalidRequest(
-            f"{name!r:.80} is not a valid key name. Use up to 128 printable characters, but not "
-            f"{COMMAND!r}.",
-            (("name", "not printable, empty, too long or reserved"),),
-        )
+    _check_name(name, "key")
     granted: dict[str, Scope] = dict(grants or {EVERY: "admin"})
     for one in granted:
         if not re.fullmatch(GRANTED, one):
@@ -320,10 +317,32 @@ def create_key(
             )
     until = None if expires_at is None else _until(expires_at)
     with store.database.write() as connection:
-        secret = stored.create_key(connection, name, granted, until)
+        secret = stored.create_key(connection, name, granted, until, tenant)
         row = stored.find_key(connection, secret)
     assert row is not None
     return MadeKey(secret=secret, **_key_record(row).model_dump())
+
+
+def create_tenant(store: Store, name: str) -> None:
+    """Create a tenant without keys.
+
+    Raises
+    ------
+    InvalidRequest : the name is empty, too long, not printable or taken by us.
+    Conflict : there is a tenant of that name.
+    """
+    _check_name(name, "tenant")
+    with store.database.write() as connection:
+        tenants.create_tenant(connection, name)
+
+
+def _check_name(name: str, of: str) -> None:
+    if not (0 < len(name) <= 128 and name.isprintable()) or name == COMMAND:
+        raise InvalidRequest(
+            f"{name!r:.80} is not a valid {of} name. Use up to 128 printable characters, but not "
+            f"{COMMAND!r}.",
+            (("name", "not printable, empty, too long or reserved"),),
+        )
 
 
 def list_keys(store: Store, cursor: str | None = None, limit: int = 100) -> Page[Key]:
@@ -361,6 +380,7 @@ def _key_record(row: stored.KeyRow) -> Key:
         grants=row.grants,
         created_at=datetime.fromtimestamp(row.created_at, UTC),
         expires_at=None if row.expires_at is None else datetime.fromtimestamp(row.expires_at, UTC),
+        tenant=row.tenant,
     )
 
 

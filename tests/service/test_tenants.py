@@ -1,0 +1,184 @@
+"""Tenants: two keys of one are counted as one, whatever headers say, and another works on."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from contextlib import ExitStack
+
+import httpx
+import pytest
+from sqlalchemy import select
+
+from sceneprint.engine import Engine
+from sceneprint.engine.admin.operations import create_tenant
+from sceneprint.errors import RateLimited
+from sceneprint.settings import Settings
+from sceneprint.store.tables import jobs
+from service.body_limits import IN_MEMORY, Broken, RequestBody, Spool
+from service.gate import Holdings, Turns, share
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture(scope="module")
+def shared(wall):
+    """A service with two keys of one tenant, and one of another."""
+    held = wall({"victim": {"*": "admin"}}, "--workers", "0", event_streams=8, requests_per_s=0)
+    with Engine(Settings(data_dir=held.server.folder, database_url=None)) as engine:
+        create_tenant(engine.store, "noisy")
+        for name in ("one", "two"):
+            made = engine.create_key(name, {"*": "admin"}, tenant="noisy")
+            held.secrets[name] = made.secret
+    return held
+
+
+def test_two_authorization_headers_are_refused_whoever_sends_them(shared, refused):
+    for path in ("/v1/maps", "/healthz"):
+        headers = [("Authorization", f"Bearer {shared.secrets['one']}"),
+                   ("Authorization", "Bearer made-up")]  # fmt: skip
+        answer = shared.server.client.get(path, headers=headers)
+        refused(answer, 400, "ambiguous-key", "more than one Authorization header")
+
+
+def test_keys_of_a_tenant_share_its_streams_and_leave_some_to_others(shared, until):
+    url = httpx.URL(shared.server.url)
+
+    def listen(key: str, stack: ExitStack) -> bytes:
+        wire = stack.enter_context(socket.create_connection((url.host, url.port), timeout=60))
+        wire.sendall(
+            "GET /v1/events HTTP/1.1\r\nHost: localhost\r\nAccept: text/event-stream\r\n"
+            f"Authorization: Bearer {shared.secrets[key]}\r\n\r\n".encode()
+        )
+        return wire.recv(12)
+
+    with ExitStack() as stack:
+        said = [listen("one" if i % 2 else "two", stack) for i in range(8)]
+        assert said == [b"HTTP/1.1 200"] * 6 + [b"HTTP/1.1 429"] * 2
+        assert [listen("victim", stack) for _ in range(2)] == [b"HTTP/1.1 200"] * 2
+        assert shared.ask("one", "GET", "/v1/keys/me").status_code == 200
+
+
+def test_keys_tell_their_tenant(shared, refused):
+    listed = shared.ask("victim", "GET", "/v1/keys").json()["items"]
+    assert {one["name"]: one["tenant"] for one in listed} == {
+        "victim": "victim", "one": "noisy", "two": "noisy",
+    }  # fmt: skip
+    new = {"name": "three", "grants": {"*": "read"}, "tenant": "nobody"}
+    answer = shared.ask("victim", "POST", "/v1/keys", json=new)
+    refused(answer, 404, "unknown-tenant", "no tenant named 'nobody'")
+    made = shared.ask("victim", "POST", "/v1/keys", json=new | {"tenant": "noisy"})
+    assert (made.status_code, made.json()["tenant"]) == (201, "noisy")
+    assert shared.ask("victim", "DELETE", "/v1/keys/three").status_code == 204
+
+
+def test_a_job_is_of_the_tenant_that_asked(shared):
+    job = shared.ask("two", "POST", "/v1/snapshots").json()
+    with (
+        Engine(Settings(data_dir=shared.server.folder, database_url=None)) as engine,
+        engine.store.database.read() as connection,
+    ):
+        asked = select(jobs.c.tenant).where(jobs.c.id == job["job_id"])
+        assert connection.execute(asked).scalar_one() == "noisy"
+
+
+def test_a_tenant_holds_three_quarters_at_most_and_gives_it_back():
+    held = Holdings()
+    assert [held.take("a", 1, 4) for _ in range(4)] == [True, True, True, False]
+    assert held.take("b", 1, 4)
+    assert [held.take("", 1, 4) for _ in range(9)] == [True] * 9  # where no key is asked for
+    held.give("a", 1)
+    assert (held.take("a", 1, 4), held.total) == (True, 13)
+    assert [share(room) for room in (1, 4, 66, 100)] == [1, 3, 49, 75]
+
+
+def test_turns_alternate_between_tenants_and_leave_half_to_others():
+    async def test() -> list[str]:
+        clock = Clock()
+        turns, order = Turns(4, clock), []
+
+        async def ask(tenant: str, weight: int = 1) -> None:
+            await turns.acquire(tenant, weight)
+            order.append(tenant)
+
+        await asyncio.gather(*(ask("a") for _ in range(4)))  # alone it has all
+        waiting = [asyncio.create_task(ask(name)) for name in "aaabb"]
+        await asyncio.sleep(0)
+        assert order == ["a"] * 4
+        turns.release("a")
+        turns.release("a")
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        assert order[4:] == ["b", "b"]  # the others of a wait: it has half
+        turns.release("b")
+        turns.release("a")
+        for _ in range(3):
+            await asyncio.sleep(0)
+        assert order[6:] == ["a"]
+        clock.now += 61.0  # b was gone for long, and holds one still: it counts
+        late = asyncio.create_task(ask("a"))
+        await asyncio.sleep(0)
+        for task in (*waiting, late):
+            task.cancel()
+        await asyncio.gather(*waiting, late, return_exceptions=True)
+        return order
+
+    assert asyncio.run(test()) == ["a"] * 4 + ["b", "b", "a"]
+
+
+def test_who_gives_up_takes_no_turn():
+    async def test() -> None:
+        turns = Turns(1)
+        await turns.acquire("a")
+        gone = asyncio.create_task(turns.acquire("b"))
+        next_one = asyncio.create_task(turns.acquire("c"))
+        await asyncio.sleep(0)
+        gone.cancel()
+        turns.release("a")
+        assert await asyncio.wait_for(next_one, 30) == 1
+        with pytest.raises(asyncio.CancelledError):
+            await gone
+        turns.release("c")
+        assert await asyncio.wait_for(turns.acquire("b", 9), 30) == 1  # no more than there are
+
+    asyncio.run(test())
+
+
+class SmallSpool(Spool):
+    """With room for eight MiB."""
+
+    def _room(self) -> int:
+        return 8 << 20
+
+
+def test_a_body_is_charged_before_it_is_written_and_given_back():
+    spool, half = SmallSpool(), IN_MEMORY // 2
+
+    async def receive():
+        return {"type": "http.request", "body": bytes(half), "more_body": True}
+
+    async def read(body: RequestBody, count: int) -> None:
+        for _ in range(count):
+            await body.next()
+
+    first = RequestBody(receive, 1 << 30, 30)
+    first.charge(spool, "a")
+    asyncio.run(read(first, 2))  # one MiB is kept in memory
+    spool.require_room("a", 7 << 20)
+    with pytest.raises(RateLimited, match="more than 6 MiB of the service's temporary folder"):
+        spool.require_room("a", (7 << 20) + 1)
+    asyncio.run(read(first, 12))  # six more on disk
+    with pytest.raises(Broken):
+        asyncio.run(read(first, 1))
+    assert isinstance(first.fault, RateLimited)
+    with pytest.raises(RateLimited):
+        spool.require_room("a", 2 << 20)
+    spool.require_room("b", 7 << 20)
+    first.close()
+    spool.require_room("a", 7 << 20)
