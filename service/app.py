@@ -38,6 +38,7 @@ from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.selections import FramesEdit, FrameSelection, RestoreOptions
 from sceneprint_client.api.sessions import NewAssociation
 from service import api_docs, dashboard, problems
+from service.audit import RefusalFilter
 from service.browser_security import origins_of
 from service.context import Context, Gate
 from service.event_stream import Feed
@@ -182,6 +183,7 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
                 engine, gate, uploads, figures, settings.asks_for_keys, feed=feed, limits=limits
             )
             loading = warming(engine) if warm else nullcontext()
+            app.state.refusals = RefusalFilter()
             async with housekeeping(engine, figures.sampler), loading:
                 yield
             feed.close()

@@ -22,7 +22,7 @@ COMMANDS = {
     "serve": "serve",
     "work": "serve",
     "keys": "admin",
-    "audit": "admin",
+    "audit": "audit",
     "maps": "inventory",
     "upload": "upload",
     "query": "query",

@@ -87,6 +87,7 @@ maps = Table(
     Column("used_frames", BigInteger, nullable=False, server_default="0"),
     Column("used_bytes", BigInteger, nullable=False, server_default="0"),
     Column("up", JSON(none_as_null=True)),  # unit vector in the parent frames; null: learnt
+    Column("first_event", BigInteger),  # that it was made; those of before are of a former map
     sqlite_autoincrement=True,
 )
 
@@ -278,7 +279,47 @@ audit = Table(
     Column("target", _string(128)),
     Column("request_id", _string(64)),
     Column("data", JSON, nullable=False),
+    # the chain that the line is part of, its place there, and its hash; null: of before version 0.3
+    Column("tenant", _string(128)),
+    Column("refused", Boolean),
+    Column("sequence", WHOLE),
+    Column("hash", _string(64)),
+    Index("uq_audit_tenant_refused_sequence", "tenant", "refused", "sequence", unique=True),
+    Index(None, "at"),
     sqlite_autoincrement=True,
+)
+
+#: Chains of the audit log: changes and refusals of each tenant. What was pruned ends in `anchor`.
+audit_chains = Table(
+    "audit_chains",
+    metadata,
+    Column("tenant", _string(128), primary_key=True),
+    Column("refused", Boolean, primary_key=True),
+    Column("pruned", WHOLE, nullable=False),  # place of the last line that is gone; 0: none is
+    Column("anchor", _string(64), nullable=False),  # hash of that line
+    Column("last", WHOLE, nullable=False),  # place of the newest line
+    Column("head", _string(64), nullable=False),  # its hash
+)
+
+#: One row: the oldest revision whose processes may write to this schema.
+schema_range = Table(
+    "schema_range",
+    metadata,
+    Column("least_revision", _string(32), primary_key=True),
+)
+
+#: One row: how far stored bytes have been read to see that they are sound.
+scrubs = Table(
+    "scrubs",
+    metadata,
+    Column("number", WHOLE, primary_key=True, autoincrement=False),
+    Column("position", WHOLE, nullable=False),  # number of the last frame that was read
+    Column("next_at", Float, nullable=False),  # when somebody may go on, by the database's clock
+    Column("began_at", Float, nullable=False),  # of this pass
+    Column("finished_at", Float),  # the last whole pass; null: there was none
+    Column("blobs", BigInteger, nullable=False),  # these and the next: of this pass, or the last
+    Column("bytes", BigInteger, nullable=False),
+    Column("damaged", BigInteger, nullable=False),
 )
 
 #: Figures of processes, a few times a minute, for an hour or two.
@@ -302,6 +343,7 @@ former_maps = Table(
     Column("number", BigInteger, nullable=False),  # of the event
     Column("quota_frames", BigInteger),
     Column("quota_bytes", BigInteger),
+    Column("at", Float),  # when it was deleted
     Index(None, "number"),
 )
 
@@ -556,6 +598,7 @@ class MapRow:
     used_frames: int = 0
     used_bytes: int = 0
     up: list[float] | None = None
+    first_event: int | None = None
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ class Me(ApiRecord):
 
 
 class Audited(ApiRecord):
-    """A change, and who made it."""
+    """A change and who made it, or what somebody was refused."""
 
     at: datetime
     actor: str | None = Field(
@@ -94,6 +94,20 @@ class Audited(ApiRecord):
     target: str | None = Field(description="What was changed in it, or of no map: an id or name.")
     request_id: str | None = Field(description="As in the log.")
     data: dict[str, Any] = Field(description="More of what was changed, by the operation.")
+    refused: bool = Field(
+        default=False, description="Whether it was refused (401 or 403) and nothing was changed."
+    )
+    tenant: str | None = Field(
+        default=None,
+        description="In whose chain the line is; null: a line of before version 0.3, in none.",
+    )
+    sequence: int | None = Field(
+        default=None, description="Place in the chain of the tenant's changes, or of refusals."
+    )
+    hash: str | None = Field(
+        default=None,
+        description="SHA-256 of the hash before it in its chain and of the line, as hexadecimal.",
+    )
 
 
 # How a service does, and what it signs with, as JSON.

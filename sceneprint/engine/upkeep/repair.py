@@ -95,7 +95,8 @@ def _due(connection: Connection, numbers: Sequence[int], model_id: str) -> list[
     now, due = time.time(), []
     for number in dict.fromkeys(numbers):
         job = last_of(connection, REENCODE, number, model_id)
-        busy = job is not None and (not job.state.over or now - job.created_at < PAUSE_S)
+        # a job of the future was made before the clock was set back
+        busy = job is not None and (not job.state.over or abs(now - job.created_at) < PAUSE_S)
         if number not in found or busy or is_known_loss(found[number].reason):
             continue  # or nothing is left to sign it from
         if found[number].state == FrameState.INDEXED:

@@ -62,8 +62,9 @@ from sceneprint.store.tables import metadata, secrets
 #
 # file  --copy_into-->  PostgreSQL: the same rows, the same numbers, the same next numbers
 
-#: What a database of which nobody has made use holds: its secret, and what a service counts.
-_OF_ITSELF = ("secrets", "samples")
+#: What a database of which nobody has made use holds: its secret, what a service counts, and who
+#: may write.
+_OF_ITSELF = ("secrets", "samples", "schema_range")
 
 
 def copy_into(connection: Connection, file: sqlite3.Connection) -> None:
