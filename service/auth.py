@@ -40,6 +40,7 @@ class Caller:
     expires_at : of the key, seconds since 1970; None: never
     key_id : of the key; None where none is asked for
     changed : maps of which more than reading was asked, for the audit log
+    created_at : of the key, seconds since 1970; None where none is asked for
     """
 
     name: str
@@ -47,6 +48,7 @@ class Caller:
     expires_at: float | None = None
     key_id: str | None = None
     changed: set[str] = field(default_factory=set, compare=False)
+    created_at: float | None = None
 
     def may(self, scope: Scope, map_name: str = EVERY) -> bool:
         """Whether the caller may do that with a map; default: with all and what is of none."""
@@ -136,7 +138,7 @@ async def caller(
         enforce_rate_limit(request, here.limits.failed_keys, network_of(address_of(request)))
         raise KeyRequired(_why(request, here) if key is None else _EXPIRED)
     request.state.caller = key.name
-    found = Caller(key.name, key.grants, key.expires_at, key.id)
+    found = Caller(key.name, key.grants, key.expires_at, key.id, created_at=key.created_at)
     request.state.changed = found.changed
     enforce_rate_limit(request, here.limits.requests, key.name)
     return found

@@ -1,4 +1,6 @@
-"""Audit lines chained by hash, the range of revisions that may write, and what a scrub has read."""
+"""Audit lines chained by hash, the range of revisions that may write, what a scrub has read, and
+where the events of a map begin.
+"""
 
 from __future__ import annotations
 
@@ -61,6 +63,7 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("number", name="pk_scrubs"),
     )
     op.add_column("maps", sa.Column("first_event", sa.BigInteger(), nullable=True))
+    op.add_column("maps", sa.Column("former_until", sa.Float(), nullable=True))
     op.execute(
         "UPDATE maps SET first_event = (SELECT max(events.number) FROM events "
         "WHERE events.map = maps.name AND events.kind = 'map.created')"

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, delete, func, insert, or_, select
+from sqlalchemy import ColumnElement, Connection, and_, delete, func, insert, or_, select
 
 from sceneprint.store.tables import MapRow, among, blocks, events, former_maps, maps
 
@@ -86,11 +86,14 @@ class Wanted:
     maps : only of these; None: of all, and those of no map
     kinds : beginnings of kinds, one of which must fit; none: all
     of_maps : whether those of no map are left out
+    since : when whoever asks was first let in, seconds since 1970: of a map that was deleted before
+        nothing is told, though another has its name; None: of those too
     """
 
     maps: frozenset[str] | None = None
     kinds: tuple[str, ...] = ()
     of_maps: bool = False
+    since: float | None = None
 
     def __call__(self, event: EventRow) -> bool:
         """Whether an event is one of them."""
@@ -115,8 +118,14 @@ def newest_seen(connection: Connection, wanted: Wanted) -> int:
     hidden: when it changes, the caller was told what happened.
     """
     if wanted.maps is not None:
+        beginnings = _beginnings(connection, wanted)
         newest = select(func.max(events.c.number))
-        of = [connection.execute(newest.where(events.c.map == one)) for one in wanted.maps]
+        of = [
+            connection.execute(
+                newest.where(events.c.map == one, events.c.number >= beginnings.get(one, 0))
+            )
+            for one in wanted.maps
+        ]
         return max((int(one.scalar() or 0) for one in of), default=0)
     if not wanted.of_maps:
         return newest_number(connection)
@@ -139,13 +148,54 @@ def list_events(
     if before is not None:
         asked = asked.where(events.c.number < before)
     if wanted.maps is not None:
-        asked = asked.where(events.c.map.in_(sorted(wanted.maps)))
+        asked = asked.where(_of_maps(wanted.maps, _beginnings(connection, wanted)))
     elif wanted.of_maps:
         asked = asked.where(events.c.map.is_not(None))
     if wanted.kinds:
         fits = [events.c.kind.startswith(one, autoescape=True) for one in wanted.kinds]
         asked = asked.where(or_(*fits))
     return [EventRow(**row) for row in connection.execute(asked).mappings()]
+
+
+#: Beyond any number of an event.
+_NEVER = 2**62
+#: Maps with a beginning of their own that one statement asks about: SQLite bounds its depth.
+_MOST_BEGINNINGS = 500
+
+
+def _beginnings(connection: Connection, wanted: Wanted) -> dict[str, int]:
+    """By map, the number of the first event that whoever asks may be told, where it is not told of
+    a former map of the name.
+    """
+    if wanted.since is None or wanted.maps is None:
+        return {}
+    found = dict.fromkeys(wanted.maps, _NEVER)
+    names = sorted(wanted.maps)
+    before = events.c.map == maps.c.name, events.c.number < maps.c.first_event
+    has_former = select(events.c.number).where(*before).exists()
+    there = select(maps.c.name, maps.c.first_event, maps.c.former_until, has_former)
+    for name, first, until, has in connection.execute(there.where(maps.c.name.in_(names))):
+        known = until is not None and wanted.since <= until
+        found[name] = first if has and not known else 0
+    former = select(former_maps.c.name, former_maps.c.at)
+    for name, at in connection.execute(former.where(former_maps.c.name.in_(names))):
+        if at is not None and wanted.since <= at:
+            found[name] = 0
+    return {name: first for name, first in found.items() if first > 0}
+
+
+def _of_maps(names: Collection[str], beginnings: Mapping[str, int]) -> ColumnElement[bool]:
+    """That an event is of one of some maps, and not of before its beginning."""
+    whole = events.c.map.in_(sorted(set(names) - beginnings.keys()))
+    parts = {name: first for name, first in beginnings.items() if first < _NEVER}
+    if len(parts) > _MOST_BEGINNINGS:
+        first = max(parts.values())
+        return or_(whole, and_(events.c.map.in_(sorted(parts)), events.c.number >= first))
+    of = [
+        and_(events.c.map == name, events.c.number >= first)
+        for name, first in sorted(parts.items())
+    ]
+    return or_(whole, *of)
 
 
 def anchor_number(anchor: str) -> int | None:
@@ -204,7 +254,8 @@ def floor_of(connection: Connection, wanted: Wanted, kept: int, after: int) -> i
         return max(found.values(), default=0)
     names = set(_names(connection))
     own = [found.get(one, 0) for one in wanted.maps & names]
-    return max([*own, *_floors_of_gone(connection, wanted.maps - names, found.get(None, 0))])
+    gone = wanted.maps - names - _beginnings(connection, wanted).keys()
+    return max([*own, *_floors_of_gone(connection, gone, found.get(None, 0))])
 
 
 def _floors_of_gone(connection: Connection, names: Collection[str], floor: int) -> Iterator[int]:
@@ -285,7 +336,7 @@ def remember(connection: Connection, row: MapRow) -> None:
     connection.execute(
         insert(former_maps).values(
             name=row.name, number=connection.execute(last).scalar_one(),
-            quota_frames=row.quota_frames, quota_bytes=row.quota_bytes,
+            quota_frames=row.quota_frames, quota_bytes=row.quota_bytes, at=time.time(),
         )
     )  # fmt: skip
     beyond = (
@@ -301,8 +352,11 @@ def remember(connection: Connection, row: MapRow) -> None:
 
 
 def inherited(connection: Connection, name: str) -> dict[str, float | None]:
-    """The quota of the map that had a name before; from now on the new one has it."""
-    asked = select(former_maps.c.quota_frames, former_maps.c.quota_bytes)
+    """The quota of the map that had a name before, which the new one has from now on; and until
+    when it was there.
+    """
+    former = former_maps.c
+    asked = select(former.quota_frames, former.quota_bytes, former.at.label("former_until"))
     found = connection.execute(asked.where(former_maps.c.name == name)).mappings().first()
     connection.execute(delete(former_maps).where(former_maps.c.name == name))
     return {} if found is None else dict(found)

@@ -87,7 +87,9 @@ maps = Table(
     Column("used_frames", BigInteger, nullable=False, server_default="0"),
     Column("used_bytes", BigInteger, nullable=False, server_default="0"),
     Column("up", JSON(none_as_null=True)),  # unit vector in the parent frames; null: learnt
-    Column("first_event", BigInteger),  # that it was made; those of before are of a former map
+    # its first event, and when the former map of this name was deleted; null: not known
+    Column("first_event", BigInteger),
+    Column("former_until", Float),
     sqlite_autoincrement=True,
 )
 
@@ -599,6 +601,7 @@ class MapRow:
     used_bytes: int = 0
     up: list[float] | None = None
     first_event: int | None = None
+    former_until: float | None = None
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import itertools
 import re
+import time
 from pathlib import Path
 
 import pytest
-from sqlalchemy import insert, select
+from sqlalchemy import insert, select, update
 
 from sceneprint.store import Store
-from sceneprint.store.events import Wanted, list_events, newest_seen
+from sceneprint.store.deletion import remove_map
+from sceneprint.store.events import Wanted, floor_of, list_events, newest_seen
 from sceneprint.store.maps import add_map, keep_model
 from sceneprint.store.store_counts import count_events
-from sceneprint.store.tables import events
+from sceneprint.store.tables import events, former_maps
 from sceneprint_client.api.admin import KINDS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -132,3 +134,38 @@ def test_every_kind_that_is_told_is_declared():
     assert {"frame.indexed", "map.created", "key.revoked"} <= told
     assert told <= set(KINDS)
     assert all(re.fullmatch(r"[a-z_]+\.[a-z_]+", kind) and len(kind) <= 32 for kind in KINDS)
+
+
+def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store: Store) -> None:
+    """Nor is it told of one that was deleted before it was made, and of which there is no other."""
+
+    def told(since: float | None, *names: str) -> list[tuple[str, str | None]]:
+        wanted = Wanted(frozenset(names), since=since)
+        with store.database.read() as connection:
+            found = [(one.kind, one.map) for one in list_events(connection, wanted)]
+            newest = newest_seen(connection, wanted)
+            lost = floor_of(connection, wanted, 1, 0)
+            numbers = connection.execute(select(events.c.number, events.c.kind, events.c.map))
+            last = [row.number for row in numbers if (row.kind, row.map) in found]
+        assert newest == max(last, default=0)
+        assert found or lost == 0
+        return found
+
+    with store.database.write() as connection:
+        keep_model(connection, "m" * 64, "small", b"")
+        for name in ("hall", "shop"):
+            remove_map(connection, add_map(connection, name, None, "m" * 64))
+    between = time.time() + 0.001
+    with store.database.write() as connection:
+        connection.execute(update(former_maps).values(at=between - 1))
+        add_map(connection, "hall", None, "m" * 64)
+        add_map(connection, "yard", None, "m" * 64)
+    former = [("map.created", "hall"), ("map.deleted", "hall")]
+    assert told(None, "hall") == [*former, ("map.created", "hall")]
+    assert told(between - 2, "hall") == [*former, ("map.created", "hall")]
+    assert told(between, "hall") == [("map.created", "hall")]
+    assert told(between, "shop") == told(between, "attic") == []
+    assert told(between - 2, "shop") == [("map.created", "shop"), ("map.deleted", "shop")]
+    assert told(between, "hall", "shop", "yard") == [
+        ("map.created", "hall"), ("map.created", "yard"),
+    ]  # fmt: skip
