@@ -13,6 +13,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.engine import open_engine
 from sceneprint.errors import SceneprintError, StoreAway
 from sceneprint.logs import log_as_json, of_request
+from sceneprint.maintenance.scrub import Scrub
 from sceneprint.maintenance.snapshot.catalog import LONGEST_S as SNAPSHOT_S
 from sceneprint.maintenance.snapshot.catalog import SNAPSHOT, snapshot_handler
 from sceneprint.process_limits import StopSignal, limit_memory, raise_descriptors
@@ -85,6 +86,7 @@ class Worker:
 
     def __init__(self, engine: Engine, listener: Listening, trace: Trace, stop: StopSignal) -> None:
         self._engine, self._listener, self._trace, self._stop = engine, listener, trace, stop
+        self._scrub = Scrub(engine.settings, engine.store)
         self.name = process_name()
         self.unsound = False  # an error came that nobody raised on purpose
         # frames first: where publishing kills every worker, each still signs for a while
@@ -127,6 +129,7 @@ class Worker:
         self._upkeep_at = time.monotonic() + UPKEEP_S  # also where it fails: frames go first
         try:
             self._engine.publish_due()
+            self._scrub.run()
         except MemoryError:  # the next process would have no more
             log.error("not enough memory to publish an index; raise SCENEPRINT_WORKER_BYTES")
             self._upkeep_at = time.monotonic() + POOR_S

@@ -138,7 +138,7 @@ class Engine:
         )
         self.audit = Audit(self.store, settings.audit_kept_days)
         self.outputs = FrameFiles(self.store, self.signers)
-        self.points = PointClouds(self.store, self.inspection.pairs, self.kept)
+        self.points = PointClouds(self.store, self.signers, self.inspection.pairs, self.kept)
         self.reconstructions = ReconstructionJobs(self.store, self.tasks)
         self.retiring = Retention(self.store)
         self.undo_limits = UndoLimits(settings.undo_s, settings.undo_bytes)
