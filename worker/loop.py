@@ -11,7 +11,7 @@ import time
 
 from sceneprint.engine import Engine
 from sceneprint.engine.engine import open_engine
-from sceneprint.errors import SceneprintError, StoreAway
+from sceneprint.errors import NewerSchema, SceneprintError, StoreAway
 from sceneprint.logs import log_as_json, of_request
 from sceneprint.maintenance.scrub import Scrub
 from sceneprint.maintenance.snapshot.catalog import LONGEST_S as SNAPSHOT_S
@@ -32,6 +32,8 @@ UPKEEP_S, POOR_S = 5.0, 300.0
 NICENESS = 5
 #: Seconds to wait where the database does not answer.
 TROUBLE_S = 2.0
+#: Seconds between two lines of the log that say that this version may not write any more.
+OUTDATED_S = 60.0
 
 
 def work(settings: Settings, parent: int, trace: Trace) -> None:
@@ -102,6 +104,9 @@ class Worker:
                 self._publish()
             if not found:
                 self._listener.wait(self._pause(), *self._wakers)
+        except NewerSchema as error:  # nothing but another version can go on
+            log.error("store migrated by a later version", extra={"error": str(error)})
+            self._stop.wait(OUTDATED_S)
         except SceneprintError as error:
             log.error("store unreachable", extra={"error": str(error)})
             self._stop.wait(TROUBLE_S)

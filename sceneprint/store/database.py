@@ -17,7 +17,14 @@ from sqlalchemy import Connection, Engine, event
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
 from sceneprint.store.database_errors import database_label, explained
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.sqlite import BUSY_S, HELD_S, ReadOnlyFile, open_sqlite, shrink_log
+from sceneprint.store.sqlite import (
+    BUSY_S,
+    HELD_S,
+    ReadOnlyFile,
+    open_sqlite,
+    read_only_file,
+    shrink_log,
+)
 
 if TYPE_CHECKING:
     import psycopg
@@ -335,6 +342,13 @@ class Database:
         """Whether it may be read alone, and every `write` raises ReadOnlyStore."""
         return self._sealed is not None
 
+    @property
+    def turned_read_only(self) -> bool:
+        """Whether its file may be read alone by now: disks turn read-only under those who use them,
+        and the system says so before anybody writes.
+        """
+        return self.is_sqlite and read_only_file(self._engine.url) is not None
+
     def require_writable(self) -> None:
         """See that it may be written.
 
@@ -348,6 +362,12 @@ class Database:
     def guard_schema(self) -> None:
         """From now on, have each `write` see that the schema is one that this version may use."""
         self._guarded = True
+
+    def require_schema(self) -> None:
+        """See that this process may still write; NewerSchema where another version migrated it."""
+        if self._guarded:
+            with self.read() as connection:
+                require_schema(connection)
 
     @contextmanager
     def read(self) -> Iterator[Connection]:

@@ -35,7 +35,8 @@ from sceneprint_client import Client, Status
 Run = Callable[..., Any]
 #: What is said of a service.
 SERVICE = [
-    "service", "ready", "service clock", "store", "service disk", "workers", "queue", "models",
+    "service", "ready", "service clock", "store", "scrub", "service disk", "workers",
+    "queue", "models",
 ]  # fmt: skip
 
 
