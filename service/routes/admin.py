@@ -190,8 +190,8 @@ def list_changes(
     cursor: Cursor = None,
     limit: Limit = 100,
 ) -> Page[Audited]:
-    """Who changed what, and who was refused (401, 403), the newest first: all but uploads of frames,
-    which the events tell of.
+    """Who changed what, and who was refused (401, 403), the newest first: all but uploads of
+    frames, which the events tell of.
 
     Lines are kept for `SCENEPRINT_AUDIT_KEPT_DAYS`; of each tenant at most 200,000 changes and as
     many refusals. `sceneprint audit verify` checks their hashes.
