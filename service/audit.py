@@ -32,7 +32,7 @@ REFUSED = (401, 403)
 #: Refusals of one caller from one address that are noted at once, and how long one more takes.
 AT_ONCE, AGAIN_S = 10, 600.0
 #: Refusals of all callers together that are noted at once, and each second: each is a commit.
-ALL_AT_ONCE, ALL_PER_S = 60, 1.0
+ALL_AT_ONCE, ALL_PER_S = 20, 1.0
 
 
 class RefusalFilter:

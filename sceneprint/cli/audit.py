@@ -173,6 +173,7 @@ def _append(path: Path, lines: Iterable[Audited]) -> int:
     last: dict[tuple[str | None, bool], int] = {}
     unchained: set[str] = set()
     if path.exists():
+        _cut_unfinished(path)
         for one in _read_copy(path):
             if one.sequence is None:
                 unchained.add(one.model_dump_json())
@@ -192,6 +193,21 @@ def _append(path: Path, lines: Iterable[Audited]) -> int:
         file.flush()
         os.fsync(file.fileno())
     return count
+
+
+def _cut_unfinished(path: Path) -> None:
+    """Remove the end of a line that was being written when its writer died."""
+    with path.open("rb+") as file:
+        size = file.seek(0, os.SEEK_END)
+        while size > 0:
+            start = max(size - 65536, 0)
+            file.seek(start)
+            end = file.read(size - start).rfind(b"\n")
+            if end >= 0:
+                size = start + end + 1
+                break
+            size = start
+        file.truncate(size)
 
 
 def _send(url: str, lines: Iterable[Audited]) -> int:

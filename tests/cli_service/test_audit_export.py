@@ -63,6 +63,8 @@ def test_a_file_gets_what_it_lacks_and_is_compared(
     assert sceneprint(*export).stdout == f"0 entries exported to {copy}\n"
     with Engine(Settings(data_dir=data, database_url=None)) as engine:
         engine.audit.note(KeyChange("edit_map", "screen"))
+    with copy.open("a") as file:
+        file.write('{"at": "2026')  # whoever wrote it died
     assert sceneprint(*export).stdout == f"1 entries exported to {copy}\n"
     lines = [json.loads(line) for line in copy.read_text().splitlines()]
     assert [(one["actor"], one["refused"], one["sequence"]) for one in lines] == [

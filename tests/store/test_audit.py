@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from sqlalchemy import delete, insert, select, text, update
 
+from sceneprint.engine.admin.operations import Audit
 from sceneprint.store import Store
 from sceneprint.store.audit_chain import (
     BEGINNING,
@@ -181,6 +182,16 @@ def test_lines_are_kept_for_their_time_and_the_chain_goes_on(store: Store) -> No
     _write(store, KeyChange("edit", "robot"))
     assert [one.sequence for one in _lines(store)] == [6]
     assert _broken(store) == []
+
+
+def test_old_lines_are_removed_between_jobs(store: Store) -> None:
+    day, log = 86_400.0, Audit(store, kept_days=2.0)
+    for at in (1.0, 2.0, 3.0):
+        log.note(KeyChange("edit", "robot", at=day * at))
+    assert log.tidy(now=day * 4.5) == 2
+    assert log.tidy(now=day * 4.5) == 0
+    assert log.tidy(now=day * 9) == 0  # not before an hour is over
+    assert [one.at for one in _lines(store)] == [day * 3]
 
 
 def test_a_copy_tells_of_a_log_that_was_made_anew(store: Store) -> None:
