@@ -1,5 +1,5 @@
 """Audit lines chained by hash, the range of revisions that may write, what a scrub has read, and
-where the events of a map begin.
+which events end a map.
 """
 
 from __future__ import annotations
@@ -62,14 +62,8 @@ def upgrade() -> None:
         sa.Column("damaged", sa.BigInteger(), nullable=False),
         sa.PrimaryKeyConstraint("number", name="pk_scrubs"),
     )
-    op.add_column("maps", sa.Column("first_event", sa.BigInteger(), nullable=True))
-    op.add_column("maps", sa.Column("former_until", sa.Float(), nullable=True))
-    op.execute(
-        "UPDATE maps SET first_event = (SELECT max(events.number) FROM events "
-        "WHERE events.map = maps.name AND events.kind = 'map.created')"
-    )
-    op.add_column("former_maps", sa.Column("at", sa.Float(), nullable=True))
-    op.execute(
-        "UPDATE former_maps SET at = (SELECT events.at FROM events "
-        "WHERE events.number = former_maps.number)"
-    )
+    deleted = sa.text("kind = 'map.deleted'")
+    op.create_index(
+        "ix_events_map_number_deleted", "events", ["map", "number"], sqlite_where=deleted,
+        postgresql_where=deleted,
+    )  # fmt: skip

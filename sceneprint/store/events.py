@@ -7,7 +7,17 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, and_, delete, func, insert, or_, select
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    and_,
+    delete,
+    func,
+    insert,
+    literal_column,
+    or_,
+    select,
+)
 
 from sceneprint.store.tables import MapRow, among, blocks, events, former_maps, maps
 
@@ -122,7 +132,7 @@ def newest_seen(connection: Connection, wanted: Wanted) -> int:
         newest = select(func.max(events.c.number))
         of = [
             connection.execute(
-                newest.where(events.c.map == one, events.c.number >= beginnings.get(one, 0))
+                newest.where(events.c.map == one, events.c.number > beginnings.get(one, 0))
             )
             for one in wanted.maps
         ]
@@ -157,43 +167,35 @@ def list_events(
     return [EventRow(**row) for row in connection.execute(asked).mappings()]
 
 
-#: Beyond any number of an event.
-_NEVER = 2**62
 #: Maps with a beginning of their own that one statement asks about: SQLite bounds its depth.
 _MOST_BEGINNINGS = 500
+#: As the index of those says it; see `_LIVING` of `deletion`.
+_DELETED: ColumnElement[bool] = events.c.kind == literal_column("'map.deleted'")
 
 
 def _beginnings(connection: Connection, wanted: Wanted) -> dict[str, int]:
-    """By map, the number of the first event that whoever asks may be told, where it is not told of
-    a former map of the name.
+    """By map, the number after which its events begin for whoever asks, where a map of the name was
+    deleted before it was let in.
     """
     if wanted.since is None or wanted.maps is None:
         return {}
-    found = dict.fromkeys(wanted.maps, _NEVER)
-    names = sorted(wanted.maps)
-    before = events.c.map == maps.c.name, events.c.number < maps.c.first_event
-    has_former = select(events.c.number).where(*before).exists()
-    there = select(maps.c.name, maps.c.first_event, maps.c.former_until, has_former)
-    for name, first, until, has in connection.execute(there.where(maps.c.name.in_(names))):
-        known = until is not None and wanted.since <= until
-        found[name] = first if has and not known else 0
-    former = select(former_maps.c.name, former_maps.c.at)
-    for name, at in connection.execute(former.where(former_maps.c.name.in_(names))):
-        if at is not None and wanted.since <= at:
-            found[name] = 0
-    return {name: first for name, first in found.items() if first > 0}
+    asked = (
+        select(events.c.map, func.max(events.c.number))
+        .where(_DELETED, events.c.map.in_(sorted(wanted.maps)), events.c.at < wanted.since)
+        .group_by(events.c.map)
+    )
+    return {row[0]: int(row[1]) for row in connection.execute(asked)}
 
 
 def _of_maps(names: Collection[str], beginnings: Mapping[str, int]) -> ColumnElement[bool]:
     """That an event is of one of some maps, and not of before its beginning."""
     whole = events.c.map.in_(sorted(set(names) - beginnings.keys()))
-    parts = {name: first for name, first in beginnings.items() if first < _NEVER}
-    if len(parts) > _MOST_BEGINNINGS:
-        first = max(parts.values())
-        return or_(whole, and_(events.c.map.in_(sorted(parts)), events.c.number >= first))
+    if len(beginnings) > _MOST_BEGINNINGS:
+        last = max(beginnings.values())
+        return or_(whole, and_(events.c.map.in_(sorted(beginnings)), events.c.number > last))
     of = [
-        and_(events.c.map == name, events.c.number >= first)
-        for name, first in sorted(parts.items())
+        and_(events.c.map == name, events.c.number > last)
+        for name, last in sorted(beginnings.items())
     ]
     return or_(whole, *of)
 
@@ -254,7 +256,11 @@ def floor_of(connection: Connection, wanted: Wanted, kept: int, after: int) -> i
         return max(found.values(), default=0)
     names = set(_names(connection))
     own = [found.get(one, 0) for one in wanted.maps & names]
-    gone = wanted.maps - names - _beginnings(connection, wanted).keys()
+    beginnings = _beginnings(connection, wanted)
+    gone = {
+        name for name in wanted.maps - names
+        if last_event(connection, name) > beginnings.get(name, 0)
+    }  # fmt: skip
     return max([*own, *_floors_of_gone(connection, gone, found.get(None, 0))])
 
 
@@ -336,7 +342,7 @@ def remember(connection: Connection, row: MapRow) -> None:
     connection.execute(
         insert(former_maps).values(
             name=row.name, number=connection.execute(last).scalar_one(),
-            quota_frames=row.quota_frames, quota_bytes=row.quota_bytes, at=time.time(),
+            quota_frames=row.quota_frames, quota_bytes=row.quota_bytes,
         )
     )  # fmt: skip
     beyond = (
@@ -352,11 +358,8 @@ def remember(connection: Connection, row: MapRow) -> None:
 
 
 def inherited(connection: Connection, name: str) -> dict[str, float | None]:
-    """The quota of the map that had a name before, which the new one has from now on; and until
-    when it was there.
-    """
-    former = former_maps.c
-    asked = select(former.quota_frames, former.quota_bytes, former.at.label("former_until"))
+    """The quota of the map that had a name before; from now on the new one has it."""
+    asked = select(former_maps.c.quota_frames, former_maps.c.quota_bytes)
     found = connection.execute(asked.where(former_maps.c.name == name)).mappings().first()
     connection.execute(delete(former_maps).where(former_maps.c.name == name))
     return {} if found is None else dict(found)

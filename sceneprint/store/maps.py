@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, func, insert, select, update
 
 from sceneprint.errors import QuotaExceeded, UnknownMap
-from sceneprint.store.events import inherited, newest_number, record_event
+from sceneprint.store.events import inherited, record_event
 from sceneprint.store.tables import (
     MapRow,
     frames,
@@ -94,8 +94,6 @@ def add_map(
         )
     )  # fmt: skip
     record_event(connection, "map.created", name)
-    own = maps.c.name == name
-    connection.execute(update(maps).where(own).values(first_event=newest_number(connection)))
     return find_map(connection, name)
 
 

@@ -87,9 +87,6 @@ maps = Table(
     Column("used_frames", BigInteger, nullable=False, server_default="0"),
     Column("used_bytes", BigInteger, nullable=False, server_default="0"),
     Column("up", JSON(none_as_null=True)),  # unit vector in the parent frames; null: learnt
-    # its first event, and when the former map of this name was deleted; null: not known
-    Column("first_event", BigInteger),
-    Column("former_until", Float),
     sqlite_autoincrement=True,
 )
 
@@ -255,6 +252,11 @@ events = Table(
     Index(None, "map", "number"),
     sqlite_autoincrement=True,
 )
+#: Where the events of a former map of a name end.
+Index(
+    "ix_events_map_number_deleted", events.c.map, events.c.number,
+    sqlite_where=events.c.kind == "map.deleted", postgresql_where=events.c.kind == "map.deleted",
+)  # fmt: skip
 
 #: What was done under an `Idempotency-Key`, for a day.
 idempotency = Table(
@@ -345,7 +347,6 @@ former_maps = Table(
     Column("number", BigInteger, nullable=False),  # of the event
     Column("quota_frames", BigInteger),
     Column("quota_bytes", BigInteger),
-    Column("at", Float),  # when it was deleted
     Index(None, "number"),
 )
 
@@ -600,8 +601,6 @@ class MapRow:
     used_frames: int = 0
     used_bytes: int = 0
     up: list[float] | None = None
-    first_event: int | None = None
-    former_until: float | None = None
 
 
 @dataclass(frozen=True)

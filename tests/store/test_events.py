@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import re
-import time
 from pathlib import Path
 
 import pytest
@@ -13,9 +12,9 @@ from sqlalchemy import insert, select, update
 from sceneprint.store import Store
 from sceneprint.store.deletion import remove_map
 from sceneprint.store.events import Wanted, floor_of, list_events, newest_seen
-from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.maps import add_map, find_map, keep_model
 from sceneprint.store.store_counts import count_events
-from sceneprint.store.tables import events, former_maps
+from sceneprint.store.tables import events
 from sceneprint_client.api.admin import KINDS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -151,21 +150,41 @@ def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store: Store) -
         assert found or lost == 0
         return found
 
+    def at(seconds: float) -> None:
+        """When what has happened since the last time was."""
+        with store.database.write() as connection:
+            new = events.c.at > 10_000
+            connection.execute(update(events).where(new).values(at=seconds))
+
+    def begin(*names: str) -> None:
+        with store.database.write() as connection:
+            for name in names:
+                add_map(connection, name, None, "m" * 64)
+
+    def end(*names: str) -> None:
+        with store.database.write() as connection:
+            for name in names:
+                remove_map(connection, find_map(connection, name))
+
     with store.database.write() as connection:
         keep_model(connection, "m" * 64, "small", b"")
-        for name in ("hall", "shop"):
-            remove_map(connection, add_map(connection, name, None, "m" * 64))
-    between = time.time() + 0.001
-    with store.database.write() as connection:
-        connection.execute(update(former_maps).values(at=between - 1))
-        add_map(connection, "hall", None, "m" * 64)
-        add_map(connection, "yard", None, "m" * 64)
-    former = [("map.created", "hall"), ("map.deleted", "hall")]
-    assert told(None, "hall") == [*former, ("map.created", "hall")]
-    assert told(between - 2, "hall") == [*former, ("map.created", "hall")]
-    assert told(between, "hall") == [("map.created", "hall")]
-    assert told(between, "shop") == told(between, "attic") == []
-    assert told(between - 2, "shop") == [("map.created", "shop"), ("map.deleted", "shop")]
-    assert told(between, "hall", "shop", "yard") == [
-        ("map.created", "hall"), ("map.created", "yard"),
-    ]  # fmt: skip
+    begin("hall", "shop")
+    at(100)
+    end("hall", "shop")
+    at(200)
+    begin("hall", "yard")
+    at(300)
+    made, gone = ("map.created", "hall"), ("map.deleted", "hall")
+    assert told(None, "hall") == told(150, "hall") == [made, gone, made]
+    assert told(250, "hall") == told(900, "hall") == [made]
+    assert told(250, "shop") == told(250, "attic") == []
+    assert told(150, "shop") == [("map.created", "shop"), ("map.deleted", "shop")]
+    assert told(250, "hall", "shop", "yard") == [made, ("map.created", "yard")]
+    end("hall")  # by whoever had it: what was before it stays hidden
+    at(400)
+    assert told(250, "hall") == [made, gone]
+    assert told(500, "hall") == []
+    begin("hall")
+    at(600)
+    assert told(250, "hall") == [made, gone, made]
+    assert told(500, "hall") == [made]
