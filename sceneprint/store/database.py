@@ -103,10 +103,13 @@ class SchemaRange:
     def allows(self, own: str) -> bool:
         """Whether a process that works with a revision may use the store as it is.
 
-        Revisions are numbers of four digits, so that their order is that of the texts.
+        Revisions are numbers of four digits, so that their order is that of the texts; what is
+        none is of nobody that is known.
         """
         return self.revision == own or (
-            self.least is not None and self.least <= own < self.revision
+            self.revision.isdecimal()
+            and self.least is not None
+            and self.least <= own < self.revision
         )
 
 

@@ -105,6 +105,7 @@ def test_a_process_may_begin_on_a_later_schema_that_allows_it(url: str, store: S
         ("0014", "0013", "0015", False),  # restored under it: migrated when it is opened again
         ("0014", None, "0015", False),
         ("0016", None, "0015", False),
+        ("from the future", "0015", "0015", False),
     ],
 )
 def test_which_processes_a_schema_allows(
