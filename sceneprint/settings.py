@@ -99,6 +99,8 @@ class Settings(BaseSettings):
     snapshots_kept: int = Field(default=5, ge=1, le=1000)
     #: Seconds after which a worker reads all index files again, to see that they are sound.
     scrub_s: float = Field(default=3600.0, ge=1, le=31_536_000)
+    #: Stored bytes that workers read each second, to see that they are sound, MB; 0: none are read.
+    scrub_mb_per_s: float = Field(default=1.0, ge=0, le=10_000)
     #: Room for answers that can be looked at afterwards, bytes; the oldest are removed. 0 for none.
     query_bytes: int = Field(default=256 << 20, ge=0)
     #: Seconds for which an answer can be looked at afterwards.
@@ -115,6 +117,9 @@ class Settings(BaseSettings):
     event_streams: int = Field(default=64, ge=0, le=10_000)
     #: Newest events of each map that are kept; older ones are removed, 200 bytes each.
     events_kept: int = Field(default=1_000_000, ge=1000)
+    #: Days for which lines of the audit log are kept; of each tenant at most 200,000 changes and as
+    #: many refusals.
+    audit_kept_days: float = Field(default=365.0, gt=0, le=36_500)
     #: Days for which a small record of each query is kept; 0: none is written.
     history_days: float = Field(default=30.0, ge=0, le=36_500)
     #: Newest records of queries of each map that are kept, some 600 bytes each.

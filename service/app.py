@@ -43,6 +43,7 @@ from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.sessions import NewAssociation, NewDifference
 from sceneprint_client.api.surface import NewReconstruction
 from service import api_docs, dashboard, problems
+from service.audit import RefusalFilter
 from service.browser_security import origins_of
 from service.context import Context
 from service.event_stream import Feed
@@ -192,6 +193,7 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
                 places=places, wait_s=settings.wait_s,
             )  # fmt: skip
             loading = warming(engine) if warm else nullcontext()
+            app.state.refusals = RefusalFilter()
             async with housekeeping(engine, figures.sampler), loading:
                 yield
             feed.close()

@@ -53,6 +53,7 @@ class Caller:
     key_id : of the key; None where none is asked for
     tenant : of the key; NOBODY where none is asked for
     changed : maps of which more than reading was asked, for the audit log
+    created_at : of the key, seconds since 1970; None where none is asked for
     """
 
     name: str
@@ -61,6 +62,7 @@ class Caller:
     key_id: str | None = None
     tenant: str = NOBODY
     changed: set[str] = field(default_factory=set, compare=False)
+    created_at: float | None = None
 
     def may(self, scope: Scope, map_name: str = EVERY) -> bool:
         """Whether the caller may do that with a map; default: with all and what is of none."""
@@ -150,8 +152,10 @@ async def caller(
     if key is None or (key.expires_at is not None and key.expires_at <= time.time()):
         enforce_rate_limit(request, here.limits.failed_keys, network_of(address_of(request)))
         raise KeyRequired(_why(request, here) if key is None else _EXPIRED)
-    request.state.caller = key.name
-    found = Caller(key.name, key.grants, key.expires_at, key.id, key.tenant)
+    request.state.caller, request.state.tenant = key.name, key.tenant
+    found = Caller(
+        key.name, key.grants, key.expires_at, key.id, key.tenant, created_at=key.created_at
+    )
     request.state.changed = found.changed
     await _admit(request, here, key.tenant)
     return found

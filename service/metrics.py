@@ -168,6 +168,8 @@ class Metrics:
         )  # fmt: skip
         self._events = self._gauge("newest_event", "Number of the newest event: grows for ever.")
         self._disk = self._gauge("disk_bytes", "Disk space taken by each part.", "part")
+        self._scrubbed = self._gauge("scrub_bytes", "Stored bytes that this scrub has read.")
+        self._damaged = self._gauge("scrub_damaged", "What this scrub found lost or damaged.")
         self._replica: tuple[Gauge, Gauge] | None = None  # told where there is one
         self._free = self._gauge("disk_free_bytes", "Left on the disk of the data folder.")
         self._gauge("build_info", "Version of the service.", "version", "python").labels(
@@ -223,6 +225,8 @@ class Metrics:
         for kind in JobState:
             self._jobs.labels(kind).set(stats.jobs.get(kind, 0))
         self._streams.set(streams)
+        self._scrubbed.set(0 if stats.scrub is None else stats.scrub.bytes)
+        self._damaged.set(0 if stats.scrub is None else stats.scrub.damaged)
         self._maps.set(stats.maps)
         self._oldest.set(stats.oldest_waiting_s or 0.0)
         for gauge in (self._generation, self._tail):

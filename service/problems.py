@@ -46,7 +46,9 @@ STATUSES: dict[type[errors.SceneprintError], int] = {
 #: Seconds after which to come back: at once where others are in the way, later where a person is
 #: needed first.
 RETRY_AFTER_S = {429: "1", 503: "1", 507: "30"}
-LATER_S: dict[type[errors.SceneprintError], str] = {errors.ReadOnlyStore: "60"}
+LATER_S: dict[type[errors.SceneprintError], str] = {
+    errors.ReadOnlyStore: "60", errors.NewerSchema: "60",
+}  # fmt: skip
 #: What is told of a store that cannot be used: its errors name folders, which are the operator's.
 _LOG = "See its log under the request's id."
 UNUSABLE: dict[type[errors.SceneprintError], str] = {
@@ -54,6 +56,8 @@ UNUSABLE: dict[type[errors.SceneprintError], str] = {
     f"{_LOG} Free some space there, and send the request again.",
     errors.ReadOnlyStore: "The service's store is read-only, so nothing was stored. Queries "
     f"still work. {_LOG} Make the data folder writable there, and restart the service.",
+    errors.NewerSchema: "A later version of sceneprint has migrated the service's store, so this "
+    f"process stored nothing. {_LOG} Stop it, and start the later version.",
     errors.StoreLocked: "Another process has locked the service's store for too long, so "
     f"nothing was stored. Queries still work. {_LOG} Retry later.",
     errors.StoreAway: "The service's database or object store does not answer. The request may "

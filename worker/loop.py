@@ -18,7 +18,8 @@ from typing import Any
 
 from sceneprint.engine import Engine
 from sceneprint.engine.engine import open_engine
-from sceneprint.errors import SceneprintError, StoreAway
+from sceneprint.errors import NewerSchema, SceneprintError, StoreAway
+from sceneprint.maintenance.scrub import Scrub
 from sceneprint.maintenance.snapshot.creation import LONGEST_S as SNAPSHOT_S
 from sceneprint.maintenance.snapshot.creation import SNAPSHOT, snapshot_handler
 from sceneprint.process import StopSignal, limit_memory, log_as_json, of_request, raise_descriptors
@@ -36,6 +37,8 @@ UPKEEP_S, POOR_S = 5.0, 300.0
 NICENESS = 5
 #: Seconds to wait where the database does not answer.
 TROUBLE_S = 2.0
+#: Seconds between two lines of the log that say that this version may not write any more.
+OUTDATED_S = 60.0
 
 
 def work(settings: Settings, parent: int, trace: Trace) -> None:
@@ -90,6 +93,7 @@ class Worker:
 
     def __init__(self, engine: Engine, listener: Listening, trace: Trace, stop: StopSignal) -> None:
         self._engine, self._listener, self._trace, self._stop = engine, listener, trace, stop
+        self._scrub = Scrub(engine.settings, engine.store)
         self.name = process_name()
         self.unsound = False  # an error came that nobody raised on purpose
         # frames first: where publishing kills every worker, each still signs for a while
@@ -105,6 +109,9 @@ class Worker:
                 self._publish()
             if not found:
                 self._listener.wait(self._pause(), *self._wakers)
+        except NewerSchema as error:  # nothing but another version can go on
+            log.error("store migrated by a later version", extra={"error": str(error)})
+            self._stop.wait(OUTDATED_S)
         except SceneprintError as error:
             log.error("store unreachable", extra={"error": str(error)})
             self._stop.wait(TROUBLE_S)
@@ -132,6 +139,7 @@ class Worker:
         self._upkeep_at = time.monotonic() + UPKEEP_S  # also where it fails: frames go first
         try:
             self._engine.publish_due()
+            self._scrub.run()
         except MemoryError:  # the next process would have no more
             log.error("not enough memory to publish an index; raise SCENEPRINT_WORKER_BYTES")
             self._upkeep_at = time.monotonic() + POOR_S

@@ -295,8 +295,8 @@ class StoreAway(UnusableStore):
     """The server of the database, or of the blobs, does not answer, or the connection was lost."""
 
 
-class NewerSchema(StoreError):
-    """A later version of sceneprint wrote the database."""
+class NewerSchema(UnusableStore):
+    """A later version of sceneprint wrote the database, and this one may not write to it."""
 
 
 class DamagedBlob(StoreError):

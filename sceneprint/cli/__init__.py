@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures.process import BrokenProcessPool
+from datetime import timedelta
 from importlib import import_module
 
 from sceneprint import __version__
@@ -24,7 +26,7 @@ COMMANDS = {
     "work": "serve",
     "keys": "admin",
     "tenants": "admin",
-    "audit": "admin",
+    "audit": "audit",
     "maps": "inventory",
     "upload": "upload",
     "query": "query",
@@ -157,3 +159,14 @@ def metres(text: str) -> float:
     if not 0 < distance <= 1e4:  # false for NaN as well
         raise argparse.ArgumentTypeError(f"{text!r} is not a distance of up to 10000 m")
     return distance
+
+
+_SECONDS = {"m": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
+
+
+def duration(text: str) -> timedelta:
+    """A duration such as 12h."""
+    found = re.fullmatch(r"([1-9][0-9]{0,4})([mhdw])", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a duration such as 12h, 30d or 8w")
+    return timedelta(seconds=int(found[1]) * _SECONDS[found[2]])

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import re
 import sys
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from sceneprint.cli import whole_number
-from sceneprint.cli.options import one_line, require_database
+from sceneprint.cli import duration
+from sceneprint.cli.options import one_line
 from sceneprint.cli.serve import add_data_option, settings_of
 from sceneprint_client.api.admin import EVERY, SCOPES
 
 if TYPE_CHECKING:
-    from sceneprint_client.api.admin import Audited, Key, Scope
-
-_SECONDS = {"m": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
+    from sceneprint_client.api.admin import Key, Scope
 
 
 def add_keys(commands: Any) -> None:
@@ -53,7 +50,7 @@ def add_keys(commands: Any) -> None:
     )
     command.add_argument(
         "--expires",
-        type=_duration,
+        type=duration,
         metavar="TIME",
         help="lifetime of the key, such as 12h, 30d or 8w (default: no expiry)",
     )
@@ -111,13 +108,6 @@ def _key_line(key: Key) -> str:
     return f"{text}, {ends} {key.expires_at:%Y-%m-%dT%H:%M:%SZ}"
 
 
-def _duration(text: str) -> timedelta:
-    found = re.fullmatch(r"([1-9][0-9]{0,4})([mhdw])", text)
-    if found is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a duration such as 12h, 30d or 8w")
-    return timedelta(seconds=int(found[1]) * _SECONDS[found[2]])
-
-
 # `sceneprint tenants`: whom keys belong to.
 
 
@@ -166,57 +156,3 @@ def run_tenants(options: argparse.Namespace) -> int:
             engine.audit.command("tenants --create", target=options.create)
             print(f"tenant {one_line(options.create)} is created")
     return 0
-
-
-# `sceneprint audit`: who changed what.
-
-
-def add_audit(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "audit",
-        help="print the audit log",
-        description="Print the audit log, newest entry first: who changed what, and from which "
-        "address. Frame uploads are not logged here; see the frames themselves.",
-    )
-    command.add_argument(
-        "--actor",
-        metavar="NAME",
-        help="only changes made with this key, or `command` for the command line",
-    )
-    command.add_argument("--map", metavar="MAP", help="only changes to this map")
-    command.add_argument(
-        "--limit",
-        type=whole_number,
-        default=100,
-        metavar="N",
-        help="maximum number of entries (default: 100)",
-    )
-    command.add_argument("--json", action="store_true", help="print one JSON object per line")
-    add_data_option(command)
-    command.set_defaults(run=run_audit)
-
-
-def run_audit(options: argparse.Namespace) -> int:
-    """Print the changes."""
-    from sceneprint.engine import Engine
-
-    settings = settings_of(options)
-    require_database(settings)
-    with Engine(settings) as engine:
-        cursor, left = None, options.limit
-        while left > 0:
-            page = engine.audit.page(cursor, min(left, 1000), options.actor, options.map)
-            for one in page.items:
-                print(one.model_dump_json() if options.json else _audit_line(one))
-            cursor, left = page.next_cursor, left - len(page.items)
-            if cursor is None:
-                break
-    return 0
-
-
-def _audit_line(one: Audited) -> str:
-    who = "no key" if one.actor is None else one.actor
-    whence = "" if one.address is None else f" from {one.address}"
-    what = " ".join(part for part in (one.action, one.map, one.target) if part)
-    return one_line(f"{one.at:%Y-%m-%dT%H:%M:%SZ}  {who}{whence}  {what}")

@@ -109,6 +109,7 @@ def service_checks(client: Client, url: str) -> Iterator[Check]:
     else:
         yield clock_check(before, stats.at.timestamp(), time.time())
         yield store_check(stats)
+        yield scrub_check(stats)
         if stats.bytes.free is not None:
             yield disk_check("service disk", stats.bytes.free)
         yield worker_check(stats, read_only=status.read_only)
@@ -153,6 +154,24 @@ def store_check(stats: Stats) -> Check:
     if stats.replica is not None and not stats.replica.used:
         return Check("note", "store", f"{text}; the replica is not in use: see the service's log")
     return Check("ok", "store", text)
+
+
+def scrub_check(stats: Stats) -> Check:
+    """What workers found that read all stored bytes."""
+    seen = stats.scrub
+    if seen is None:
+        return Check("note", "scrub", "no stored bytes have been read to check them yet")
+    ended = "the first is under way"
+    if seen.finished_at is not None:
+        ended = f"the last ended {seen.finished_at:%Y-%m-%dT%H:%M:%SZ}"
+    text = f"{seen.blobs} blobs of {seen.bytes / 1e6:.1f} MB read, {ended}"
+    if seen.damaged:
+        text += (
+            f"; {seen.damaged} lost or damaged: derived data is made again, and `sceneprint fsck` "
+            "names uploads to send again"
+        )
+        return Check("note", "scrub", text)
+    return Check("ok", "scrub", f"{text}, none damaged")
 
 
 def worker_check(stats: Stats, *, read_only: bool) -> Check:

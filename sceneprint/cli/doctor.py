@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     from sceneprint.settings import Settings
     from sceneprint.store import Database
+    from sceneprint.store.database import SchemaRange
 
 # What `sceneprint doctor` says of the database, which is only ever read.
 
@@ -111,13 +112,13 @@ def _sqlite_file(settings: Settings, url: URL) -> Check:
 
 def _database_server(settings: Settings) -> Check:
     from sceneprint.errors import SceneprintError
-    from sceneprint.store.database import reach_database, revision_of
+    from sceneprint.store.database import reach_database, schema_range_of
 
     try:
         database = reach_database(settings.database)
         try:
             with database.read() as connection:
-                return _compared(revision_of(connection), database.shown)
+                return _compared(schema_range_of(connection), database.shown)
         finally:
             database.close()
     except SceneprintError as error:
@@ -136,24 +137,31 @@ def _path_of(url: URL) -> Path | None:
 
 def _schema(engine: Engine) -> Check:
     """Compare the schema with the one of this version; the database is not touched."""
-    from sceneprint.store.database import revision_of
+    from sceneprint.store.database import schema_range_of
 
     try:
         with engine.connect() as connection:
-            found = revision_of(connection)
+            found = schema_range_of(connection)
     finally:
         engine.dispose()
     return _compared(found, repr(engine.url))
 
 
-def _compared(found: str | None, place: str) -> Check:
+def _compared(found: SchemaRange | None, place: str) -> Check:
     from sceneprint.store.database import known_revisions
 
     head, known = known_revisions()
-    place = f"{place}, schema {found}"
-    if found == head:
+    if found is None:
+        return Check(
+            "note", "database", f"{place}, schema None; the next use migrates it to {head}"
+        )
+    place = f"{place}, schema {found.revision}"
+    if found.revision == head:
         return Check("ok", "database", place)
-    if found is None or found in known:
+    if found.allows(head):
+        text = f"{place} of a later version, which this one may still use. Upgrade this one too."
+        return Check("note", "database", text)
+    if found.revision in known:
         return Check("note", "database", f"{place}; the next use migrates it to {head}")
     text = (
         f"{place}: it was written by a later version of sceneprint. Use that version, or another "

@@ -135,9 +135,9 @@ class Engine:
         self._surface_upkeep = SurfaceUpkeep(
             self.store, self.bell, auto=settings.surfaces == "auto"
         )
-        self.audit = Audit(self.store)
+        self.audit = Audit(self.store, settings.audit_kept_days)
         self.outputs = FrameFiles(self.store, self.signers)
-        self.points = PointClouds(self.store, self.inspection.pairs, self.kept)
+        self.points = PointClouds(self.store, self.signers, self.inspection.pairs, self.kept)
         self.reconstructions = ReconstructionJobs(self.store, self.tasks)
         self.retiring = Retention(self.store)
         self.undo_limits = UndoLimits(settings.undo_s, settings.undo_bytes)
@@ -380,6 +380,7 @@ class Engine:
         published = self._upkeep.run()
         self._vector_tables.run()
         self.operations.tidy()
+        self.audit.tidy()
         self.history.tidy()
         self.imports.tidy()
         self._surface_upkeep.run()

@@ -50,6 +50,11 @@ class Store:
         near = current()
         return self.database if near is None else near.database
 
+    @property
+    def read_only(self) -> bool:
+        """Whether nothing can be stored: it was opened so, or its disk was remounted since."""
+        return self.database.read_only or self.database.turned_read_only or self.blobs.read_only
+
     @cached_property
     def geometries(self) -> GeometryCache:
         """Geometry artifacts, those that were read lately from memory."""

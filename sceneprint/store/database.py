@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,14 @@ from sqlalchemy import Connection, Engine, event
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
 from sceneprint.store.database_errors import database_label, explained
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.sqlite import BUSY_S, HELD_S, ReadOnlyFile, open_sqlite, shrink_log
+from sceneprint.store.sqlite import (
+    BUSY_S,
+    HELD_S,
+    ReadOnlyFile,
+    open_sqlite,
+    read_only_file,
+    shrink_log,
+)
 
 if TYPE_CHECKING:
     import psycopg
@@ -27,12 +35,12 @@ from functools import cache
 from secrets import token_bytes
 from typing import TYPE_CHECKING, TypeVar, cast
 
-from sqlalchemy import URL, insert, inspect, make_url
+from sqlalchemy import URL, insert, inspect, make_url, select
 from sqlalchemy.exc import ArgumentError
 
 import migrations
 from sceneprint.errors import SceneprintError
-from sceneprint.store.tables import metadata, secrets
+from sceneprint.store.tables import metadata, schema_range, secrets
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -41,6 +49,11 @@ if TYPE_CHECKING:
 _FOLDER = Path(migrations.__file__).parent
 #: How each file of `migrations/versions` says what it makes of what.
 _SAYS = re.compile(r'^(revision|down_revision) = (?:"(\w+)"|None)$', re.MULTILINE)
+
+
+#: The oldest revision whose processes may write to a store of this version: what the newest
+#: migration that changed or removed something wrote in `schema_range`.
+LEAST_REVISION = "0015"
 
 
 def migration_config() -> Config:
@@ -74,10 +87,78 @@ def revision_of(connection: Connection) -> str | None:
     return found
 
 
+@dataclass(frozen=True)
+class SchemaRange:
+    """Which processes may use a store.
+
+    Parameters
+    ----------
+    revision : of its schema
+    least : the oldest revision whose processes may write to it; None: a store of before 0015
+    """
+
+    revision: str
+    least: str | None
+
+    def allows(self, own: str) -> bool:
+        """Whether a process that works with a revision may use the store as it is.
+
+        Revisions are numbers of four digits, so that their order is that of the texts; what is
+        none is of nobody that is known.
+        """
+        return self.revision == own or (
+            self.revision.isdecimal()
+            and self.least is not None
+            and self.least <= own < self.revision
+        )
+
+
+def schema_range_of(connection: Connection) -> SchemaRange | None:
+    """Which processes may use a database; None: nobody has made a schema in it."""
+    revision = revision_of(connection)
+    if revision is None:
+        return None
+    if not inspect(connection).has_table(schema_range.name):
+        return SchemaRange(revision, None)
+    return SchemaRange(revision, connection.execute(select(schema_range)).scalar())
+
+
+#: What each writer asks, in its transaction.
+_RANGE = "SELECT version_num, (SELECT max(least_revision) FROM schema_range) FROM alembic_version"
+
+
+def require_schema(connection: Connection, *, locked: bool = False) -> None:
+    """See that a store has not been brought beyond what this process may write.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    locked : keep a migration from beginning until the transaction is over
+
+    Raises
+    ------
+    NewerSchema : it has, since this process opened it; nothing may be written.
+    """
+    row = connection.exec_driver_sql(f"{_RANGE} FOR KEY SHARE" if locked else _RANGE).one()
+    found, own = SchemaRange(*row), known_revisions()[0]
+    if not found.allows(own):
+        raise _outdated(connection, found, own)
+
+
+def _outdated(connection: Connection, found: SchemaRange, own: str) -> NewerSchema:
+    what = "later" if found.revision > own else "earlier"
+    return NewerSchema(
+        f"{database_label(connection.engine.url)} was brought to schema {found.revision} of a "
+        f"{what} version of sceneprint while this process ran, and this process works with {own}. "
+        "Nothing was stored. Stop this process, and start the version that the others run."
+    )
+
+
 def create_schema(connection: Connection) -> None:
     """Create all tables of this version in an empty SQLite database, as the migrations would."""
     head, _ = known_revisions()
     metadata.create_all(connection, checkfirst=False)
+    connection.execute(insert(schema_range).values(least_revision=LEAST_REVISION))
     connection.execute(insert(secrets).values(name="seals", value=token_bytes(32)))
     connection.exec_driver_sql(
         "CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL, "
@@ -163,6 +244,9 @@ def migrate(database: Database) -> None:
 
             config = migration_config()
             config.attributes["connection"] = connection
+            if not database.is_sqlite and current is not None:
+                # who writes out of turn ends first, and who comes later finds the new schema
+                connection.exec_driver_sql("SELECT version_num FROM alembic_version FOR UPDATE")
             with _migrating:
                 command.upgrade(config, "head")
             # what `unchecked` did not look at, looked at in the end
@@ -180,18 +264,24 @@ def migrate(database: Database) -> None:
 def current_revision(connection: Connection) -> str | None:
     """Revision of a database that this version knows; None: nobody has made a schema in it.
 
+    Of a later version's schema that this one may write to, it is the revision of this version.
+
     Raises
     ------
-    NewerSchema : a later version of sceneprint wrote it.
+    NewerSchema : a later version of sceneprint wrote it, and this one may not use it.
     """
-    current = revision_of(connection)
-    if current is not None and current not in known_revisions()[1]:
-        raise NewerSchema(
-            f"{database_label(connection.engine.url)} has schema {current}, which this version of "
-            "sceneprint does not know: a later one wrote it. Use that version, or another data "
-            "folder."
-        )
-    return current
+    found, (head, known) = schema_range_of(connection), known_revisions()
+    if found is None:
+        return None
+    if found.revision in known:
+        return found.revision
+    if found.allows(head):
+        return head
+    raise NewerSchema(
+        f"{database_label(connection.engine.url)} has schema {found.revision}, which this version "
+        "of sceneprint does not know: a later one wrote it. Use that version, or another data "
+        "folder."
+    )
 
 
 class Database:
@@ -214,6 +304,7 @@ class Database:
         self._turn = threading.Lock()
         self._held = False  # by another process, for longer than anybody should wait
         self._history: str | None = None
+        self._guarded = False
         if not self.is_sqlite:
             event.listen(engine, "connect", self._note_history)
 
@@ -254,6 +345,13 @@ class Database:
         """Whether it may be read alone, and every `write` raises ReadOnlyStore."""
         return self._sealed is not None
 
+    @property
+    def turned_read_only(self) -> bool:
+        """Whether its file may be read alone by now: disks turn read-only under those who use them,
+        and the system says so before anybody writes.
+        """
+        return self.is_sqlite and read_only_file(self._engine.url) is not None
+
     def require_writable(self) -> None:
         """See that it may be written.
 
@@ -263,6 +361,16 @@ class Database:
         """
         if self._sealed is not None:
             raise self._sealed.refusal()
+
+    def guard_schema(self) -> None:
+        """From now on, have each `write` see that the schema is one that this version may use."""
+        self._guarded = True
+
+    def require_schema(self) -> None:
+        """See that this process may still write; NewerSchema where another version migrated it."""
+        if self._guarded:
+            with self.read() as connection:
+                require_schema(connection)
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
@@ -291,11 +399,14 @@ class Database:
         StoreLocked : another process writes for longer than BUSY_S; who comes after that waits
             for HELD_S only (of the database's kind), until somebody gets through.
         StoreFull : the disk has no room.
+        NewerSchema : another version has brought it beyond what this process may write.
         UnusableStore : it cannot be written for another reason.
         """
         self.require_writable()
         if not turn and not self.is_sqlite:
             with self.explained(), self._engine.begin() as connection:
+                if self._guarded:
+                    require_schema(connection, locked=True)
                 yield connection
             return
         held_s = HELD_S if self.is_sqlite else postgres.HELD_S
@@ -316,6 +427,8 @@ class Database:
                 writing = connection.execution_options(**options)
                 with writing.begin():
                     self._held = False
+                    if self._guarded and not unchecked:
+                        require_schema(writing)
                     yield writing
                 if not self.is_sqlite:
                     postgres.require_synchronous(writing)
@@ -416,6 +529,7 @@ def open_database(url: str) -> Database:
     database = reach_database(url)
     try:
         migrate(database)
+        database.guard_schema()
     except BaseException:
         database.close()
         raise

@@ -6,6 +6,7 @@ OSError | error of SQLite or PostgreSQL  -->  StoreFull, ReadOnlyStore, StoreLoc
 from __future__ import annotations
 
 import errno
+import os
 import re
 import shutil
 import sqlite3
@@ -104,6 +105,11 @@ def _of_sqlite(url: URL, error: DBAPIError) -> UnusableStore | None:
         return ReadOnlyStore(
             f"{what} The database or its folder is read-only. Make both writable, and start again."
         )
+    if code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN) and _turned_read_only(url.database):
+        return ReadOnlyStore(
+            f"{what} Its disk is mounted read-only, as after an error of the disk. Look into the "
+            "system's log, make the disk writable, and start again."
+        )
     no_room = code == sqlite3.SQLITE_IOERR and _no_room(url.database)
     if code == sqlite3.SQLITE_FULL or no_room:
         return StoreFull(f"{what} Nothing was stored. Free some space on its disk.")
@@ -111,6 +117,14 @@ def _of_sqlite(url: URL, error: DBAPIError) -> UnusableStore | None:
         f"{what} Check that the database is there, that it may be written, and that the disk has "
         "room."
     )
+
+
+def _turned_read_only(path: str | None) -> bool:
+    """Whether the disk of a file is mounted read-only by now: SQLite says `disk I/O error`."""
+    try:
+        return path is not None and bool(os.statvfs(Path(path).parent).f_flag & os.ST_RDONLY)
+    except OSError:
+        return False
 
 
 def _no_room(path: str | None) -> bool:

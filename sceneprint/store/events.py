@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, delete, func, insert, or_, select
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    and_,
+    delete,
+    func,
+    insert,
+    literal_column,
+    or_,
+    select,
+)
 
 from sceneprint.store.tables import MapRow, among, blocks, events, former_maps, maps
 
@@ -86,11 +96,14 @@ class Wanted:
     maps : only of these; None: of all, and those of no map
     kinds : beginnings of kinds, one of which must fit; none: all
     of_maps : whether those of no map are left out
+    since : when whoever asks was first let in, seconds since 1970: of a map that was deleted before
+        nothing is told, though another has its name; None: of those too
     """
 
     maps: frozenset[str] | None = None
     kinds: tuple[str, ...] = ()
     of_maps: bool = False
+    since: float | None = None
 
     def __call__(self, event: EventRow) -> bool:
         """Whether an event is one of them."""
@@ -115,8 +128,14 @@ def newest_seen(connection: Connection, wanted: Wanted) -> int:
     hidden: when it changes, the caller was told what happened.
     """
     if wanted.maps is not None:
+        beginnings = _beginnings(connection, wanted)
         newest = select(func.max(events.c.number))
-        of = [connection.execute(newest.where(events.c.map == one)) for one in wanted.maps]
+        of = [
+            connection.execute(
+                newest.where(events.c.map == one, events.c.number > beginnings.get(one, 0))
+            )
+            for one in wanted.maps
+        ]
         return max((int(one.scalar() or 0) for one in of), default=0)
     if not wanted.of_maps:
         return newest_number(connection)
@@ -139,13 +158,46 @@ def list_events(
     if before is not None:
         asked = asked.where(events.c.number < before)
     if wanted.maps is not None:
-        asked = asked.where(events.c.map.in_(sorted(wanted.maps)))
+        asked = asked.where(_of_maps(wanted.maps, _beginnings(connection, wanted)))
     elif wanted.of_maps:
         asked = asked.where(events.c.map.is_not(None))
     if wanted.kinds:
         fits = [events.c.kind.startswith(one, autoescape=True) for one in wanted.kinds]
         asked = asked.where(or_(*fits))
     return [EventRow(**row) for row in connection.execute(asked).mappings()]
+
+
+#: Maps with a beginning of their own that one statement asks about: SQLite bounds its depth.
+_MOST_BEGINNINGS = 500
+#: As the index of those says it; see `_LIVING` of `deletion`.
+_DELETED: ColumnElement[bool] = events.c.kind == literal_column("'map.deleted'")
+
+
+def _beginnings(connection: Connection, wanted: Wanted) -> dict[str, int]:
+    """By map, the number after which its events begin for whoever asks, where a map of the name was
+    deleted before it was let in.
+    """
+    if wanted.since is None or wanted.maps is None:
+        return {}
+    asked = (
+        select(events.c.map, func.max(events.c.number))
+        .where(_DELETED, events.c.map.in_(sorted(wanted.maps)), events.c.at < wanted.since)
+        .group_by(events.c.map)
+    )
+    return {row[0]: int(row[1]) for row in connection.execute(asked)}
+
+
+def _of_maps(names: Collection[str], beginnings: Mapping[str, int]) -> ColumnElement[bool]:
+    """That an event is of one of some maps, and not of before its beginning."""
+    whole = events.c.map.in_(sorted(set(names) - beginnings.keys()))
+    if len(beginnings) > _MOST_BEGINNINGS:
+        last = max(beginnings.values())
+        return or_(whole, and_(events.c.map.in_(sorted(beginnings)), events.c.number > last))
+    of = [
+        and_(events.c.map == name, events.c.number > last)
+        for name, last in sorted(beginnings.items())
+    ]
+    return or_(whole, *of)
 
 
 def anchor_number(anchor: str) -> int | None:
@@ -204,7 +256,12 @@ def floor_of(connection: Connection, wanted: Wanted, kept: int, after: int) -> i
         return max(found.values(), default=0)
     names = set(_names(connection))
     own = [found.get(one, 0) for one in wanted.maps & names]
-    return max([*own, *_floors_of_gone(connection, wanted.maps - names, found.get(None, 0))])
+    beginnings = _beginnings(connection, wanted)
+    gone = {
+        name for name in wanted.maps - names
+        if last_event(connection, name) > beginnings.get(name, 0)
+    }  # fmt: skip
+    return max([*own, *_floors_of_gone(connection, gone, found.get(None, 0))])
 
 
 def _floors_of_gone(connection: Connection, names: Collection[str], floor: int) -> Iterator[int]:

@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Select, String, delete, insert, select
+from sqlalchemy import Connection, Select, delete, insert, select
 
 from sceneprint.errors import Conflict, IdempotencyConflict, UnknownKey
 from sceneprint.store.events import record_event
-from sceneprint.store.tables import audit, idempotency, keys
+from sceneprint.store.tables import idempotency, keys
 from sceneprint.store.tenants import join_tenant, leave_tenant
 from sceneprint_client.api.admin import Scope
 
@@ -111,75 +111,6 @@ def _select_keys() -> Select[tuple[str, str, dict[str, Scope], float, float | No
 
 def _digest(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
-
-
-# Who changed what: the newest lines of it.
-
-#: Lines that are kept.
-KEPT = 100_000
-
-
-@dataclass(frozen=True)
-class KeyChange:
-    """A change.
-
-    Parameters
-    ----------
-    action : the operation
-    actor : name of the key that was shown; "" where none was asked for
-    address : where the request came from
-    map, target : what was changed
-    request_id : as in the log
-    data : more about it
-    at : seconds since 1970; None: now
-    number : of the line; 0 before it is one
-    """
-
-    action: str
-    actor: str
-    address: str | None = None
-    map: str | None = None
-    target: str | None = None
-    request_id: str | None = None
-    data: dict[str, Any] | None = None
-    at: float | None = None
-    number: int = 0
-
-
-#: Columns whose texts may be whatever somebody asked for.
-_TEXTS = ("actor", "address", "action", "map", "target", "request_id")
-
-
-def _cut(name: str, text: str | None) -> str | None:
-    """As much of a text as its column takes."""
-    kind = audit.c[name].type
-    return text if text is None or not isinstance(kind, String) else text[: kind.length]
-
-
-def note(connection: Connection, change: KeyChange, kept: int = KEPT) -> None:
-    """Add a line; the oldest go where there are too many."""
-    added = connection.execute(
-        insert(audit).values(
-            at=time.time() if change.at is None else change.at, data=change.data or {},
-            **{name: _cut(name, getattr(change, name)) for name in _TEXTS},
-        )
-    ).inserted_primary_key  # fmt: skip
-    assert added is not None
-    connection.execute(delete(audit).where(audit.c.number <= added[0] - kept))
-
-
-def list_changes(
-    connection: Connection, before: int | None, limit: int, actor: str | None, map_name: str | None
-) -> list[KeyChange]:
-    """Changes, the newest first, from below number `before` on."""
-    asked = select(audit).order_by(audit.c.number.desc()).limit(limit)
-    if before is not None:
-        asked = asked.where(audit.c.number < before)
-    if actor is not None:
-        asked = asked.where(audit.c.actor == actor)
-    if map_name is not None:
-        asked = asked.where(audit.c.map == map_name)
-    return [KeyChange(**row) for row in connection.execute(asked).mappings()]
 
 
 # Keys under which a caller may send a request again: what came of it, kept for a day.

@@ -226,6 +226,9 @@ MAXIMUM_ATTEMPTS = 10
 UPKEEP = -10
 #: Seconds before the second try; each further one waits four times as long.
 BACKOFF_S = 2.0
+#: No job waits longer than this, and no lease is longer (seconds): what is due later was written
+#: before the clock was set back, and is due now.
+LONGEST_PAUSE_S, LONGEST_LEASE_S = 60.0, 3600.0
 
 
 def enqueue(
@@ -278,10 +281,16 @@ def due_in_s(connection: Connection) -> float | None:
 def has_due(connection: Connection) -> bool:
     """Whether there is a job to claim or to move to the dead letters; costs no lock."""
     at = now(connection)
-    waiting = and_(jobs.c.state == JobState.QUEUED, jobs.c.run_after <= at)
-    silent = and_(jobs.c.state == JobState.RUNNING, jobs.c.leased_until < at)
+    early, late = jobs.c.run_after <= at, jobs.c.run_after > at + LONGEST_PAUSE_S
+    waiting = and_(jobs.c.state == JobState.QUEUED, or_(early, late))
+    silent = and_(jobs.c.state == JobState.RUNNING, _lease_over(at))
     asked = select(jobs.c.number).where(or_(waiting, silent)).limit(1)
     return connection.execute(asked).first() is not None
+
+
+def _lease_over(at: ColumnElement[float]) -> ColumnElement[bool]:
+    """That a lease has ended, or ends later than any lease that was given by this clock."""
+    return or_(jobs.c.leased_until < at, jobs.c.leased_until > at + LONGEST_LEASE_S)
 
 
 def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
@@ -295,8 +304,10 @@ def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
     """
     at = now(connection)
     # "+ 0.0" keeps SQLite to the index that has the order: it would sort all that is due
-    waiting = jobs.c.state == JobState.QUEUED, jobs.c.run_after + 0.0 <= at
-    silent = jobs.c.state == JobState.RUNNING, jobs.c.leased_until < at
+    due_at = jobs.c.run_after + 0.0
+    is_due = or_(due_at <= at, due_at > at + LONGEST_PAUSE_S)
+    waiting = jobs.c.state == JobState.QUEUED, is_due
+    silent = jobs.c.state == JobState.RUNNING, _lease_over(at)
     found = None
     for tenant, turn in _tenants_due(connection, *waiting):  # the first's may all be locked
         found = _lock_first(connection, turn, *waiting, jobs.c.tenant == tenant)
@@ -620,7 +631,7 @@ def _out_of_tries(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
     """What holds of a job that fell silent in the last of its tries."""
     return (
         jobs.c.state == JobState.RUNNING,
-        jobs.c.leased_until < at,
+        _lease_over(at),
         jobs.c.attempts >= MAXIMUM_ATTEMPTS,
     )
 

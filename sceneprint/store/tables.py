@@ -270,6 +270,11 @@ events = Table(
     Index(None, "map", "number"),
     sqlite_autoincrement=True,
 )
+#: Where the events of a former map of a name end.
+Index(
+    "ix_events_map_number_deleted", events.c.map, events.c.number,
+    sqlite_where=events.c.kind == "map.deleted", postgresql_where=events.c.kind == "map.deleted",
+)  # fmt: skip
 
 #: What was done under an `Idempotency-Key`, for a day.
 idempotency = Table(
@@ -296,7 +301,47 @@ audit = Table(
     Column("target", _string(128)),
     Column("request_id", _string(64)),
     Column("data", JSON, nullable=False),
+    # the chain that the line is part of, its place there, and its hash; null: of before version 0.3
+    Column("tenant", _string(128)),
+    Column("refused", Boolean),
+    Column("sequence", WHOLE),
+    Column("hash", _string(64)),
+    Index("uq_audit_tenant_refused_sequence", "tenant", "refused", "sequence", unique=True),
+    Index(None, "at"),
     sqlite_autoincrement=True,
+)
+
+#: Chains of the audit log: changes and refusals of each tenant. What was pruned ends in `anchor`.
+audit_chains = Table(
+    "audit_chains",
+    metadata,
+    Column("tenant", _string(128), primary_key=True),
+    Column("refused", Boolean, primary_key=True),
+    Column("pruned", WHOLE, nullable=False),  # place of the last line that is gone; 0: none is
+    Column("anchor", _string(64), nullable=False),  # hash of that line
+    Column("last", WHOLE, nullable=False),  # place of the newest line
+    Column("head", _string(64), nullable=False),  # its hash
+)
+
+#: One row: the oldest revision whose processes may write to this schema.
+schema_range = Table(
+    "schema_range",
+    metadata,
+    Column("least_revision", _string(32), primary_key=True),
+)
+
+#: One row: how far stored bytes have been read to see that they are sound.
+scrubs = Table(
+    "scrubs",
+    metadata,
+    Column("number", WHOLE, primary_key=True, autoincrement=False),
+    Column("position", WHOLE, nullable=False),  # number of the last frame that was read
+    Column("next_at", Float, nullable=False),  # when somebody may go on, by the database's clock
+    Column("began_at", Float, nullable=False),  # of this pass
+    Column("finished_at", Float),  # the last whole pass; null: there was none
+    Column("blobs", BigInteger, nullable=False),  # these and the next: of this pass, or the last
+    Column("bytes", BigInteger, nullable=False),
+    Column("damaged", BigInteger, nullable=False),
 )
 
 #: Figures of processes, a few times a minute, for an hour or two.

@@ -74,12 +74,13 @@ async def healthz() -> Health:
 @router.head("/readyz", include_in_schema=False)
 @router.get("/readyz", responses=declared(), response_model_exclude_defaults=True)
 def readyz(here: Here, asking: Guest) -> Readiness:
-    """Answers while the database and the object store do; 503 while one does not, and while
-    kernels are being compiled. No key is asked for.
+    """Answers while the database and the object store do; 503 while one does not, while kernels are
+    being compiled, and for good once a later version has migrated the store. No key is asked for.
     """
     here.engine.signers.require_kernels(LOOK_S)
     frames = jobs = None
     here.engine.store.blobs.check()
+    here.engine.store.database.require_schema()
     if asking is not None and asking.reads_every:
         frames, jobs = here.engine.counts()
     else:  # whoever shows no key has nothing counted: that takes the longer the more there is
@@ -88,7 +89,7 @@ def readyz(here: Here, asking: Guest) -> Readiness:
     return Readiness(
         status="ready",
         version=__version__,
-        read_only=here.engine.store.database.read_only,
+        read_only=here.engine.store.read_only,
         frames=frames,
         jobs=jobs,
         replica=_replica(here.engine.operations.statistics.replica()),
@@ -190,9 +191,11 @@ def list_changes(
     cursor: Cursor = None,
     limit: Limit = 100,
 ) -> Page[Audited]:
-    """Who changed what, the newest first: all but uploads of frames, which the events tell of.
+    """Who changed what, and who was refused (401, 403), the newest first: all but uploads of
+    frames, which the events tell of.
 
-    The newest 100,000 changes are kept.
+    Lines are kept for `SCENEPRINT_AUDIT_KEPT_DAYS`; of each tenant at most 200,000 changes and as
+    many refusals. `sceneprint audit verify` checks their hashes.
     """
     return here.engine.audit.page(cursor, limit, actor, map_name)
 

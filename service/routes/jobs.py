@@ -191,6 +191,8 @@ def _wanted(here: Context, asking: Caller, map_name: str | None, kinds: list[str
     if map_name is not None:
         asking.require(map_name, "read")
     wanted = here.engine.operations.wanted(map_name, kinds)
+    if not asking.reads_every:
+        wanted = replace(wanted, since=asking.created_at)
     if map_name is not None or asking.may("admin"):
         return wanted
     if asking.named is not None:

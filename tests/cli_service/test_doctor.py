@@ -35,7 +35,8 @@ from sceneprint_client import Client, Status
 Run = Callable[..., Any]
 #: What is said of a service.
 SERVICE = [
-    "service", "ready", "service clock", "store", "service disk", "workers", "queue", "models",
+    "service", "ready", "service clock", "store", "scrub", "service disk", "workers",
+    "queue", "models",
 ]  # fmt: skip
 
 
@@ -171,6 +172,11 @@ def test_databases_of_other_versions(tmp_path: Path) -> None:
     with sqlite3.connect(path) as connection:
         connection.execute("UPDATE alembic_version SET version_num = '9999'")
     connection.close()
+    finding = found_in(settings)["database"]
+    assert (finding.verdict, "which this one may still use" in finding.text) == ("note", True)
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE schema_range SET least_revision = '9999'")
+    connection.close()
     before = path.read_bytes()
     finding = found_in(settings)["database"]
     assert (finding.verdict, "schema 9999: it was written by a later version" in finding.text) == (
@@ -211,6 +217,7 @@ def test_looking_at_a_database_changes_nothing(tmp_path: Path) -> None:
     with sqlite3.connect(path) as writer:
         writer.execute("PRAGMA wal_autocheckpoint = 0")
         writer.execute("UPDATE alembic_version SET version_num = '9999'")
+        writer.execute("UPDATE schema_range SET least_revision = '9999'")
         writer.commit()
         assert look() == "WRONG"  # what is in the log only is seen too
         shutil.copytree(path.parent, killed.parent)

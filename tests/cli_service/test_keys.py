@@ -13,7 +13,7 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
-from sceneprint.store.keys import KeyChange
+from sceneprint.store.audit_chain import KeyChange
 
 Run = Callable[..., Any]
 

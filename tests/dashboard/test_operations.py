@@ -225,8 +225,10 @@ def test_keys_are_made_shown_once_and_withdrawn(station, page, settle, axe):
     assert httpx.get(f"{station.url}/v1/keys/me", headers=shown).status_code == 401
     page.goto(f"{station.home}#/operations?tab=audit")
     settle(page)
-    newest = page.locator("tbody tr").first.inner_text().split("\t")
-    assert newest[1:5] == ["no key required", "revoke key", "–", "robot/7"]
+    rows = page.locator("tbody tr")
+    newest, before = (rows.nth(i).inner_text().split("\t") for i in range(2))
+    assert newest[1:5] == ["no key required", "me (refused)", "–", "–"]  # with the revoked key
+    assert before[1:5] == ["no key required", "revoke key", "–", "robot/7"]
     assert axe(page) == []
 
 

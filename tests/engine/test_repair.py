@@ -12,7 +12,7 @@ from sqlalchemy import select, update
 from sceneprint.engine import Engine
 from sceneprint.engine.upkeep import repair
 from sceneprint.engine.upkeep.repair import MOST, PAUSE_S, PRIORITY, resign_frames
-from sceneprint.errors import DamagedBlob, DamagedSignature
+from sceneprint.errors import DamagedBlob
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import MapRow, frames, jobs, signatures
@@ -111,14 +111,18 @@ def test_a_damaged_artifact_is_skipped_and_soon_made_again(
     assert waiting(full) == []
 
 
-def test_a_frame_whose_own_artifact_is_damaged_is_refused_and_soon_well(
+def test_a_frame_whose_own_artifact_is_damaged_is_answered_and_soon_well(
     full: Engine, ids: Ids, work_off: WorkOff
 ) -> None:
     hurt = ids(full)[3]
     before = full.query_frame("hall", hurt, Query())
     damage(artifact(full, hurt))
-    with pytest.raises(DamagedBlob):
-        full.query_frame("hall", hurt, Query())
+    answer = full.query_frame("hall", hurt, Query())
+    assert statuses(answer) == statuses(before)
+    assert [m.transform for m in answer.matches] == [m.transform for m in before.matches]
+    wanted = full.operations.wanted("hall", ["frame.damaged"])
+    (event,) = full.operations.events(wanted).items
+    assert (event.frame_id, event.job_id) == (hurt, waiting(full)[0].id)
     assert [job.frame_number for job in waiting(full)] == [number_of(full, hurt)]
     assert work_off(full) == [JobState.SUCCEEDED]
     assert statuses(full.query_frame("hall", hurt, Query())) == statuses(before)
@@ -130,8 +134,10 @@ def test_a_damaged_signature_is_never_compared_and_soon_made_again(
     hurt, ask = ids(full)[3], Query(stages=("retrieve",), k=50)
     others = full.query_frame("hall", hurt, ask)
     sound = damage_signature(full, hurt)
-    with pytest.raises(DamagedSignature, match="made again"):
-        full.query_frame("hall", hurt, ask)
+    answer = full.query_frame("hall", hurt, ask)
+    assert [(m.frame_id, m.distance) for m in answer.matches] == [
+        (m.frame_id, m.distance) for m in others.matches
+    ]
     assert [job.frame_number for job in waiting(full)] == [number_of(full, hurt)]
     fresh = make_engine()  # `full` holds it from before
     answer = fresh.query_upload("hall", uploads[3].data, uploads[3].meta, ask)
@@ -168,6 +174,16 @@ def test_who_passes_a_damaged_signature_over_has_it_made_again(
     answer = make_engine().query_upload("hall", uploads[4].data, uploads[4].meta, ask)
     assert (answer.index_generation, answer.matches[0].frame_id) == (1, other)
     assert len(answer.matches) == answer.counts.map == 12
+
+
+def test_a_frame_with_nothing_sound_left_says_so(full: Engine, ids: Ids) -> None:
+    hurt = ids(full)[3]
+    damage(artifact(full, hurt))
+    with full.store.database.read() as connection:
+        blob = connection.execute(select(frames.c.blob).where(frames.c.id == hurt)).scalar_one()
+    damage(full.store.blobs.path(blob))
+    with pytest.raises(DamagedBlob, match=f"blob {blob[:12]} is damaged"):
+        full.query_frame("hall", hurt, Query())
 
 
 def test_what_cannot_be_healed_is_not_tried_for_ever(

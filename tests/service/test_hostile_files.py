@@ -125,7 +125,7 @@ def test_blobs_that_are_missing_cost_what_needs_them(
     assert "No such file" in told[frames[0]]["reason"]
     assert (answer["status"], told[frames[1]]["status"]) == ("found", "accepted")
     own = server.client.post(f"{HALL}/queries", json={"frame_id": frames[0]})
-    refused(own, 500, "damaged-blob", "Restore the data folder from a copy")
+    assert (own.status_code, own.json()["status"]) == (200, "found")  # made of its upload
     assert nearest(server, frames[0])["counts"]["compared"] == 8  # without the stage that needs it
 
     (folder / "blobs").rename(folder / "away")
@@ -188,7 +188,7 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
             place.rename(folder / "away")
         place.write_bytes(b"a file where the folder should be")
         with monkeypatch.context() as patch:
-            patch.setattr(lifecycle, "LEFT_S", 600.0)
+            patch.setattr(lifecycle, "LEFT_S", 50.0)
             with pytest.raises(UnusableStore):
                 engine.run(engine.claim("w"))
             assert engine.claim("w") is None  # it lets others go first
@@ -216,6 +216,7 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
 def test_the_folder_of_a_later_version_is_left_alone(command, folder, truth):
     with truth(folder) as connection:
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+        connection.exec_driver_sql("UPDATE schema_range SET least_revision = '9999'")
     before = contents(folder)
     start = [BIN / "sceneprint", command, "--data", folder]
     done = subprocess.run(start, capture_output=True, text=True, timeout=90, check=False)

@@ -13,6 +13,7 @@ import pytest
 
 from sceneprint.errors import InvalidRequest
 from sceneprint.settings import Settings
+from service.audit import AGAIN_S, ALL_AT_ONCE, AT_ONCE, RefusalFilter
 from service.browser_security import origins_of
 
 FLEET = "https://fleet.example"
@@ -330,7 +331,6 @@ def test_changes_are_noted_and_found(walled):
     assert [line["actor"] for line in lines] == ["boss", "boss"]
     assert (lines[0]["request_id"], lines[0]["data"]["status"]) == ("delete-1", 204)
     assert lines[0]["at"] >= lines[1]["at"]
-    assert walled.ask("boss", "GET", "/v1/audit?actor=watcher").json()["items"] == []
     page = walled.ask("boss", "GET", "/v1/audit?limit=1&map=m1").json()
     rest = walled.ask("boss", "GET", f"/v1/audit?map=m1&cursor={page['next_cursor']}").json()
     assert [page["items"] + rest["items"], rest["next_cursor"]] == [lines, None]
@@ -349,6 +349,38 @@ def test_the_address_is_that_of_the_connection(walled):
     assert made.status_code == 201
     (line,) = walled.ask("boss", "GET", "/v1/audit?map=seen").json()["items"]
     assert (line["address"], line["actor"]) == ("127.0.0.1", "boss")
+
+
+def test_what_a_key_was_refused_is_noted_a_few_times(walled):
+    """However often it tries; the lines of others stay as they are."""
+    new = {"name": "peeper", "grants": {"m2": "read"}}
+    secret = walled.ask("boss", "POST", "/v1/keys", json=new).json()["secret"]
+    given = {"Authorization": f"Bearer {secret}", "X-Request-Id": "peep"}
+    for _ in range(AT_ONCE + 5):
+        answer = walled.server.client.get("/v1/audit", headers=given)
+        assert answer.status_code == 403
+    lines = walled.ask("boss", "GET", "/v1/audit?actor=peeper&limit=1000").json()["items"]
+    assert [one["sequence"] for one in lines] == list(range(AT_ONCE, 0, -1))
+    told = ("action", "tenant", "address", "refused", "request_id", "data")
+    assert [lines[0][name] for name in told] == [
+        "list_changes", "peeper", "127.0.0.1", True, "peep", {"status": 403},
+    ]  # fmt: skip
+
+
+def test_refusals_are_counted_for_each_caller_and_address():
+    now = 0.0
+    filtered = RefusalFilter(lambda: now)
+    assert [filtered.count("robot", "10.0.0.1") for _ in range(AT_ONCE + 3)] \
+        == [0] * AT_ONCE + [None] * 3  # fmt: skip
+    assert filtered.count("robot", "10.0.0.2") == filtered.count("", "10.0.0.1") == 0
+    now = AGAIN_S
+    assert [filtered.count("robot", "10.0.0.1") for _ in range(2)] == [3, None]
+    now += AGAIN_S
+    # of one network of IPv6 all are one, and all callers together have a limit too
+    one_by_one = [filtered.count("", f"2001:db8::{i:x}") for i in range(AT_ONCE + 1)]
+    assert one_by_one == [0] * AT_ONCE + [None]
+    many = [filtered.count("", f"10.1.{i}.1") for i in range(ALL_AT_ONCE)]
+    assert many.count(0) == ALL_AT_ONCE - AT_ONCE
 
 
 def test_what_was_refused_is_in_the_log(walled, until):

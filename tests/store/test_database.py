@@ -26,11 +26,11 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.tables import MapRow, metadata
 
 TABLES = [
-    "audit", "deleted_frames", "deletions", "doomed", "events", "former_maps", "frame_tags",
-    "frames", "idempotency", "job_files", "job_items", "jobs", "kept_answer_frames",
+    "audit", "audit_chains", "deleted_frames", "deletions", "doomed", "events", "former_maps",
+    "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs", "kept_answer_frames",
     "kept_answer_maps", "kept_answers", "keys", "maps", "models", "query_records", "samples",
-    "secrets", "signatures", "surface_frames", "surface_tiles", "surface_touches", "surfaces",
-    "tenants",
+    "schema_range", "scrubs", "secrets", "signatures", "surface_frames", "surface_tiles",
+    "surface_touches", "surfaces", "tenants",
 ]  # fmt: skip
 
 
@@ -59,7 +59,12 @@ def described(path: Path) -> set[tuple[str, ...]]:
             "SELECT type, name, tbl_name, sql FROM sqlite_master WHERE tbl_name NOT LIKE 'alembic%'"
         ).fetchall()
     return {
-        (kind, name, table, *sorted((sql or "").replace(",", " ").replace('"', "").split()))
+        (
+            kind,
+            name,
+            table,
+            *sorted((sql or "").replace(",", " ").replace(")", " ) ").replace('"', "").split()),
+        )
         for kind, name, table, sql in rows
     }
 
@@ -154,6 +159,7 @@ def test_a_database_of_a_later_version_is_left_as_it_is(url: str, tmp_path: Path
     path = tmp_path / "truth.db"
     with closing(sqlite3.connect(path, isolation_level=None)) as connection:
         connection.execute("UPDATE alembic_version SET version_num = '9999'")
+        connection.execute("UPDATE schema_range SET least_revision = '9999'")
     before = path.read_bytes()
     with pytest.raises(NewerSchema, match="has schema 9999, which this version"):
         open_database(url)

@@ -7,11 +7,12 @@ import re
 from pathlib import Path
 
 import pytest
-from sqlalchemy import insert, select
+from sqlalchemy import insert, select, update
 
 from sceneprint.store import Store
-from sceneprint.store.events import Wanted, list_events, newest_seen
-from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.deletion import remove_map
+from sceneprint.store.events import Wanted, floor_of, list_events, newest_seen
+from sceneprint.store.maps import add_map, find_map, keep_model
 from sceneprint.store.store_counts import count_events
 from sceneprint.store.tables import events
 from sceneprint_client.api.admin import KINDS
@@ -132,3 +133,58 @@ def test_every_kind_that_is_told_is_declared():
     assert {"frame.indexed", "map.created", "key.revoked"} <= told
     assert told <= set(KINDS)
     assert all(re.fullmatch(r"[a-z_]+\.[a-z_]+", kind) and len(kind) <= 32 for kind in KINDS)
+
+
+def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store: Store) -> None:
+    """Nor is it told of one that was deleted before it was made, and of which there is no other."""
+
+    def told(since: float | None, *names: str) -> list[tuple[str, str | None]]:
+        wanted = Wanted(frozenset(names), since=since)
+        with store.database.read() as connection:
+            found = [(one.kind, one.map) for one in list_events(connection, wanted)]
+            newest = newest_seen(connection, wanted)
+            lost = floor_of(connection, wanted, 1, 0)
+            numbers = connection.execute(select(events.c.number, events.c.kind, events.c.map))
+            last = [row.number for row in numbers if (row.kind, row.map) in found]
+        assert newest == max(last, default=0)
+        assert found or lost == 0
+        return found
+
+    def at(seconds: float) -> None:
+        """When what has happened since the last time was."""
+        with store.database.write() as connection:
+            new = events.c.at > 10_000
+            connection.execute(update(events).where(new).values(at=seconds))
+
+    def begin(*names: str) -> None:
+        with store.database.write() as connection:
+            for name in names:
+                add_map(connection, name, None, "m" * 64)
+
+    def end(*names: str) -> None:
+        with store.database.write() as connection:
+            for name in names:
+                remove_map(connection, find_map(connection, name))
+
+    with store.database.write() as connection:
+        keep_model(connection, "m" * 64, "small", b"")
+    begin("hall", "shop")
+    at(100)
+    end("hall", "shop")
+    at(200)
+    begin("hall", "yard")
+    at(300)
+    made, gone = ("map.created", "hall"), ("map.deleted", "hall")
+    assert told(None, "hall") == told(150, "hall") == [made, gone, made]
+    assert told(250, "hall") == told(900, "hall") == [made]
+    assert told(250, "shop") == told(250, "attic") == []
+    assert told(150, "shop") == [("map.created", "shop"), ("map.deleted", "shop")]
+    assert told(250, "hall", "shop", "yard") == [made, ("map.created", "yard")]
+    end("hall")  # by whoever had it: what was before it stays hidden
+    at(400)
+    assert told(250, "hall") == [made, gone]
+    assert told(500, "hall") == []
+    begin("hall")
+    at(600)
+    assert told(250, "hall") == [made, gone, made]
+    assert told(500, "hall") == [made]

@@ -179,6 +179,7 @@ def test_another_schema_on_a_read_only_folder_is_left_alone(
     folder.chmod(0o755)
     with closing(sqlite3.connect(folder / "a.db")) as connection:
         connection.execute("UPDATE alembic_version SET version_num = ?", (schema,))
+        connection.execute("UPDATE schema_range SET least_revision = ?", (schema,))
         connection.commit()
     folder.chmod(0o555)
     before = (folder / "a.db").read_bytes()

@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 from sqlalchemy import event, select, update
 
+from sceneprint.engine.jobs.lifecycle import LEFT_S
 from sceneprint.errors import LostLease, UnknownJob
+from sceneprint.settings import Settings
 from sceneprint.store import Store, queue
 from sceneprint.store.signatures import StoredSignature, index_frame
 from sceneprint.store.tables import FrameRow, JobRow, MapRow, jobs, signatures
@@ -65,7 +67,7 @@ def test_a_claim_is_a_lease_with_a_token(store: Store, hand: Any, queued: Queued
 
 def test_a_job_waits_for_its_time(store: Store, hand: Any, queued: Queued, turned: Turned) -> None:
     job = queued("a")
-    turned(job, run_after=time.time() + 100)
+    turned(job, run_after=time.time() + 30)
     assert not hand.due()
     assert hand.take() is None
     turned(job, run_after=time.time() - 0.001)
@@ -247,3 +249,25 @@ def test_a_clock_set_back_changes_no_turn(
     if store.database.is_sqlite:
         monkeypatch.setattr(time, "time", lambda: 1e9)
     assert [hand.taken().tenant for _ in range(3)] == ["b", "a", "b"]
+
+
+def test_jobs_and_leases_written_before_the_clock_was_set_back_are_taken(
+    store: Store, hand: Any, queued: Queued, turned: Turned
+) -> None:
+    """A year back: what was due then is due now, and no lease was ever that long."""
+    year, job = 365 * 86_400.0, queued("a")
+    turned(job, run_after=time.time() + year)
+    assert hand.due()
+    first = hand.taken("first")
+    assert first.number == job.number
+    turned(job, leased_until=time.time() + year)
+    assert hand.due()
+    second = hand.taken("second")
+    assert (second.worker, second.token) == ("second", 2)
+
+
+def test_no_pause_and_no_lease_is_longer_than_the_clock_may_be_wrong_by() -> None:
+    longest = max(queue.pause_s(n) for n in range(1, queue.MAXIMUM_FAILURES))
+    assert max(longest, LEFT_S) < queue.LONGEST_PAUSE_S
+    lease = Settings.model_fields["lease_s"].metadata
+    assert max(one.le for one in lease if hasattr(one, "le")) == queue.LONGEST_LEASE_S

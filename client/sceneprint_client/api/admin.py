@@ -84,7 +84,7 @@ class Me(ApiRecord):
 
 
 class Audited(ApiRecord):
-    """A change, and who made it."""
+    """A change and who made it, or what somebody was refused."""
 
     at: datetime
     actor: str | None = Field(
@@ -99,6 +99,20 @@ class Audited(ApiRecord):
     target: str | None = Field(description="What was changed in it, or of no map: an id or name.")
     request_id: str | None = Field(description="As in the log.")
     data: dict[str, Any] = Field(description="More of what was changed, by the operation.")
+    refused: bool = Field(
+        default=False, description="Whether it was refused (401 or 403) and nothing was changed."
+    )
+    tenant: str | None = Field(
+        default=None,
+        description="In whose chain the line is; null: a line of before version 0.3, in none.",
+    )
+    sequence: int | None = Field(
+        default=None, description="Place in the chain of the tenant's changes, or of refusals."
+    )
+    hash: str | None = Field(
+        default=None,
+        description="SHA-256 of the hash before it in its chain and of the line, as hexadecimal.",
+    )
 
 
 # How a service does, and what it signs with, as JSON.
@@ -227,6 +241,21 @@ class MapUse(ApiRecord):
     retention_days: float | None = Field(description="Null: frames are kept.")
 
 
+class ScrubSeen(ApiRecord):
+    """How far stored bytes were read to see that they are sound."""
+
+    began_at: datetime = Field(description="Of the pass that is under way, or else the last one.")
+    finished_at: datetime | None = Field(
+        description="When the last whole pass ended; null: there was none."
+    )
+    blobs: int = Field(description="Uploads and artifacts that this pass has read.")
+    bytes: int = Field(description="Of these.")
+    damaged: int = Field(
+        description="Uploads, artifacts and signatures that it found lost or damaged; events "
+        "`frame.damaged` name their frames, and `sceneprint fsck` all of them."
+    )
+
+
 class Stats(ApiRecord):
     """How the service, or one map, does now and did lately."""
 
@@ -253,6 +282,9 @@ class Stats(ApiRecord):
     replica: ReplicaSeen | None = Field(
         default=None,
         description="Null where there is none, or a map was asked for.",
+    )
+    scrub: ScrubSeen | None = Field(
+        default=None, description="Null where none has begun, or a map was asked for."
     )
     total: Counted = Field(description="All minutes together.")
     minutes: list[Minute] = Field(description="The oldest first; the last is not over yet.")
@@ -373,6 +405,8 @@ KINDS = {
     "frame.redundant": "It was not kept, as asked: the map has its place.",
     "frame.failed": "Signing it broke down in every try, or was given up.",
     "frame.edited": "Its metadata was changed.",
+    "frame.damaged": "What was made of it is damaged, and a worker signs it again from its upload; "
+    "or `data.upload`: that is lost or damaged, and sending it again heals.",
     "frame.reencoded": "It was signed once more, for the model to come or what was damaged.",
     "frame.deleted": (
         "It was removed; no query finds it. `data.reason` is `retention` where its map keeps none "

@@ -7,7 +7,7 @@ import binascii
 import logging
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,9 +19,10 @@ from sceneprint.engine.maps.map_lifecycle import Catalogue
 from sceneprint.engine.serializers import when
 from sceneprint.errors import InvalidRequest, SceneprintError
 from sceneprint.settings import Settings
-from sceneprint.store import Database, Store, tenants
+from sceneprint.store import Database, Store, audit_chain, tenants
 from sceneprint.store import keys as stored
-from sceneprint.store.deletion import remove_in_blocks
+from sceneprint.store.audit_chain import ChainsVerified, KeyChange
+from sceneprint.store.deletion import DAY_S, remove_in_blocks
 from sceneprint.store.events import (
     EventRow,
     Wanted,
@@ -32,9 +33,9 @@ from sceneprint.store.events import (
     remove_events,
     spent_numbers,
 )
-from sceneprint.store.keys import KeyChange
 from sceneprint.store.maps import find_map
 from sceneprint.store.opaque_ids import OpaqueIds, invalid_cursor
+from sceneprint.store.queue import read_clock
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Page
 from sceneprint_client.api.admin import (
@@ -231,16 +232,81 @@ def event_record(seals: OpaqueIds, row: EventRow) -> Event:
 COMMAND = "command"
 
 
-class Audit:
-    """The audit log of one store."""
+#: Seconds between two looks for lines that are no longer kept.
+PRUNE_S = 3600.0
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+
+class Audit:
+    """The audit log of one store.
+
+    Parameters
+    ----------
+    store : see Store
+    kept_days : after which a line is removed
+    """
+
+    def __init__(self, store: Store, kept_days: float) -> None:
+        self._store, self._kept_s = store, DAY_S * kept_days
+        self._pruned = time.monotonic() - PRUNE_S
 
     def note(self, change: KeyChange) -> None:
         """Add a line."""
         with self._store.database.write() as connection:
-            stored.note(connection, change)
+            audit_chain.note(connection, change)
+
+    def tidy(self, now: float | None = None) -> int:
+        """Remove some lines that are no longer kept, if it is time; returns how many.
+
+        What goes wrong is logged and tried again.
+
+        Parameters
+        ----------
+        now : seconds since 1970; default: by the clock of the database
+        """
+        if time.monotonic() - self._pruned < PRUNE_S or self._store.database.read_only:
+            return 0
+        self._pruned = time.monotonic()
+        try:
+            with self._store.database.read() as connection:
+                before = (read_clock(connection) if now is None else now) - self._kept_s
+                if not audit_chain.has_old_lines(connection, before):
+                    return 0
+            with self._store.database.write() as connection:
+                removed = audit_chain.prune_old_lines(connection, before)
+        except SceneprintError as error:
+            log.warning("audit entries not removed", extra={"error": str(error)})
+            return 0
+        if removed:
+            self._pruned -= PRUNE_S  # there may be more
+        return removed
+
+    def verify(self) -> ChainsVerified:
+        """See whether a line was changed or removed; see `audit_chain.verify_chains`."""
+        with self._store.database.read() as connection:
+            return audit_chain.verify_chains(connection)
+
+    def lines(self, since: float | None = None) -> Iterator[Audited]:
+        """All lines, the oldest first; of a time, seconds since 1970, and later."""
+        after = 0
+        while True:  # whoever takes them may be slow, and no transaction waits for that
+            with self._store.database.read() as connection:
+                block = audit_chain.lines_in_order(connection, after, since)
+            if not block:
+                return
+            yield from map(_audit_record, block)
+            after = block[-1].number
+
+    def differences(self, copy: Iterable[Audited]) -> Iterator[tuple[Audited, str]]:
+        """Lines of a copy that are no longer what is stored, with the difference in words."""
+        with self._store.database.read() as connection:
+            for one in copy:
+                line = KeyChange(
+                    one.action, one.actor or "", tenant=one.tenant, refused=one.refused,
+                    sequence=one.sequence, hash=one.hash,
+                )  # fmt: skip
+                why = audit_chain.differs_from_copy(connection, line)
+                if why is not None:
+                    yield one, why
 
     def command(
         self, action: str, *, map_name: str | None = None, target: str | None = None, **data: Any
@@ -267,7 +333,7 @@ class Audit:
         seals = self._store.seals
         before = seals.row("audit", cursor)
         with self._store.database.read() as connection:
-            found = stored.list_changes(connection, before, limit + 1, actor, map_name)
+            found = audit_chain.list_changes(connection, before, limit + 1, actor, map_name)
         more = seals.next_cursor("audit", [one.number for one in found], limit)
         return Page[Audited](items=[_audit_record(one) for one in found[:limit]], next_cursor=more)
 
@@ -283,6 +349,10 @@ def _audit_record(change: KeyChange) -> Audited:
         target=change.target,
         request_id=change.request_id,
         data=change.data or {},
+        refused=bool(change.refused),
+        tenant=change.tenant,
+        sequence=change.sequence,
+        hash=change.hash,
     )
 
 

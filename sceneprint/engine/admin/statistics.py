@@ -29,6 +29,7 @@ from sceneprint.store.events import anchor_number, newest_number
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.queue import count_jobs, read_clock
+from sceneprint.store.scrub_rows import ScrubRow, read_scrub
 from sceneprint.store.signatures import count_indexed
 from sceneprint.store.tables import MapRow
 from sceneprint.store.wakeup import Wakeup
@@ -42,6 +43,7 @@ from sceneprint_client.api.admin import (
     MapUse,
     Minute,
     ReplicaSeen,
+    ScrubSeen,
     Sizes,
     Stats,
     WorkerSeen,
@@ -335,6 +337,7 @@ class Statistics:
                 jobs = count_jobs(connection, row.number)
                 maps, indexes = 1, [index_state(connection, self._indexes, row)]
                 oldest, workers = store_counts.oldest_waiting(connection, row.number), None
+            scrub = None if row is not None else _scrub_seen(read_scrub(connection))
             taken = None if row is None else self._sizes_of_map(connection, row)
         return Stats(
             at=when(now),
@@ -349,6 +352,7 @@ class Statistics:
             bytes=taken or self.sizes(),
             use=None if row is None else _use(row),
             replica=self.replica() if row is None else None,
+            scrub=scrub,
             total=Counted(**_recent_counts(happened, range(minutes), samples)),
             minutes=_minutes(happened, samples, start, minutes),
         )
@@ -405,6 +409,18 @@ class Statistics:
             kept[row.number] = now, found
             self._sizes_of = kept
         return kept[row.number][1]
+
+
+def _scrub_seen(row: ScrubRow | None) -> ScrubSeen | None:
+    if row is None:
+        return None
+    return ScrubSeen(
+        began_at=when(row.began_at),
+        finished_at=None if row.finished_at is None else when(row.finished_at),
+        blobs=row.blobs,
+        bytes=row.bytes,
+        damaged=row.damaged,
+    )
 
 
 def _use(row: MapRow) -> MapUse:

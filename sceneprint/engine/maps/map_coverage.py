@@ -466,7 +466,7 @@ class CoverageHandler:
 
         def ask(rows: list[MapRow]) -> Answer:
             self._signers(rows[0].model_id)  # while no connection is held
-            ready = prepare_stored(self._store, row.name, stop.id, plain)
+            ready = prepare_stored(self._store, self._signers, row.name, stop.id, plain)
             if ready.frame is None or ready.frame[0] != stop.number:
                 raise UnknownFrame(f"Frame {stop.id} was deleted, and a new frame has its id.")
             ready = replace(ready, taken=taken)

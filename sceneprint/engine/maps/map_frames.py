@@ -20,7 +20,7 @@ from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_stored
 from sceneprint.engine.serializers import frame_records, model_label, sensor_of, tag_of, when
 from sceneprint.engine.signers import Signers
-from sceneprint.engine.upkeep.repair import resign_frames
+from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.formats.export import points_of, write_ply
@@ -106,12 +106,12 @@ def living(row: MapRow, frame: FrameRow) -> FrameRow:
     return frame
 
 
-def geometry_of(store: Store, found: IndexedFrame) -> Geometry:
-    """The geometry artifact of a frame; a damaged one is made again.
+def geometry_of(store: Store, signers: Signers, found: IndexedFrame) -> Geometry:
+    """The geometry artifact of a frame; a damaged one is made again from the upload.
 
     Raises
     ------
-    DamagedBlob, UnreadableGeometry : it is lost or damaged.
+    DamagedBlob : it is lost or damaged, and so is the upload.
     UnknownFrame, NotIndexed, Busy : see `check_unchanged`.
     """
     try:
@@ -119,7 +119,8 @@ def geometry_of(store: Store, found: IndexedFrame) -> Geometry:
     except (errors.DamagedBlob, errors.UnreadableGeometry):
         check_unchanged(store, found)
         resign_frames(store, found.row, [found.frame.number], found.row.model_id)
-        raise
+    _, artifact = rebuild_frame(store, signers(found.row.model_id), found.frame)
+    return read_geometry(artifact)
 
 
 def check_unchanged(store: Store, found: IndexedFrame) -> None:
@@ -462,7 +463,7 @@ class FrameFiles:
                     f"model {found.label}"]  # fmt: skip
 
         def make() -> bytes:
-            points, normals = points_of(geometry_of(self._store, found).surface)
+            points, normals = points_of(geometry_of(self._store, self._signers, found).surface)
             if within == "optical":
                 return write_ply(points, normals, comments=comments)
             to_name = np.array(matrix)
@@ -486,7 +487,7 @@ class FrameFiles:
             if view == "patches":
                 colours, text = patches_view(self._labels(found))
             else:
-                surface = geometry_of(self._store, found).surface
+                surface = geometry_of(self._store, self._signers, found).surface
                 colours, text = (depth_view if view == "depth" else normals_view)(surface)
             told = {"view": view, "frame": sensor_of(found.frame), "model": found.label}
             return picture(colours, width, {**told, **text})
@@ -504,7 +505,7 @@ class FrameFiles:
                 frame=sensor_of(found.frame),
                 model=found.label,
                 levels=[level_of(one) for one in self._hierarchy(found)[1].levels],
-                validation=level_of(geometry_of(self._store, found).patches),
+                validation=level_of(geometry_of(self._store, self._signers, found).patches),
             )
 
         return Output(found.tag("patches", found.frame.id, found.row.name), make)
@@ -576,7 +577,7 @@ class FrameFiles:
         labels = hierarchy.labels[0]
         if isinstance(seen.camera, Intrinsics):
             return labels
-        drawn = geometry_of(self._store, found).surface
+        drawn = geometry_of(self._store, self._signers, found).surface
         return onto(vista_of(drawn), drawn, seen.points.reshape(-1, 3), labels.ravel())
 
     def _signature(self, found: IndexedFrame) -> tuple[bytes, tuple[list[int], list[int]]]:

@@ -29,7 +29,7 @@ from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import query_sensor, sensor_of, tag_of, transform
 from sceneprint.engine.signers import Signers
-from sceneprint.engine.upkeep.repair import resign_frames
+from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
 from sceneprint.errors import DamagedSignature, InvalidRequest, NotIndexed, UnknownFrame
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.export import LIMIT, encode_points, points_of, thinned, write_ply
@@ -52,7 +52,7 @@ from sceneprint.geometry.validation.validation import PairValidation, Validation
 from sceneprint.pictures import depth_view, normals_view, picture
 from sceneprint.pipeline import validate, validate_guided, validate_without_up
 from sceneprint.store import Store
-from sceneprint.store.frames import find_frame, frames_of, refers_to
+from sceneprint.store.frames import find_frame, frame_of, frames_of, refers_to
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.postgres.replica import read_through
 from sceneprint.store.signatures import geometry_blobs, stored_signatures, stored_vector
@@ -150,7 +150,7 @@ class Pairs:
 
         Raises
         ------
-        DamagedBlob, UnreadableGeometry : the match's is damaged; it is made again.
+        DamagedBlob : the match's is damaged, and so is its upload. Else it is made again.
         UnknownFrame : the match was deleted meanwhile.
         """
         query = geometry_of_query(pair.kept)
@@ -160,9 +160,11 @@ class Pairs:
             with self._store.database.read() as connection:
                 if not refers_to(connection, pair.blob):
                     raise _deleted(pair.match) from None
+                frame = frame_of(connection, pair.number)
             if pair.row.model_id == pair.kept.model_id:
                 resign_frames(self._store, pair.row, [pair.number], pair.row.model_id)
-            raise
+        _, artifact = rebuild_frame(self._store, self._signers(pair.kept.model_id), frame)
+        return query, read_geometry(artifact)
 
     def parameters(self, pair: StoredPair) -> ValidationParameters:
         """Those of the model, by which evidence is counted."""
@@ -422,8 +424,8 @@ def _triples(rows: Floats) -> list[Triple]:
 class PointClouds:
     """Points to be drawn."""
 
-    def __init__(self, store: Store, pairs: Pairs, kept: StoredResults) -> None:
-        self._store, self._pairs, self._kept = store, pairs, kept
+    def __init__(self, store: Store, signers: Signers, pairs: Pairs, kept: StoredResults) -> None:
+        self._store, self._signers, self._pairs, self._kept = store, signers, pairs, kept
 
     def frame(
         self, map_name: str, frame_id: str, within: CloudFrame = "optical", limit: int = LIMIT
@@ -435,7 +437,7 @@ class PointClouds:
         name, matrix = placed(found.frame, within)
 
         def make() -> bytes:
-            geometry = geometry_of(self._store, found)
+            geometry = geometry_of(self._store, self._signers, found)
             points, total = _some(geometry, limit)
             return _encoded(geometry, points, total, np.array(matrix))
 

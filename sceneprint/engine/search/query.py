@@ -150,7 +150,7 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
         ready = []
         for side in sides:
             if isinstance(side, NamedFrame):
-                ready.append(prepare_stored(store, side.map, side.frame_id, query))
+                ready.append(prepare_stored(store, signers, side.map, side.frame_id, query))
             else:
                 ready.append(prepare_upload(*side, signer, query))
         check_model(ready[0].model_id, ready[1].model_id)
@@ -314,7 +314,7 @@ class Queries:
         def ask(rows: list[MapRow]) -> Answer:
             self._check_models(rows)
             self._signers(rows[0].model_id)  # while no connection is held: a crowd would hold all
-            ready = prepare_stored(self._store, frame.map, frame.frame_id, query)
+            ready = prepare_stored(self._store, self._signers, frame.map, frame.frame_id, query)
             return self.answer(rows[: len(maps)], ready, query, deadline)
 
         home = [] if frame.map in maps else [frame.map]

@@ -17,7 +17,8 @@ from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_upload
 from sceneprint.engine.search.map_view import MapView, Stored, search_stored
 from sceneprint.engine.search.up_vectors import known_ups
-from sceneprint.engine.upkeep.repair import resign_frames
+from sceneprint.engine.signers import Signers
+from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.retrieval.distance import Ranking, ranking_size, similarity
 from sceneprint.index import SearchHits
@@ -103,28 +104,29 @@ def prepare_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -
     )  # fmt: skip
 
 
-def prepare_stored(store: Store, map_name: str, frame_id: str, query: Query) -> PreparedQuery:
-    """Make a frame of the map ready.
+def prepare_stored(
+    store: Store, signers: Signers, map_name: str, frame_id: str, query: Query
+) -> PreparedQuery:
+    """Make a frame of the map ready; what is damaged of it is made again from its upload.
 
     Raises
     ------
     UnknownMap, UnknownFrame : there is none.
     InvalidRequest : the frame has no signature, or not yet; or the filter asks for distance from
         its session, and it has none, or no time.
-    DamagedSignature, DamagedBlob, UnreadableGeometry : what was made of it is damaged; it is made
-        again.
+    DamagedBlob : what was made of it is damaged, and its upload too.
     """
     start = time.perf_counter()
-    try:
-        with store.queried.read() as connection:
-            row = find_map(connection, map_name)
-            frame = find_frame(connection, row, frame_id)
+    with store.queried.read() as connection:
+        row = find_map(connection, map_name)
+        frame = find_frame(connection, row, frame_id)
+        try:
             vector = stored_vector(connection, frame.number, row.model_id)
-            blobs = geometry_blobs(connection, [frame.number], row.model_id)
-            up = known_ups(connection, [frame.number]).get(frame.number)
-    except errors.DamagedSignature:
-        resign_frames(store, row, [frame.number], row.model_id)
-        raise
+            damaged = False
+        except errors.DamagedSignature:
+            vector, damaged = b"", True
+        blobs = geometry_blobs(connection, [frame.number], row.model_id)
+        up = known_ups(connection, [frame.number]).get(frame.number)
     if vector is None:
         raise errors.InvalidRequest(
             f"Frame {frame_id} is {frame.state}: {frame.state.sentence} Only an indexed frame "
@@ -132,10 +134,11 @@ def prepare_stored(store: Store, map_name: str, frame_id: str, query: Query) -> 
             (("frame_id", f"is {frame.state}"),),
         )
     taken = check_taken(QueryOrigin(frame.robot, frame.session, frame.captured_at), query)
-    geometry = artifact = base = None
+    asked, geometry, artifact, base = np.frombuffer(vector, np.uint8), None, None, None
     if frame.base is not None:
         base = str(frame.base_frame), np.array(frame.base)
-    if "validate" in query.stages:
+    validates = "validate" in query.stages
+    if validates and not damaged:
         try:
             artifact = store.blobs.get(blobs[frame.number])
             geometry = read_geometry(artifact)
@@ -145,10 +148,13 @@ def prepare_stored(store: Store, map_name: str, frame_id: str, query: Query) -> 
                     raise errors.UnknownFrame(
                         f"Frame {frame_id} of map {map_name!r} was deleted during the query."
                     ) from None
-            resign_frames(store, row, [frame.number], row.model_id)
-            raise
+            damaged = True
+    if damaged:
+        resign_frames(store, row, [frame.number], row.model_id)
+        asked, made = rebuild_frame(store, signers(row.model_id), frame)
+        if validates:
+            artifact, geometry = made, read_geometry(made)
     own = (frame.number, frame.id)
-    asked = np.frombuffer(vector, np.uint8)
     return PreparedQuery(
         row.model_id, asked, geometry, taken, own, _since(start), row, base, artifact, frame.kind,
         up,

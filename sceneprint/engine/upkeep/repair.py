@@ -13,15 +13,20 @@ from collections.abc import Sequence
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
+from sceneprint.engine.ingest.frame_decoder import read_stored
 from sceneprint.errors import SceneprintError, UnknownFrame
+from sceneprint.formats.artifact import write_geometry
+from sceneprint.pipeline import Signer, prepare
 from sceneprint.store import Store
 from sceneprint.store.blobs.folder import Condition
+from sceneprint.store.events import record_event
 from sceneprint.store.frames import find_frame, frames_of, renew_upload
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import enqueue, last_of
 from sceneprint.store.reencoding_rows import REENCODE
 from sceneprint.store.signatures import geometry_blobs
-from sceneprint.store.tables import MapRow
+from sceneprint.store.tables import FrameRow, MapRow
+from sceneprint.types import Bytes
 from sceneprint_client.api import FrameState
 
 log = logging.getLogger(__name__)
@@ -81,8 +86,10 @@ def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: s
             return 0
         with store.database.write() as connection:
             due = _due(connection, due, model_id)
+            ids = {one.number: one.id for one in frames_of(connection, due).values()}
             for number in due:
-                enqueue(connection, REENCODE, number, PRIORITY, model_id)
+                job = enqueue(connection, REENCODE, number, PRIORITY, model_id)
+                record_event(connection, "frame.damaged", row.name, ids[number], job.id)
     except (SceneprintError, SQLAlchemyError) as error:
         log.warning("repair failed", extra={"map": row.name, "error": str(error)})
         return 0
@@ -90,12 +97,32 @@ def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: s
     return len(due)
 
 
+def rebuild_frame(store: Store, signer: Signer, frame: FrameRow) -> tuple[Bytes, bytes]:
+    """What signing makes of a stored frame, for a request that meets it damaged: a worker stores
+    it later, see `resign_frames`.
+
+    Returns
+    -------
+    vector : of its signature
+    artifact : bytes of its geometry, the same that were stored
+
+    Raises
+    ------
+    DamagedBlob : its upload is lost or damaged too.
+    FrameError : nothing in it can be signed.
+    """
+    read = read_stored(store.blobs.get(frame.blob), frame)
+    signature, geometry = prepare(read, signer)
+    return signature.vector, write_geometry(geometry)
+
+
 def _due(connection: Connection, numbers: Sequence[int], model_id: str) -> list[int]:
     found = frames_of(connection, numbers)
     now, due = time.time(), []
     for number in dict.fromkeys(numbers):
         job = last_of(connection, REENCODE, number, model_id)
-        busy = job is not None and (not job.state.over or now - job.created_at < PAUSE_S)
+        # a job of the future was made before the clock was set back
+        busy = job is not None and (not job.state.over or abs(now - job.created_at) < PAUSE_S)
         if number not in found or busy or is_known_loss(found[number].reason):
             continue  # or nothing is left to sign it from
         if found[number].state == FrameState.INDEXED:

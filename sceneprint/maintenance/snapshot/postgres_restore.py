@@ -61,8 +61,9 @@ from sceneprint.store.tables import metadata, secrets
 #
 # file  --copy_into-->  PostgreSQL: the same rows, the same numbers, the same next numbers
 
-#: What a database of which nobody has made use holds: its secret, and what a service counts.
-_OF_ITSELF = ("secrets", "samples")
+#: What a database of which nobody has made use holds: its secret, what a service counts, who may
+#: write, and where a scrub stands.
+_OF_ITSELF = ("secrets", "samples", "schema_range", "scrubs")
 
 
 def copy_into(connection: Connection, file: sqlite3.Connection) -> None:

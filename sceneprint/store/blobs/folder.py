@@ -295,6 +295,11 @@ class Blobs(ABC):
     def entries(self) -> Iterator[BlobEntry]:
         """All that lies where blobs are kept, in no order."""
 
+    @property
+    def read_only(self) -> bool:
+        """Whether blobs may be read alone, as far as that can be seen without writing."""
+        return False
+
     def check(self) -> None:  # noqa: B027
         """See that a store on the network answers, or did two seconds ago; a folder has nothing
         to be asked.
@@ -336,6 +341,11 @@ class FolderBlobs(Blobs):
                 make_folder(folder)
         except OSError as error:
             raise unusable(f"{folder}: the folder cannot be made", error) from error
+
+    @property
+    def read_only(self) -> bool:
+        """Whether the folder is there and may not be written, as of a disk that was remounted."""
+        return self._folder.is_dir() and not os.access(self._folder, os.W_OK)
 
     def put(self, data: bytes) -> str:
         """Keep bytes; when this returns they survive the loss of power. See `Blobs.put`."""

@@ -63,7 +63,8 @@ def ask(url: str, asked: str) -> list[tuple]:
 
 def rows_in(url: str) -> int:
     """Rows that are not there of themselves."""
-    names = [one.name for one in metadata.sorted_tables if one.name not in ("secrets", "samples")]
+    own = ("secrets", "samples", "schema_range", "scrubs")
+    names = [one.name for one in metadata.sorted_tables if one.name not in own]
     return sum(ask(url, f"SELECT count(*) FROM {name}")[0][0] for name in names)
 
 

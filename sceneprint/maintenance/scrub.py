@@ -1,0 +1,159 @@
+"""Reading all stored bytes at a low rate, to find damage before a query or a restore does.
+
+frames of the store  --Scrub.run, a slice a minute-->  damage told, derived data signed again
+
+It looks as `sceneprint fsck` does at uploads, artifacts and signatures. What is made of an upload
+is made again; a damaged upload is only told: nothing is moved while nobody looks.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from sqlalchemy import select
+
+from sceneprint.engine.upkeep.repair import resign_frames
+from sceneprint.errors import NotFound, SceneprintError
+from sceneprint.maintenance.fsck.blobs import check_artifacts, check_signatures, check_uploads
+from sceneprint.maintenance.fsck.check import GRACE_S
+from sceneprint.maintenance.fsck.findings import Finding, Folder
+from sceneprint.settings import Settings
+from sceneprint.store import Store
+from sceneprint.store.events import record_event
+from sceneprint.store.frames import find_frame
+from sceneprint.store.maps import find_map
+from sceneprint.store.queue import read_clock
+from sceneprint.store.scrub_rows import (
+    SLICE_S,
+    ScrubRow,
+    claim_slice,
+    frames_behind,
+    read_scrub,
+    record_slice,
+)
+from sceneprint.store.tables import frames, signatures
+
+log = logging.getLogger(__name__)
+
+#: Frames that are looked at together, and the longest time for one slice: others wait to be signed.
+AT_ONCE, TURN_S = 16, 2.0
+#: Of what is damaged, what can be made again from the upload.
+_DERIVED = ("damaged-artifact", "missing-artifact", "damaged-signature")
+
+
+@dataclass(frozen=True, eq=False)
+class _Slice(Folder):
+    """A data folder of which a few frames are looked at."""
+
+    chosen: tuple[int, ...] = ()
+
+    def numbers(self, subject: str) -> Iterator[list[int]]:
+        """Numbers of the frames that are looked at."""
+        self.progress(subject, 0, len(self.chosen))
+        yield list(self.chosen)
+
+
+class Scrub:
+    """Reads a slice of the store's bytes, where it is time; any number of processes may.
+
+    Parameters
+    ----------
+    settings : `scrub_mb_per_s` is the rate of all workers of the store together
+    store : see Store
+    """
+
+    def __init__(self, settings: Settings, store: Store) -> None:
+        self._settings, self._store = settings, store
+        self._budget = int(settings.scrub_mb_per_s * 1e6 * SLICE_S)
+        self._next = time.monotonic() + SLICE_S
+
+    def run(self, *, now: bool = False) -> ScrubRow | None:
+        """Read a slice, if it is due; what goes wrong is logged and tried again.
+
+        Parameters
+        ----------
+        now : look whether one is due, although this process did a moment ago
+
+        Returns
+        -------
+        where the scrub stands; None: nothing was read
+        """
+        if self._budget <= 0 or self._store.database.read_only:
+            return None
+        if not now and time.monotonic() < self._next:
+            return None
+        self._next = time.monotonic() + SLICE_S
+        try:
+            with self._store.database.read() as connection:  # most often it is not due: no lock
+                row = read_scrub(connection)
+                if row is not None and not row.is_due(read_clock(connection)):
+                    return None
+            with self._store.database.write() as connection:
+                row = claim_slice(connection)
+            return None if row is None else self._read(row)
+        except SceneprintError as error:
+            log.warning("scrub incomplete", extra={"error": str(error)})
+            return None
+
+    def _read(self, row: ScrubRow) -> ScrubRow:
+        until, left = time.monotonic() + TURN_S, self._budget
+        finished = False
+        while left > 0 and time.monotonic() < until and not finished:
+            with self._store.database.read() as connection:
+                numbers = frames_behind(connection, row.position, AT_ONCE)
+            if not numbers:
+                finished = True
+                break
+            size = self._size(numbers)
+            folder = _Slice(
+                self._settings, self._store, None, False, GRACE_S, lambda *_: None,
+                chosen=tuple(numbers),
+            )  # fmt: skip
+            damaged = 0
+            for check in (check_uploads, check_artifacts, check_signatures):
+                for finding in check(folder):
+                    if finding.severity == "damage":
+                        damaged += 1
+                        self._tell(finding)
+            left -= size
+            row = replace(
+                row, position=numbers[-1], blobs=row.blobs + folder.counts["blobs"],
+                bytes=row.bytes + size, damaged=row.damaged + damaged,
+            )  # fmt: skip
+        with self._store.database.write() as connection:
+            record_slice(connection, row, finished=finished)
+        if finished:
+            about = {"blobs": row.blobs, "bytes": row.bytes, "damaged": row.damaged}
+            log.info("scrub finished", extra=about)
+        return row
+
+    def _size(self, numbers: list[int]) -> int:
+        """Bytes of the blobs of some frames."""
+        with self._store.database.read() as connection:
+            uploads = connection.execute(select(frames.c.blob).where(frames.c.number.in_(numbers)))
+            made = connection.execute(
+                select(signatures.c.geometry).where(signatures.c.frame_number.in_(numbers))
+            )
+            digests = [*uploads.scalars(), *made.scalars()]
+        return sum(self._store.blobs.size(one) or 0 for one in digests)
+
+    def _tell(self, finding: Finding) -> None:
+        """Say what was found; what can be made again is signed again."""
+        about = {"map": finding.map, "frame_id": finding.frame_id, "finding": finding.kind}
+        log.error("damage found", extra=about | {"means": finding.means})
+        if finding.map is None or finding.frame_id is None:
+            return
+        try:
+            with self._store.database.read() as connection:
+                row = find_map(connection, finding.map)
+                frame = find_frame(connection, row, finding.frame_id)
+        except NotFound:  # deleted meanwhile
+            return
+        if finding.kind in _DERIVED:
+            resign_frames(self._store, row, [frame.number], row.model_id)
+            return
+        with self._store.database.write() as connection:
+            record_event(connection, "frame.damaged", row.name, frame.id, upload=True)

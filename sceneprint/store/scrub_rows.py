@@ -1,0 +1,88 @@
+"""How far stored bytes have been read to see that they are sound: one row for all workers.
+
+A pass reads all frames in the order of their numbers, a slice at a time. Whoever claims a slice
+keeps the others from it until it is due again, so that the rate is that of the store, however many
+workers it has; and a slice whose worker dies is read again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+from sqlalchemy import Connection, insert, select, update
+
+from sceneprint.store.queue import read_clock
+from sceneprint.store.tables import frames, scrubs
+
+#: Seconds between two slices, and between the beginnings of two passes at least.
+SLICE_S, PASS_S = 60.0, 86_400.0
+
+
+@dataclass(frozen=True)
+class ScrubRow:
+    """Where a scrub stands; fields as in the table."""
+
+    number: int
+    position: int
+    next_at: float
+    began_at: float
+    finished_at: float | None
+    blobs: int
+    bytes: int
+    damaged: int
+
+    def is_due(self, now: float) -> bool:
+        """Whether somebody may go on; what is due later than any pass was written by a clock that
+        has been set back since.
+        """
+        return not now < self.next_at <= now + PASS_S
+
+
+def read_scrub(connection: Connection) -> ScrubRow | None:
+    """Where the scrub stands; None: none has begun."""
+    row = connection.execute(select(scrubs)).mappings().first()
+    return None if row is None else ScrubRow(**row)
+
+
+def claim_slice(connection: Connection) -> ScrubRow | None:
+    """Take the next slice; None where it is not due.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    """
+    now, row = read_clock(connection), read_scrub(connection)
+    if row is None:
+        row = ScrubRow(1, 0, now + SLICE_S, now, None, 0, 0, 0)
+        connection.execute(insert(scrubs).values(**asdict(row)))
+        return row
+    if not row.is_due(now):
+        return None
+    if row.position == 0:  # a new pass
+        row = replace(row, began_at=now, blobs=0, bytes=0, damaged=0)
+    row = replace(row, next_at=now + SLICE_S)
+    connection.execute(update(scrubs).values(**asdict(row)))
+    return row
+
+
+def frames_behind(connection: Connection, position: int, count: int) -> list[int]:
+    """Numbers of the next frames, at most so many."""
+    asked = select(frames.c.number).where(frames.c.number > position)
+    return list(connection.execute(asked.order_by(frames.c.number).limit(count)).scalars())
+
+
+def record_slice(connection: Connection, row: ScrubRow, *, finished: bool) -> None:
+    """Note what came of a slice; a pass that is finished is begun anew when its time has come.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    row : of `claim_slice`, with the position and the counts after the slice
+    finished : whether there are no more frames
+    """
+    if finished:
+        now = read_clock(connection)
+        row = replace(
+            row, position=0, finished_at=now, next_at=max(now + SLICE_S, row.began_at + PASS_S)
+        )
+    connection.execute(update(scrubs).values(**asdict(row)))

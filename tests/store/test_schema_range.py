@@ -1,0 +1,121 @@
+"""A process of an earlier version, and a store that a later one has migrated under it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+from sqlalchemy import text
+
+from sceneprint.errors import NewerSchema
+from sceneprint.store import Store, open_database
+from sceneprint.store.database import LEAST_REVISION, SchemaRange, known_revisions, reach_database
+
+#: Opens the store, says so, and makes an event for each line that it is sent.
+OLD_PROCESS = """
+import sys
+from sceneprint.errors import SceneprintError
+from sceneprint.store import open_database
+from sceneprint.store.events import record_event
+
+database = open_database(sys.argv[1])
+print("open", flush=True)
+for line in sys.stdin:
+    name, turn = line.split()
+    try:
+        with database.write(turn=turn == "turn") as connection:
+            record_event(connection, "map.edited", name)
+        print("written", flush=True)
+    except SceneprintError as error:
+        print(f"{type(error).__name__}: {error}", flush=True)
+"""
+
+
+@pytest.fixture
+def old_process(url: str, store: Store) -> Iterator[subprocess.Popen[str]]:
+    """A process that has the store open."""
+    started = subprocess.Popen(
+        [sys.executable, "-c", OLD_PROCESS, url],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    with started:
+        assert started.stdout is not None
+        assert started.stdout.readline() == "open\n"
+        yield started
+        assert started.stdin is not None
+        started.stdin.close()
+
+
+def _migrate(url: str, revision: str, least: str) -> None:
+    """What a migration of a later version leaves."""
+    with closing(reach_database(url)) as later, later.write() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = :v"), {"v": revision})
+        connection.execute(text("UPDATE schema_range SET least_revision = :v"), {"v": least})
+
+
+def _names(url: str) -> list[str]:
+    with closing(reach_database(url)) as found, found.read() as connection:
+        return list(connection.execute(text("SELECT map FROM events ORDER BY number")).scalars())
+
+
+def test_an_old_process_writes_as_long_as_the_schema_allows_it(
+    url: str, old_process: subprocess.Popen[str]
+) -> None:
+    assert old_process.stdin is not None
+    assert old_process.stdout is not None
+
+    def written(name: str, turn: str = "turn") -> str:
+        assert old_process.stdin is not None
+        assert old_process.stdout is not None
+        print(name, turn, file=old_process.stdin, flush=True)
+        return old_process.stdout.readline()
+
+    head = known_revisions()[0]
+    assert written("first") == "written\n"
+    _migrate(url, "9998", head)  # it only added
+    assert written("second") == "written\n"
+    _migrate(url, "9999", "9998")  # it changed or removed
+    for turn in ("turn", "none"):
+        told = written("third", turn)
+        assert told.startswith("NewerSchema: ")
+        assert f"was brought to schema 9999 of a later version of sceneprint while this process " \
+            f"ran, and this process works with {head}. Nothing was stored. Stop this process, " \
+            "and start the version that the others run." in told  # fmt: skip
+    assert _names(url) == ["first", "second"]
+    with pytest.raises(NewerSchema, match="schema 9999, which this version of sceneprint does"):
+        open_database(url)
+
+
+def test_a_process_may_begin_on_a_later_schema_that_allows_it(url: str, store: Store) -> None:
+    _migrate(url, "9999", known_revisions()[0])
+    with closing(open_database(url)) as opened, opened.read() as connection:
+        found = connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one()
+    assert found == "9999"  # as it was
+
+
+@pytest.mark.parametrize(
+    ("revision", "least", "own", "allowed"),
+    [
+        ("0015", "0015", "0015", True),
+        ("0017", "0015", "0015", True),
+        ("0017", "0016", "0015", False),
+        ("0014", "0013", "0015", False),  # restored under it: migrated when it is opened again
+        ("0014", None, "0015", False),
+        ("0016", None, "0015", False),
+        ("from the future", "0015", "0015", False),
+    ],
+)
+def test_which_processes_a_schema_allows(
+    revision: str, least: str | None, own: str, allowed: bool
+) -> None:
+    assert SchemaRange(revision, least).allows(own) is allowed
+
+
+def test_a_new_store_and_a_migrated_one_allow_the_same(store: Store) -> None:
+    with store.database.read() as connection:
+        found = connection.execute(text("SELECT least_revision FROM schema_range")).scalars().all()
+    assert found == [LEAST_REVISION]
+    assert known_revisions()[0] >= LEAST_REVISION
