@@ -21,6 +21,7 @@ import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from sceneprint.atomic_files import warn_if_public
 from sceneprint.errors import UnusableStore
 from sceneprint.process_limits import raise_descriptors
 from sceneprint.settings import Settings
@@ -236,6 +237,7 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     except BaseException:
         listening.close()
         raise
+    warn_if_public(settings.data_dir)
     if read_only:
         log.warning(
             "the store is read-only: queries work, but nothing is stored or signed",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sqlalchemy import Connection, update
 
-from sceneprint.atomic_files import write_durable
+from sceneprint.atomic_files import make_folder, write_durable
 from sceneprint.engine.upkeep.repair import PRIORITY, reason_of_loss
 from sceneprint.errors import StoreError, UnusableStore
 from sceneprint.maintenance.fsck.findings import Folder
@@ -98,7 +98,7 @@ def quarantine_blob(folder: Folder, digest: str) -> str:
 def quarantine_bytes(folder: Folder, name: str, data: bytes) -> Path:
     """Keep damaged bytes that are about to be removed from the database."""
     place = folder.quarantine / name
-    place.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(place.parent)
     write_durable(place, data)
     return place
 

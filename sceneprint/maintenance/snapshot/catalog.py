@@ -191,7 +191,7 @@ class SnapshotCatalog:
         """
         found = self.find(snapshot_id)
         make_folder(folder)
-        with staging(folder, _STAGING, 0o700) as place:
+        with staging(folder, _STAGING) as place:
             check_room(place, found.bytes, "the snapshot")
             yield self._rack.local(snapshot_id, place)
 
@@ -218,7 +218,7 @@ class SnapshotCatalog:
         try:
             make_folder(place)
             # archives have all frames, and the hashes of keys
-            with staging(place, _STAGING, 0o700) as folder:
+            with staging(place, _STAGING) as folder:
                 taken = take_snapshot(self._settings, folder / "archive", progress)
                 with taken.path.open("rb") as file:
                     digest = hashlib.file_digest(file, "sha256").hexdigest()

@@ -10,6 +10,7 @@ holds one state, and all of it.
 from __future__ import annotations
 
 import hashlib
+import os
 import sqlite3
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -22,6 +23,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Literal
 
+from sceneprint.atomic_files import create_private
 from sceneprint.errors import DamagedBlob, SnapshotError, UnusableStore
 from sceneprint.maintenance.fsck.repair_actions import opened_blobs
 from sceneprint.maintenance.snapshot import database_copy
@@ -187,7 +189,7 @@ def _create(source: database_copy.Source, blobs: Store, path: Path, progress: Pr
     folder = path.absolute().parent
     with (
         full_disk_explained(path),
-        staging(folder, _PREFIX, 0o700) as workplace,
+        staging(folder, _PREFIX) as workplace,
         blobs.kept(),  # before the copy: what it refers to must not go
     ):
         begun = datetime.now(UTC)
@@ -207,8 +209,8 @@ def _create(source: database_copy.Source, blobs: Store, path: Path, progress: Pr
             total = draft.database.bytes + total_bytes(blobs, database_copy.referred(copy), count)
             check_room(folder, total, "the snapshot")  # room for the copy is taken already
             archive = workplace / "archive"
-            with archive.open("xb") as file:
-                archive.chmod(0o600)  # it has all pictures, and the hashes of keys
+            # private: it has all pictures, and the hashes of keys
+            with os.fdopen(create_private(archive), "wb") as file:
                 writer = ArchiveWriter(
                     file, int(begun.timestamp()),
                     lambda done: progress(ahead + min(done, total), ahead + total),
