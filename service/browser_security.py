@@ -44,9 +44,9 @@ def security_headers(given: Headers) -> Headers:
 # A service on a loopback address asks for no key: whoever reaches it is on this machine. So is a
 # browser, and pages of others run in it. A page may let its own name point to 127.0.0.1 and read
 # the answers as its own ("DNS rebinding"): the header Host then still has its name. It may also
-# send without reading, and the header Origin then has its name; or load an address as a picture or
-# a frame, which has no Origin, and the header Sec-Fetch-Site then says that a page did it. Following
-# a link to a page of the service shows nothing to whoever set the link.
+# send without reading, and the header Origin then has its name; or load an address as a picture,
+# which has no Origin, and the header Sec-Fetch-Site then says that a page did it. A link of others
+# to a page of the service shows them nothing.
 
 #: What Sec-Fetch-Site says of our own pages, and of who types an address or opens a bookmark.
 _OWN_SITES = (b"same-origin", b"none")
