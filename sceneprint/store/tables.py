@@ -237,6 +237,10 @@ keys = Table(
     Column("grants", JSON, nullable=False),  # scope by name of a map, "*" for all
     Column("created_at", Float, nullable=False),
     Column("expires_at", Float),
+    # of the secret before the last rotation, which works until then
+    Column("previous_digest", _string(64), index=True),
+    Column("previous_until", Float),
+    Column("last_used_at", Float),
 )
 
 events = Table(
