@@ -520,7 +520,8 @@ def test_what_is_not_noted_is_said(operations):
     }
     assert names >= UNNOTED
     assert names - UNNOTED == {
-        "create_key", "rotate_key", "revoke_key", "create_map", "patch_map", "delete_map", "patch_frame",
+        "create_key", "rotate_key", "revoke_key",
+        "create_map", "patch_map", "delete_map", "patch_frame",
         "delete_frames", "edit_frames", "restore_frames", "restore_frame", "keep_answer",
         "release_answer",
         "delete_frame", "patch_session", "delete_session_frames", "cancel_job", "retry_job",
