@@ -330,7 +330,7 @@ def environment_problems(name: str, part: dict[str, Any]) -> list[str]:
     given, found = part.get("environment", {}), []
     for key, value in given.items():
         if key.endswith("_FILE"):
-            if value not in [f"/run/secrets/{one}" for one in part.get("secrets", ())]:
+            if value not in [f"/run/secrets/{one}" for one in part.get("secrets") or ()]:
                 found.append(f"{name}: {key} names no secret that it has")
         elif re.search("PASSWORD|SECRET", key) and not re.fullmatch(
             r"\$\{SCENEPRINT_\w+:-\}", value

@@ -148,14 +148,13 @@ def names_of(requirements: Sequence[str]) -> list[str]:
 
 
 def locked(path: Path) -> dict[str, str]:
-    """What a lock says of each package, as it stands there: the version, and a hash at least."""
+    """Version and hashes of each package of a lock; each has a hash at least."""
     text = path.read_text()
     assert "://" not in text
-    entries = re.findall(
-        r"^([\w.-]+)(==\S+.*(?:\\\n    --hash=sha256:[0-9a-f]{64} ?)+)$", text, re.M
-    )
+    hashed = r"((?:\\\n    --hash=sha256:[0-9a-f]{64} ?)+)"
+    entries = re.findall(rf"^([\w.-]+)(?:\[.*\])?==(\S+).*?{hashed}$", text, re.M)
     assert len(entries) == len(re.findall(r"^\S", text, re.M))
-    return dict(entries)
+    return {name: f"{version} {hashes}" for name, version, hashes in entries}
 
 
 def blocks(text: str, language: str) -> list[str]:

@@ -127,8 +127,7 @@ class Engine:
         associating = Associating(self.store, self.signers, self._readers)
         self.tasks.register(ASSOCIATE, associating)
         self.coverage = CoverageJobs(self.store, self.tasks)
-        measuring = CoverageHandler(self.store, self.signers, self.queries)
-        self.tasks.register(COVERAGE, measuring)
+        self.tasks.register(COVERAGE, CoverageHandler(self.store, self.signers, self.queries))
         self.differences = DifferenceJobs(self.store, self.tasks)
         self.tasks.register(DIFFERENCE, DifferenceHandler(self.store, self.signers))
         self.surfaces = MapSurfaces(self.store, self.bell)
@@ -137,7 +136,6 @@ class Engine:
             self.store, self.bell, auto=settings.surfaces == "auto"
         )
         self.audit = Audit(self.store)
-        #: When keys were used, as far as it is not written yet.
         self.key_uses = stored_keys.KeyUses()
         self.outputs = FrameFiles(self.store, self.signers)
         self.points = PointClouds(self.store, self.inspection.pairs, self.kept)
