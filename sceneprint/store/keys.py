@@ -111,11 +111,12 @@ def rotate_key(connection: Connection, name: str, overlap_s: float) -> str:
     ).first()  # fmt: skip
     if found is None:
         raise _unknown_key(name)
-    previous, until = found.digest, now + overlap_s
-    if found.previous_until is not None and found.previous_until > now:
-        previous, until = found.previous_digest, found.previous_until
+    previous: str | None = found.digest
+    until: float | None = now + overlap_s
     if overlap_s == 0:
         previous = until = None
+    elif found.previous_until is not None and found.previous_until > now:
+        previous, until = found.previous_digest, found.previous_until
     secret = _new_secret()
     connection.execute(
         update(keys)
