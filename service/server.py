@@ -90,8 +90,9 @@ class Connection(H11Protocol):
         """Wait for the next request."""
         self.silent_since = time.monotonic()
         super().on_response_complete()
-        if self.wire is not None and self._reading is None and self._unread() > 0:
-            self._time_reading()  # TLS says nothing of what waits below it
+        # TLS says nothing of what waits below it, and waits for the other side to agree to its end
+        if self.wire is not None and (self._unread() > 0 or self.transport.is_closing()):
+            self._time_reading()
 
     def shutdown(self) -> None:
         """Stop, as the service does: what is in flight ends, what is idle is closed."""
@@ -168,7 +169,10 @@ class Connection(H11Protocol):
         self._reading = None
         if not (self.silent or self.flow.write_paused):
             return  # it was read, and the next request came
-        if self._unread() > self._unread_before - READING_BYTES:
+        unread, silent_s = self._unread(), time.monotonic() - self.silent_since
+        if unread == 0 and not self.transport.is_closing() and silent_s < self.timeout_keep_alive:
+            return  # all of it was read, and `timeout_keep_alive_handler` is still to come
+        if unread > self._unread_before - READING_BYTES:
             self.transport.abort()
         else:
             self._time_reading()

@@ -174,25 +174,34 @@ def test_the_rest_of_a_body_that_was_refused_is_not_read_for_ever(opened):
         assert rest(wire).endswith(b"\r\n\r\n0")
 
 
-@by_both
-def test_an_answer_nobody_reads_is_given_up(opened, monkeypatch):
-    lost: set[Any] = set()
+@pytest.fixture
+def lost(monkeypatch) -> Callable[[Any], None]:
+    """Waits until the service has given up the connection of an address."""
+    gone: set[Any] = set()
     ended = threading.Event()
     before = Connection.connection_lost
 
     def noted(self: Connection, exc: Exception | None) -> None:
         before(self, exc)
-        lost.add(self.client)
+        gone.add(self.client)
         ended.set()
 
+    def wait(address: Any) -> None:
+        while address not in gone:
+            assert ended.wait(PATIENCE_S)
+            ended.clear()
+
     monkeypatch.setattr(Connection, "connection_lost", noted)
+    return wait
+
+
+@by_both
+def test_an_answer_nobody_reads_is_given_up(opened, lost):
     wire = opened()
     wire.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     name = wire.getsockname()
     wire.sendall(ask("/large"))
-    while name not in lost:
-        assert ended.wait(PATIENCE_S)
-        ended.clear()
+    lost(name)
 
 
 @by_both
@@ -249,6 +258,16 @@ def test_connections_without_tls_yet_are_counted_too(opened, monkeypatch):
     for wire in crowd[:16]:
         assert rest(wire) == b""
     assert rest(opened(ask("/", CLOSE))).endswith(b"\r\n\r\n0")
+
+
+@by_tls
+def test_who_never_agrees_to_the_end_is_closed_nevertheless(opened, lost, monkeypatch):
+    """TLS ends by a word of both sides, and this one reads all and keeps silent."""
+    monkeypatch.setattr(Connection, "_unread", lambda _: 0)
+    wire = opened(ask("/", CLOSE))
+    name = wire.getsockname()
+    assert rest(wire).endswith(b"\r\n\r\n0")
+    lost(name)
 
 
 @by_tls
