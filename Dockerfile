@@ -2,6 +2,10 @@
 # tests/test_container.py lints this file and runs its steps without a container engine.
 #
 #   docker compose up --build          service and workers, see docker-compose.yml
+#
+# A tag may be moved to another image. To build on one that you have looked at, append the digest
+# that `docker buildx imagetools inspect python:3.11-slim-bookworm` prints to both lines FROM, as
+# @sha256:DIGEST (docs/deployment.md).
 #   docker build -t sceneprint . && docker run -p 127.0.0.1:8008:8008 -v data:/data sceneprint
 #
 # Beyond its own machine the service asks for a key, and from within a container every caller is
@@ -17,28 +21,28 @@ ENV PIP_NO_CACHE_DIR=1 \
 WORKDIR /src
 
 # What changes seldom first, so that a change of code installs no dependency anew.
-COPY pyproject.toml requirements.txt ./
+COPY requirements-image.lock ./
 
-# The lock holds the dev extra as well: it is a constraint here, what to install says pyproject.toml.
+# Every file that is installed has a hash in the lock, or pip refuses it.
 # Without open3d: 0.9 GB with what it brings, and it wants libGL, libX11 and libusb. Only benchmarks,
 # which are not in the image, and reconstructions load it (an import contract in pyproject.toml keeps
 # that true): here those fail, and name what is missing. All else works.
 # Without pip in the environment: the final stage installs nothing.
 RUN python -m venv --without-pip /opt/sceneprint && \
-    python -c "import tomllib; print(*(d for d in tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies'] if not d.startswith(('open3d', 'sceneprint-client'))), sep='\n')" > runtime.txt && \
-    python -m pip --python /opt/sceneprint install --quiet --constraint requirements.txt --requirement runtime.txt
+    python -m pip --python /opt/sceneprint install --quiet --require-hashes --requirement requirements-image.lock
 
-COPY README.md LICENSE ./
+COPY pyproject.toml README.md LICENSE ./
 COPY client client/
 COPY migrations migrations/
 COPY sceneprint sceneprint/
 COPY service service/
 COPY worker worker/
 
-# --no-deps: our own requirement of open3d is left unmet on purpose.
-RUN python -m pip install --quiet --constraint requirements.txt setuptools && \
-    python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir wheels ./client . && \
-    python -m pip --python /opt/sceneprint install --quiet --no-deps wheels/*.whl
+# --no-deps: our own requirement of open3d is left unmet on purpose. setuptools of the lock builds
+# our wheels, so that none is fetched unchecked, and is not part of the image.
+RUN python -m pip --python /opt/sceneprint wheel --quiet --no-deps --no-build-isolation --wheel-dir wheels ./client . && \
+    python -m pip --python /opt/sceneprint install --quiet --no-deps wheels/*.whl && \
+    python -m pip --python /opt/sceneprint uninstall --quiet --yes setuptools
 
 
 FROM python:3.11-slim-bookworm
@@ -65,6 +69,7 @@ ENV PATH=/opt/sceneprint/bin:$PATH \
 RUN groupadd --gid 10001 sceneprint && \
     useradd --uid 10001 --gid 10001 --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin sceneprint && \
     mkdir -p /data /var/cache/sceneprint && \
+    chmod 0700 /data && \
     chown 10001:10001 /data /var/cache/sceneprint
 
 COPY --from=build /opt/sceneprint /opt/sceneprint
@@ -85,7 +90,7 @@ STOPSIGNAL SIGTERM
 
 # Of the service; docker-compose.yml has another for workers. It answers before kernels are loaded.
 HEALTHCHECK --interval=15s --timeout=5s --start-period=120s --retries=3 \
-    CMD ["python", "-c", "import http.client, os, sys; c = http.client.HTTPConnection('127.0.0.1', int(os.environ['SCENEPRINT_PORT']), timeout=3); c.request('GET', '/healthz'); sys.exit(c.getresponse().status != 200)"]
+    CMD ["python", "-c", "import http.client as h, os, ssl, sys; e = os.environ; a = ('127.0.0.1', int(e['SCENEPRINT_PORT'])); c = h.HTTPSConnection(*a, timeout=3, context=ssl._create_unverified_context()) if e.get('SCENEPRINT_TLS_CERT') else h.HTTPConnection(*a, timeout=3); c.request('GET', '/healthz'); sys.exit(c.getresponse().status != 200)"]
 
 # The command, not `python -m service`: the same image makes keys, signs and evaluates, and a
 # container of its own is complete, as `serve` starts workers beside the service.

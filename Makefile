@@ -4,6 +4,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# Tools of the supply chain, apart: what they need must not move what we run.
+TOOLS := $(VENV)/tools
+PIP := python -m pip install --quiet --disable-pip-version-check
 # Our kernels want one thread each; more processes, not more threads, use more processors.
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
@@ -13,7 +16,8 @@ unexport PYTHONDONTWRITEBYTECODE
 export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
 	'import os; n = len(os.sched_getaffinity(0)); print(n + (n + 1) // 2)')
 
-.PHONY: help demo test pytest test-thorough test-postgres lint kernels format bench screenshots soak siege models lock clean
+.PHONY: help demo test pytest test-thorough test-postgres lint kernels format bench screenshots soak siege models lock sbom \
+	advisories clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
@@ -27,16 +31,17 @@ help:
 	@echo "make siege   broken uploads, fuzzing, ten times too many requests, noisy neighbours; likewise"
 	@echo "make fleet   robots, services, workers and PostgreSQL with a standby, parts killed; likewise"
 	@echo "make models  train the presets that ship with the package (minutes)"
-	@echo "make lock    resolve the dependencies anew into requirements.txt"
+	@echo "make lock    write requirements*.lock anew from pyproject.toml [UPGRADE=1 for the newest]"
+	@echo "make sbom    what the service and its image consist of, as CycloneDX, into out/"
+	@echo "make advisories  known vulnerabilities of all locked packages; needs a network"
 
-$(STAMP): requirements.txt pyproject.toml client/pyproject.toml
+$(STAMP): requirements-dev.lock pyproject.toml client/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "sceneprint needs Python 3.11 or later; set PYTHON=/path/to/python3"; exit 2; }
 	$(PYTHON) -m venv $(VENV) || \
 		{ echo "python3 cannot make environments; on Debian or Ubuntu: apt install python3-venv"; exit 2; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation \
-		-e client -e .
+	$(BIN)/$(PIP) --require-hashes -r requirements-dev.lock
+	$(BIN)/$(PIP) --no-deps --no-build-isolation -e client -e .
 	@touch $(STAMP)
 
 demo: $(STAMP)
@@ -99,11 +104,39 @@ models: $(STAMP)
 	$(BIN)/sceneprint train --preset lidar --out sceneprint/presets/lidar.safetensors
 	$(BIN)/sceneprint train --preset paper --out sceneprint/presets/paper.safetensors
 
-lock: $(STAMP)
-	$(BIN)/python -m pip install --quiet uv
-	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --no-header \
-		--no-annotate --no-emit-index-url --no-emit-package sceneprint-client \
-		--output-file requirements.txt pyproject.toml
+$(TOOLS)/.installed: requirements-tools.lock
+	$(PYTHON) -m venv $(TOOLS)
+	$(TOOLS)/bin/$(PIP) --require-hashes -r requirements-tools.lock
+	@touch $@
+
+# Every version with the hashes of all its files, for every platform and Python from 3.11 on. Pins
+# that are there stay, unless UPGRADE is set. The image leaves open3d out (docs/dependencies.md).
+COMPILE = $(TOOLS)/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes \
+	--no-header --no-annotate --no-emit-index-url --no-emit-package sceneprint-client \
+	$(if $(UPGRADE),--upgrade)
+
+lock: $(TOOLS)/.installed
+	$(COMPILE) --extra build --output-file requirements.lock pyproject.toml
+	echo open3d | $(COMPILE) --extra build --constraint requirements.lock --excludes /dev/stdin \
+		--output-file requirements-image.lock pyproject.toml
+	$(COMPILE) --extra dev --constraint requirements.lock \
+		--output-file requirements-dev.lock pyproject.toml
+	$(COMPILE) --group tools --output-file requirements-tools.lock
+
+sbom: $(TOOLS)/.installed
+	@mkdir -p out
+	@for of in "" -image; do \
+		$(TOOLS)/bin/cyclonedx-py requirements requirements$$of.lock --pyproject pyproject.toml \
+			--output-reproducible --output-format JSON --output-file out/sbom$$of.cdx.json && \
+		echo "out/sbom$$of.cdx.json" || exit 1; \
+	done
+
+# It asks OSV about each version that is locked, so it installs nothing.
+advisories: $(TOOLS)/.installed
+	@for of in "" -dev -tools; do \
+		$(TOOLS)/bin/pip-audit --disable-pip --require-hashes --vulnerability-service osv \
+			--requirement requirements$$of.lock || failed=1; \
+	done; exit $${failed:-0}
 
 clean:
 	rm -rf $(VENV) build client/build out demo *.egg-info client/*.egg-info tools/javascript/node_modules

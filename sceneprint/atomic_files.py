@@ -1,13 +1,56 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and who may read what the store makes."""
 
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+
+#: Permissions of all that the store makes, whatever the umask: frames are pictures of somebody's
+#: rooms, and the database has the hashes of keys.
+PRIVATE_FOLDER, PRIVATE_FILE = 0o700, 0o600
+
+
+def create_private(path: Path) -> int:
+    """Create a file that only its owner may read, and open it for reading and writing.
+
+    Returns
+    -------
+    descriptor : of the empty file
+
+    Raises
+    ------
+    OSError : it exists, or cannot be created.
+    """
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+    return os.open(path, flags, PRIVATE_FILE)
+
+
+def public_mode(folder: Path) -> int | None:
+    """The permissions of a folder that users outside its group may read or enter; else None."""
+    try:
+        mode = stat.S_IMODE(folder.stat().st_mode)
+    except OSError:
+        return None
+    return mode if mode & stat.S_IRWXO else None
+
+
+def warn_if_public(folder: Path) -> None:
+    """Log that users outside its group may read a data folder, as one of version 0.2."""
+    mode = public_mode(folder)
+    if mode is not None:
+        log.warning(
+            "every user of this machine may read the data folder; `chmod -R o-rwx` ends that",
+            extra={"data": str(folder), "permissions": f"{mode:o}"},
+        )
 
 
 def check_writable(path: Path) -> None:
@@ -27,19 +70,20 @@ def check_writable(path: Path) -> None:
     part.unlink()
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_whole(path: Path, data: bytes, *, private: bool = False) -> None:
     """Put a file there in one step: a process killed here leaves the old one or none.
 
     Parameters
     ----------
     path : of the file; its folder must exist
     data : all of it
+    private : only its owner may read it; else the umask says who may
 
     Raises
     ------
     OSError : it cannot be written; nothing is left behind.
     """
-    _put(path, data, durable=False)
+    _put(path, data, private=private, durable=False)
 
 
 @contextmanager
@@ -64,7 +108,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_durable(path: Path, data: bytes, *, folder_is_new: bool = True) -> None:
-    """As `write_whole`, and when it returns the file survives the loss of power.
+    """As `write_whole` of a private file, which survives the loss of power when this returns.
 
     Parameters
     ----------
@@ -77,7 +121,7 @@ def write_durable(path: Path, data: bytes, *, folder_is_new: bool = True) -> Non
     OSError : it cannot be written, and nothing is left behind; or the folder cannot be synced, and
         the file is there, but might not survive.
     """
-    _put(path, data, durable=True)
+    _put(path, data, private=True, durable=True)
     sync_folder(path.parent)
     if folder_is_new:
         sync_folder(path.parent.parent)
@@ -86,20 +130,26 @@ def write_durable(path: Path, data: bytes, *, folder_is_new: bool = True) -> Non
 def make_folder(folder: Path) -> None:
     """Make a folder where it is missing, and those above it; they survive the loss of power.
 
+    Only their owner may read what is made here; the permissions of others stay as they are.
+
     Raises
     ------
     OSError : it cannot be made, or is a file.
     """
+    if folder.is_dir():
+        return
     missing = [one for one in (folder, *folder.parents) if not one.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
+    for one in reversed(missing):
+        one.mkdir(PRIVATE_FOLDER, exist_ok=True)
+    folder.mkdir(PRIVATE_FOLDER, exist_ok=True)  # FileExistsError where it is a file
     for made in missing:
         sync_folder(made.parent)
 
 
-def _put(path: Path, data: bytes, *, durable: bool) -> None:
+def _put(path: Path, data: bytes, *, private: bool, durable: bool) -> None:
     part = _beside(path)
     try:
-        with part.open("wb") as file:
+        with os.fdopen(create_private(part), "wb") if private else part.open("wb") as file:
             file.write(data)
             if durable:  # before its name: a name must never lead to half a file
                 file.flush()

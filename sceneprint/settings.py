@@ -60,6 +60,10 @@ class Settings(BaseSettings):
     host: str = "127.0.0.1"
     #: Port of the service; 0 for a free one.
     port: int = Field(default=8008, ge=0, le=65535)
+    #: Certificate of the service and its chain, PEM. With its key the service speaks HTTPS alone.
+    tls_cert: Path | None = None
+    #: Key of the certificate, PEM, not encrypted.
+    tls_key: Path | None = Field(default=None, validate_default=True)
     #: Worker processes that sign frames; they give way to requests.
     workers: int = Field(default_factory=lambda: os.cpu_count() or 1, ge=0, le=256)
     #: Uploads and queries that are worked on at once; more wait.
@@ -135,6 +139,13 @@ class Settings(BaseSettings):
     def _has_primary(cls, given: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
         if given is not None and info.data.get("database_url") is None:
             raise ValueError("a replica needs its primary in SCENEPRINT_DATABASE_URL")
+        return given
+
+    @field_validator("tls_key")
+    @classmethod
+    def _has_certificate(cls, given: Path | None, info: ValidationInfo) -> Path | None:
+        if (given is None) != (info.data.get("tls_cert") is None):
+            raise ValueError("HTTPS needs SCENEPRINT_TLS_CERT and SCENEPRINT_TLS_KEY; set both")
         return given
 
     @field_validator("blob_url", "snapshot_url")

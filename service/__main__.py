@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 
@@ -9,6 +10,7 @@ from pydantic import ValidationError
 
 from sceneprint.errors import SceneprintError
 from sceneprint.process import log_as_json
+from sceneprint.secret_files import read_secret_files
 from sceneprint.settings import Settings
 from service.server import run
 
@@ -19,6 +21,7 @@ def main() -> int:
     # uvicorn handles both signals while it runs, and raises them again at the end
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
+        read_secret_files(os.environ)
         run(Settings(), lambda url, _: print(f"sceneprint: serving {url}", flush=True))  # noqa: T201
     except (SceneprintError, ValidationError) as error:
         print(f"service: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201

@@ -44,7 +44,14 @@ def security_headers(given: Headers) -> Headers:
 # A service on a loopback address asks for no key: whoever reaches it is on this machine. So is a
 # browser, and pages of others run in it. A page may let its own name point to 127.0.0.1 and read
 # the answers as its own ("DNS rebinding"): the header Host then still has its name. It may also
-# send without reading, and the header Origin then has its name.
+# send without reading, and the header Origin then has its name; or load an address as a picture,
+# which has no Origin, and the header Sec-Fetch-Site then says that a page did it. A link of others
+# to a page of the service shows them nothing.
+
+#: What Sec-Fetch-Site says of our own pages, and of who types an address or opens a bookmark.
+_OWN_SITES = (b"same-origin", b"none")
+#: Pages that links of others may lead to.
+_PAGES = re.compile(r"/|/docs/?|/dashboard(/[^.]*)?")
 
 _HOST = re.compile(r"(?:\[(?P<v6>[^\[\]]*)\]|(?P<name>[^:\[\]]*))(?::\d*)?")
 
@@ -68,7 +75,7 @@ def forwarded(headers: Mapping[bytes, bytes]) -> str | None:
 
 
 def stranger(
-    headers: Iterable[tuple[bytes, bytes]], allows: Callable[[bytes], bool]
+    headers: Iterable[tuple[bytes, bytes]], allows: Callable[[bytes], bool], path: str = ""
 ) -> SceneprintError | None:
     """Why a request for this machine alone is refused by its headers; None where it is not.
 
@@ -78,8 +85,12 @@ def stranger(
     ----------
     headers : of the request
     allows : whether pages of another origin may ask nevertheless
+    path : of the request: links of others may lead to pages of the service
     """
+    fetch: dict[bytes, bytes] = {}
     for name, value in headers:
+        if name == b"origin" or name.startswith(b"sec-fetch-"):
+            fetch[name] = value.strip().lower()
         text = value.decode("latin-1").strip()
         if name == b"host" and not _is_here(text):
             return Misdirected(
@@ -93,7 +104,16 @@ def stranger(
                 "so accepts requests only from pages on its own machine. Serve the page from "
                 "localhost, or name its origin in SCENEPRINT_CORS_ORIGINS."
             )
-    return None
+    # a page that may ask says who it is: its Origin was looked at above
+    if b"origin" in fetch or fetch.get(b"sec-fetch-site", b"none") in _OWN_SITES:
+        return None
+    if _PAGES.fullmatch(path) and fetch.get(b"sec-fetch-dest") == b"document":
+        return None
+    return ForeignOrigin(
+        "A page of another origin loaded this address, but this service requires no key and so "
+        "accepts requests only from its own pages. Open the address itself; or send the request "
+        "with fetch(), and name the page's origin in SCENEPRINT_CORS_ORIGINS."
+    )
 
 
 def _is_here(authority: str) -> bool:

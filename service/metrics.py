@@ -99,6 +99,8 @@ async def housekeeping(engine: Engine, sampler: Sampler) -> AsyncIterator[None]:
         with suppress(asyncio.CancelledError):
             await task
         await to_thread.run_sync(sampler.flush, engine.store.database)
+        with suppress(SceneprintError):  # of a store that is away
+            await to_thread.run_sync(engine.key_uses.write, engine.store.database)
 
 
 async def _keep(engine: Engine, sampler: Sampler) -> None:
@@ -107,6 +109,7 @@ async def _keep(engine: Engine, sampler: Sampler) -> None:
         await to_thread.run_sync(sampler.flush, engine.store.database)
         try:
             await to_thread.run_sync(engine.forget_gone)
+            await to_thread.run_sync(engine.key_uses.write, engine.store.database)
         except SceneprintError as error:
             log.info("store unreachable", extra={"error": str(error)})
 

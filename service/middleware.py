@@ -130,7 +130,7 @@ class RequestMiddleware:
         origin, length = headers.get(b"origin"), headers.get(b"content-length", b"")
         known = origin is not None and self._origins.allows(origin)
         if self._alone:
-            unwelcome = stranger(scope["headers"], self._origins.allows)
+            unwelcome = stranger(scope["headers"], self._origins.allows, scope["path"])
             if unwelcome is not None:
                 return unwelcome
         if known and is_preflight(scope["method"], headers):

@@ -9,19 +9,22 @@ import logging
 import resource
 import signal
 import socket
+import ssl
 import struct
 import sys
 import termios
 import time
 import uuid
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import TYPE_CHECKING, Any, cast
 
 import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from sceneprint.errors import UnusableStore
+from sceneprint.atomic_files import warn_if_public
+from sceneprint.errors import InvalidRequest, UnusableStore
 from sceneprint.process import raise_descriptors
 from sceneprint.settings import Settings
 from sceneprint.store import open_store
@@ -30,6 +33,7 @@ from service.startup import Front
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
+    from uvicorn.server import ServerState
 
 # Connections: none is kept by who neither speaks nor listens.
 #
@@ -57,6 +61,8 @@ class Connection(H11Protocol):
     _reading: asyncio.TimerHandle | None = None
     _unread_before = 0
     silent_since = 0.0
+    #: What carries the TLS of this connection, where it has any.
+    wire: asyncio.Transport | None = None
 
     @property
     def silent(self) -> bool:
@@ -72,11 +78,7 @@ class Connection(H11Protocol):
         """Begin; where there is no room, the connection that was silent for longest makes some."""
         super().connection_made(transport)
         self.silent_since = time.monotonic()
-        if len(self.connections) > room():
-            others = [one for one in self.connections if isinstance(one, Connection)]
-            waiting = [one for one in others if one is not self and one.idle]
-            if waiting:
-                min(waiting, key=lambda one: one.silent_since).transport.abort()
+        close_oldest(self.connections, self)
         self._time_head()
 
     def data_received(self, data: bytes) -> None:
@@ -88,6 +90,15 @@ class Connection(H11Protocol):
         """Wait for the next request."""
         self.silent_since = time.monotonic()
         super().on_response_complete()
+        # TLS says nothing of what waits below it, and waits for the other side to agree to its end
+        if self.wire is not None and (self._unread() > 0 or self.transport.is_closing()):
+            self._time_reading()
+
+    def shutdown(self) -> None:
+        """Stop, as the service does: what is in flight ends, what is idle is closed."""
+        if self.wire is not None and self.idle:
+            self.loop.call_later(FAREWELL_S, self.transport.abort)
+        super().shutdown()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """End."""
@@ -110,7 +121,8 @@ class Connection(H11Protocol):
 
     def timeout_keep_alive_handler(self) -> None:
         """Close what was not used again; an answer that is still being read has its time."""
-        if self.transport.get_write_buffer_size() == 0:
+        carried = 0 if self.wire is None else self.wire.get_write_buffer_size()
+        if self.transport.get_write_buffer_size() + carried == 0:
             self.transport.abort()
         elif self._reading is None:
             self._time_reading()
@@ -134,6 +146,8 @@ class Connection(H11Protocol):
         ):
             self.transport.write(self.conn.send(event) or b"")
         self.transport.close()
+        if self.wire is not None:
+            self._time_reading()
 
     def _time_head(self) -> None:
         """Have the next head timed while none is being answered; each byte is not a new start."""
@@ -155,19 +169,140 @@ class Connection(H11Protocol):
         self._reading = None
         if not (self.silent or self.flow.write_paused):
             return  # it was read, and the next request came
-        if self._unread() > self._unread_before - READING_BYTES:
+        unread, silent_s = self._unread(), time.monotonic() - self.silent_since
+        if unread == 0 and not self.transport.is_closing() and silent_s < self.timeout_keep_alive:
+            return  # all of it was read, and `timeout_keep_alive_handler` is still to come
+        if unread > self._unread_before - READING_BYTES:
             self.transport.abort()
         else:
             self._time_reading()
 
     def _unread(self) -> int:
         """Bytes of answers that the other side has not taken yet: ours, and the kernel's."""
+        carried = 0 if self.wire is None else self.wire.get_write_buffer_size()
         known = self.transport.get_extra_info("socket")
         try:
             (kernel,) = struct.unpack("i", fcntl.ioctl(known, termios.TIOCOUTQ, bytes(4)))
         except (OSError, TypeError):  # closed meanwhile
             kernel = 0
-        return self.transport.get_write_buffer_size() + int(kernel)
+        return self.transport.get_write_buffer_size() + carried + int(kernel)
+
+
+def close_oldest(connections: Iterable[object], new: object) -> None:
+    """Where there is no room for a new connection, close the one that was silent for longest."""
+    known = [one for one in connections if isinstance(one, Connection | Handshake)]
+    if len(known) <= room():
+        return
+    waiting = [one for one in known if one is not new and one.idle]
+    if waiting:
+        min(waiting, key=lambda one: one.silent_since).transport.abort()
+
+
+# TLS. asyncio would make a connection of ours only after the handshake: until then nobody would
+# count it, and it could take a minute.
+
+#: Seconds that the other side may take to agree to the end of an idle connection.
+FAREWELL_S = 2.0
+#: asyncio would end a connection that is being closed while its last answer is still being read:
+#: `Connection` looks itself whether it is.
+NEVER_S = 86_400.0
+#: Bytes of an answer that wait to be encrypted before no more are written, as without TLS.
+UNENCRYPTED_BYTES = 64 << 10
+
+
+def tls_context(settings: Settings) -> ssl.SSLContext | None:
+    """How the service proves who it is; None: it speaks plain HTTP.
+
+    Raises
+    ------
+    InvalidRequest : certificate or key cannot be read, or do not belong together.
+    """
+    if settings.tls_cert is None or settings.tls_key is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.options |= ssl.OP_NO_RENEGOTIATION  # it costs us more than whoever asks for it
+    context.set_alpn_protocols(["http/1.1"])
+    try:
+        # an encrypted key would be asked for on the terminal
+        context.load_cert_chain(settings.tls_cert, settings.tls_key, password=lambda: "")
+    except (OSError, ValueError) as error:  # SSLError is an OSError
+        reason = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
+        raise InvalidRequest(
+            f"The certificate {settings.tls_cert} and the key {settings.tls_key} cannot be used "
+            f"({reason}). Set SCENEPRINT_TLS_CERT to a PEM file with the certificate and its "
+            "chain, and SCENEPRINT_TLS_KEY to one with its key, not encrypted."
+        ) from error
+    return context
+
+
+class Handshake(asyncio.Protocol):
+    """A connection whose TLS is not agreed on yet, counted and timed like any other.
+
+    Parameters
+    ----------
+    context : see `tls_context`
+    server_state : of uvicorn, which has all connections
+    more : what uvicorn makes connections with
+    """
+
+    transport: asyncio.Transport
+    silent_since = 0.0
+
+    def __init__(self, context: ssl.SSLContext, *, server_state: ServerState, **more: Any) -> None:
+        self._context, self._state, self._more = context, server_state, more
+        self._connections: set[Any] = server_state.connections
+        self._early = bytearray()  # what came between the end of the handshake and our hearing it
+        self._lost = False
+
+    @property
+    def idle(self) -> bool:
+        """Whether it is not being closed already."""
+        return not self.transport.is_closing()
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin."""
+        self.transport, self.silent_since = transport, time.monotonic()
+        transport.pause_reading()  # start_tls reads on
+        self._connections.add(self)
+        close_oldest(self._connections, self)
+        self._task = asyncio.get_running_loop().create_task(self._agree())
+
+    def data_received(self, data: bytes) -> None:
+        """Keep what the connection will read."""
+        self._early += data
+
+    def connection_lost(self, _exc: Exception | None) -> None:
+        """End."""
+        self._lost = True
+        self._connections.discard(self)
+
+    def shutdown(self) -> None:
+        """Stop, as the service does."""
+        self.transport.abort()
+
+    async def _agree(self) -> None:
+        """Agree on TLS, and hand over to a connection."""
+        try:
+            secured = await asyncio.get_running_loop().start_tls(
+                self.transport, self, self._context, server_side=True,
+                ssl_handshake_timeout=HEAD_S, ssl_shutdown_timeout=NEVER_S,
+            )  # fmt: skip
+        except OSError:  # no TLS, none of ours, too slow, or gone
+            self.transport.abort()
+            return
+        finally:
+            self._connections.discard(self)
+        if secured is None or self._lost:
+            self.transport.abort()
+            return
+        secured.set_write_buffer_limits(high=UNENCRYPTED_BYTES)
+        connection = Connection(server_state=self._state, **self._more)
+        connection.wire = self.transport
+        secured.set_protocol(connection)
+        connection.connection_made(secured)
+        if self._early:
+            connection.data_received(bytes(self._early))
 
 
 def room() -> int:
@@ -228,21 +363,25 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
 
     Raises
     ------
+    InvalidRequest : there is no certificate where the settings name one.
     UnusableStore, NewerSchema : the store cannot be opened, or the address not listened on.
     """
+    context = tls_context(settings)
     listening = listen(settings)  # first: where it is refused, no data folder is made
     try:
         read_only = _require_store(settings)
     except BaseException:
         listening.close()
         raise
+    warn_if_public(settings.data_dir)
     if read_only:
         log.warning(
             "the store is read-only: queries work, but nothing is stored or signed",
             extra={"data": str(settings.data_dir)},
         )
     host, port = listening.getsockname()[:2]
-    url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    scheme = "http" if context is None else "https"
+    url = f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
     app = Front(settings, lambda: _load(settings), lambda: server.handle_exit(signal.SIGTERM, None))
     config = uvicorn.Config(
         app,
@@ -251,7 +390,8 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
         timeout_keep_alive=30,
-        http=Connection,  # which has the limits that uvicorn lacks
+        # which has the limits that uvicorn lacks
+        http=Connection if context is None else secured(context),
         ws="none",
         h11_max_incomplete_event_size=16 << 10,
         proxy_headers=False,  # uvicorn would believe X-Forwarded-For of whoever is on this machine
@@ -278,6 +418,11 @@ def _require_store(settings: Settings) -> bool:
         return store.database.read_only
     finally:
         store.close()
+
+
+def secured(context: ssl.SSLContext) -> type[asyncio.Protocol]:
+    """What uvicorn makes of a connection, where it speaks TLS."""
+    return cast("type[asyncio.Protocol]", partial(Handshake, context))
 
 
 def _load(settings: Settings) -> FastAPI:

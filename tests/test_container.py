@@ -32,6 +32,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from sceneprint.models import PRESETS
+from sceneprint.secret_files import SECRETS
 from sceneprint.settings import Settings
 from sceneprint.types import DepthFrame
 
@@ -198,7 +199,6 @@ LAST_FROM = "\n\nFROM python:3.11-slim-bookworm\n"
         ("DL3006", LAST_FROM, "\n\nFROM python\n"),
         ("DL3020", "COPY migrations", "ADD migrations"),
         ("DL3025", 'CMD ["serve"]', "CMD serve"),
-        ("DL3042", "PIP_NO_CACHE_DIR=1", "PIP_NO_INPUT=1"),
         ("DL3009", "VOLUME", "RUN apt-get update\nVOLUME"),
         ("DL3002", "USER 10001:10001", "USER root"),
     ],
@@ -322,18 +322,24 @@ def waits_rightly(part: str, other: str, condition: str, parts: dict[str, Any]) 
 
 
 #: Of libraries that ours are built on: who they are to PostgreSQL and to the object store.
-OF_LIBRARIES = re.compile(r"PGPASSWORD|AWS_[A-Z_]+")
+OF_LIBRARIES = re.compile(r"PGPASSWORD|AWS_[A-Z_]+(?<!_FILE)")
 
 
 def environment_problems(name: str, part: dict[str, Any]) -> list[str]:
     """What is wrong with what a part is told."""
     given, found = part.get("environment", {}), []
     for key, value in given.items():
-        if re.search("PASSWORD|SECRET", key) and not re.fullmatch(r"\$\{SCENEPRINT_\w+:-\}", value):
+        if key.endswith("_FILE"):
+            if value not in [f"/run/secrets/{one}" for one in part.get("secrets") or ()]:
+                found.append(f"{name}: {key} names no secret that it has")
+        elif re.search("PASSWORD|SECRET", key) and not re.fullmatch(
+            r"\$\{SCENEPRINT_\w+:-\}", value
+        ):
             found.append(f"{name}: {key} has a default")
     if not part["image"].startswith("sceneprint:"):
         return found
-    unknown = {key for key in set(given) - KNOWN_SETTINGS if not OF_LIBRARIES.fullmatch(key)}
+    ours = {one for one in given if one.removesuffix("_FILE") in SECRETS}
+    unknown = {one for one in set(given) - KNOWN_SETTINGS - ours if not OF_LIBRARIES.fullmatch(one)}
     if unknown:
         found.append(f"{name}: nothing reads {', '.join(sorted(unknown))}")
     try:
@@ -424,7 +430,9 @@ def test_our_rules_have_nothing_against_the_composition() -> None:
         ("worker: restart is 'no'", "restart: unless-stopped", 'restart: "no"'),
         ("service: limits only ['cpus', 'memory']", "          pids: 256\n", ""),
         ("worker: the health check is no Python", "sys.exit(not any(", "sys.exit(not any"),
-        ("database: POSTGRES_PASSWORD has a default", "SCENEPRINT_DATABASE_PASSWORD:-", ":-x"),
+        ("database: POSTGRES_PASSWORD_FILE names no", "/run/secrets/database_password  #", "/x  #"),
+        ("api: PGPASSWORD_FILE names no secret", "    - database_password\n  depends", "  depends"),
+        ("api: nothing reads PGPASS_FILE", "PGPASSWORD_FILE", "PGPASS_FILE"),
         ("objects: ROOT_SECRET_KEY has a default", "SCENEPRINT_OBJECTS_SECRET:-", "X:-secret"),
         ("database: pgvector/pgvector has no version", ":0.8.6-pg18-trixie", ""),
         ("objects: no health check in exec form", '["CMD", "wget"', '["wget"'),
@@ -631,7 +639,9 @@ def test_what_is_installed_is_the_lock_and_no_more(image: Image) -> None:
     )  # fmt: skip
     there: dict[str, str] = json.loads(told.stdout)
     assert there.pop("sceneprint") == there.pop("sceneprint-client") == PROJECT["version"]
-    lock = set(re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / "requirements.txt").read_text(), re.M))
+    lock = set(
+        re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / "requirements-image.lock").read_text(), re.M)
+    )
     assert set(there.items()) <= {(name.lower(), version) for name, version in lock}
     wanted = {re.split(r"[<>=;\[ ]", line)[0] for line in PROJECT["dependencies"]}
     assert wanted - set(there) == {"open3d", "sceneprint-client"}

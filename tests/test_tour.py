@@ -204,9 +204,11 @@ def test_operators_see_what_goes_on(outputs: dict[str, list[str]]) -> None:
     assert made["secret"].startswith("sp_")
     assert [key["name"] for key in listed["items"]] == ["robot-7"]
     assert (me["name"], me["grants"]) == (None, {"*": "admin"})
-    proxied, refused, audit = one(outputs, "Keys", 1)
+    proxied, refused, audit, rotated = one(outputs, "Keys", 1)
     assert (proxied["name"], refused["type"]) == ("robot-7", "/problems/key-required")
     assert len(audit["items"]) == 3
+    assert (rotated["name"], rotated["secret"] != made["secret"]) == ("robot-7", True)
+    assert rotated["previous_until"] is not None
     restored, deleted = one(outputs, "Take out")
     assert restored["state"] == "received"
     assert deleted["frames"] == deleted["deletion"]["frames"] == 1

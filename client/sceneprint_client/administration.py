@@ -71,6 +71,24 @@ class AdminMethods(JobMethods):
         """All keys by name, without their secrets."""
         return list(self._items(Page[Key], "/v1/keys"))
 
+    def rotate_key(self, name: str, overlap_s: float = 3600.0) -> MadeKey:
+        """Give a key a new secret; only what is returned has it. The one before ends later.
+
+        Parameters
+        ----------
+        name : of the key
+        overlap_s : seconds for which the secret before still works, up to 30 days; 0: it ends now.
+            Called again within that time, it keeps its end, and the secret between ends
+
+        Raises
+        ------
+        UnknownKey : there is none of that name.
+        Forbidden : the key of this client is not for `admin` of all.
+        InvalidRequest : an overlap that is none.
+        """
+        path = f"/v1/keys/{quote(name, safe='')}/rotate"
+        return self._ask(MadeKey, "POST", path, params={"overlap_s": overlap_s})
+
     def revoke_key(self, name: str) -> None:
         """Let a key open nothing any more; UnknownKey where there is none of that name."""
         self._delete(f"/v1/keys/{quote(name, safe='')}")

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import email.utils
 import logging
+import os
 import random
+import ssl
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
@@ -90,6 +92,7 @@ class ServiceConnection:
                 headers=headers,
                 timeout=timeout_s,
                 transport=transport,
+                verify=_authorities(parsed),
                 # no proxy stands before this machine
                 trust_env=transport is None and not is_loopback(parsed.host),
             )
@@ -186,6 +189,22 @@ class RequestLogFilter(logging.Filter):
         return not any(str(one).startswith(self._url) for one in about)
 
 
+def _authorities(url: httpx.URL) -> ssl.SSLContext | bool:
+    """Whose certificates are believed: those of SSL_CERT_FILE and SSL_CERT_DIR, where they are set.
+
+    httpx looks at them too, but not where it is told to look for no proxies.
+    """
+    file, folder = os.environ.get("SSL_CERT_FILE"), os.environ.get("SSL_CERT_DIR")
+    if url.scheme != "https" or not (file or folder):
+        return True
+    try:
+        return ssl.create_default_context(cafile=file or None, capath=folder or None)
+    except OSError as error:
+        raise ValueError(
+            f"SSL_CERT_FILE or SSL_CERT_DIR names no certificates: {error.strerror or error}"
+        ) from error
+
+
 # Trying again where that may help: a busy service, a broken connection.
 
 
@@ -241,6 +260,11 @@ def unreachable(url: str, error: Exception | None) -> errors.Unreachable:
         return errors.Unreachable(
             f"{url} did not answer in time ({type(error).__name__}). Look into the service's log, "
             "or give it longer."
+        )
+    if "CERTIFICATE_VERIFY_FAILED" in str(error):
+        return errors.Unreachable(
+            f"{url} shows a certificate that is not trusted here ({error}). Check the address; if "
+            "it is right, set SSL_CERT_FILE to the PEM file of the authority that issued it."
         )
     return errors.Unreachable(
         f"{url} cannot be reached ({error}). Check the address and that the service runs; "

@@ -14,6 +14,7 @@ from importlib import import_module
 
 from sceneprint import __version__
 from sceneprint.errors import SceneprintError
+from sceneprint.secret_files import read_secret_files
 
 #: Exit code of a command that was asked for something it cannot do.
 USAGE = 2
@@ -99,6 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:  # from the first import on, which takes a second
         options = parser(_needed(given)).parse_args(given)
         command = f"sceneprint {options.command}"
+        read_secret_files(os.environ)
         return int(options.run(options))
     except SceneprintError as error:
         return _refuse(command, str(error))

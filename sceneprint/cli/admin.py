@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.cli import duration
@@ -13,16 +13,20 @@ from sceneprint.cli.serve import add_data_option, settings_of
 from sceneprint_client.api.admin import EVERY, SCOPES
 
 if TYPE_CHECKING:
-    from sceneprint_client.api.admin import Key, Scope
+    from sceneprint.engine import Engine
+    from sceneprint_client.api.admin import Key, MadeKey, Scope
+
+#: How long before the end of a key it is told of.
+SOON = timedelta(days=7)
 
 
 def add_keys(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "keys",
-        help="create, list and revoke the API keys of a service",
-        description="Create, list or revoke API keys. A service needs them once it listens "
-        "beyond its own machine. The secret of a key is printed once, on creation; only its "
+        help="create, list, rotate and revoke the API keys of a service",
+        description="Create, list, rotate or revoke API keys. A service needs them once it listens "
+        "beyond its own machine. The secret of a key is printed once; only its "
         "hash is stored.",
     )
     what = command.add_mutually_exclusive_group(required=True)
@@ -30,7 +34,12 @@ def add_keys(commands: Any) -> None:
     what.add_argument(
         "--list",
         action="store_true",
-        help="list keys with their creation time, name, scope, tenant and expiry",
+        help="list keys with their creation time, name, scope, tenant, expiry and last use",
+    )
+    what.add_argument(
+        "--rotate",
+        metavar="NAME",
+        help="give a key a new secret and print it; the old one works for a while longer",
     )
     what.add_argument("--revoke", metavar="NAME", help="revoke a key")
     command.add_argument("--scope", choices=SCOPES, help="scope of the new key (default: admin)")
@@ -54,6 +63,13 @@ def add_keys(commands: Any) -> None:
         metavar="TIME",
         help="lifetime of the key, such as 12h, 30d or 8w (default: no expiry)",
     )
+    command.add_argument(
+        "--overlap",
+        type=_overlap,
+        metavar="TIME",
+        help="how long the old secret still works, such as 30m or 7d, up to 30d; 0 ends it at once "
+        "(default: 1h)",
+    )
     add_data_option(command)
     command.set_defaults(run=run_keys)
 
@@ -61,23 +77,25 @@ def add_keys(commands: Any) -> None:
 def run_keys(options: argparse.Namespace) -> int:
     """Do what was asked for with the keys of the data folder."""
     from sceneprint.engine import Engine
-    from sceneprint.engine.admin.operations import list_keys
     from sceneprint.errors import InvalidRequest
 
     own = ("scope", "map", "tenant", "expires")
     given = [name for name in own if getattr(options, name) is not None]
     if given and options.create is None:
         raise InvalidRequest(f"--{given[0]} applies to a new key only. Use it with --create.")
+    if options.overlap is not None and options.rotate is None:
+        raise InvalidRequest("--overlap applies to a rotation only. Use it with --rotate.")
     with Engine(settings_of(options)) as engine:
         if options.list:
-            cursor = None
-            while True:
-                page = list_keys(engine.store, cursor, 1000)
-                for key in page.items:
-                    print(_key_line(key))
-                cursor = page.next_cursor
-                if cursor is None:
-                    break
+            _print_keys(engine)
+        elif options.rotate is not None:
+            overlap = timedelta(hours=1) if options.overlap is None else options.overlap
+            made = engine.rotate_key(options.rotate, overlap.total_seconds())
+            engine.audit.command("keys --rotate", target=made.name)
+            _print_secret(made)
+            if made.previous_until is not None:
+                ends = f"{made.previous_until:%Y-%m-%dT%H:%M:%SZ}"
+                print(f"the old secret works until {ends}", file=sys.stderr)
         elif options.revoke is not None:
             engine.revoke_key(options.revoke)
             engine.audit.command("keys --revoke", target=options.revoke)
@@ -88,11 +106,35 @@ def run_keys(options: argparse.Namespace) -> int:
             until = None if options.expires is None else datetime.now(UTC) + options.expires
             made = engine.create_key(options.create, grants, until, options.tenant)
             engine.audit.command("keys --create", target=made.name)
-            print(made.secret)
-            print(
-                "save this secret now: it is not stored and cannot be shown again", file=sys.stderr
-            )
+            _print_secret(made)
     return 0
+
+
+def _print_secret(made: MadeKey) -> None:
+    print(made.secret)
+    print("save this secret now: it is not stored and cannot be shown again", file=sys.stderr)
+
+
+def _print_keys(engine: Engine) -> None:
+    """All keys, and below which of them end soon."""
+    from sceneprint.engine.admin.operations import list_keys
+
+    now, cursor, soon = datetime.now(UTC), None, []
+    while True:
+        page = list_keys(engine.store, cursor, 1000)
+        for key in page.items:
+            print(_key_line(key))
+            if key.expires_at is not None and now < key.expires_at <= now + SOON:
+                soon.append(one_line(key.name))
+        cursor = page.next_cursor
+        if cursor is None:
+            break
+    if soon:
+        print(
+            f"expiring within {SOON.days} days: {', '.join(soon)}. Create keys in their place with "
+            "--create.",
+            file=sys.stderr,
+        )
 
 
 def _key_line(key: Key) -> str:
@@ -102,10 +144,18 @@ def _key_line(key: Key) -> str:
     text = f"{key.created_at:%Y-%m-%dT%H:%M:%SZ}  {one_line(key.name)}  {grants}"
     if key.tenant != key.name:
         text += f", tenant {one_line(key.tenant)}"
-    if key.expires_at is None:
-        return text
-    ends = "expired" if key.expires_at <= datetime.now(UTC) else "until"
-    return f"{text}, {ends} {key.expires_at:%Y-%m-%dT%H:%M:%SZ}"
+    if key.expires_at is not None:
+        ends = "expired" if key.expires_at <= datetime.now(UTC) else "until"
+        text += f", {ends} {key.expires_at:%Y-%m-%dT%H:%M:%SZ}"
+    if key.previous_until is not None:
+        text += f", old secret until {key.previous_until:%Y-%m-%dT%H:%M:%SZ}"
+    if key.last_used_at is not None:
+        text += f", used {key.last_used_at:%Y-%m-%dT%H:%MZ}"
+    return text
+
+
+def _overlap(text: str) -> timedelta:
+    return timedelta() if text == "0" else duration(text)
 
 
 # `sceneprint tenants`: whom keys belong to.

@@ -6,6 +6,7 @@ import argparse
 import ctypes
 import errno
 import os
+import shlex
 import shutil
 import sqlite3
 import sys
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from sceneprint import __version__
+from sceneprint.atomic_files import public_mode
 from sceneprint.cli.checks import (
     APART_S,
     Check,
@@ -490,6 +492,13 @@ def _folder(data_dir: Path) -> Iterator[Check]:
         if data_dir == default_data_dir():
             text += ": the default, --data names another"
         yield Check("ok", "data folder", text)
+    mode = public_mode(data_dir)
+    if mode is not None:
+        text = (
+            f"{data_dir} has the permissions {mode:o}, so every user of this machine may read "
+            f"frames and the hashes of keys. Run `chmod -R o-rwx {shlex.quote(str(data_dir))}`."
+        )
+        yield Check("note", "permissions", text)
     yield disk_check("disk", shutil.disk_usage(there).free)
 
 

@@ -157,6 +157,7 @@ def add_work(commands: Any) -> None:
 
 def run_work(options: argparse.Namespace) -> int:
     """Work until told to stop."""
+    from sceneprint.atomic_files import warn_if_public
     from sceneprint.cli.options import prepare_presets
     from sceneprint.engine.engine import open_engine
     from sceneprint.process import log_as_json
@@ -164,6 +165,7 @@ def run_work(options: argparse.Namespace) -> int:
 
     settings = settings_of(options)
     log_as_json()  # from the first line on
+    warn_if_public(settings.data_dir)
     with open_engine(settings) as engine:  # what is wrong is said once, and not by every worker
         engine.store.database.require_writable()
     prepare_presets(settings, logging.getLogger(__name__).info)

@@ -126,8 +126,7 @@ class Engine:
         associating = Associating(self.store, self.signers, self._readers)
         self.tasks.register(ASSOCIATE, associating)
         self.coverage = CoverageJobs(self.store, self.tasks)
-        measuring = CoverageHandler(self.store, self.signers, self.queries)
-        self.tasks.register(COVERAGE, measuring)
+        self.tasks.register(COVERAGE, CoverageHandler(self.store, self.signers, self.queries))
         self.differences = DifferenceJobs(self.store, self.tasks)
         self.tasks.register(DIFFERENCE, DifferenceHandler(self.store, self.signers))
         self.surfaces = MapSurfaces(self.store, self.bell)
@@ -136,6 +135,7 @@ class Engine:
             self.store, self.bell, auto=settings.surfaces == "auto"
         )
         self.audit = Audit(self.store, settings.audit_kept_days)
+        self.key_uses = stored_keys.KeyUses()
         self.outputs = FrameFiles(self.store, self.signers)
         self.points = PointClouds(self.store, self.signers, self.inspection.pairs, self.kept)
         self.reconstructions = ReconstructionJobs(self.store, self.tasks)
@@ -246,6 +246,10 @@ class Engine:
         """Make a key, and show its secret; see `operations.create_key`."""
         return operations.create_key(self.store, name, grants, expires_at, tenant)
 
+    def rotate_key(self, name: str, overlap_s: float = operations.OVERLAP_S) -> MadeKey:
+        """Give a key a new secret, and show it; see `operations.rotate_key`."""
+        return operations.rotate_key(self.store, name, overlap_s)
+
     def revoke_key(self, name: str) -> None:
         """Let a key open nothing any more, and remove the records of its queries; UnknownKey."""
         with self.store.database.write() as connection:
@@ -255,7 +259,10 @@ class Engine:
     def find_key(self, secret: str) -> stored_keys.KeyRow | None:
         """The key with that secret, or None; also one that has expired."""
         with self.store.database.read() as connection:
-            return stored_keys.find_key(connection, secret)
+            found = stored_keys.find_key(connection, secret)
+        if found is not None and (found.expires_at is None or found.expires_at > time.time()):
+            self.key_uses.note(found)
+        return found
 
     def __enter__(self) -> Engine:
         return self

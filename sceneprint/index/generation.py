@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import mmap
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneprint.atomic_files import create_private
 from sceneprint.errors import DamagedIndex
 from sceneprint.geometry.retrieval.distance import Metric, distances
 from sceneprint.index import faiss_index, generation_files
@@ -557,7 +559,7 @@ def _draft(
 def _spooled(folder: Path, blocks: Iterable[Block], dimension: int | None) -> tuple[Keys, Bytes]:
     """Keys (n,) and signatures (n, D) as they come: in a file without a name, not in memory."""
     keys, path = [np.empty(0, np.int64)], unfinished(folder)
-    with path.open("x+b") as file:
+    with os.fdopen(create_private(path), "w+b") as file:
         path.unlink()
         for own, signatures in blocks:
             if dimension is not None and signatures.ndim == 2 and signatures.shape[1] != dimension:

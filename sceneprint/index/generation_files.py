@@ -24,7 +24,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.atomic_files import sync_folder, write_durable
+from sceneprint.atomic_files import (
+    PRIVATE_FILE,
+    create_private,
+    make_folder,
+    sync_folder,
+    write_durable,
+)
 from sceneprint.errors import DamagedIndex
 from sceneprint.types import Bytes
 
@@ -76,7 +82,7 @@ def put(
     """
     part, digest = unfinished(folder), hashlib.sha256()
     try:
-        with part.open("xb") as file:
+        with os.fdopen(create_private(part), "wb") as file:
 
             def take(data: bytes) -> None:
                 file.write(data)
@@ -143,9 +149,10 @@ def building(folder: Path) -> Iterator[bool]:
 
     The kernel releases the lock of a process that dies, however it dies.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     # of this call alone: flock then keeps out other threads as well as other processes
-    descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
+    descriptor = os.open(folder / ".lock", flags, PRIVATE_FILE)
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

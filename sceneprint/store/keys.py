@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import secrets
+import threading
 import time
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Connection, Select, delete, insert, select
+from sqlalchemy import Connection, Select, delete, insert, select, update
 
 from sceneprint.errors import Conflict, IdempotencyConflict, UnknownKey
 from sceneprint.store.events import record_event
 from sceneprint.store.tables import idempotency, keys
 from sceneprint.store.tenants import join_tenant, leave_tenant
 from sceneprint_client.api.admin import Scope
+
+if TYPE_CHECKING:
+    from sceneprint.store.database import Database
 
 #: So that a key is known for one where it should not be, such as in a public file.
 PREFIX = "sp_"
@@ -33,6 +37,8 @@ class KeyRow:
     grants : scope by name of a map, `*` for all
     created_at, expires_at : None: it does not expire
     tenant : whom it belongs to
+    previous_until : until when the secret before the last rotation works; None: none does
+    last_used_at : to the hour or so; None: never yet
     """
 
     id: str
@@ -41,6 +47,8 @@ class KeyRow:
     created_at: float
     expires_at: float | None
     tenant: str
+    previous_until: float | None
+    last_used_at: float | None
 
 
 def create_key(
@@ -58,7 +66,7 @@ def create_key(
     """
     if connection.execute(select(keys.c.id).where(keys.c.name == name)).first() is not None:
         raise Conflict(f"There is a key named {name!r}. Choose another name.")
-    secret = PREFIX + secrets.token_urlsafe(32)  # 256 random bits: no slow hash is needed
+    secret = _new_secret()
     connection.execute(
         insert(keys).values(
             id=uuid.uuid4().hex, name=name, digest=_digest(secret), grants=dict(grants),
@@ -71,10 +79,67 @@ def create_key(
 
 
 def find_key(connection: Connection, secret: str) -> KeyRow | None:
-    """The key with that secret, or None; also one that has expired."""
-    own = keys.c.digest == _digest(secret)
-    found = connection.execute(_select_keys().where(own)).mappings().first()
-    return None if found is None else KeyRow(**found)
+    """The key with that secret, or None; also one that has expired.
+
+    Found by the secret before its rotation, a key expires when that does.
+    """
+    digest = _digest(secret)
+    found = connection.execute(_select_keys().where(keys.c.digest == digest)).mappings().first()
+    if found is not None:
+        return KeyRow(**found)
+    previous = (keys.c.previous_digest == digest) & (keys.c.previous_until > time.time())
+    found = connection.execute(_select_keys().where(previous)).mappings().first()
+    if found is None:
+        return None
+    ends = [one for one in (found["expires_at"], found["previous_until"]) if one is not None]
+    return replace(KeyRow(**found), expires_at=min(ends))
+
+
+def rotate_key(connection: Connection, name: str, overlap_s: float) -> str:
+    """Give a key a new secret, and return it; what it may do stays.
+
+    The secret before works for so long. Where one before that still does, it keeps its time, and
+    the one between ends: an answer with a new secret that was lost costs nobody the key in use.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    name : of the key
+    overlap_s : seconds; 0: all secrets before end now
+
+    Raises
+    ------
+    UnknownKey : there is none of that name.
+    """
+    now = time.time()
+    found = connection.execute(
+        select(keys.c.digest, keys.c.previous_digest, keys.c.previous_until)
+        .where(keys.c.name == name)
+    ).first()  # fmt: skip
+    if found is None:
+        raise _unknown_key(name)
+    previous: str | None = found.digest
+    until: float | None = now + overlap_s
+    if overlap_s == 0:
+        previous = until = None
+    elif found.previous_until is not None and found.previous_until > now:
+        previous, until = found.previous_digest, found.previous_until
+    secret = _new_secret()
+    connection.execute(
+        update(keys)
+        .where(keys.c.name == name)
+        .values(digest=_digest(secret), previous_digest=previous, previous_until=until)
+    )
+    record_event(connection, "key.rotated", name=name)
+    return secret
+
+
+def find_named_key(connection: Connection, name: str) -> KeyRow:
+    """The key of that name; UnknownKey where there is none."""
+    found = connection.execute(_select_keys().where(keys.c.name == name)).mappings().first()
+    if found is None:
+        raise _unknown_key(name)
+    return KeyRow(**found)
 
 
 def list_keys(
@@ -97,20 +162,56 @@ def revoke_key(connection: Connection, name: str) -> None:
     gone = delete(keys).where(keys.c.name == name).returning(keys.c.tenant)
     tenant = connection.execute(gone).scalar()
     if tenant is None:
-        raise UnknownKey(
-            f"There is no key named {name!r:.80}. List them with `sceneprint keys --list`."
-        )
+        raise _unknown_key(name)
     leave_tenant(connection, name, tenant)
     record_event(connection, "key.revoked", name=name)
 
 
-def _select_keys() -> Select[tuple[str, str, dict[str, Scope], float, float | None, str]]:
-    own = keys.c
-    return select(own.id, own.name, own.grants, own.created_at, own.expires_at, own.tenant)
+def _unknown_key(name: str) -> UnknownKey:
+    return UnknownKey(
+        f"There is no key named {name!r:.80}. List them with `sceneprint keys --list`."
+    )
+
+
+def _select_keys() -> Select[Any]:
+    return select(*(keys.c[one.name] for one in fields(KeyRow)))
+
+
+def _new_secret() -> str:
+    return PREFIX + secrets.token_urlsafe(32)  # 256 random bits: no slow hash is needed
 
 
 def _digest(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
+
+
+#: Seconds for which a use of a key is not noted again: whether it is in use at all is the question.
+USED_S = 3600.0
+
+
+class KeyUses:
+    """When keys were used, noted in memory and written now and then; safe to share."""
+
+    def __init__(self) -> None:
+        self._due: dict[str, float] = {}
+        self._lock = threading.Lock()
+
+    def note(self, key: KeyRow) -> None:
+        """Note that a key is used now, unless the database knows about as much."""
+        now = time.time()
+        if key.last_used_at is None or not 0 <= now - key.last_used_at < USED_S:
+            with self._lock:
+                self._due[key.id] = now
+
+    def write(self, database: Database) -> None:
+        """Write what was noted; what cannot be written is lost, and noted at the next use."""
+        with self._lock:
+            due, self._due = self._due, {}
+        if not due or database.read_only:
+            return
+        with database.write() as connection:
+            for key_id, at in due.items():
+                connection.execute(update(keys).where(keys.c.id == key_id).values(last_used_at=at))
 
 
 # Keys under which a caller may send a request again: what came of it, kept for a day.

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import stat
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, event, make_url
 from sqlalchemy.exc import ArgumentError
 
+from sceneprint.atomic_files import PRIVATE_FILE
 from sceneprint.errors import ReadOnlyStore, UnusableStore
 
 # A SQLite file that may be read and not written: on a read-only disk, or of another user.
@@ -118,9 +121,22 @@ def open_sqlite(url: URL) -> tuple[Engine, ReadOnlyFile | None]:
     else:
         # SQLite waits for a writer itself, fairly enough; readers never wait in WAL
         engine = create_engine(url, connect_args={"timeout": BUSY_S}, pool_size=16, max_overflow=-1)
+        event.listen(engine, "do_connect", _create_file)
     event.listen(engine, "connect", configure_sqlite if sealed is None else configure_read_only)
     event.listen(engine, "begin", begin_sqlite)
     return engine, sealed
+
+
+def _create_file(_dialect: Any, _record: Any, arguments: list[Any], _named: Any) -> None:
+    """Create a file that is missing, which SQLite would let others read; its log is as its file.
+
+    It is not opened: closing it would release the locks that this process has on it.
+    """
+    path = arguments[0] if arguments else ""
+    if path in ("", ":memory:") or path.startswith("file:"):
+        return
+    with suppress(OSError):  # it is there; or it cannot be made, and SQLite says so
+        os.mknod(path, stat.S_IFREG | PRIVATE_FILE)
 
 
 def configure_sqlite(connection: Any, _record: Any) -> None:

@@ -245,6 +245,10 @@ keys = Table(
     Column("created_at", Float, nullable=False),
     Column("expires_at", Float),
     Column("tenant", _string(128), nullable=False, server_default=""),
+    # of the secret before the last rotation, which works until then
+    Column("previous_digest", _string(64), index=True),
+    Column("previous_until", Float),
+    Column("last_used_at", Float),
     Index(None, "tenant"),
 )
 

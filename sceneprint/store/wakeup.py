@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from sqlalchemy import Connection, text
 
+from sceneprint.atomic_files import make_folder
 from sceneprint.errors import SceneprintError
 from sceneprint.store.database import Database
 
@@ -170,7 +171,7 @@ class Listener:
     def _open(self) -> None:
         self._alive = time.monotonic()
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self._path.parent)
             os.mkfifo(self._path, 0o600)
             # to write as well: without a writer it would be at its end, and always readable
             self._fifo = os.open(self._path, os.O_RDWR | os.O_NONBLOCK)

@@ -168,6 +168,33 @@ def me(asking: Asking) -> Me:
     )
 
 
+@keys_router.post(
+    "/keys/{key_name:path}/rotate",
+    responses=declared(404, 422),
+    dependencies=[Depends(administers)],
+)
+def rotate_key(
+    key_name: Annotated[str, Path(description="Of the key.")],
+    here: Here,
+    request: Request,
+    overlap_s: Annotated[
+        float,
+        Query(
+            ge=0,
+            le=operations.MOST_OVERLAP_S,
+            description="Seconds for which the secret before still works; 0: it ends now.",
+        ),
+    ] = operations.OVERLAP_S,
+) -> MadeKey:
+    """Give a key a new secret, which is in this answer and nowhere else.
+
+    Rotated again within the overlap, the secret in use keeps its end, and the new one is replaced.
+    """
+    made = here.engine.rotate_key(key_name, overlap_s)
+    request.state.audited = made.model_dump(mode="json", include={"previous_until"})
+    return made
+
+
 @keys_router.delete(
     "/keys/{key_name:path}",
     status_code=204,

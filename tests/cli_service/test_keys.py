@@ -39,6 +39,50 @@ def test_keys_are_made_listed_and_revoked(sceneprint: Run, tmp_path: Path) -> No
     assert [one and (one.name, one.grants) for one in found] == [None, ("robot 2", {"*": "admin"})]
 
 
+def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint: Run, tmp_path: Path) -> None:
+    def keys(*arguments: str, expect: int = 0) -> Any:
+        return sceneprint("keys", *arguments, "--data", tmp_path, expect=expect)
+
+    def named(secret: str) -> str | None:
+        with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
+            found = engine.find_key(secret)
+            engine.key_uses.write(engine.store.database)
+            return None if found is None else found.name
+
+    old = keys("--create", "robot", "--scope", "read", "--expires", "3d").stdout.strip()
+    done = keys("--rotate", "robot", "--overlap", "2h")
+    new = done.stdout.strip()
+    assert new != old
+    assert done.stderr.splitlines()[0].startswith("save this secret now")
+    until = datetime.fromisoformat(
+        done.stderr.splitlines()[1].removeprefix("the old secret works until ")
+    )
+    assert timedelta(seconds=7000) < until - datetime.now(UTC) <= timedelta(hours=2)
+    assert [named(one) for one in (old, new)] == ["robot", "robot"]
+    listed = keys("--list")
+    assert "robot  read of all, until 2" in listed.stdout
+    assert f", old secret until {until:%Y-%m-%dT%H:%M:%SZ}, used {until:%Y-}" in listed.stdout
+    assert (
+        listed.stderr
+        == "expiring within 7 days: robot. Create keys in their place with --create.\n"
+    )
+    newer = keys("--rotate", "robot", "--overlap", "7d").stdout.strip()
+    assert [named(one) for one in (old, new, newer)] == ["robot", None, "robot"]
+    last = keys("--rotate", "robot", "--overlap", "0").stdout.strip()
+    assert [named(one) for one in (old, newer, last)] == [None, None, "robot"]
+    assert "old secret" not in keys("--list").stdout
+    assert "no key named 'nobody'" in keys("--rotate", "nobody", expect=2).stderr
+    assert (
+        "not within 0 s and 30 days"
+        in keys("--rotate", "robot", "--overlap", "31d", expect=2).stderr
+    )
+    assert "Use it with --rotate" in keys("--list", "--overlap", "1h", expect=2).stderr
+    actions = [
+        line.split("  ")[2] for line in sceneprint("audit", "--data", tmp_path).stdout.splitlines()
+    ]
+    assert actions == ["keys --rotate robot"] * 3 + ["keys --create robot"]
+
+
 @pytest.mark.parametrize(
     "arguments", [(), ("--list", "--revoke", "x"), ("--create", "x", "--list")]
 )

@@ -181,6 +181,14 @@ def test_keys_are_made_listed_and_revoked_alike(request: pytest.FixtureRequest, 
         client.create_key("empty", {})
     me = client.me()
     assert (me.name, me.grants) == ("boss" if where == "keyed" else None, {"*": "admin"})
+    turned = client.rotate_key("cart 9", 60)
+    assert (turned.secret != made.secret, turned.grants) == (True, made.grants)
+    assert turned.previous_until is not None
+    assert turned.previous_until - datetime.now(UTC) <= timedelta(seconds=60)
+    with pytest.raises(UnknownKey, match="'cart 10'"):
+        client.rotate_key("cart 10")
+    with pytest.raises(InvalidRequest, match="overlap_s"):
+        client.rotate_key("cart 9", -1)
     client.revoke_key("cart 9")
     found = client.keys()
     assert "cart 9" not in [key.name for key in found]

@@ -6,13 +6,16 @@ import json
 import os
 import re
 import signal
+import ssl
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from functools import partial
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,10 @@ import httpx
 import numpy as np
 import pytest
 from anyio.from_thread import BlockingPortal, start_blocking_portal
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import write_depth_png
@@ -120,6 +127,31 @@ class Server:
             self.process.stdout.close()
 
 
+@pytest.fixture(scope="session")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A certificate of this machine that nobody else vouches for, and its key."""
+    folder = tmp_path_factory.mktemp("certificate")
+    key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "localhost")])
+    names = [x509.DNSName("localhost"), x509.IPAddress(IPv4Address("127.0.0.1"))]
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - timedelta(days=1))
+        .not_valid_after(now + timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    (folder / "certificate.pem").write_bytes(made.public_bytes(Encoding.PEM))
+    (folder / "key.pem").write_bytes(
+        key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    )
+    return folder / "certificate.pem", folder / "key.pem"
+
+
 def promised(document: dict[str, Any], answer: httpx.Response) -> None:
     """Hold an answer to the OpenAPI document: its status and its type are declared."""
     method, path = answer.request.method.lower(), answer.request.url.path
@@ -157,8 +189,13 @@ def starter(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Server]:
         if wait:
             assert process.stdout is not None
             line = process.stdout.readline()
-            assert line.startswith("sceneprint: serving http://"), errors.read_text()
+            assert re.match("sceneprint: serving https?://", line), errors.read_text()
             server.url = line.split()[-1]
+            if "tls_cert" in settings:
+                server.client = httpx.Client(
+                    timeout=60, trust_env=False,
+                    verify=ssl.create_default_context(cafile=str(settings["tls_cert"])),
+                )  # fmt: skip
             server.client.base_url = httpx.URL(server.url)
             if not document:
                 document.update(server.client.get("/openapi.json").json())

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
+import ssl
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,9 +16,16 @@ from typing import Any
 
 import pytest
 import uvicorn
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    PrivateFormat,
+    load_pem_private_key,
+)
 from starlette.requests import Request
 from starlette.responses import Response
 
+from sceneprint.errors import InvalidRequest
 from sceneprint.settings import Settings
 from service import body_limits
 from service import server as connections
@@ -40,9 +48,10 @@ async def app(scope: Any, receive: Any, send: Any) -> None:
 
 
 @contextmanager
-def running(application: Any) -> Iterator[tuple[str, int]]:
+def running(application: Any, context: ssl.SSLContext | None = None) -> Iterator[tuple[str, int]]:
+    http = Connection if context is None else connections.secured(context)
     config = uvicorn.Config(
-        application, http=Connection, lifespan="off", log_config=None, access_log=False
+        application, http=http, lifespan="off", log_config=None, access_log=False
     )
     server = uvicorn.Server(config)
     listening = socket.create_server(("127.0.0.1", 0))
@@ -57,17 +66,27 @@ def running(application: Any) -> Iterator[tuple[str, int]]:
 
 
 @pytest.fixture
-def opened(monkeypatch) -> Iterator[Callable[..., socket.socket]]:
-    """Connections to a service that is soon tired of waiting."""
+def opened(monkeypatch, request, certificate) -> Iterator[Callable[..., socket.socket]]:
+    """Connections to a service that is soon tired of waiting; by TLS where a test asks for it."""
+    cert, key = certificate
+    asked = context = None
+    if getattr(request, "param", "http") == "https":
+        context = connections.tls_context(Settings(tls_cert=cert, tls_key=key))
+        asked = ssl.create_default_context(cafile=str(cert))
     monkeypatch.setattr(connections, "HEAD_S", 0.8)
     monkeypatch.setattr(connections, "READING_S", 1.0)
     monkeypatch.setattr(body_limits, "IDLE_S", 0.8)
     settings = Settings(body_s=1, upload_bytes=1 << 20, cors_origins=())
     made: list[socket.socket] = []
-    with running(RequestMiddleware(app, settings, Origins(()), Metrics())) as address:
+    with running(RequestMiddleware(app, settings, Origins(()), Metrics()), context) as address:
 
-        def connect(said: bytes = b"") -> socket.socket:
-            made.append(socket.create_connection(address, timeout=PATIENCE_S))
+        def connect(said: bytes = b"", *, bare: bool = False) -> socket.socket:
+            wire = socket.create_connection(address, timeout=PATIENCE_S)
+            if asked is not None and not bare:
+                wire = asked.wrap_socket(
+                    wire, server_hostname="localhost", suppress_ragged_eofs=True
+                )
+            made.append(wire)
             made[-1].sendall(said)
             return made[-1]
 
@@ -78,13 +97,17 @@ def opened(monkeypatch) -> Iterator[Callable[..., socket.socket]]:
                 one.close()
 
 
+by_both = pytest.mark.parametrize("opened", ["http", "https"], indirect=True)
+by_tls = pytest.mark.parametrize("opened", ["https"], indirect=True)
+
+
 def rest(wire: socket.socket) -> bytes:
     """All that comes until the other side closes."""
     data = b""
     try:
         while more := wire.recv(1 << 16):
             data += more
-    except ConnectionError:
+    except (ConnectionError, ssl.SSLError):
         pass
     return data
 
@@ -122,6 +145,7 @@ def dripping(wire: socket.socket, drop: bytes) -> Iterator[None]:
         thread.join()
 
 
+@by_both
 def test_a_head_that_drips_is_not_waited_for(opened):
     wire = opened(b"GET / HTTP/1.1\r\nHost: localhost\r\n")
     with dripping(wire, b"X-A: b\r\n"):
@@ -133,6 +157,7 @@ def test_an_answer_that_takes_long_is_not_cut_short(opened):
     assert rest(opened(ask("/wait", CLOSE))).endswith(b"\r\n\r\n0")
 
 
+@by_both
 def test_a_connection_may_be_used_again(opened):
     wire = opened(ask("/"))
     for path in ("/wait", "/"):
@@ -149,35 +174,48 @@ def test_the_rest_of_a_body_that_was_refused_is_not_read_for_ever(opened):
         assert rest(wire).endswith(b"\r\n\r\n0")
 
 
-def test_an_answer_nobody_reads_is_given_up(opened, monkeypatch):
-    lost: set[Any] = set()
+@pytest.fixture
+def lost(monkeypatch) -> Callable[[Any], None]:
+    """Waits until the service has given up the connection of an address."""
+    gone: set[Any] = set()
     ended = threading.Event()
     before = Connection.connection_lost
 
     def noted(self: Connection, exc: Exception | None) -> None:
         before(self, exc)
-        lost.add(self.client)
+        gone.add(self.client)
         ended.set()
 
-    monkeypatch.setattr(Connection, "connection_lost", noted)
-    with socket.socket() as wire:
-        wire.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        wire.connect(opened().getpeername())
-        wire.sendall(ask("/large"))
-        while wire.getsockname() not in lost:  # the other one is silent, and closed as well
+    def wait(address: Any) -> None:
+        while address not in gone:
             assert ended.wait(PATIENCE_S)
             ended.clear()
 
+    monkeypatch.setattr(Connection, "connection_lost", noted)
+    return wait
 
+
+@by_both
+def test_an_answer_nobody_reads_is_given_up(opened, lost):
+    wire = opened()
+    wire.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    name = wire.getsockname()
+    wire.sendall(ask("/large"))
+    lost(name)
+
+
+@by_both
 def test_an_answer_that_is_read_slowly_is_given_whole(opened):
     wire = opened(ask("/large", CLOSE))
     data, seen = b"", threading.Event()
     while more := wire.recv(1 << 18):
+        if (len(data) + len(more)) >> 18 > len(data) >> 18:
+            seen.wait(0.05)  # 32 pauses, longer together than the limit
         data += more
-        seen.wait(0.05)  # 32 pauses, longer together than the limit
     assert len(data) > LARGE
 
 
+@by_both
 def test_who_was_silent_for_longest_makes_room(opened, monkeypatch):
     monkeypatch.setattr(connections, "HEAD_S", 60)
     monkeypatch.setattr(connections, "room", lambda: 3)
@@ -201,6 +239,68 @@ def test_of_a_crowd_that_comes_at_once_no_more_stay_than_there_is_room_for(opene
     for wire in crowd[36:]:
         wire.sendall(ask("/", CLOSE))
         assert rest(wire).endswith(b"0")
+
+
+@by_tls
+def test_who_does_not_agree_on_tls_is_closed_without_a_word(opened):
+    assert rest(opened(bare=True)) == b""
+    with dripping(wire := opened(b"\x16\x03\x01\x10\x00", bare=True), b"\x01"):
+        assert rest(wire) == b""
+    assert b"HTTP" not in rest(opened(ask("/", CLOSE), bare=True))
+    assert rest(opened(ask("/", CLOSE))).endswith(b"\r\n\r\n0")
+
+
+@by_tls
+def test_connections_without_tls_yet_are_counted_too(opened, monkeypatch):
+    monkeypatch.setattr(connections, "HEAD_S", 60)
+    monkeypatch.setattr(connections, "room", lambda: 3)
+    crowd = [opened(bare=True) for _ in range(20)]
+    for wire in crowd[:16]:
+        assert rest(wire) == b""
+    assert rest(opened(ask("/", CLOSE))).endswith(b"\r\n\r\n0")
+
+
+@by_tls
+def test_who_never_agrees_to_the_end_is_closed_nevertheless(opened, lost, monkeypatch):
+    """TLS ends by a word of both sides, and this one reads all and keeps silent."""
+    monkeypatch.setattr(Connection, "_unread", lambda _: 0)
+    wire = opened(ask("/", CLOSE))
+    name = wire.getsockname()
+    assert rest(wire).endswith(b"\r\n\r\n0")
+    lost(name)
+
+
+@by_tls
+def test_tls_is_of_version_1_2_or_later(opened, certificate):
+    wire = opened()
+    assert (wire.version(), wire.cipher()[2]) == ("TLSv1.3", 256)
+    cert, key = certificate
+    context = connections.tls_context(Settings(tls_cert=cert, tls_key=key))
+    assert context.minimum_version == ssl.TLSVersion.TLSv1_2
+    assert all("CBC" not in one["name"] for one in context.get_ciphers())
+
+
+def test_a_certificate_that_cannot_be_used_is_said(certificate, tmp_path):
+    cert, key = certificate
+    for given, said in (
+        ({"tls_cert": cert, "tls_key": tmp_path / "none.pem"}, "No such file or directory"),
+        ({"tls_cert": key, "tls_key": key}, "cannot be used"),
+        ({"tls_cert": cert, "tls_key": cert}, "cannot be used"),
+    ):
+        with pytest.raises(InvalidRequest, match=said):
+            connections.tls_context(Settings(**given))
+    for half in ({"tls_cert": cert}, {"tls_key": key}):
+        with pytest.raises(ValueError, match="HTTPS needs SCENEPRINT_TLS_CERT"):
+            Settings(**half)
+    locked = tmp_path / "locked.pem"
+    found = load_pem_private_key(key.read_bytes(), None)
+    locked.write_bytes(
+        found.private_bytes(
+            Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"of somebody")
+        )
+    )
+    with pytest.raises(InvalidRequest, match="not encrypted"):
+        connections.tls_context(Settings(tls_cert=cert, tls_key=locked))
 
 
 def refusal(said: bytes) -> tuple[int, dict[str, Any]]:
@@ -255,6 +355,7 @@ def test_each_mebibyte_that_came_gives_more_time(monkeypatch):
     assert left == [2.0, 3.0, 4.0, 5.0]
 
 
+@by_both
 def test_what_is_no_http_is_refused_as_all_else(opened):
     status, problem = refusal(rest(opened(b"HELLO\r\n\r\n")))
     assert (status, problem["type"], problem["status"]) == (400, "/problems/bad-request", 400)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import shutil
@@ -316,7 +317,9 @@ def test_workers_and_doctor_say_that_a_folder_is_read_only(sealed, stored):
         sealed("work"), env=given, capture_output=True, text=True, timeout=90, check=False
     )
     assert (done.returncode, done.stdout) == (2, "")
-    (line,) = done.stderr.splitlines()
+    warning, line = done.stderr.splitlines()
+    assert json.loads(warning)["permissions"] == "555"
+    assert "every user of this machine may read the data folder" in warning
     assert line.startswith("sceneprint work: ")
     assert "is read-only: it is read, and nothing can be stored" in line
     done = subprocess.run(sealed("doctor"), capture_output=True, text=True, timeout=90, check=False)

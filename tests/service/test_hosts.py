@@ -61,6 +61,42 @@ def test_a_page_makes_nothing_and_its_body_is_not_waited_for(served, refused):
         assert wire.recv(65536).startswith(b"HTTP/1.1 421 ")
 
 
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("site", ["cross-site", "same-site", "Cross-Site", "new-word"])
+@pytest.mark.parametrize("kind", ["image", "empty", "iframe"])
+def test_a_page_of_others_that_sends_no_origin_is_told_nothing(served, refused, path, site, kind):
+    given = {"Sec-Fetch-Site": site, "Sec-Fetch-Dest": kind, "Sec-Fetch-Mode": "no-cors"}
+    answer = served.client.get(path, headers=given)
+    refused(answer, 403, "foreign-origin", "A page of another origin loaded this address")
+
+
+@pytest.mark.parametrize("site", ["same-origin", "none"])
+def test_our_own_pages_and_typed_addresses_are_answered(served, site):
+    for path in ("/v1/maps", "/docs", "/openapi.json"):
+        assert served.client.get(path, headers={"Sec-Fetch-Site": site}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [
+        ("/", 307), ("/dashboard", 200), ("/dashboard/", 307), ("/docs", 200),
+        ("/v1/maps", 403), ("/openapi.json", 403), ("/docs/start.js", 403),
+        ("/dashboard/main.js", 403), ("/v1/maps/dashboard", 403),
+    ],
+)  # fmt: skip
+def test_a_link_of_others_leads_to_pages_and_to_nothing_else(served, path, status):
+    given = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Accept": "text/html"}
+    followed = served.client.get(path, headers=given | {"Sec-Fetch-Dest": "document"})
+    assert followed.status_code == status
+    framed = served.client.get(path, headers=given | {"Sec-Fetch-Dest": "iframe"})
+    assert framed.status_code == 403
+
+
+def test_a_page_of_this_machine_that_says_who_it_is_may_ask(served):
+    given = {"Origin": "http://localhost:3000", "Sec-Fetch-Site": "same-site"}
+    assert served.client.get("/v1/maps", headers=given).status_code == 200
+
+
 def test_an_old_client_that_names_no_host_is_no_browser(served):
     address = httpx.URL(served.url)
     with socket.create_connection((address.host, address.port), timeout=60) as wire:

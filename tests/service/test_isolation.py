@@ -147,6 +147,7 @@ MADE_OF_ANYTHING = (
 #: The operator's: 403 for who has a map, whatever is asked for.
 OF_ALL = (
     "GET /v1/keys", "POST /v1/keys", "DELETE /v1/keys/{key_name}", "GET /v1/audit", "GET /metrics",
+    "POST /v1/keys/{key_name}/rotate",
     "POST /v1/snapshots", "GET /v1/snapshots", "GET /v1/snapshots/{snapshot_id}",
     "DELETE /v1/snapshots/{snapshot_id}",
 )  # fmt: skip
@@ -519,7 +520,8 @@ def test_what_is_not_noted_is_said(operations):
     }
     assert names >= UNNOTED
     assert names - UNNOTED == {
-        "create_key", "revoke_key", "create_map", "patch_map", "delete_map", "patch_frame",
+        "create_key", "rotate_key", "revoke_key",
+        "create_map", "patch_map", "delete_map", "patch_frame",
         "delete_frames", "edit_frames", "restore_frames", "restore_frame", "keep_answer",
         "release_answer",
         "delete_frame", "patch_session", "delete_session_frames", "cancel_job", "retry_job",

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.engine.admin.operations import list_keys
+from sceneprint.settings import Settings
+from service.metrics import Sampler, housekeeping
 
 BELOW = (
     ("GET", "/v1/maps"),
@@ -111,3 +117,21 @@ def test_a_key_has_a_name_that_can_be_printed(name: str, tmp_path: Path) -> None
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1
     assert "is not a valid key name" in done.stderr
+
+
+def test_who_uses_a_key_waits_for_no_note_of_it(tmp_path):
+    """It is written later, by whoever keeps house, and at the latest when the service ends."""
+    with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
+        engine.create_key("idle")
+        secret = engine.create_key("busy").secret
+
+        def used() -> dict[str, bool]:
+            return {one.name: one.last_used_at is not None for one in list_keys(engine.store).items}
+
+        async def serve() -> None:
+            async with housekeeping(engine, Sampler()):
+                assert engine.find_key(secret).name == "busy"
+                assert used() == {"busy": False, "idle": False}
+
+        asyncio.run(serve())
+        assert used() == {"busy": True, "idle": False}

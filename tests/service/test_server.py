@@ -1,13 +1,19 @@
-"""The socket that is listened on."""
+"""The socket that is listened on, and TLS on it."""
 
 from __future__ import annotations
 
+import signal
 import socket
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
 from sceneprint.errors import UnusableStore
 from sceneprint.settings import Settings
+from sceneprint_client import Client
+from sceneprint_client.errors import Unreachable
 from service.server import listen
 
 
@@ -24,3 +30,27 @@ def test_accepted_connections_do_not_wait_for_acknowledgements(tmp_path):
                 assert accepted.proto == socket.IPPROTO_TCP
         with pytest.raises(UnusableStore, match=f"127.0.0.1:{port} is not available"):
             listen(Settings(data_dir=tmp_path, port=port))
+
+
+def test_by_two_settings_the_service_speaks_https(begin, certificate, monkeypatch):
+    cert, key = certificate
+    server = begin(tls_cert=cert, tls_key=key, workers=0)
+    assert server.url.startswith("https://127.0.0.1:")
+    answer = server.client.get("/healthz", headers={"Origin": server.url})
+    assert answer.json()["status"] == "ok"
+    port = server.client.base_url.port
+    with pytest.raises(Unreachable, match=r"not trusted here .* set SSL_CERT_FILE"):
+        Client(server.url).status()
+    with socket.create_connection(("127.0.0.1", port), timeout=60) as wire:
+        wire.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert not wire.recv(1 << 16).startswith(b"HTTP")
+    monkeypatch.setenv("SSL_CERT_FILE", str(cert))
+    with Client(server.url) as client:  # which keeps its connection until the service ends
+        assert client.status().version == answer.json()["version"]
+        command = str(Path(sys.executable).with_name("sceneprint"))
+        done = subprocess.run(
+            [command, "maps", "--url", f"https://localhost:{port}"],
+            capture_output=True, text=True, timeout=90, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert server.end(signal.SIGTERM) == 0

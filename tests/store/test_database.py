@@ -199,6 +199,7 @@ def test_a_folder_that_may_not_be_written_says_so() -> None:
         open_database(f"sqlite:///{folder}/other/there.db").close()
         for path in (folder, folder / "other"):
             path.chmod(0o755)
+        (folder / "other" / "there.db").chmod(0o644)
         done = subprocess.run(
             [sys.executable, "-c", AS_NOBODY, made], capture_output=True, text=True, check=False
         )

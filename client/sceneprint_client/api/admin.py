@@ -64,10 +64,17 @@ class Key(ApiRecord):
     created_at: datetime
     expires_at: datetime | None = Field(description="Null: it does not expire.")
     tenant: str = Field(description="Whom it belongs to: what its keys ask is counted together.")
+    previous_until: datetime | None = Field(
+        default=None,
+        description="Until when the secret before the last rotation still works; null: none does.",
+    )
+    last_used_at: datetime | None = Field(
+        default=None, description="To about an hour; null: it was never used."
+    )
 
 
 class MadeKey(Key):
-    """A key that was just made."""
+    """A key that was just made, or given a new secret."""
 
     secret: str = Field(
         description="Send it as `Authorization: Bearer SECRET`. It is shown this once: only its "
@@ -424,6 +431,7 @@ KINDS = {
     "coverage.measured": "A job that measured a map's coverage is over; `data` is its result.",
     "difference.found": "A job that compared two sessions is over; `data` is its result.",
     "key.created": "A key was made; of no map.",
+    "key.rotated": "A key has a new secret; the one before ends soon. Of no map.",
     "key.revoked": "A key opens nothing any more; of no map.",
 }
 #: Stands in a stream where events are not there any more; kept by nobody.

@@ -415,6 +415,35 @@ def _check_name(name: str, of: str) -> None:
         )
 
 
+#: Seconds for which a secret works after its rotation, unless told otherwise, and at most.
+OVERLAP_S, MOST_OVERLAP_S = 3600.0, 30 * 86_400.0
+
+
+def rotate_key(store: Store, name: str, overlap_s: float = OVERLAP_S) -> MadeKey:
+    """Give a key a new secret, shown this once; the one before works for a while longer.
+
+    Parameters
+    ----------
+    store : see Store
+    name : of the key
+    overlap_s : seconds; 0: the one before ends now
+
+    Raises
+    ------
+    InvalidRequest : `overlap_s` is negative, or more than 30 days.
+    UnknownKey : there is none of that name.
+    """
+    if not 0 <= overlap_s <= MOST_OVERLAP_S:
+        raise InvalidRequest(
+            f"An overlap of {overlap_s:g} s is not within 0 s and 30 days. Choose a shorter one.",
+            (("overlap_s", "not within 0 and 2592000"),),
+        )
+    with store.database.write() as connection:
+        secret = stored.rotate_key(connection, name, overlap_s)
+        row = stored.find_named_key(connection, name)
+    return MadeKey(secret=secret, **_key_record(row).model_dump())
+
+
 def list_keys(store: Store, cursor: str | None = None, limit: int = 100) -> Page[Key]:
     """Keys by name.
 
@@ -445,13 +474,21 @@ def _until(expires_at: datetime) -> float:
 
 
 def _key_record(row: stored.KeyRow) -> Key:
+    now = time.time()
     return Key(
         name=row.name,
         grants=row.grants,
         created_at=datetime.fromtimestamp(row.created_at, UTC),
-        expires_at=None if row.expires_at is None else datetime.fromtimestamp(row.expires_at, UTC),
+        expires_at=_time(row.expires_at),
         tenant=row.tenant,
+        # when it has passed, it is of no more interest
+        previous_until=_time(row.previous_until) if (row.previous_until or 0) > now else None,
+        last_used_at=_time(row.last_used_at),
     )
+
+
+def _time(seconds: float | None) -> datetime | None:
+    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
 
 
 def _name_of(cursor: str) -> str:

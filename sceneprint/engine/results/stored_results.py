@@ -30,7 +30,7 @@ import numpy as np
 from pydantic import ValidationError
 from sqlalchemy import ColumnElement, select
 
-from sceneprint.atomic_files import write_whole
+from sceneprint.atomic_files import make_folder, write_whole
 from sceneprint.errors import UnknownQuery, UnusableStore
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Store
@@ -271,9 +271,9 @@ class ResultFolder(StoredResults):
         if len(data) > self._most:
             return False
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self._folder)
             self._make_room(len(data))
-            write_whole(self._folder / kept.answer.query_id, data)
+            write_whole(self._folder / kept.answer.query_id, data, private=True)
         except OSError as error:  # a full disk, a folder that may only be read
             self._refuse(error)
             return False

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, select
 
+from sceneprint.atomic_files import make_folder
 from sceneprint.engine.search.map_view import IndexView, MapView, StoredMaps
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import UnusableStore
@@ -142,7 +143,7 @@ def _nameless(folder: Path, size: int) -> mmap.mmap:
     failed: OSError | None = None
     for place in (folder, Path(tempfile.gettempdir())):
         try:
-            place.mkdir(parents=True, exist_ok=True)
+            make_folder(place)
             with tempfile.TemporaryFile(dir=place) as file:
                 # set aside now: a page that has no room when it is written kills the process
                 os.posix_fallocate(file.fileno(), 0, size)

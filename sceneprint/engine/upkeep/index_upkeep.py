@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
+from sceneprint.atomic_files import PRIVATE_FILE, make_folder
 from sceneprint.engine.search.local_index import (
     READ_MOST,
     Setting,
@@ -101,8 +102,8 @@ class Scrubber:
         except OSError:
             pass  # never yet
         try:
-            self._indexes.mkdir(parents=True, exist_ok=True)
-            stamp.touch()
+            make_folder(self._indexes)
+            stamp.touch(PRIVATE_FILE)
         except OSError:
             return False  # a cache that cannot be written cannot be healed either
         return True
@@ -297,7 +298,7 @@ class Upkeep:
         now = time.time()
         with suppress(OSError):  # removed meanwhile: then there is nothing to be left in peace
             mark = index_folder(self._indexes, row) / _REST
-            mark.touch()
+            mark.touch(PRIVATE_FILE)
             os.utime(mark, (now, now + seconds))
 
     def is_rested(self, row: MapRow) -> bool:

@@ -13,7 +13,7 @@ from typing import Literal, TypeVar
 from sqlalchemy import Connection, func, select, update
 from sqlalchemy.exc import DBAPIError
 
-from sceneprint.atomic_files import write_durable
+from sceneprint.atomic_files import make_folder, write_durable
 from sceneprint.engine.upkeep.repair import PRIORITY, reason_of_loss
 from sceneprint.errors import StoreError, UnreadableModel, UnusableStore
 from sceneprint.models import Model, parse_model
@@ -246,7 +246,7 @@ def quarantine_blob(folder: Folder, digest: str) -> str:
 def quarantine_bytes(folder: Folder, name: str, data: bytes) -> Path:
     """Keep damaged bytes that are about to be removed from the database."""
     place = folder.quarantine / name
-    place.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(place.parent)
     write_durable(place, data)
     return place
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 import re
 import secrets
 import sqlite3
@@ -31,7 +32,7 @@ from typing import TYPE_CHECKING, BinaryIO, Literal
 
 from pydantic import ValidationError
 
-from sceneprint.atomic_files import make_folder, sync_folder, write_durable
+from sceneprint.atomic_files import create_private, make_folder, sync_folder, write_durable
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
 from sceneprint.errors import DamagedBlob, SnapshotError, UnknownSnapshot, UnusableStore
 from sceneprint.maintenance.fsck.findings import opened_blobs
@@ -201,7 +202,7 @@ def _create(source: database_copy.Source, blobs: Store, path: Path, progress: Pr
     folder = path.absolute().parent
     with (
         full_disk_explained(path),
-        staging(folder, _PREFIX, 0o700) as workplace,
+        staging(folder, _PREFIX) as workplace,
         blobs.kept(),  # before the copy: what it refers to must not go
     ):
         begun = datetime.now(UTC)
@@ -221,8 +222,8 @@ def _create(source: database_copy.Source, blobs: Store, path: Path, progress: Pr
             total = draft.database.bytes + total_bytes(blobs, database_copy.referred(copy), count)
             check_room(folder, total, "the snapshot")  # room for the copy is taken already
             archive = workplace / "archive"
-            with archive.open("xb") as file:
-                archive.chmod(0o600)  # it has all pictures, and the hashes of keys
+            # private: it has all pictures, and the hashes of keys
+            with os.fdopen(create_private(archive), "wb") as file:
                 writer = ArchiveWriter(
                     file, int(begun.timestamp()),
                     lambda done: progress(ahead + min(done, total), ahead + total),
@@ -455,7 +456,7 @@ class SnapshotCatalog:
         """
         found = self.find(snapshot_id)
         make_folder(folder)
-        with staging(folder, _STAGING, 0o700) as place:
+        with staging(folder, _STAGING) as place:
             check_room(place, found.bytes, "the snapshot")
             yield self._rack.local(snapshot_id, place)
 
@@ -482,7 +483,7 @@ class SnapshotCatalog:
         try:
             make_folder(place)
             # archives have all frames, and the hashes of keys
-            with staging(place, _STAGING, 0o700) as folder:
+            with staging(place, _STAGING) as folder:
                 taken = take_snapshot(self._settings, folder / "archive", progress)
                 with taken.path.open("rb") as file:
                     digest = hashlib.file_digest(file, "sha256").hexdigest()

@@ -22,13 +22,14 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import datetime
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from sceneprint.atomic_files import sync_folder
+from sceneprint.atomic_files import PRIVATE_FOLDER, create_private, sync_folder
 from sceneprint.errors import DamagedSnapshot, SnapshotError
 
 #: Bytes read or written at once.
@@ -307,8 +308,8 @@ def _checksum(record: dict[str, Any]) -> str:
 
 
 @contextmanager
-def staging(folder: Path, prefix: str, mode: int = 0o777) -> Iterator[Path]:
-    """A new folder within another, removed at the end with what is still in it.
+def staging(folder: Path, prefix: str) -> Iterator[Path]:
+    """A new private folder within another, removed at the end with what is still in it.
 
     It is locked, so that those of processes that were killed are known: they are removed first.
 
@@ -316,7 +317,6 @@ def staging(folder: Path, prefix: str, mode: int = 0o777) -> Iterator[Path]:
     ----------
     folder : in which it is made
     prefix : of its name, and of those that were left behind
-    mode : of it, less what the user masks
 
     Raises
     ------
@@ -324,7 +324,7 @@ def staging(folder: Path, prefix: str, mode: int = 0o777) -> Iterator[Path]:
     """
     for name in left_behind(folder, prefix):
         _remove_dead(folder / name)
-    path, descriptor = _make(folder, prefix, mode)
+    path, descriptor = _make(folder, prefix)
     try:
         yield path
     finally:
@@ -396,10 +396,10 @@ def put_new(made: Path, path: Path) -> None:
     sync_folder(path.parent)
 
 
-def _make(folder: Path, prefix: str, mode: int) -> tuple[Path, int]:
+def _make(folder: Path, prefix: str) -> tuple[Path, int]:
     while True:
         path = folder / f"{prefix}{secrets.token_hex(6)}"
-        path.mkdir(mode)
+        path.mkdir(PRIVATE_FOLDER)
         try:
             descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except FileNotFoundError:
@@ -451,7 +451,7 @@ class DurableFiles:
         self._folders: set[Path] = set()
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="sync")
         if folder is not None:
-            folder.mkdir()
+            folder.mkdir(PRIVATE_FOLDER)
 
     def __enter__(self) -> DurableFiles:
         return self
@@ -486,9 +486,9 @@ class DurableFiles:
             return hashed.hexdigest()
         whole = self._folder / path
         if whole.parent not in self._folders:
-            whole.parent.mkdir()
+            whole.parent.mkdir(PRIVATE_FOLDER)
             self._folders.add(whole.parent)
-        file = whole.open("xb", buffering=0)
+        file = FileIO(create_private(whole), "wb")
         self._open.append(file)
         for chunk in chunks:
             hashed.update(chunk)

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 
 from pydantic import ValidationError
 
-from sceneprint.atomic_files import make_folder, sync_folder
+from sceneprint.atomic_files import create_private, make_folder, sync_folder
 from sceneprint.errors import DamagedSnapshot, SnapshotError
 from sceneprint.maintenance.snapshot import database_copy
 from sceneprint.maintenance.snapshot.creation import Progress, Snapshot
@@ -129,7 +129,7 @@ def _write_database(reader: ArchiveReader, manifest: SnapshotManifest, path: Pat
     if reader.next() != (DATABASE, manifest.database.bytes):
         raise reader.damaged("its database is not where it should be")
     hashed = hashlib.sha256()
-    with path.open("xb") as file:
+    with os.fdopen(create_private(path), "wb") as file:
         for chunk in reader.content(manifest.database.bytes):
             hashed.update(chunk)
             file.write(chunk)

@@ -16,7 +16,13 @@ from io import FileIO
 from pathlib import Path
 from typing import BinaryIO, Literal
 
-from sceneprint.atomic_files import make_folder, sync_folder, write_durable
+from sceneprint.atomic_files import (
+    PRIVATE_FOLDER,
+    create_private,
+    make_folder,
+    sync_folder,
+    write_durable,
+)
 from sceneprint.errors import DamagedBlob, UnusableStore
 from sceneprint.store.database_errors import unusable
 
@@ -365,7 +371,7 @@ class FolderBlobs(Blobs):
         part = self._folder / f".{secrets.token_hex(6)}.part"
         what = f"{self._folder}: a blob cannot be written"
         try:
-            file = part.open("xb", buffering=0)
+            file = FileIO(create_private(part), "wb")
         except OSError as error:
             raise unusable(what, error) from error
         try:
@@ -387,7 +393,7 @@ class FolderBlobs(Blobs):
     def _made(self, folder: Path) -> bool:
         """See that a folder is there; whether it may not be durable yet."""
         try:
-            folder.mkdir()
+            folder.mkdir(PRIVATE_FOLDER)
         except FileExistsError:
             return folder.name not in self._durable
         return True
@@ -449,7 +455,7 @@ class FolderBlobs(Blobs):
     def quarantine(self, digest: str, folder: Path) -> Path | None:
         """Move what lies under a digest out of the way; see `Blobs.quarantine`."""
         path, place = self.path(digest), folder / f"blob-{digest}"
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         try:
             os.replace(path, place)  # noqa: PTH105  (the one call that is atomic by contract)
         except FileNotFoundError:

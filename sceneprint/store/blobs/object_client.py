@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 from urllib.parse import unquote, urlsplit
 
-from sceneprint.atomic_files import make_folder, sync_folder
+from sceneprint.atomic_files import create_private, make_folder, sync_folder
 from sceneprint.errors import StoreAway, StoreFull, UnusableStore
 
 if TYPE_CHECKING:
@@ -239,7 +239,7 @@ class Objects:
 
     def get_file(self, key: str, path: Path) -> None:
         """Write an object into a file that is made; FileNotFoundError where there is none."""
-        with path.open("xb") as file:
+        with os.fdopen(create_private(path), "wb") as file:
             for chunk in self.chunks(key):
                 file.write(chunk)
 

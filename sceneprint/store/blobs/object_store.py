@@ -23,7 +23,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from sceneprint.atomic_files import sync_folder
+from sceneprint.atomic_files import make_folder, sync_folder
 from sceneprint.errors import DamagedBlob, UnusableStore
 from sceneprint.store.blobs.folder import (
     DIGEST,
@@ -274,7 +274,7 @@ class ObjectBlobs(Blobs):
         """Fetch what lies under a digest into a folder of this machine, durably, and remove it."""
         require_digest(digest)
         place = folder / f"blob-{digest}"
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         place.unlink(missing_ok=True)
         try:
             self.objects.get_file(_key(digest), place)

@@ -1,0 +1,77 @@
+"""What a data folder lets other users of the machine read: nothing, whatever the umask."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from sceneprint.atomic_files import make_folder, public_mode
+from sceneprint.cli.doctor import machine
+from sceneprint.engine import Engine
+from sceneprint.maintenance.snapshot.creation import take_snapshot
+from sceneprint.maintenance.snapshot.restoration import restore_snapshot
+from sceneprint_client.api import NewMap, Query
+
+
+@pytest.fixture
+def no_umask() -> Iterator[None]:
+    before = os.umask(0)
+    yield
+    os.umask(before)
+
+
+def public_paths(folder: Path) -> set[str]:
+    """What in a folder anybody but its owner may read, write or enter; its own name is `.`."""
+    found = [folder, *folder.rglob("*")]
+    return {str(one.relative_to(folder)) for one in found if one.stat().st_mode & 0o077}
+
+
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
+def test_all_that_is_made_is_its_owners_alone(no_umask, tmp_path, uploads, settings):
+    data = tmp_path / "new" / "data"
+    with Engine(settings(data)) as engine:
+        engine.create_map(NewMap(name="hall", model="depth"))
+        for each in uploads[:3]:
+            engine.add_frame("hall", each.data, each.meta)
+        while (work := engine.claim("w")) is not None:
+            engine.run(work)
+        engine.rebuild_index("hall")
+        engine.query_upload("hall", uploads[0].data, uploads[0].meta, Query())
+        assert {path.name for path in data.iterdir()} >= {
+            "sceneprint.db", "sceneprint.db-wal", "sceneprint.db-shm", "blobs", "index", "queries",
+        }  # fmt: skip
+        assert len(list((data / "index").rglob("*.json"))) == 1
+        assert public_paths(data.parent) == set()
+    take_snapshot(settings(data), tmp_path / "backup.tar")
+    restore_snapshot(tmp_path / "backup.tar", tmp_path / "restored")
+    assert (tmp_path / "backup.tar").stat().st_mode & 0o777 == 0o600
+    assert len(list((tmp_path / "restored").rglob("*"))) > 6
+    assert public_paths(tmp_path / "restored") == set()
+
+
+def test_a_folder_that_is_there_keeps_its_permissions(no_umask, tmp_path):
+    (tmp_path / "data").mkdir(0o755)
+    make_folder(tmp_path / "data" / "blobs")
+    assert public_paths(tmp_path / "data") == {"."}
+    assert public_mode(tmp_path / "data") == 0o755
+    (tmp_path / "data").chmod(0o750)  # a group is somebody's decision
+    assert public_mode(tmp_path / "data") is None
+    (tmp_path / "file").touch()
+    with pytest.raises(FileExistsError):
+        make_folder(tmp_path / "file")
+
+
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
+def test_doctor_names_the_command_for_an_older_folder(tmp_path, settings):
+    folder = tmp_path / "of 0.2"
+    folder.mkdir()
+    folder.chmod(0o755)
+    found = {check.subject: check for check in machine(settings(folder))}
+    assert found["permissions"].verdict == "note"
+    assert "755" in found["permissions"].text
+    assert f"chmod -R o-rwx '{folder}'" in found["permissions"].text
+    folder.chmod(0o700)
+    assert "permissions" not in {check.subject for check in machine(settings(folder))}

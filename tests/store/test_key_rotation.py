@@ -1,0 +1,68 @@
+"""Which secret of a key opens it, and when a key was last used."""
+
+from __future__ import annotations
+
+import pytest
+from sqlalchemy import select
+
+from sceneprint.errors import UnknownKey
+from sceneprint.store import Store, keys
+from sceneprint.store.tables import keys as table
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time that keys go by; to be moved by hand."""
+    now = [1_000_000.0]
+    monkeypatch.setattr(keys.time, "time", lambda: now[0])
+    return now
+
+
+def test_a_secret_ends_with_its_overlap_and_the_next_goes_on(
+    store: Store, clock: list[float]
+) -> None:
+    with store.database.write() as connection:
+        first = keys.create_key(connection, "robot", {"hall": "write"}, 1_000_900.0)
+        second = keys.rotate_key(connection, "robot", 100)
+        ends = [keys.find_key(connection, one).expires_at for one in (first, second)]
+        assert ends == [1_000_100.0, 1_000_900.0]  # of the old secret, when it does
+        clock[0] += 99
+        third = keys.rotate_key(connection, "robot", 500)  # the first keeps its end
+        found = [keys.find_key(connection, one) for one in (first, second, third)]
+        assert [one and one.grants for one in found] == [{"hall": "write"}, None, {"hall": "write"}]
+        clock[0] += 1
+        assert keys.find_key(connection, first) is None
+        fourth = keys.rotate_key(connection, "robot", 5000)  # a key ends with its own end
+        ends = [keys.find_key(connection, one).expires_at for one in (third, fourth)]
+        assert ends == [1_000_900.0, 1_000_900.0]
+        with pytest.raises(UnknownKey, match="'cart'"):
+            keys.rotate_key(connection, "cart", 1)
+        keys.revoke_key(connection, "robot")
+        assert [keys.find_key(connection, one) for one in (third, fourth)] == [None, None]
+
+
+def test_a_use_is_written_once_an_hour(store: Store, clock: list[float]) -> None:
+    uses = keys.KeyUses()
+
+    def used() -> list[float | None]:
+        with store.database.read() as connection:
+            return list(connection.execute(select(table.c.last_used_at)).scalars())
+
+    with store.database.write() as connection:
+        secret = keys.create_key(connection, "robot", {"*": "read"})
+
+    def use() -> None:
+        with store.database.read() as connection:
+            found = keys.find_key(connection, secret)
+        assert found is not None
+        uses.note(found)
+
+    use()
+    assert used() == [None]  # nobody waits for it to be written
+    uses.write(store.database)
+    assert used() == [1_000_000.0]
+    for seconds, expected in ((3599, 1_000_000.0), (1, 1_003_600.0), (-7200, 996_400.0)):
+        clock[0] += seconds  # the last: a clock that was set back
+        use()
+        uses.write(store.database)
+        assert used() == [expected]
