@@ -279,7 +279,7 @@ def _forget(page: Page) -> None:
 def open_page(browser: Browser, shared_context: BrowserContext) -> Iterator[Callable[..., Page]]:
     """Open a page; with arguments, as of Browser.new_context, in a context of its own.
 
-    Without, it shares one with those of other tests, and nothing stays of it there.
+    Without, it shares one with those of other tests; its cookies and storage go with it.
 
     The test fails on whatever a page says in its console as a warning or an error, on what is
     thrown in it, and on requests to other places than the address it was sent to first. A page
