@@ -21,6 +21,7 @@ from sceneprint_client.poses import rotation_of
 ROOT = Path(__file__).resolve().parent.parent
 
 
+@pytest.mark.thorough  # tests/cli_service and tests/engine/test_equal_rooms.py ask all of it
 def test_the_robot_maps_a_room_and_finds_itself(tmp_path: Path) -> None:
     ran = subprocess.run(
         [sys.executable, ROOT / "examples" / "robot_loop.py", "--data", tmp_path / "robot"],

@@ -181,7 +181,8 @@ def scans_model() -> Model:
     return read_model("lidar")
 
 
-@pytest.mark.parametrize("doors", [24, pytest.param(60, marks=pytest.mark.thorough)])
+@pytest.mark.thorough  # tests/geometry/test_validation_clouds.py has a room of equal sides
+@pytest.mark.parametrize("doors", [24, 60])
 def test_scans_of_a_corridor_of_equal_doors_are_not_believed(
     doors: int, scans_model: Model
 ) -> None:

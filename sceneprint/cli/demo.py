@@ -60,10 +60,13 @@ def write_building(folder: Path, rooms: int) -> Generator[None]:
     folder : new
     rooms : how many
     """
-    with ProcessPoolExecutor(
-        min(os.cpu_count() or 1, rooms), mp_context=get_context("spawn")
-    ) as pool:
-        yield from pool.map(partial(_write_room, folder), range(rooms))
+    write = partial(_write_room, folder)
+    jobs = min(os.cpu_count() or 1, rooms)
+    if jobs == 1:  # a process of its own would import all anew
+        yield from map(write, range(rooms))
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(write, range(rooms))
 
 
 def _write_room(folder: Path, number: int) -> None:

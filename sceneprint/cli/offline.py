@@ -512,6 +512,9 @@ def _rooms(options: argparse.Namespace) -> Iterator[None]:
         write = _write_site if options.sensor == "lidar" else _write_room
         make = partial(write, *where, along_path=options.path, perfect=options.perfect)
     jobs = min(options.jobs, options.rooms)
+    if jobs == 1:  # a process of its own would import all anew
+        yield from map(make, range(options.rooms))
+        return
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         yield from pool.map(make, range(options.rooms))
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from multiprocessing import get_context
@@ -241,15 +241,17 @@ def train(
     model_p, mixture_p : its parameters, such as those of a preset: see `preset_parameters`
     p : see TrainingParameters
     references : frames of one's own beside the rooms, each with the name of its place
-    jobs : processes that make and segment frames
+    jobs : processes that make and segment frames; with one, this process does
     report : called as the stages advance
 
     Raises
     ------
-    TrainingError : too little data, or frames of fewer than two places.
+    TrainingError : too little data, frames of fewer than two places, or no such level.
     """
     from threadpoolctl import threadpool_limits
 
+    if p.whitening_rooms and max(p.levels) >= (n_levels := model_p.hierarchy.n_levels):
+        raise TrainingError(f"There is no level {max(p.levels)}: the hierarchy has {n_levels}.")
     tell = report or _silent
     n_frames = p.rooms * p.views + len(references)
     drawn = Draw(
@@ -338,15 +340,12 @@ def whitened(
 
     Raises
     ------
-    TrainingError : too few frames for the dimension of the whitening, or no such level.
+    TrainingError : too few frames for the dimension of the whitening.
     """
     from threadpoolctl import threadpool_limits
 
-    if max(p.levels) >= (n_levels := model.parameters.hierarchy.n_levels):
-        raise TrainingError(f"There is no level {max(p.levels)}: the hierarchy has {n_levels}.")
     psi, places = list[Ints16](), list[str]()
-    context = get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, _open_signer, (model, p.levels)) as pool:
+    with _helpers(jobs, _open_signer, model, p.levels) as pool:
         rooms = pool.map(partial(_room_psi, p), range(p.whitening_rooms))
         for done, (place, found) in enumerate(rooms, 1):
             report("whitening", done, p.whitening_rooms)
@@ -407,13 +406,20 @@ def _median_distance(stored: Bytes, metric: Metric) -> float:
     return float(np.median(among[np.triu_indices(len(stored), 1)]))
 
 
+def _helpers(jobs: int, begin: Callable[..., None] | None = None, *arguments: Any) -> Executor:
+    """So many processes, each of which begins with a call; for one, a thread of this process."""
+    if jobs == 1:
+        return ThreadPoolExecutor(1, "training", begin, arguments)
+    return ProcessPoolExecutor(jobs, get_context("spawn"), begin, arguments)
+
+
 def _lessons(
     model_p: ModelParameters, p: TrainingParameters, draw: Draw,
     references: Sequence[tuple[str, FrameReference]], jobs: int, report: Report,
 ) -> Iterator[Lesson]:  # fmt: skip
     room = partial(_room_lessons, model_p, p, draw)
     frame = partial(_own_lesson, model_p, p, draw)
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+    with _helpers(jobs) as pool:
         for done, lessons in enumerate(pool.map(room, range(p.rooms)), 1):
             report("rooms", done, p.rooms)
             yield from lessons

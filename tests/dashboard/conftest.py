@@ -24,7 +24,14 @@ import httpx
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
-from playwright.sync_api import Browser, Page, Request, sync_playwright
+from playwright.sync_api import (
+    Browser,
+    BrowserContext,
+    Page,
+    Request,
+    ViewportSize,
+    sync_playwright,
+)
 
 from benchmarks.rooms import circled, send
 from sceneprint.formats.dataset import write_depth_png
@@ -36,6 +43,7 @@ FLAGS = [
 ]  # fmt: skip
 #: What Chromium says of drawing without a graphics card, whatever a page does.
 NOISE = "GL Driver Message"
+VIEWPORT: ViewportSize = {"width": 1280, "height": 800}
 #: Processors are few and shared: what takes longer than this does not come.
 PATIENCE_S = 60.0
 ROOMS, VIEWS = 2, 8
@@ -245,9 +253,33 @@ def _shots(folder: Path) -> Iterator[tuple[dict[str, Any], bytes]]:
             )
 
 
+@pytest.fixture(scope="session")
+def shared_context(browser: Browser) -> BrowserContext:
+    """That of all pages that ask for nothing else, which come and go beside an empty one.
+
+    Chromium makes a window for the first page of a context, at half a second of processor.
+    """
+    context = browser.new_context(viewport=VIEWPORT)
+    context.new_page()
+    return context
+
+
+def _forget(page: Page) -> None:
+    """Close a page of the shared context, and leave the next one nothing of it."""
+    page.context.set_offline(False)
+    page.context.clear_cookies()
+    page.context.clear_permissions()
+    browser = page.context.new_cdp_session(page)
+    for origin in page.origins:  # type: ignore[attr-defined]
+        browser.send("Storage.clearDataForOrigin", {"origin": origin, "storageTypes": "all"})
+    page.close()
+
+
 @pytest.fixture
-def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
-    """Open a page in a context of its own; arguments as of Browser.new_context.
+def open_page(browser: Browser, shared_context: BrowserContext) -> Iterator[Callable[..., Page]]:
+    """Open a page; with arguments, as of Browser.new_context, in a context of its own.
+
+    Without, it shares one with those of other tests; its cookies and storage go with it.
 
     The test fails on whatever a page says in its console as a warning or an error, on what is
     thrown in it, and on requests to other places than the address it was sent to first. A page
@@ -256,9 +288,12 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
     opened: list[Page] = []
 
     def open_one(**context: Any) -> Page:
-        size = {"width": 1280, "height": 800}
-        page = browser.new_context(**{"viewport": size, **context}).new_page()
+        within = (
+            browser.new_context(**{"viewport": VIEWPORT, **context}) if context else shared_context
+        )
+        page = within.new_page()
         page.allowed, page.said, page.pending = [], [], set()  # type: ignore[attr-defined]
+        page.origins = set()  # type: ignore[attr-defined]
         page.on(
             "console",
             lambda one: (
@@ -278,7 +313,10 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
         if not any(part in text for part in (NOISE, *page.allowed))  # type: ignore[attr-defined]
     ]  # fmt: skip
     for page in opened:
-        page.context.close()
+        if page.context is shared_context:
+            _forget(page)
+        else:
+            page.context.close()
     assert said == []
 
 
@@ -292,6 +330,7 @@ def _asked(page: Page, request: Request) -> None:
     """Note what a page asks for; a stream is never over."""
     home = httpx.URL(page.url if page.url.startswith("http") else request.url)
     there = httpx.URL(request.url.removeprefix("blob:"))
+    page.origins.add(f"{there.scheme}://{there.netloc.decode()}")  # type: ignore[attr-defined]
     if (there.host, there.port) != (home.host, home.port):
         page.said.append(f"elsewhere: {request.url}")  # type: ignore[attr-defined]
     if request.headers.get("accept") != "text/event-stream":

@@ -116,17 +116,21 @@ def work_off() -> Callable[[Engine], list[JobState | None]]:
 
 @pytest.fixture(scope="session")
 def signed_folder(
-    tmp_path_factory: pytest.TempPathFactory, uploads: tuple[Upload, ...],
+    once: Callable[[str, Callable[[Path], object]], Path], uploads: tuple[Upload, ...],
     work_off: Callable[[Engine], list[JobState | None]],
 ) -> Path:  # fmt: skip
-    """A data folder whose map `hall` holds all uploads, signed in their order."""
-    folder = tmp_path_factory.mktemp("signed") / "data"
-    with Engine(Settings(data_dir=folder)) as engine:
-        engine.create_map(NewMap(name="hall", model="depth"))
-        for each in uploads:
-            engine.add_frame("hall", each.data, each.meta)
-        assert work_off(engine) == [JobState.SUCCEEDED] * len(uploads)
-    return folder
+    """A data folder whose map `hall` holds all uploads, signed in their order. Only to be copied,
+    as all processes of the run have it.
+    """
+
+    def make(folder: Path) -> None:
+        with Engine(Settings(data_dir=folder)) as engine:
+            engine.create_map(NewMap(name="hall", model="depth"))
+            for each in uploads:
+                engine.add_frame("hall", each.data, each.meta)
+            assert work_off(engine) == [JobState.SUCCEEDED] * len(uploads)
+
+    return once("signed", make)
 
 
 @pytest.fixture
