@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 EDITED = [
     "docs/trust.md",
     "docs/dashboard.md",
+    "docs/api.md",
 ]
 MEDIAN_WORDS, MOST_WORDS = 18, 45
 #: Phrases that follow another language's syntax, or that docs/style.md retires.
@@ -63,4 +64,4 @@ def test_edited_pages_are_in_short_sentences(name: str) -> None:
 
 @pytest.mark.parametrize("name", EDITED)
 def test_edited_pages_have_no_phrase_that_readers_stumble_over(name: str) -> None:
-    assert STUMBLES.findall((ROOT / name).read_text()) == []
+    assert STUMBLES.findall(" ".join(sentences((ROOT / name).read_text()))) == []
