@@ -15,6 +15,7 @@ EDITED = [
     "docs/dashboard.md",
     "docs/api.md",
     "docs/clouds.md",
+    "docs/recordings.md",
 ]
 MEDIAN_WORDS, MOST_WORDS = 18, 45
 #: Phrases that follow another language's syntax, or that docs/style.md retires.
