@@ -17,6 +17,7 @@ EDITED = [
     "docs/clouds.md",
     "docs/recordings.md",
     "docs/tracker.md",
+    "docs/associations.md",
 ]
 MEDIAN_WORDS, MOST_WORDS = 18, 45
 #: Phrases that follow another language's syntax, or that docs/style.md retires.
