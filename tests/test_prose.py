@@ -21,6 +21,7 @@ EDITED = [
     "docs/coverage.md",
     "docs/surface.md",
     "docs/reconstruction.md",
+    "docs/uncertainty.md",
 ]
 MEDIAN_WORDS, MOST_WORDS = 18, 45
 #: Phrases that follow another language's syntax, or that docs/style.md retires.
