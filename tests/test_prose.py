@@ -22,6 +22,7 @@ EDITED = [
     "docs/surface.md",
     "docs/reconstruction.md",
     "docs/uncertainty.md",
+    "docs/viewers.md",
 ]
 MEDIAN_WORDS, MOST_WORDS = 18, 45
 #: Phrases that follow another language's syntax, or that docs/style.md retires.
