@@ -27,6 +27,7 @@ EDITED = [
     "docs/model.md",
     "docs/paper.md",
     "examples/README.md",
+    "client/README.md",
 ]
 MEDIAN_WORDS, MOST_WORDS = 18, 45
 #: Phrases that follow another language's syntax, or that docs/style.md retires.
