@@ -28,6 +28,7 @@ EDITED = [
     "docs/paper.md",
     "examples/README.md",
     "client/README.md",
+    "ros2/sceneprint_ros/README.md",
 ]
 MEDIAN_WORDS, MOST_WORDS = 18, 45
 #: Phrases that follow another language's syntax, or that docs/style.md retires.
