@@ -139,9 +139,7 @@ def metric_families() -> list[MetricFamily]:
     metrics = Metrics()
     metrics._tell_replica(ReplicaSeen(used=True, behind_s=0.5))  # told only where there is one
     found = set()
-    for (
-        collector
-    ) in metrics.registry._collector_to_names:  # the registry lists only those with data
+    for collector in metrics.registry._collector_to_names:  # `collect` leaves out empty ones
         assert isinstance(collector, MetricWrapperBase)
         for family in collector.describe():
             name = family.name + ("_total" if family.type == "counter" else "")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
@@ -36,9 +36,9 @@ _ASSETS = {"site.css": "tools/site/site.css", "icon.svg": "service/dashboard/pag
 class _Build:
     """What the events of one build share."""
 
-    pages: dict[str, GeneratedPage] = {}
+    pages: ClassVar[dict[str, GeneratedPage]] = {}
     #: Paths in the repository of pages, by their paths on the site.
-    sources: dict[str, str] = {}
+    sources: ClassVar[dict[str, str]] = {}
 
 
 def navigation_of(index: str, generated: list[GeneratedPage]) -> list[dict[str, Any]]:
@@ -103,7 +103,7 @@ def with_figures(text: str, page: str) -> str:
         count += 1
         diagram: Diagram = read_diagram(found[1])
         svg = svg_of(diagram, f"{heading_anchor(page)}-{count}")
-        return f'<figure class="diagram" tabindex="0" markdown="0">{svg}</figure>'
+        return f'<figure class="diagram" tabindex="0">{svg}</figure>'
 
     return _MERMAID.sub(drawn, text)
 
@@ -152,6 +152,7 @@ def on_page_markdown(text: str, page: Page, config: MkDocsConfig, files: Files) 
     text = rewritten(text, path)
     if path == INDEX:
         text = with_generated(text, list(_Build.pages.values()))
+        page.meta["hide"] = ["navigation"]  # the page itself is one
     # git hosts need a backslash before a bar within a table; Python-Markdown takes it as it is
     text = outside_fences(text, lambda part: re.sub(r"`[^`\n]*`", _without_escapes, part))
     return with_figures(text, path)

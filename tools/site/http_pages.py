@@ -1,4 +1,4 @@
-"""Pages of the HTTP API from its OpenAPI document: a page for each resource, one for all records."""
+"""Pages of the HTTP API from its OpenAPI document: one for each resource, one for all records."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ JSON = "application/json"
 PROBLEM = "application/problem+json"
 #: What parameters begin with that stand in for a form, where the body is the frame itself.
 BARE = "Where the frame is the body: "
-_METHODS = ("get", "post", "put", "patch", "delete", "head")
+_METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "HEAD")
 #: Bounds of JSON Schema, as they are written after a type.
 _BOUNDS = {
     "minimum": "at least {}", "exclusiveMinimum": "above {}", "maximum": "at most {}",
@@ -57,11 +57,9 @@ def operations(document: Json) -> list[Operation]:
         Operation(method.upper(), path, body["tags"][0], body)
         for path, methods in document["paths"].items()
         for method, body in methods.items()
-        if method in _METHODS
+        if method.upper() in _METHODS
     ]
-    return sorted(
-        found, key=lambda one: (one.resource, one.path, _METHODS.index(one.method.lower()))
-    )
+    return sorted(found, key=lambda one: (one.resource, one.path, _METHODS.index(one.method)))
 
 
 def resource_page(name: str, document: Json) -> str:
