@@ -86,22 +86,36 @@ def _method(owner: str, name: str, function: Callable[..., object]) -> str:
 def signature(name: str, function: Callable[..., object]) -> str:
     """A function's signature as one would write it, a parameter a line where it is long."""
     told = inspect.signature(function)
-    parameters = [one for one in told.parameters.values() if one.name not in ("self", "cls")]
-    parts = [str(one).replace("'", "") for one in parameters]
-    for kind in (inspect.Parameter.KEYWORD_ONLY,):
-        at = next((i for i, one in enumerate(parameters) if one.kind is kind), None)
-        starred = any(one.kind is inspect.Parameter.VAR_POSITIONAL for one in parameters)
-        if at is not None and not starred:
-            parts.insert(at, "*")
-    returned = told.return_annotation
-    end = "" if returned is told.empty else f" -> {str(returned).strip(chr(39))}"
-    line = f"{name}({', '.join(parts)}){end}"
-    if name[:1].isupper():
-        line = line.removesuffix(" -> None")
-        end = ""
+    parts: list[str] = []
+    before: inspect._ParameterKind | None = None
+    for one in told.parameters.values():
+        if one.name in ("self", "cls"):
+            continue
+        if one.kind is one.KEYWORD_ONLY and before not in (one.VAR_POSITIONAL, one.KEYWORD_ONLY):
+            parts.append("*")
+        before = one.kind
+        parts.append(_parameter(one))
+    # of a class there is no need to say what it returns
+    returned = "" if name[:1].isupper() else f" -> {_annotation(told.return_annotation)}"
+    line = f"{name}({', '.join(parts)}){returned}"
     if len(line) <= _WIDTH:
         return line
-    return f"{name}(\n" + "".join(f"    {part},\n" for part in parts) + f"){end}"
+    return f"{name}(\n" + "".join(f"    {part},\n" for part in parts) + f"){returned}"
+
+
+def _parameter(one: inspect.Parameter) -> str:
+    stars = "*" * (one.kind is one.VAR_POSITIONAL) + "**" * (one.kind is one.VAR_KEYWORD)
+    text = stars + one.name
+    if one.annotation is not one.empty:
+        text += f": {_annotation(one.annotation)}"
+    if one.default is one.empty:
+        return text
+    return f"{text} = {one.default!r}" if ":" in text else f"{text}={one.default!r}"
+
+
+def _annotation(given: Any) -> str:
+    """An annotation as the source has it; modules that put off evaluating it keep its text."""
+    return given if isinstance(given, str) else inspect.formatannotation(given)
 
 
 def documented(one: object) -> str:

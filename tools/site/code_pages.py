@@ -19,6 +19,13 @@ from tools.site.markup import cell, code, fenced, page, plain, table
 
 #: Bounds of pydantic's fields, as they are written after a type.
 _BOUNDS = {"ge": "at least {}", "gt": "above {}", "le": "at most {}", "lt": "below {}"}
+#: Defaults that are computed, in words.
+_COMPUTED = {
+    "default_cache_dir": "`sceneprint` in the user's cache folder",
+    "default_data_dir": "`sceneprint` in the user's data folder",
+    "os.cpu_count() or 1": "number of processors",
+    "max(os.cpu_count() or 1, 2)": "number of processors, at least 2",
+}
 
 
 @dataclass(frozen=True)
@@ -30,7 +37,7 @@ class Setting:
     name : of the variable
     kind : of its value, as Python writes it
     bounds : of a number
-    default : Python, as the source has it
+    default : Markdown
     meaning : for operators
     """
 
@@ -68,7 +75,7 @@ def _setting(field: ast.AnnAssign, lines: list[str]) -> Setting:
     ]
     return Setting(
         f"SCENEPRINT_{name.upper()}", _kind(field.annotation), ", ".join(bounds),
-        _default(field.value), " ".join(comment),
+        _default(name, field.value), " ".join(comment),
     )  # fmt: skip
 
 
@@ -80,17 +87,22 @@ def _kind(annotation: ast.expr) -> str:
     return ast.unparse(annotation).replace("SecretStr", "str")
 
 
-def _default(value: ast.expr | None) -> str:
-    """The default as the source writes it; of one that is computed, how."""
-    if isinstance(value, ast.Call):
-        given = {one.arg: one.value for one in value.keywords}
-        if "default_factory" in given:
-            factory = given["default_factory"]
-            if isinstance(factory, ast.Lambda):
-                return ast.unparse(factory.body)
-            return f"{ast.unparse(factory)}()"
-        value = given["default"]
-    return "" if value is None else ast.unparse(value)
+def _default(name: str, value: ast.expr | None) -> str:
+    """The default of a setting; one that is computed, in words.
+
+    Raises
+    ------
+    KeyError : there are no words for how it is computed.
+    """
+    default = settings.Settings.model_fields[name].default
+    for given in value.keywords if isinstance(value, ast.Call) else ():
+        if given.arg == "default_factory":
+            how = given.value.body if isinstance(given.value, ast.Lambda) else given.value
+            return _COMPUTED[ast.unparse(how)]
+    if default in (None, ()):
+        return "none"
+    mebibytes = f" ({default >> 20:,} MiB)" if name.endswith("_bytes") else ""
+    return code(str(default)) + mebibytes
 
 
 def settings_page() -> str:
@@ -107,7 +119,7 @@ def settings_page() -> str:
                 (
                     f"`{one.name}`",
                     code(one.kind) + (f", {one.bounds}" if one.bounds else ""),
-                    code(one.default) if one.default not in ("", "None") else "none",
+                    one.default,
                     cell(one.meaning),
                 )
                 for one in found

@@ -153,6 +153,8 @@ def on_page_markdown(text: str, page: Page, config: MkDocsConfig, files: Files) 
     if path == INDEX:
         text = with_generated(text, list(_Build.pages.values()))
         page.meta["hide"] = ["navigation"]  # the page itself is one
+    if path == PROJECT["Changelog"] or not path.endswith(".md"):
+        page.meta["search"] = {"exclude": True}  # what is true today would be found after it
     # git hosts need a backslash before a bar within a table; Python-Markdown takes it as it is
     text = outside_fences(text, lambda part: re.sub(r"`[^`\n]*`", _without_escapes, part))
     return with_figures(text, path)

@@ -130,7 +130,7 @@ def _parameters(given: list[Json]) -> str:
     rows = (
         (
             code(one["name"]),
-            one["in"] + (", required" if one.get("required") else ""),
+            one["in"] + (" (required)" if one.get("required") else ""),
             type_of(one["schema"]),
             _meaning(one.get("description", "").removeprefix(BARE), one["schema"]),
         )
@@ -207,7 +207,7 @@ def _fields(schema: Json) -> str:
     required = schema.get("required", ())
     rows = (
         (
-            code(name) + (", required" if name in required else ""),
+            code(name) + (" (required)" if name in required else ""),
             type_of(field),
             _meaning(field.get("description", ""), field),
         )
@@ -219,7 +219,7 @@ def _fields(schema: Json) -> str:
 def _meaning(description: str, schema: Json) -> str:
     text = cell(description)
     default = schema.get("default")
-    if default is None or default in ([], {}):
+    if default is None or default in ([], {}, ""):
         return text
     shown = str(default).lower() if isinstance(default, bool) else str(default)
     return f"{text} Default: {code(shown)}.".lstrip()
@@ -231,7 +231,7 @@ def type_of(schema: Json) -> str:
     if content is not None:
         return f"{type_of(content)} as JSON"
     bounds = [text.format(schema[key]) for key, text in _BOUNDS.items() if key in schema]
-    return ", ".join([_name_of(schema), *bounds])
+    return _name_of(schema) + (f" ({', '.join(bounds)})" if bounds else "")
 
 
 def _name_of(schema: Json) -> str:
