@@ -83,12 +83,10 @@ OTHERS = (
 )  # fmt: skip
 
 
-def kinds(base: type[SceneprintError] = SceneprintError) -> Iterator[type[SceneprintError]]:
-    """All kinds of errors of the product, without the one that all are."""
-    for one in base.__subclasses__():
-        if one.__module__.startswith(("sceneprint.", "sceneprint_client.")):
-            yield one
-            yield from kinds(one)
+def kinds() -> list[type[SceneprintError]]:
+    """All kinds of errors that are public, without the one that all are."""
+    found = [getattr(errors, name) for name in errors.__all__ if name[:1].isupper()]
+    return [one for one in found if one is not SceneprintError]
 
 
 def status(kind: type[SceneprintError]) -> int:
@@ -103,7 +101,7 @@ def remedy(kind: type[SceneprintError]) -> str:
 
 def error_page() -> str:
     """Markdown that lists every error, by status and by name."""
-    known = sorted(set(kinds()), key=lambda kind: (status(kind), kind.__name__))
+    known = sorted(kinds(), key=lambda kind: (status(kind), kind.__name__))
     told = [kind for kind in known if status(kind) != 500]
     inner = sorted((kind for kind in known if status(kind) == 500), key=lambda one: one.__name__)
     return page(
