@@ -160,5 +160,11 @@ def on_page_markdown(text: str, page: Page, config: MkDocsConfig, files: Files) 
     return with_figures(text, path)
 
 
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """Name the dialog of the search for screen readers, as the theme does not."""
+    del page, config
+    return output.replace('role="dialog"', 'role="dialog" aria-label="Search"', 1)
+
+
 def _without_escapes(found: re.Match[str]) -> str:
     return found[0].replace("\\|", "|")
