@@ -9,7 +9,15 @@ from xml.etree import ElementTree
 
 import pytest
 
-from tools.site.diagrams import Diagram, Layout, Link, crossings, layered, read_diagram, svg_of
+from tools.site.diagrams import (
+    Diagram,
+    LayeredGraph,
+    Link,
+    crossings,
+    layered,
+    read_diagram,
+    svg_of,
+)
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 FIGURES = [
@@ -70,7 +78,7 @@ def test_layers_follow_the_longest_way_and_an_edge_that_closes_a_circle_goes_bac
     assert diagram.nodes["a"].x < diagram.nodes["b"].x < diagram.nodes["c"].x
 
 
-def naive_crossings(found: Layout, across: bool) -> int:
+def naive_crossings(found: LayeredGraph, across: bool) -> int:
     """By the places of the ends: segments between the same two layers, in another order."""
     segments = [
         sorted((a, b), key=lambda one: one.layer)

@@ -141,7 +141,7 @@ def _lines(text: str) -> tuple[str, ...]:
 
 
 @dataclass
-class Layout:
+class LayeredGraph:
     """A diagram whose nodes have places.
 
     Parameters
@@ -157,14 +157,14 @@ class Layout:
     height: float = 0.0
 
 
-def layered(diagram: Diagram) -> Layout:
+def layered(diagram: Diagram) -> LayeredGraph:
     """Nodes in layers, so that edges lead on, but for those that close a circle (Sugiyama et al.).
 
     Labels of edges have layers of their own, so that nothing lies upon them.
     """
     backward = set(_backward(diagram))
     _assign_layers(diagram, backward)
-    found = Layout(list(diagram.nodes.values()), [])
+    found = LayeredGraph(list(diagram.nodes.values()), [])
     for number, link in enumerate(diagram.links):
         ends = [diagram.nodes[link.source], diagram.nodes[link.target]]
         if number in backward:
@@ -224,7 +224,7 @@ def _route(source: Node, target: Node, link: Link, number: int) -> Iterator[Node
     yield target
 
 
-def _ordered(found: Layout) -> list[list[Node]]:
+def _ordered(found: LayeredGraph) -> list[list[Node]]:
     """Nodes of each layer in the order, of those that sweeps find, in which fewest edges cross."""
     layers: list[list[Node]] = [[] for _ in range(max(one.layer for one in found.nodes) + 1)]
     for one in found.nodes:
@@ -273,7 +273,7 @@ def _mean(values: Iterable[float], default: float) -> float:
     return sum(known) / len(known) if known else default
 
 
-def _place(found: Layout, layers: list[list[Node]], across: bool) -> None:
+def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
     """Give nodes their places: layers one after another, in each of them near their neighbours."""
     size = {one.name: (one.height, one.width) if across else (one.width, one.height)
             for one in found.nodes}  # fmt: skip
