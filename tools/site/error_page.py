@@ -13,9 +13,9 @@ from tools.site.markup import cell, code, page, table
 #: What to do about an error; about one that is not here, what helps against its nearest base.
 REMEDIES: dict[type[SceneprintError], str] = {
     errors.FrameError: "Do not repeat the request: nothing was stored. `detail` names the fault.",
-    errors.UnreadableFrame: "Send a 16-bit PNG, or another format of images that is read.",
-    errors.UnreadableCloud: "Send PLY, PCD, KITTI, NPY, LAS or PointCloud2, and name the format "
-    "if the file's name does not tell it.",
+    errors.UnreadableFrame: "Send a 16-bit greyscale PNG, or a two-dimensional NPY.",
+    errors.UnreadableCloud: "Send PLY, PCD, LAS, LAZ, NPY or PointCloud2. For the `.bin` of KITTI, "
+    "send `format=kitti` as well.",
     errors.InvalidIntrinsics: "Send `fx`, `fy`, `cx`, `cy` in pixels of this image.",
     errors.InvalidPose: "Send a finite translation in metres and a unit quaternion.",
     errors.UselessFrame: "Take the frame where more surface is in the sensor's range.",
