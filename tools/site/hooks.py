@@ -103,7 +103,7 @@ def with_figures(text: str, page: str) -> str:
         count += 1
         diagram: Diagram = read_diagram(found[1])
         svg = svg_of(diagram, f"{heading_anchor(page)}-{count}")
-        return f'<figure class="diagram" tabindex="0">{svg}</figure>'
+        return f'\n<figure class="diagram" tabindex="0">{svg}</figure>\n'
 
     return _MERMAID.sub(drawn, text)
 
