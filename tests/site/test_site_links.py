@@ -7,7 +7,13 @@ from pathlib import Path
 import pytest
 
 from tools.site.hooks import navigation_of, with_generated
-from tools.site.links import heading_anchor, linked_files, rewritten, site_path
+from tools.site.links import (
+    heading_anchor,
+    linked_files,
+    rewritten,
+    site_path,
+    with_deep_lists,
+)
 from tools.site.markup import cell, first_sentence, table
 from tools.site.reference import GeneratedPage
 
@@ -88,6 +94,12 @@ def test_what_pages_link_to_is_found_through_other_pages(tmp_path: Path) -> None
 
 def test_anchors_are_those_of_git_hosts() -> None:
     assert heading_anchor("How it's decided: R1, `found` & DR") == "how-its-decided-r1-found--dr"
+
+
+def test_inner_lists_are_indented_as_the_site_needs_them() -> None:
+    text = "1. a\n   b\n   * c\n     d\n2. e\n\n- f\n  - g\n```\n  - h\n```\n"
+    deep = "1. a\n   b\n    * c\n     d\n2. e\n\n- f\n    - g\n```\n  - h\n```\n"
+    assert with_deep_lists(text) == deep
 
 
 def test_navigation_follows_the_index_and_lists_generated_pages_in_reference() -> None:

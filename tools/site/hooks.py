@@ -18,7 +18,14 @@ from mkdocs.structure.pages import Page
 
 from tools.site import markup
 from tools.site.diagrams import Diagram, read_diagram, svg_of
-from tools.site.links import heading_anchor, linked_files, outside_fences, rewritten, site_path
+from tools.site.links import (
+    heading_anchor,
+    linked_files,
+    outside_fences,
+    rewritten,
+    site_path,
+    with_deep_lists,
+)
 from tools.site.reference import GeneratedPage, generated_pages
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -144,12 +151,12 @@ def _outside(path: str, config: MkDocsConfig) -> File:
 
 
 def on_page_markdown(text: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """A page as the site shows it: links and figures."""
+    """A page as the site shows it: links, lists and figures."""
     del config, files
     path = _Build.sources.get(page.file.src_uri)
     if path is None:
         return text
-    text = rewritten(text, path)
+    text = with_deep_lists(rewritten(text, path))
     if path == INDEX:
         text = with_generated(text, list(_Build.pages.values()))
         page.meta["hide"] = ["navigation"]  # the page itself is one

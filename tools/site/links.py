@@ -1,4 +1,4 @@
-"""Where each page of the site comes from, and how its links change on the way there.
+"""Where each page of the site comes from, and what changes on the way there: links, inner lists.
 
 A page of the site is a file of the repository. Pages below docs/ lie at the top of the site; what
 they link to elsewhere in the repository keeps its path, so that no link leads out of the site.
@@ -90,6 +90,15 @@ def outside_fences(text: str, change: Callable[[str], str]) -> str:
         parts += [change(text[end : fence.start()]), fence[0]]
         end = fence.end()
     return "".join(parts) + change(text[end:])
+
+
+def with_deep_lists(text: str) -> str:
+    """A page's text with inner lists indented by four blanks, as Python-Markdown needs them.
+
+    Git hosts are content with two or three, which put them below the text of the outer item.
+    """
+    inner = re.compile(r"^ {2,3}(?=(?:[-*+]|\d+\.) )", re.MULTILINE)
+    return outside_fences(text, lambda part: inner.sub("    ", part))
 
 
 def heading_anchor(title: str, separator: str = "-") -> str:
