@@ -96,9 +96,9 @@ def test_anchors_are_those_of_git_hosts() -> None:
     assert heading_anchor("How it's decided: R1, `found` & DR") == "how-its-decided-r1-found--dr"
 
 
-def test_inner_lists_are_indented_as_the_site_needs_them() -> None:
-    text = "1. a\n   b\n   * c\n     d\n2. e\n\n- f\n  - g\n```\n  - h\n```\n"
-    deep = "1. a\n   b\n    * c\n     d\n2. e\n\n- f\n    - g\n```\n  - h\n```\n"
+def test_what_lies_within_list_items_is_indented_as_the_site_needs_it() -> None:
+    text = "1. a\n   * c\n     d\n\n   | e |\n2. f\n\n- g\n  - h\n```\n  - i\n```\n"
+    deep = "1. a\n    * c\n     d\n\n    | e |\n2. f\n\n- g\n    - h\n```\n  - i\n```\n"
     assert with_deep_lists(text) == deep
 
 

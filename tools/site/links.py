@@ -16,6 +16,7 @@ DOCS = "docs/"
 README = "introduction.md"
 _LINK = re.compile(r"(?<=\]\()([^)\s]+)(?=\))")
 _FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+_SHALLOW = re.compile(r"^ {2,3}(?=\S)", re.MULTILINE)
 #: Ends of names of files that a browser shows or saves; all other files are shown as text.
 _BINARY = (".png", ".svg", ".json")
 
@@ -93,12 +94,11 @@ def outside_fences(text: str, change: Callable[[str], str]) -> str:
 
 
 def with_deep_lists(text: str) -> str:
-    """A page's text with inner lists indented by four blanks, as Python-Markdown needs them.
+    """A page's text with what lies within list items indented by four, as Python-Markdown needs it.
 
-    Git hosts are content with two or three, which put them below the text of the outer item.
+    Git hosts are content with two or three, which put it below the text of the item.
     """
-    inner = re.compile(r"^ {2,3}(?=(?:[-*+]|\d+\.) )", re.MULTILINE)
-    return outside_fences(text, lambda part: inner.sub("    ", part))
+    return outside_fences(text, lambda part: _SHALLOW.sub("    ", part))
 
 
 def heading_anchor(title: str, separator: str = "-") -> str:
