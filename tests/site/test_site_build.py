@@ -113,6 +113,19 @@ def test_figures_are_drawn_while_the_site_is_built(read: dict[Path, PageReader])
     assert not any('class="mermaid"' in text for text in texts)
 
 
+def test_no_list_and_no_table_is_left_as_text(site: Path) -> None:
+    """As one would be that git hosts understand and Python-Markdown does not."""
+    code = re.compile(r"<(pre|code|script)\b.*?</\1>", re.DOTALL)
+    left = [
+        f"{path.relative_to(site)}: {line}"
+        for path in sorted(site.rglob("*.html"))
+        for line in re.findall(
+            r"^\s*(?:\|.*\||[*-] \w.*|\d+\. \w.*)$", code.sub("", path.read_text()), re.MULTILINE
+        )
+    ]
+    assert left == []
+
+
 class _QuietHandler(SimpleHTTPRequestHandler):
     def log_message(self, *_: object) -> None:
         """Say nothing."""
