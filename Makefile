@@ -16,8 +16,8 @@ unexport PYTHONDONTWRITEBYTECODE
 export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
 	'import os; n = len(os.sched_getaffinity(0)); print(n + (n + 1) // 2)')
 
-.PHONY: help demo test pytest test-thorough test-postgres lint kernels format bench screenshots soak siege models lock sbom \
-	advisories clean
+.PHONY: help demo test pytest test-thorough test-postgres lint kernels format bench screenshots docs docs-serve soak siege \\
+	models lock sbom advisories clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
@@ -27,6 +27,8 @@ help:
 	@echo "make lint    lint, types and import contracts only, of the dashboard's JavaScript too"
 	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
 	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
+	@echo "make docs    the documentation as a site, into out/site; a dead link is an error"
+	@echo "make docs-serve  the same at http://127.0.0.1:8009, made anew when a page changes"
 	@echo "make soak    200 kills, and a crowd of writers and readers; rewrites its part of docs/reliability.md"
 	@echo "make siege   broken uploads, fuzzing, ten times too many requests, noisy neighbours; likewise"
 	@echo "make fleet   robots, services, workers and PostgreSQL with a standby, parts killed; likewise"
@@ -88,6 +90,15 @@ bench: $(STAMP)
 
 screenshots: $(STAMP)
 	$(BIN)/python -m benchmarks.screenshots --out out/screenshots
+
+# mkdocs-material announces its successor at each start
+docs: export NO_MKDOCS_2_WARNING = 1
+docs: $(STAMP)
+	$(BIN)/python -m mkdocs build --strict
+
+docs-serve: export NO_MKDOCS_2_WARNING = 1
+docs-serve: $(STAMP)
+	$(BIN)/python -m mkdocs serve --dev-addr 127.0.0.1:8009 --watch tools/site
 
 soak: $(STAMP)
 	$(BIN)/python -m benchmarks.soak --page docs/reliability.md

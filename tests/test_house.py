@@ -11,7 +11,7 @@ from itertools import combinations
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("sceneprint", "service", "worker", "client", "ros2")
+PACKAGES = ("sceneprint", "service", "worker", "client", "ros2", "tools/site")
 MOST_LINES = 60
 #: Words that an engineer of the field would not know, and the standard term.
 RETIRED = {

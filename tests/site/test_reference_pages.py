@@ -1,0 +1,265 @@
+"""Pages made from the code: everything is on them, once, as the code has it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import sceneprint_client
+from sceneprint import errors
+from sceneprint.cli import COMMANDS
+from sceneprint.settings import Settings
+from sceneprint_client import Client, Tracker
+from service.problems import type_of as problem_type
+from tools.site import http_pages
+from tools.site.client_page import documented, public_methods, signature
+from tools.site.code_pages import commands, metric_families, read_settings
+from tools.site.error_page import kinds, remedy, status
+from tools.site.http_pages import operations, type_of
+from tools.site.markup import cell
+from tools.site.reference import GeneratedPage, api_document, generated_pages
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def document() -> dict[str, Any]:
+    return api_document()
+
+
+@pytest.fixture(scope="module")
+def pages() -> dict[str, GeneratedPage]:
+    return {one.path: one for one in generated_pages()}
+
+
+def sections(text: str, level: int = 2) -> dict[str, str]:
+    """Text below each heading of a level, by the heading without its anchor."""
+    parts = re.split(rf"^{'#' * level} (.*)$", text, flags=re.MULTILINE)
+    return {
+        title.partition(" {")[0]: body for title, body in zip(parts[1::2], parts[2::2], strict=True)
+    }
+
+
+def rows(text: str) -> list[list[str]]:
+    """Cells of the rows of tables."""
+    lines = re.findall(r"^\| (.*) \|$", text, re.MULTILINE)
+    return [re.split(r" \| ", line) for line in lines]
+
+
+def test_every_operation_is_described_once_on_the_page_of_its_resource(
+    document: dict[str, Any], pages: dict[str, GeneratedPage]
+) -> None:
+    frozen = json.loads((ROOT / "tests/golden/openapi.json").read_text())["paths"]
+    wanted = {
+        (f"{method.upper()} {path}", body["tags"][0])
+        for path, methods in frozen.items()
+        for method, body in methods.items()
+    }
+    described = [
+        (line, name)
+        for name in http_pages.resources(document)
+        for line in re.findall(
+            r"^```http\n(.*)\n```$", pages[f"reference/http/{name}.md"].text, re.M
+        )
+    ]
+    assert len(described) == len(wanted) > 100
+    assert set(described) == wanted
+    listed = re.findall(
+        r"^\| \[`([^`]+)`\]\((\w+)\.md#", pages["reference/http/index.md"].text, re.M
+    )
+    assert set(listed) == wanted
+    assert pages["reference/http/index.md"].text.splitlines()[2].startswith(f"{len(wanted)} opera")
+
+
+def test_an_operation_says_what_it_takes_and_what_it_answers(
+    pages: dict[str, GeneratedPage],
+) -> None:
+    text = sections(pages["reference/http/jobs.md"].text)["Retry job"]
+    assert "POST /v1/jobs/{job_id}/retry" in text
+    assert ["`job_id`", "path (required)", "string", ""] in rows(text)
+    answers = {cells[0]: cells[1] for cells in rows(text)}
+    assert answers["202"] == "[Job](records.md#job)"
+    problems = [name for name in answers if answers[name] == "[Problem](records.md#problem)"]
+    assert problems == ["404, 409, 401, 403, 408, 421, 429, 500, 503, 507"]
+    ask = sections(pages["reference/http/queries.md"].text)["Ask"]
+    folded = ask.split('??? note "Parameters if the body is the frame itself"')[1].split("**Body**")
+    assert "`fx` | query | number | of the camera, pixels." in folded[0]
+    assert "**Body** `multipart/form-data`" in ask
+    body = {cells[0]: cells[1:] for cells in rows(ask)}
+    assert body["`frame` (required)"][0] == "file"
+    assert body["`meta` (required)"][0].startswith("[FrameMeta](records.md#framemeta)")
+
+
+def test_every_record_has_its_fields(
+    document: dict[str, Any], pages: dict[str, GeneratedPage]
+) -> None:
+    schemas = document["components"]["schemas"]
+    text = pages["reference/http/records.md"].text
+    found = sections(text)
+    assert len(found) == len(schemas) > 140
+    fields = sum(len(schema.get("properties", {})) for schema in schemas.values())
+    assert sum(len(rows(body)) for body in found.values()) == fields + sum(
+        1 for schema in schemas.values() if schema.get("properties")
+    )
+    answer = {cells[0]: cells[1] for cells in rows(found["Answer"])}
+    assert answer["`status` (required)"] == "`found` or `ambiguous` or `not_found` or `unvalidated`"
+    assert answer["`alternatives`"] == "list of [Alternative](records.md#alternative)"
+    assert "received" in found["FrameState"]
+    assert r"Page\[Frame\]" in found
+
+
+@pytest.mark.parametrize(
+    ("schema", "words"),
+    [
+        ({"type": "string", "format": "date-time"}, "string (date-time)"),
+        ({"type": "integer", "minimum": 1, "maximum": 50}, "integer (at least 1, at most 50)"),
+        ({"anyOf": [{"type": "number"}, {"type": "null"}]}, "number or null"),
+        ({"type": "array", "items": {"$ref": "#/c/s/Page_Map_"}},
+         r"list of [Page\[Map\]](records.md#page-map)"),
+        ({"type": "array", "prefixItems": [{"type": "number"}, {"type": "string"}]},
+         "list of number, string"),
+        ({"type": "object", "additionalProperties": {"type": "integer"}}, "object of integer"),
+        ({"type": "string", "format": "binary"}, "file"),
+        ({"contentSchema": {"$ref": "#/c/s/Filter"}}, "[Filter](records.md#filter) as JSON"),
+        ({"const": 1}, "`1`"),
+        ({}, "anything"),
+    ],
+)  # fmt: skip
+def test_types_are_written_in_words(schema: dict[str, Any], words: str) -> None:
+    assert type_of(schema) == words
+
+
+def test_operations_of_one_resource_have_anchors_of_their_own(document: dict[str, Any]) -> None:
+    found = [(one.resource, one.anchor) for one in operations(document)]
+    assert len(set(found)) == len(found)
+
+
+def test_every_setting_is_listed_with_its_type_default_and_meaning(
+    pages: dict[str, GeneratedPage],
+) -> None:
+    names = [f"SCENEPRINT_{name.upper()}" for name in Settings.model_fields]
+    assert [one.name for one in read_settings()] == names
+    assert all(one.meaning.endswith((".", "none")) for one in read_settings())
+    text = pages["reference/settings.md"].text
+    assert f"{len(names)} environment variables" in text
+    told = {cells[0].strip("`"): cells[1:] for cells in rows(text)[1:]}
+    assert list(told) == names
+    assert told["SCENEPRINT_PORT"] == [
+        "`int`, at least 0, at most 65,535", "`8008`", "Port of the service; 0 for a free one.",
+    ]  # fmt: skip
+    assert told["SCENEPRINT_UPLOAD_BYTES"][1] == f"`{72 << 20}` (72 MiB)"
+    assert told["SCENEPRINT_WORKERS"][1] == "number of processors"
+    assert told["SCENEPRINT_DATABASE_URL"][:2] == ["`str", "None`"]  # never as a secret
+    assert told["SCENEPRINT_CORS_ORIGINS"][:1] == ["`tuple[str, ...]`"]
+
+
+def test_every_metric_is_listed_with_its_labels(pages: dict[str, GeneratedPage]) -> None:
+    watched = (ROOT / "docs/operations.md").read_text().split("| metric |")[1].split("\n\n")[0]
+    names = {one.name for one in metric_families()}
+    assert names == set(re.findall(r"`(sceneprint_\w+)`", watched))
+    told = {cells[0].strip("`"): cells[1:] for cells in rows(pages["reference/metrics.md"].text)}
+    assert set(told) == names | {"metric"}
+    assert told["sceneprint_requests_total"] == [
+        "counter", "`method`, `route`, `status`", "Requests answered.",
+    ]  # fmt: skip
+
+
+def test_every_command_is_described_with_all_its_options(pages: dict[str, GeneratedPage]) -> None:
+    frozen = json.loads((ROOT / "tests/golden/commands.json").read_text())
+    found = sections(pages["reference/commands.md"].text)
+    assert list(found) == list(commands()) == list(COMMANDS)
+    for name, options in frozen.items():
+        cells = [row[0] for row in rows(found[name])]
+        for option in options:
+            if option["help"] == argparse.SUPPRESS or "--help" in option["flags"]:
+                continue
+            for flag in option["flags"]:
+                assert any(flag in re.split(r"[`, ]+", one) for one in cells), (name, flag)
+    query = {row[0]: row[1] for row in rows(found["query"])}
+    assert query["`--k K`"] == "number of accepted matches to return (default: 5)"
+    assert found["query"].split("```text\n")[1].startswith("sceneprint query [-h]")
+
+
+def test_every_error_is_listed_with_its_status_and_what_to_do(
+    pages: dict[str, GeneratedPage],
+) -> None:
+    public = set(kinds())
+    assert {one.__name__ for one in public} == {
+        name for name in errors.__all__ if name[0].isupper()
+    } - {"SceneprintError"}
+    parts = sections(pages["reference/errors.md"].text)
+    problems = {row[1].strip("`"): row for row in rows(parts["Problems by status"])[1:]}
+    others = {row[0].strip("`"): row for row in rows(parts["Other errors"])[1:]}
+    for kind in public:
+        if status(kind) == 500:
+            assert others[kind.__name__][2]
+        else:
+            row = problems[problem_type(kind.__name__)]
+            assert row[0].startswith(f"{status(kind)} ")
+            assert row[3] == cell(remedy(kind))
+    assert problems["/problems/rate-limited"] == [
+        "429 Too Many Requests", "`/problems/rate-limited`",
+        "The caller asks more often than it may.", "Wait for the seconds in `Retry-After`.",
+    ]  # fmt: skip
+    # whatever the reference by hand lists is there, too
+    table = (ROOT / "docs/reference.md").read_text().split("## Problems")[1]
+    by_hand = re.findall(r"`([a-z]+(?:-[a-z]+)+|forbidden|misdirected|conflict|busy)`", table)
+    assert {f"/problems/{name}" for name in by_hand} - set(problems) == {"/problems/damaged-blob"}
+
+
+def test_everything_that_the_client_offers_is_described(pages: dict[str, GeneratedPage]) -> None:
+    found = sections(pages["reference/client.md"].text)
+    assert list(found) == [name for name in sceneprint_client.__all__ if name[0] != "_"]
+    methods = sections(found["Client"], 3)
+    assert set(methods) == {
+        name for name in dir(Client) if name[0] != "_" and callable(getattr(Client, name))
+    }
+    assert len(methods) > 90
+    assert "embedded(path: str | Path) -> Self" in methods["embedded"]
+    assert ["`UnknownMap`, `UnknownFrame`", "there is none."] in rows(methods["query"])
+    assert set(sections(found["Tracker"], 3)) >= {"update"}
+
+
+def test_signatures_are_written_as_in_the_source() -> None:
+    def short(a: int, *, b: str = "x", **more: object) -> list[str]:
+        """Nothing."""
+        return [f"{a}{b}{more}"]
+
+    assert signature("short", short) == (
+        "short(a: int, *, b: str = 'x', **more: object) -> list[str]"
+    )
+    long = signature("upload", public_methods(Client)["upload"]).splitlines()
+    assert long[:2] == ["upload(", "    map_name: str,"]
+    assert long[-1].startswith(") -> ")
+    assert "    *," in long
+    assert signature("Tracker", Tracker.__init__).startswith("Tracker(\n    client: ")
+
+
+def test_docstrings_become_text_and_tables() -> None:
+    def function() -> None:
+        """Do it.
+
+            code = 1
+
+        Parameters
+        ----------
+        a, b : what is
+            given
+        c : another
+
+        Raises
+        ------
+        Refused to happen.
+        """
+
+    assert documented(function) == (
+        "Do it.\n\n```python\ncode = 1\n```\n\n"
+        "**Parameters**\n\n| name | meaning |\n|---|---|\n"
+        "| `a`, `b` | what is given |\n| `c` | another |\n\n"
+        "**Raises**: Refused to happen.\n"
+    )

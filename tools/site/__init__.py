@@ -1,0 +1,1 @@
+"""The documentation site: where its pages come from, what the build makes of the code, diagrams."""

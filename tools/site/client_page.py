@@ -1,0 +1,151 @@
+"""The page of the Python client: signatures and docstrings of what the package offers."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import sceneprint_client
+from tools.site.markup import cell, code, fenced, page, plain, table
+
+_SECTION = re.compile(r"^(Parameters|Returns|Raises|Yields)\n-+\n", re.MULTILINE)
+_WIDTH = 88
+
+
+def public_names() -> list[str]:
+    """What the package offers, without its version."""
+    return [name for name in sceneprint_client.__all__ if not name.startswith("_")]
+
+
+def public_methods(kind: type) -> dict[str, Callable[..., object]]:
+    """Public methods of a class, its bases' as well, in the order in which they are defined."""
+    found: dict[str, Callable[..., object]] = {}
+    for base in reversed(kind.__mro__):
+        if not base.__module__.startswith("sceneprint_client"):
+            continue
+        for name, one in vars(base).items():
+            function = one.__func__ if isinstance(one, classmethod | staticmethod) else one
+            if not name.startswith("_") and inspect.isfunction(function):
+                found[name] = function
+    return found
+
+
+def public_properties(kind: type) -> dict[str, str]:
+    """Properties of a class with what they are."""
+    return {
+        name: inspect.getdoc(one) or ""
+        for base in reversed(kind.__mro__)
+        for name, one in vars(base).items()
+        if isinstance(one, property) and base.__module__.startswith("sceneprint_client")
+    }
+
+
+def client_page() -> str:
+    """Markdown that describes everything that `sceneprint_client` offers."""
+    return page(
+        "# Python client",
+        plain("Everything that `sceneprint_client` offers. Bodies and answers are the "
+        "records of `sceneprint_client.api`: ") + "[Records](http/records.md). It raises the "
+        "errors of `sceneprint_client.errors`: [Errors](errors.md).",
+        *(_described(name, getattr(sceneprint_client, name)) for name in public_names()),
+    )  # fmt: skip
+
+
+def _described(name: str, one: Any) -> str:
+    if not inspect.isclass(one):
+        if callable(one):
+            return page(f"## {name}", fenced(signature(name, one), "python"), documented(one))
+        return page(f"## {name}", f"{code(str(one))}")
+    methods = public_methods(one)
+    constructor = getattr(one, "__init__", None)
+    shown = signature(name, constructor) if inspect.isfunction(constructor) else f"class {name}"
+    properties = table(
+        ("property", "meaning"),
+        ((code(each), cell(text)) for each, text in public_properties(one).items()),
+    )
+    return page(
+        f"## {name}",
+        fenced(shown, "python"),
+        documented(one),
+        properties,
+        *(_method(name, each, function) for each, function in methods.items()),
+    )
+
+
+def _method(owner: str, name: str, function: Callable[..., object]) -> str:
+    anchor = f"{owner}-{name}".lower().replace("_", "-")
+    return page(
+        f"### {name} {{ #{anchor} }}",
+        fenced(signature(name, function), "python"),
+        documented(function),
+    )
+
+
+def signature(name: str, function: Callable[..., object]) -> str:
+    """A function's signature as one would write it, a parameter a line where it is long."""
+    told = inspect.signature(function)
+    parts: list[str] = []
+    before: inspect._ParameterKind | None = None
+    for one in told.parameters.values():
+        if one.name in ("self", "cls"):
+            continue
+        if one.kind is one.KEYWORD_ONLY and before not in (one.VAR_POSITIONAL, one.KEYWORD_ONLY):
+            parts.append("*")
+        before = one.kind
+        parts.append(_parameter(one))
+    # of a class there is no need to say what it returns
+    returned = "" if name[:1].isupper() else f" -> {_annotation(told.return_annotation)}"
+    line = f"{name}({', '.join(parts)}){returned}"
+    if len(line) <= _WIDTH:
+        return line
+    return f"{name}(\n" + "".join(f"    {part},\n" for part in parts) + f"){returned}"
+
+
+def _parameter(one: inspect.Parameter) -> str:
+    stars = "*" * (one.kind is one.VAR_POSITIONAL) + "**" * (one.kind is one.VAR_KEYWORD)
+    text = stars + one.name
+    if one.annotation is not one.empty:
+        text += f": {_annotation(one.annotation)}"
+    if one.default is one.empty:
+        return text
+    return f"{text} = {one.default!r}" if ":" in text else f"{text}={one.default!r}"
+
+
+def _annotation(given: Any) -> str:
+    """An annotation as the source has it; modules that put off evaluating it keep its text."""
+    return given if isinstance(given, str) else inspect.formatannotation(given)
+
+
+def documented(one: object) -> str:
+    """A docstring as Markdown: its text, and a table for each section of NumPy's style."""
+    text, *sections = _SECTION.split(inspect.getdoc(one) or "")
+    parts = [_prose(text)]
+    for title, body in zip(sections[::2], sections[1::2], strict=True):
+        rows = list(_entries(body))
+        if rows:
+            parts.append(f"**{title}**\n\n{table(('name', 'meaning'), rows)}")
+        else:
+            parts.append(f"**{title}**: {plain(' '.join(body.split()))}")
+    return page(*parts)
+
+
+def _prose(text: str) -> str:
+    """Paragraphs; what is indented is code."""
+    blocks = re.split(r"\n\n", text.strip("\n"))
+    shown: list[str] = []
+    for block in blocks:
+        if block.startswith("    "):
+            shown.append(fenced(inspect.cleandoc(block), "python"))
+        else:
+            shown.append(plain(block))
+    return page(*shown)
+
+
+def _entries(body: str) -> Iterator[tuple[str, str]]:
+    """Names with their meanings: `name : meaning`, with further lines indented."""
+    for entry in re.split(r"\n(?=\S)", body.strip("\n")):
+        name, mark, meaning = entry.partition(" : ")
+        if mark:
+            yield ", ".join(code(one.strip()) for one in name.split(",")), cell(meaning)

@@ -1,0 +1,387 @@
+"""Diagrams from text: the part of mermaid's flowcharts that the pages use, drawn as SVG.
+
+Git hosts draw mermaid in the browser, with a script that they bring along; the site draws it while
+it is built, so that a page needs no script for it and follows the theme.
+
+    flowchart LR
+      accTitle: What the picture shows
+      robot[Robot] -->|frames| service(Service)
+      service -.-> store[("Database<br>and blobs")]
+
+    text  --read_diagram-->  Diagram  --layered-->  nodes with places  --svg_of-->  SVG
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from html import escape
+from itertools import combinations, pairwise
+
+#: What text takes, in pixels of the picture: of a line, and of a letter on average.
+LINE, LETTER = 17.0, 7.0
+#: Around the text of a node; between neighbours of a layer; between layers.
+PAD_X, PAD_Y, BESIDE, BETWEEN = 14.0, 9.0, 22.0, 26.0
+_SHAPES = {"[(": "store", "[": "box", "(": "round"}
+_NODE = r'(\w+)(?:(\[\(|\[|\()"?([^"\])]*)"?[\])]+)?'
+_EDGE = re.compile(rf"^{_NODE}\s*(-->|-\.->)(?:\|([^|]*)\|)?\s*{_NODE}$")
+_ALONE = re.compile(rf"^{_NODE}$")
+_HEAD = re.compile(r"^flowchart (LR|TD)$")
+
+
+@dataclass
+class Node:
+    """A node of a diagram, or (without a shape) a place that an edge passes.
+
+    Parameters
+    ----------
+    name : unique
+    lines : of its text
+    shape : box, round or store; "" for a place of an edge
+    width, height : pixels
+    layer : counted along the direction of the edges
+    x, y : of its centre, pixels
+    """
+
+    name: str
+    lines: tuple[str, ...] = ()
+    shape: str = ""
+    layer: int = 0
+    x: float = 0.0
+    y: float = 0.0
+    width: float = 0.0
+    height: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Give it the room that its text takes."""
+        pad_x, pad_y = (PAD_X, PAD_Y) if self.shape else (5.0, 2.0)
+        if self.lines:
+            self.width = max(map(len, self.lines)) * LETTER + 2 * pad_x
+            self.height = len(self.lines) * LINE + 2 * pad_y
+
+
+@dataclass(frozen=True)
+class Link:
+    """An edge of a diagram.
+
+    Parameters
+    ----------
+    source, target : names of nodes
+    lines : of its label
+    dashed : how it is drawn
+    """
+
+    source: str
+    target: str
+    lines: tuple[str, ...]
+    dashed: bool
+
+
+@dataclass
+class Diagram:
+    """A directed graph, as a text describes it.
+
+    Parameters
+    ----------
+    title : what it shows, for those who do not see it
+    across : edges go from left to right, not down
+    nodes : by name, in the order of the text
+    links : in the order of the text
+    """
+
+    title: str
+    across: bool
+    nodes: dict[str, Node] = field(default_factory=dict)
+    links: list[Link] = field(default_factory=list)
+
+
+def read_diagram(text: str) -> Diagram:
+    """A diagram from its text.
+
+    Raises
+    ------
+    ValueError : a line is none that is understood here, or the title is missing.
+    """
+    first, *rest = [line.strip() for line in text.strip().splitlines() if line.strip()]
+    head = _HEAD.match(first)
+    if head is None:
+        raise ValueError(f"{first!r}: begin with `flowchart LR` or `flowchart TD`.")
+    found = Diagram("", head[1] == "LR")
+    for line in rest:
+        edge = _EDGE.match(line)
+        alone = _ALONE.match(line)
+        if line.startswith("accTitle:"):
+            found.title = line.partition(":")[2].strip()
+        elif edge is not None:
+            source = _note(found, *edge.group(1, 2, 3))
+            target = _note(found, *edge.group(6, 7, 8))
+            if source == target:
+                raise ValueError(f"{line!r}: an edge that leads back to its node is not drawn.")
+            found.links.append(Link(source, target, _lines(edge[5] or ""), edge[4] == "-.->"))
+        elif alone is not None:
+            _note(found, *alone.group(1, 2, 3))
+        else:
+            raise ValueError(f"{line!r} is no node, no edge and no `accTitle: ...`.")
+    if not found.title:
+        raise ValueError("The diagram needs a line `accTitle: ...` that says what it shows.")
+    return found
+
+
+def _note(diagram: Diagram, name: str, shape: str | None, text: str | None) -> str:
+    """Enter a node when it is first named, and give it its text when that comes."""
+    if name not in diagram.nodes or shape:
+        diagram.nodes[name] = Node(name, _lines(text or name), _SHAPES[shape or "["])
+    return name
+
+
+def _lines(text: str) -> tuple[str, ...]:
+    return tuple(re.split(r"<br\s*/?>", text.strip())) if text.strip() else ()
+
+
+@dataclass
+class LayeredGraph:
+    """A diagram whose nodes have places.
+
+    Parameters
+    ----------
+    nodes : those of the diagram, and places that edges pass
+    routes : nodes that each link passes, from its source to its target
+    width, height : pixels
+    """
+
+    nodes: list[Node]
+    routes: list[list[Node]]
+    width: float = 0.0
+    height: float = 0.0
+
+
+def layered(diagram: Diagram) -> LayeredGraph:
+    """Nodes in layers, so that edges lead on, but for those that close a circle (Sugiyama et al.).
+
+    Labels of edges have layers of their own, so that nothing lies upon them.
+    """
+    backward = set(_backward(diagram))
+    _assign_layers(diagram, backward)
+    found = LayeredGraph(list(diagram.nodes.values()), [])
+    for number, link in enumerate(diagram.links):
+        ends = [diagram.nodes[link.source], diagram.nodes[link.target]]
+        if number in backward:
+            ends.reverse()
+        route = list(_route(ends[0], ends[1], link, number))
+        found.nodes += route[1:-1]
+        found.routes.append(route[::-1] if number in backward else route)
+    layers = _ordered(found)
+    _place(found, layers, diagram.across)
+    return found
+
+
+def _backward(diagram: Diagram) -> Iterator[int]:
+    """Numbers of the links that lead to where the text has come from: they close circles."""
+    leaving = defaultdict(list)
+    for number, link in enumerate(diagram.links):
+        leaving[link.source].append((number, link.target))
+    done: set[str] = set()
+    found = []
+
+    def visit(name: str, above: frozenset[str]) -> None:
+        for number, target in leaving[name]:
+            if target in above:
+                found.append(number)
+            elif target not in done:
+                visit(target, above | {target})
+        done.add(name)
+
+    for name in diagram.nodes:
+        if name not in done:
+            visit(name, frozenset({name}))
+    yield from found
+
+
+def _assign_layers(diagram: Diagram, backward: set[int]) -> None:
+    """Each node two layers after the last of those that lead to it: one between is for labels."""
+    pairs = [
+        (link.target, link.source) if number in backward else (link.source, link.target)
+        for number, link in enumerate(diagram.links)
+    ]
+    changed = True
+    while changed:
+        changed = False
+        for source, target in pairs:
+            least = diagram.nodes[source].layer + 2
+            if diagram.nodes[target].layer < least:
+                diagram.nodes[target].layer = least
+                changed = True
+
+
+def _route(source: Node, target: Node, link: Link, number: int) -> Iterator[Node]:
+    """Nodes that a link passes: one in each layer, the first odd one with its label."""
+    yield source
+    for layer in range(source.layer + 1, target.layer):
+        label = link.lines if layer == source.layer + 1 else ()
+        yield Node(f"{number}.{layer}", label, "", layer)
+    yield target
+
+
+def _ordered(found: LayeredGraph) -> list[list[Node]]:
+    """Nodes of each layer in the order, of those that sweeps find, in which fewest edges cross."""
+    layers: list[list[Node]] = [[] for _ in range(max(one.layer for one in found.nodes) + 1)]
+    for one in found.nodes:
+        layers[one.layer].append(one)
+    best, fewest = [list(layer) for layer in layers], crossings(layers, found.routes)
+    for sweep in range(24):
+        step = 1 if sweep % 2 == 0 else -1
+        for before, layer in pairwise(layers[::step]):
+            _sort(layer, before, found.routes)
+        count = crossings(layers, found.routes)
+        if count < fewest:
+            best, fewest = [list(layer) for layer in layers], count
+    return best
+
+
+def _sort(layer: list[Node], before: list[Node], routes: list[list[Node]]) -> None:
+    """Order a layer by the mean places of each node's neighbours in the layer before."""
+    places = {one.name: float(at) for at, one in enumerate(before)}
+    near: dict[str, list[float]] = defaultdict(list)
+    for route in routes:
+        for a, b in pairwise(route):
+            for one, other in ((a, b), (b, a)):
+                if other.name in places:
+                    near[one.name].append(places[other.name])
+    weights = {one.name: _mean(near[one.name], float(at)) for at, one in enumerate(layer)}
+    layer.sort(key=lambda one: weights[one.name])
+
+
+def crossings(layers: list[list[Node]], routes: list[list[Node]]) -> int:
+    """How many pairs of edges cross between neighbouring layers."""
+    places = {one.name: at for layer in layers for at, one in enumerate(layer)}
+    between: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for route in routes:
+        for a, b in pairwise(route):
+            low, high = sorted((a, b), key=lambda one: one.layer)
+            between[low.layer].append((places[low.name], places[high.name]))
+    return sum(
+        (a - c) * (b - d) < 0
+        for edges in between.values()
+        for (a, b), (c, d) in combinations(edges, 2)
+    )
+
+
+def _mean(values: Iterable[float], default: float) -> float:
+    known = list(values)
+    return sum(known) / len(known) if known else default
+
+
+def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
+    """Give nodes their places: layers one after another, in each of them near their neighbours."""
+    size = {one.name: (one.height, one.width) if across else (one.width, one.height)
+            for one in found.nodes}  # fmt: skip
+    beside = {one.name: 0.0 for one in found.nodes}
+    near: dict[str, list[str]] = defaultdict(list)
+    for route in found.routes:
+        for a, b in pairwise(route):
+            near[a.name].append(b.name)
+            near[b.name].append(a.name)
+    for sweep in range(160):
+        for layer in layers[:: 1 if sweep % 2 == 0 else -1]:
+            wanted = [_mean([beside[o] for o in near[one.name]], beside[one.name]) for one in layer]
+            _spread(layer, wanted, beside, {one.name: size[one.name][0] for one in layer})
+    low = min(beside[one.name] - size[one.name][0] / 2 for one in found.nodes)
+    along = 2.0
+    for layer in layers:
+        depth = max(size[one.name][1] for one in layer)
+        for one in layer:
+            # a layer without labels takes no room: its edges pass half way between its neighbours
+            middle = along + (depth / 2 if depth else -BETWEEN / 2)
+            places = beside[one.name] - low + 2.0, middle
+            one.x, one.y = places[::-1] if across else places
+        along += depth + (BETWEEN if depth else 0.0)
+    found.width = max(one.x + one.width / 2 for one in found.nodes) + 2.0
+    found.height = max(one.y + one.height / 2 for one in found.nodes) + 2.0
+
+
+def _spread(
+    layer: list[Node], wanted: list[float], beside: dict[str, float], size: dict[str, float]
+) -> None:
+    """Nodes of a layer as near as can be to where they are wanted, in their order, apart.
+
+    Neighbours that would overlap form a block, which lies where its nodes want it on average.
+    """
+    blocks: list[tuple[list[int], float]] = []
+    offsets: list[float] = [0.0]
+    for a, b in pairwise(layer):
+        offsets.append(offsets[-1] + (size[a.name] + size[b.name]) / 2 + BESIDE)
+    for number in range(len(layer)):
+        block, at = [number], wanted[number] - offsets[number]
+        while blocks and blocks[-1][1] > at:  # in coordinates without the room between them
+            block = blocks.pop()[0] + block
+            at = _mean([wanted[i] - offsets[i] for i in block], 0.0)
+        blocks.append((block, at))
+    for block, at in blocks:
+        for i in block:
+            beside[layer[i].name] = at + offsets[i]
+
+
+def svg_of(diagram: Diagram, identity: str) -> str:
+    """The diagram as SVG of one line, whose colours a style sheet gives.
+
+    Parameters
+    ----------
+    diagram : read from its text
+    identity : unique on the page, for its marker
+    """
+    layout = layered(diagram)
+    arrow = f"arrow-{identity}"
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" role="img" viewBox="0 0 {layout.width:.0f} '
+        f'{layout.height:.0f}" width="{layout.width:.0f}" height="{layout.height:.0f}">',
+        f"<title>{escape(diagram.title)}</title>",
+        f'<marker id="{arrow}" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" '
+        'markerHeight="8" orient="auto" markerUnits="userSpaceOnUse"><path d="M0 0 8 4 0 8z"/>'
+        "</marker>",
+    ]
+    for link, route in zip(diagram.links, layout.routes, strict=True):
+        dashed = ' class="dashed"' if link.dashed else ""
+        path = _curve(route, diagram.across)
+        parts.append(f'<path d="{path}"{dashed} marker-end="url(#{arrow})"/>')
+    parts += [_drawn(one) for one in layout.nodes if one.lines]
+    return "".join([*parts, "</svg>"])
+
+
+def _curve(route: list[Node], across: bool) -> str:
+    """A smooth line through the middles of the nodes, from border to border."""
+    points = [(one.x, one.y) for one in route]
+    sign = 1.0 if route[-1].layer > route[0].layer else -1.0
+    for at, direction in ((0, sign), (-1, -sign)):
+        x, y = points[at]
+        half = (route[at].width if across else route[at].height) / 2
+        points[at] = (x + direction * half, y) if across else (x, y + direction * half)
+    path = f"M{points[0][0]:.1f} {points[0][1]:.1f}"
+    for (x0, y0), (x1, y1) in pairwise(points):
+        if across:
+            middle = (x0 + x1) / 2
+            path += f"C{middle:.1f} {y0:.1f} {middle:.1f} {y1:.1f} {x1:.1f} {y1:.1f}"
+        else:
+            middle = (y0 + y1) / 2
+            path += f"C{x0:.1f} {middle:.1f} {x1:.1f} {middle:.1f} {x1:.1f} {y1:.1f}"
+    return path
+
+
+def _drawn(one: Node) -> str:
+    """A node's outline and text, or the label of an edge on a ground that hides the edge."""
+    left, top = one.x - one.width / 2, one.y - one.height / 2
+    radius = {"round": one.height / 2, "": 3.0}.get(one.shape, 4.0)
+    outline = (
+        f'<rect x="{left:.1f}" y="{top:.1f}" width="{one.width:.1f}" height="{one.height:.1f}" '
+        f'rx="{radius:.1f}"/>'
+    )
+    if one.shape == "store":
+        lid = f'<path d="M{left:.1f} {top + 6:.1f}h{one.width:.1f}"/>'
+        outline += lid
+    first = one.y - (len(one.lines) - 1) * LINE / 2
+    text = "".join(
+        f'<text x="{one.x:.1f}" y="{first + at * LINE:.1f}">{escape(line)}</text>'
+        for at, line in enumerate(one.lines)
+    )
+    return f'<g class="{one.shape or "label"}">{outline}{text}</g>'

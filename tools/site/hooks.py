@@ -1,0 +1,177 @@
+"""What mkdocs calls while it builds the site: mkdocs.yml names this file.
+
+docs/*.md, and the pages that they link to elsewhere  --rewritten-->  pages of the site
+the code                           --generated_pages-->  pages below reference/
+the index of docs/README.md        --navigation_of-->    tabs and their pages
+blocks of mermaid                  --svg_of-->           figures
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, ClassVar
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files, InclusionLevel
+from mkdocs.structure.pages import Page
+
+from tools.site import markup
+from tools.site.diagrams import Diagram, read_diagram, svg_of
+from tools.site.links import (
+    heading_anchor,
+    linked_files,
+    outside_fences,
+    rewritten,
+    site_path,
+    with_deep_lists,
+)
+from tools.site.reference import GeneratedPage, generated_pages
+
+ROOT = Path(__file__).resolve().parents[2]
+INDEX = "docs/README.md"
+#: The section of the index that generated pages are listed in, after its own.
+REFERENCE = "Reference"
+#: The last tab: pages about the project itself.
+PROJECT = {"Contribute": "CONTRIBUTING.md", "Changelog": "CHANGELOG.md"}
+_ROW = re.compile(r"^\| \[([^\]]+)\]\(([^)#]+\.md)\) \|", re.MULTILINE)
+_MERMAID = re.compile(r"^```mermaid\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+#: What pages look like, by the name on the site.
+_ASSETS = {"site.css": "tools/site/site.css", "icon.svg": "service/dashboard/pages/icon.svg"}
+
+
+class _Build:
+    """What the events of one build share."""
+
+    pages: ClassVar[dict[str, GeneratedPage]] = {}
+    #: Paths in the repository of pages, by their paths on the site.
+    sources: ClassVar[dict[str, str]] = {}
+
+
+def navigation_of(index: str, generated: list[GeneratedPage]) -> list[dict[str, Any]]:
+    """Tabs with their pages, from the tables of the index.
+
+    Parameters
+    ----------
+    index : text of docs/README.md: a heading for each tab, a row for each page
+    generated : pages that are listed in the section Reference
+
+    Raises
+    ------
+    ValueError : there is no such section.
+    """
+    tabs: list[dict[str, Any]] = [{"Home": site_path(INDEX)}]
+    for part in index.split("\n## ")[1:]:
+        title = part.partition("\n")[0].strip()
+        pages: list[Any] = [
+            {name: rewritten(f"]({path})", INDEX)[2:-1]} for name, path in _ROW.findall(part)
+        ]
+        if title == REFERENCE:
+            pages += _listed(generated)
+        tabs.append({title: pages})
+    if not any(REFERENCE in tab for tab in tabs):
+        raise ValueError(f"{INDEX} has no section {REFERENCE!r}, where generated pages belong.")
+    tabs.append({"Project": [{name: site_path(path)} for name, path in PROJECT.items()]})
+    return tabs
+
+
+def _listed(generated: list[GeneratedPage]) -> list[Any]:
+    """Entries of generated pages; those of a group lie below the group's name."""
+    entries: list[Any] = []
+    groups: dict[str, list[Any]] = {}
+    for one in generated:
+        if not one.group:
+            entries.append({one.title: one.path})
+            continue
+        if one.group not in groups:
+            groups[one.group] = []
+            entries.append({one.group: groups[one.group]})
+        first = one.path.endswith("/index.md")  # the group's own page
+        groups[one.group].append(one.path if first else {one.title: one.path})
+    return entries
+
+
+def with_generated(index: str, generated: list[GeneratedPage]) -> str:
+    """The index, with rows of the generated pages at the end of its section Reference."""
+    rows = "\n".join(
+        f"| [{one.title}]({one.path}) | {one.about} |" for one in generated if one.about
+    )
+    head, mark, rest = index.partition(f"\n## {REFERENCE}\n")
+    section, other, tail = rest.partition("\n## ")
+    return f"{head}{mark}{section.rstrip()}\n{rows}\n{other}{tail}"
+
+
+def with_figures(text: str, page: str) -> str:
+    """A page's text with its blocks of mermaid drawn."""
+    count = 0
+
+    def drawn(found: re.Match[str]) -> str:
+        nonlocal count
+        count += 1
+        diagram: Diagram = read_diagram(found[1])
+        svg = svg_of(diagram, f"{heading_anchor(page)}-{count}")
+        return f'\n<figure class="diagram" tabindex="0">{svg}</figure>\n'
+
+    return _MERMAID.sub(drawn, text)
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Set the navigation, and anchors as git hosts make them."""
+    made = generated_pages()
+    _Build.pages = {one.path: one for one in made}
+    config.nav = navigation_of((ROOT / INDEX).read_text(encoding="utf-8"), made)
+    config.mdx_configs.setdefault("toc", {})["slugify"] = heading_anchor
+    return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add generated pages, the linked files outside docs/, and what pages look like."""
+    documents = [f"docs/{one.src_uri}" for one in files.documentation_pages()]
+    _Build.sources = {site_path(path): path for path in documents}
+    for path, one in _Build.pages.items():
+        files.append(File.generated(config, path, content=one.text))
+    for path in sorted({*linked_files(ROOT, documents), *PROJECT.values()}):
+        files.append(_outside(path, config))
+        _Build.sources[site_path(path)] = path
+    for name, path in _ASSETS.items():
+        files.append(File.generated(config, f"site/{name}", abs_src_path=str(ROOT / path)))
+    return files
+
+
+def _outside(path: str, config: MkDocsConfig) -> File:
+    """A file outside docs/: a page, or a page that shows its text."""
+    text = (ROOT / path).read_text(encoding="utf-8")
+    if not path.endswith(".md"):
+        language = {".py": "python", ".yaml": "yaml"}.get(Path(path).suffix, "text")
+        text = markup.page(f"# {Path(path).name}", markup.fenced(text, language))
+    file = File.generated(config, site_path(path), content=text)
+    if path not in PROJECT.values():
+        file.inclusion = InclusionLevel.NOT_IN_NAV
+    return file
+
+
+def on_page_markdown(text: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """A page as the site shows it: links, lists and figures."""
+    del config, files
+    path = _Build.sources.get(page.file.src_uri)
+    if path is None:
+        return text
+    text = with_deep_lists(rewritten(text, path))
+    if path == INDEX:
+        text = with_generated(text, list(_Build.pages.values()))
+        page.meta["hide"] = ["navigation"]  # the page itself is one
+    if path == PROJECT["Changelog"] or not path.endswith(".md"):
+        page.meta["search"] = {"exclude": True}  # what is true today would be found after it
+    # git hosts need a backslash before a bar within a table; Python-Markdown takes it as it is
+    text = outside_fences(text, lambda part: re.sub(r"`[^`\n]*`", _without_escapes, part))
+    return with_figures(text, path)
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """Name the dialog of the search for screen readers, as the theme does not."""
+    del page, config
+    return output.replace('role="dialog"', 'role="dialog" aria-label="Search"', 1)
+
+
+def _without_escapes(found: re.Match[str]) -> str:
+    return found[0].replace("\\|", "|")
