@@ -9,8 +9,7 @@ import sys
 from pydantic import ValidationError
 
 from sceneprint.errors import SceneprintError
-from sceneprint.process import log_as_json
-from sceneprint.secret_files import read_secret_files
+from sceneprint.process import log_as_json, read_secret_files
 from sceneprint.settings import Settings
 from service.server import run
 

@@ -42,15 +42,14 @@ from sceneprint_client.api.listing import (
 from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.sessions import NewAssociation, NewDifference
 from sceneprint_client.api.surface import NewReconstruction
-from service import api_docs, dashboard, problems
+from service import dashboard, problems, static_files
 from service.audit import RefusalFilter
 from service.browser_security import origins_of
 from service.context import Context
 from service.event_stream import Feed
-from service.gate import Gate
+from service.limits import Gate, RateLimits
 from service.metrics import Metrics, housekeeping
 from service.middleware import RequestMiddleware
-from service.rate_limits import RateLimits
 from service.routes import (
     admin,
     coverage,
@@ -208,7 +207,7 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
     )  # fmt: skip
     for router in (*ROUTERS, admin.router):  # as they are: `include_router` would make each anew
         app.router.routes.extend(router.routes)
-    app.include_router(api_docs.routes())
+    app.include_router(static_files.routes())
     app.include_router(dashboard.routes(dashboard.files_in(dashboard.PAGES)))
     problems.install(app)
     app.add_middleware(

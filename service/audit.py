@@ -14,7 +14,7 @@ from starlette.types import Scope as AsgiScope
 
 from sceneprint.errors import SceneprintError
 from sceneprint.store.audit_chain import KeyChange
-from service.rate_limits import TokenBucket, network_of
+from service.limits import TokenBucket, network_of
 
 log = logging.getLogger(__name__)
 

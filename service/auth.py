@@ -27,15 +27,17 @@ from sceneprint.store.queue import unknown_job
 from sceneprint.store.tenants import NOBODY, set_tenant
 from sceneprint_client.api import Job
 from sceneprint_client.api.admin import EVERY, Scope, allows
-from service.body_limits import is_import
 from service.context import Context, Here
-from service.gate import share, take_turn, too_many_requests
-from service.rate_limits import (
+from service.limits import (
     ROWS_PER_COST,
     enforce_rate_limit,
+    is_import,
     network_of,
     page_rows,
     request_cost,
+    share,
+    take_turn,
+    too_many_requests,
 )
 
 _bearer = HTTPBearer(auto_error=False, description="A key made by `sceneprint keys`.")

@@ -40,7 +40,7 @@ from sceneprint_client.api.frames import (
 )
 from sceneprint_client.files import HEAD, format_of
 from service.auth import Caller
-from service.body_limits import IN_MEMORY
+from service.limits import IN_MEMORY
 from service.problems import invalid
 
 _Record = TypeVar("_Record", bound=BaseModel)

@@ -9,11 +9,9 @@ from anyio import CapacityLimiter
 from fastapi import Depends, Request
 
 from sceneprint.engine import Engine
-from service.body_limits import Spool
 from service.event_stream import Feed
-from service.gate import Gate, Holdings, Turns
+from service.limits import Gate, Holdings, RateLimits, Spool, Turns
 from service.metrics import Metrics
-from service.rate_limits import RateLimits
 
 #: Threads that look keys up, beside those that all other work shares.
 LOOKUPS = 4

@@ -27,8 +27,7 @@ from sceneprint.store import Database
 from sceneprint.store.events import EventRow, Wanted, list_events, newest_number
 from sceneprint.store.tenants import NOBODY
 from sceneprint_client.api.admin import Event
-from service.body_limits import Broken
-from service.gate import Holdings, share
+from service.limits import Broken, Holdings, share
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,6 @@ from sceneprint.process import name_request
 from sceneprint.settings import Settings
 from sceneprint.store.tenants import NOBODY, set_tenant
 from service.audit import note
-from service.body_limits import Broken, RequestBody, is_import, too_large
 from service.browser_security import (
     Headers,
     Origins,
@@ -27,9 +26,9 @@ from service.browser_security import (
     security_headers,
     stranger,
 )
+from service.limits import Broken, RateState, RequestBody, is_import, too_large
 from service.metrics import Metrics
 from service.problems import problem, status_of
-from service.rate_limits import RateState
 
 log = logging.getLogger(__name__)
 

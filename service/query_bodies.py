@@ -1,8 +1,14 @@
-"""Queries as they come: a stored frame named in JSON, or a frame sent with its options."""
+"""Queries as they come, and each answered in its turn, with its count and its record.
+
+A query names a stored frame in JSON, or comes as a frame with its options.
+
+AskedQuery, what answers it  --run_query-->  Answer
+"""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any, BinaryIO, Generic, TypeVar
@@ -11,11 +17,13 @@ from fastapi import Request
 from pydantic import BaseModel, ValidationError
 from starlette.datastructures import FormData, UploadFile
 
-from sceneprint.errors import InvalidRequest, MalformedBody
-from sceneprint_client.api import Comparison, FrameMeta, NamedFrame, Query
+from sceneprint.engine.results.query_history import AskedQuery, record_of
+from sceneprint.errors import InvalidRequest, MalformedBody, NotFound
+from sceneprint_client.api import Answer, Comparison, FrameMeta, NamedFrame, Query
 from sceneprint_client.api.base import Given, Label
 from service import bodies
 from service.bodies import FORM, FRAME_BODY, FormUpload, form_of, media_type, read_json, uploaded
+from service.context import Context
 from service.problems import invalid
 
 Asked = TypeVar("Asked", bound=Query)
@@ -277,3 +285,37 @@ def _wrong(name: str, how: str) -> InvalidRequest:
         "a file part `a` or `b` with `meta_a` or `meta_b`, or named in `frame_a` or `frame_b`.",
         ((name[:80], how),),
     )
+
+
+async def run_query(
+    here: Context, asked: AskedQuery, since: float, do: Callable[[], Answer]
+) -> Answer:
+    """Answer a query when it is its turn, and leave a record of it, unless it wants none.
+
+    Parameters
+    ----------
+    here : of the service; the query has a place at its gate
+    asked : the query, and who asks
+    since : when the request came, by `time.perf_counter`
+    do : answers it, in a thread
+
+    Raises
+    ------
+    Busy : see `Gate.run`; and what `do` raises.
+    """
+    try:
+        answer = await here.gate.run(do)
+    except NotFound:  # what was asked for is not there: no query was begun
+        raise
+    except Exception as error:
+        _note(here, asked, error, since)
+        raise
+    if asked.query.record:
+        here.metrics.answer(answer)
+    _note(here, asked, answer, since)
+    return answer
+
+
+def _note(here: Context, asked: AskedQuery, came_of_it: Answer | Exception, since: float) -> None:
+    if asked.query.record:
+        here.engine.history.note(record_of(asked, came_of_it, time.perf_counter() - since))

@@ -28,7 +28,7 @@ from sceneprint.errors import InvalidRequest, UnusableStore
 from sceneprint.process import raise_descriptors
 from sceneprint.settings import Settings
 from sceneprint.store import open_store
-from sceneprint.store.startup_retry import open_patiently
+from sceneprint.store.database_errors import open_patiently
 from service.startup import Front
 
 if TYPE_CHECKING:

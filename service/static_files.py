@@ -1,13 +1,20 @@
-"""Static files as they are sent: packed once, and not again where the browser has them."""
+"""Static files as they are sent, packed once, and the page `/docs` made of them.
+
+`/docs` is Swagger UI on the service's own OpenAPI document, with nothing from elsewhere: its files
+are those that the package fastapi-offline brings along.
+"""
 
 from __future__ import annotations
 
 import gzip
 import hashlib
 from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
-from fastapi import Request, Response
+from fastapi import APIRouter, Request, Response
+from starlette.exceptions import HTTPException
 
 from service.responses import is_known
 
@@ -64,3 +71,66 @@ def answer_file(request: Request, file: StaticFile, policy: str) -> Response:
         headers["Content-Encoding"] = "gzip"
     headers["Content-Type"] = file.kind
     return Response(file.packed if packs else file.plain, headers=headers)
+
+
+#: Scripts and documents are the service's own; Swagger UI writes styles and draws its icons.
+POLICY = (
+    "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+# addresses are relative: a proxy may serve all of it below a prefix
+_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>sceneprint: HTTP API</title>
+<link rel="stylesheet" href="docs/swagger-ui.css">
+<link rel="icon" href="dashboard/icon.svg">
+</head>
+<body>
+<div id="swagger-ui"></div>
+<script src="docs/swagger-ui-bundle.js"></script>
+<script src="docs/start.js"></script>
+</body>
+</html>
+"""
+_START = """SwaggerUIBundle({
+  url: "openapi.json",
+  dom_id: "#swagger-ui",
+  deepLinking: true,
+  showCommonExtensions: true,
+  presets: [SwaggerUIBundle.presets.apis, SwaggerUIBundle.SwaggerUIStandalonePreset],
+});
+"""
+_LIBRARY = ("swagger-ui.css", "swagger-ui-bundle.js")
+
+
+def routes() -> APIRouter:
+    """Routes of the page and its files."""
+    router = APIRouter(include_in_schema=False)
+
+    @router.api_route("/docs", methods=["GET", "HEAD"])
+    def page(request: Request) -> Response:
+        return answer_file(request, _file("index.html"), POLICY)
+
+    @router.api_route("/docs/{name}", methods=["GET", "HEAD"])
+    def file(request: Request, name: str) -> Response:
+        if name != "start.js" and name not in _LIBRARY:
+            raise HTTPException(404, "the documentation of the API does not have this file")
+        return answer_file(request, _file(name), POLICY)
+
+    return router
+
+
+@cache
+def _file(name: str) -> StaticFile:
+    """A file by its name, packed when it is first asked for: the library is 1.5 MB."""
+    if name == "index.html":
+        return pack_file(".html", _PAGE.encode())
+    if name == "start.js":
+        return pack_file(".js", _START.encode())
+    found = find_spec("fastapi_offline")
+    if found is None or found.origin is None:
+        raise HTTPException(404, "the package fastapi-offline, which has Swagger UI, is missing")
+    return read_file(Path(found.origin).parent / "static" / name)

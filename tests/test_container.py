@@ -32,7 +32,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from sceneprint.models import PRESETS
-from sceneprint.secret_files import SECRETS
+from sceneprint.process import SECRETS
 from sceneprint.settings import Settings
 from sceneprint.types import DepthFrame
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sceneprint.errors import InvalidRequest
-from sceneprint.secret_files import SECRETS, read_secret_files
+from sceneprint.process import SECRETS, read_secret_files
 
 
 def test_a_file_holds_what_its_variable_would(tmp_path: Path) -> None:

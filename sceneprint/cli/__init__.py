@@ -14,7 +14,7 @@ from importlib import import_module
 
 from sceneprint import __version__
 from sceneprint.errors import SceneprintError
-from sceneprint.secret_files import read_secret_files
+from sceneprint.process import read_secret_files
 
 #: Exit code of a command that was asked for something it cannot do.
 USAGE = 2

@@ -41,10 +41,9 @@ from sceneprint.engine.sessions.session_differences import (
     DifferenceJobs,
 )
 from sceneprint.engine.signers import Signers, warm
-from sceneprint.engine.upkeep.frame_retention import Retention
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
-from sceneprint.engine.upkeep.purge import Purging
+from sceneprint.engine.upkeep.purge import Purging, Retention
 from sceneprint.errors import ModelError
 from sceneprint.geometry.execution import Cores
 from sceneprint.models import Model
@@ -53,9 +52,9 @@ from sceneprint.store import frames as stored_frames
 from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import open_store, queue
+from sceneprint.store.database_errors import PATIENCE_S, open_patiently
 from sceneprint.store.deletion import remove_map
 from sceneprint.store.reencoding_rows import models_of
-from sceneprint.store.startup_retry import PATIENCE_S, open_patiently
 from sceneprint.store.tables import MapRow
 from sceneprint.store.tenants import work_of
 from sceneprint.store.undo_rows import UndoLimits

@@ -37,10 +37,10 @@ from service.query_bodies import (
     described,
     pair,
     question,
+    run_query,
     sequence_body,
     unnamed,
 )
-from service.recorded_queries import run_query
 
 router = v1_router(tag="queries")
 

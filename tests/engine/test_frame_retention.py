@@ -8,8 +8,8 @@ import pytest
 from sqlalchemy import select, text, update
 
 from sceneprint.engine.maps.map_lifecycle import edit_map
-from sceneprint.engine.upkeep import frame_retention
-from sceneprint.engine.upkeep.frame_retention import Retention
+from sceneprint.engine.upkeep import purge
+from sceneprint.engine.upkeep.purge import Retention
 from sceneprint.errors import InvalidRequest, StoreLocked
 from sceneprint.store.deletion import DAY_S, old_frames
 from sceneprint.store.events import Wanted, list_events
@@ -30,7 +30,7 @@ def aged(full, ids):
 
 
 def test_what_is_too_old_goes_with_its_bytes(aged, ids, uploads, monkeypatch):
-    monkeypatch.setattr(frame_retention, "AT_ONCE", 2)
+    monkeypatch.setattr(purge, "AT_ONCE", 2)
     names, revision = ids(aged), aged.get_map("hall").revision
     with aged.store.database.read() as connection:
         made = select(signatures.c.geometry).order_by(signatures.c.frame_number).limit(5)
@@ -73,8 +73,8 @@ def test_time_goes_on_and_keeping_all_stops_it(aged, ids):
 
 
 def test_a_turn_is_short_and_goes_on_with_the_next(aged, ids, monkeypatch):
-    monkeypatch.setattr(frame_retention, "AT_ONCE", 3)
-    monkeypatch.setattr(frame_retention, "TURN_S", 0.0)
+    monkeypatch.setattr(purge, "AT_ONCE", 3)
+    monkeypatch.setattr(purge, "TURN_S", 0.0)
     edit_map(aged.store, "hall", {"retention_days": 0.01})
     worker = Retention(aged.store)
     assert [worker.run() for _ in range(6)] == [3, 3, 3, 3, 0, 0]
@@ -98,7 +98,7 @@ def test_a_store_without_a_turn_is_asked_again_later(aged, ids, monkeypatch):
 
     edit_map(aged.store, "hall", {"retention_days": 3})
     with monkeypatch.context() as patch:
-        patch.setattr(frame_retention, "delete_frames", locked)
+        patch.setattr(purge, "delete_frames", locked)
         assert Retention(aged.store).run() == 0
     assert len(ids(aged)) == 12
     assert Retention(aged.store).run() == 9

@@ -27,7 +27,7 @@ from starlette.responses import Response
 
 from sceneprint.errors import InvalidRequest
 from sceneprint.settings import Settings
-from service import body_limits
+from service import limits
 from service import server as connections
 from service.browser_security import Origins
 from service.metrics import Metrics
@@ -75,7 +75,7 @@ def opened(monkeypatch, request, certificate) -> Iterator[Callable[..., socket.s
         asked = ssl.create_default_context(cafile=str(cert))
     monkeypatch.setattr(connections, "HEAD_S", 0.8)
     monkeypatch.setattr(connections, "READING_S", 1.0)
-    monkeypatch.setattr(body_limits, "IDLE_S", 0.8)
+    monkeypatch.setattr(limits, "IDLE_S", 0.8)
     settings = Settings(body_s=1, upload_bytes=1 << 20, cors_origins=())
     made: list[socket.socket] = []
     with running(RequestMiddleware(app, settings, Origins(()), Metrics()), context) as address:
@@ -329,7 +329,7 @@ def test_a_body_that_drips_is_refused_in_the_end(opened):
 def test_each_mebibyte_that_came_gives_more_time(monkeypatch):
     """By hand: 2 s, and 4 s for each MiB; each part took 3 s of waiting."""
     now = [0.0]
-    monkeypatch.setattr(body_limits.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(limits.time, "monotonic", lambda: now[0])
     left = []
 
     class Timeout:
@@ -340,14 +340,14 @@ def test_each_mebibyte_that_came_gives_more_time(monkeypatch):
 
         async def __aexit__(self, *_: object) -> None: ...
 
-    monkeypatch.setattr(body_limits.asyncio, "timeout", Timeout)
+    monkeypatch.setattr(limits.asyncio, "timeout", Timeout)
 
     async def receive() -> dict[str, Any]:
         now[0] += 3
         return {"type": "http.request", "body": bytes(1 << 20), "more_body": True}
 
     async def read() -> None:
-        body = body_limits.RequestBody(receive, 1 << 30, 2.0)
+        body = limits.RequestBody(receive, 1 << 30, 2.0)
         for _ in range(4):
             await body.next()
 

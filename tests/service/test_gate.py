@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from sceneprint.errors import Busy
-from service.gate import Gate
+from service.limits import Gate
 
 
 def test_who_waits_too_long_is_sent_away_and_nothing_of_it_is_begun():

@@ -8,7 +8,7 @@ import pytest
 from starlette.requests import Request
 
 from sceneprint_client.api import Frame, Page
-from service.rate_limits import RateState, TokenBucket, network_of, request_cost
+from service.limits import RateState, TokenBucket, network_of, request_cost
 
 
 class Clock:

@@ -15,8 +15,7 @@ from sceneprint.engine.admin.operations import create_tenant
 from sceneprint.errors import RateLimited
 from sceneprint.settings import Settings
 from sceneprint.store.tables import jobs
-from service.body_limits import IN_MEMORY, Broken, RequestBody, Spool
-from service.gate import Holdings, Turns, share
+from service.limits import IN_MEMORY, Broken, Holdings, RequestBody, Spool, Turns, share
 
 
 class Clock:

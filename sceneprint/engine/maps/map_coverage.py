@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.map_jobs import MapJobs
-from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Tasks
+from sceneprint.engine.jobs.tasks import LongJob, MapJobs, SliceResult, Tasks
 from sceneprint.engine.maps.map_frames import Output
 from sceneprint.engine.maps.map_plans import (
     DrawnFrame,

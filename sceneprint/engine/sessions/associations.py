@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.map_jobs import MapJobs
-from sceneprint.engine.jobs.tasks import Tasks
+from sceneprint.engine.jobs.tasks import MapJobs, Tasks
 from sceneprint.engine.serializers import job_progress, sensor_frame, transform, when
 from sceneprint.errors import InvalidRequest, NotIndexed
 from sceneprint.formats.dataset import trajectory_row, trajectory_text

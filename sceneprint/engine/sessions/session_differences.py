@@ -18,8 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.map_jobs import MapJobs
-from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Tasks
+from sceneprint.engine.jobs.tasks import LongJob, MapJobs, SliceResult, Tasks
 from sceneprint.engine.maps.surface_job import cell_width, surface_points
 from sceneprint.engine.search.up_vectors import parent_axes
 from sceneprint.engine.serializers import job_progress, when
