@@ -85,7 +85,7 @@ def test_an_operation_says_what_it_takes_and_what_it_answers(
     answers = {cells[0]: cells[1] for cells in rows(text)}
     assert answers["202"] == "[Job](records.md#job)"
     problems = [name for name in answers if answers[name] == "[Problem](records.md#problem)"]
-    assert problems == ["404, 409, 401, 403, 408, 421, 429, 500, 503, 507"]
+    assert problems == ["404, 409, 400, 401, 403, 408, 421, 429, 500, 503, 507"]
     ask = sections(pages["reference/http/queries.md"].text)["Ask"]
     folded = ask.split('??? note "Parameters if the body is the frame itself"')[1].split("**Body**")
     assert "`fx` | query | number | of the camera, pixels." in folded[0]
