@@ -1,4 +1,4 @@
-"""What a fault of the machine means for the store, what to do about it, and waiting until it is over.
+"""What a fault of the machine means for the store, what to do about it, and waiting for its end.
 
 OSError | error of SQLite or PostgreSQL  -->  StoreFull, ReadOnlyStore, StoreLocked or UnusableStore
 
