@@ -13,6 +13,11 @@ ROOT = Path(__file__).resolve().parent.parent
 EDITED = [
     "CONTRIBUTING.md",
     "docs/style.md",
+    "README.md",
+    "docs/getting_started.md",
+    "docs/library.md",
+    "docs/limits.md",
+    "docs/security.md",
     "docs/trust.md",
     "docs/dashboard.md",
     "docs/api.md",
