@@ -248,7 +248,7 @@ def test_documented_commands_and_examples_run(tmp_path: Path) -> None:
     assert ": 2 frames queried against the rest of 6" in printed["coverage"]
     assert (tmp_path / "plan.png").stat().st_size > 10_000
     assert "room-000/seq-01" in printed["sessions"]
-    assert "coverage.measured" in printed["events"]
+    assert "frame.indexed" in printed["events"]
     assert "building" in printed["maps"]
     assert (tmp_path / "restored/sceneprint.db").stat().st_size > 3_000_000  # the model is in it
     assert printed["index"].startswith("map building, depth-")
