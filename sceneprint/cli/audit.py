@@ -84,6 +84,7 @@ def run_audit(options: argparse.Namespace) -> int:
     """Print the entries, verify them, or export them."""
     from sceneprint.engine import Engine
 
+    _check_options(options)
     settings = settings_of(options)
     require_database(settings)
     with Engine(settings) as engine:
@@ -100,6 +101,18 @@ def run_audit(options: argparse.Namespace) -> int:
             if cursor is None:
                 break
     return 0
+
+
+def _check_options(options: argparse.Namespace) -> None:
+    """InvalidRequest where an option would be ignored."""
+    from sceneprint.errors import InvalidRequest
+
+    if options.what == "verify" and options.export is not None:
+        raise InvalidRequest("`verify` checks and --export copies. Run one after the other.")
+    if options.against is not None and options.what != "verify":
+        raise InvalidRequest("--against applies to a check only. Use it with `audit verify`.")
+    if options.since is not None and options.export is None:
+        raise InvalidRequest("--since applies to an export only. Use it with --export.")
 
 
 def _audit_line(one: Audited) -> str:
@@ -127,9 +140,10 @@ def _verify(engine: Engine, copy: Path | None) -> int:
     if found.broken or differing:
         print("the audit log was changed; compare it with an exported copy", file=sys.stderr)
         return 1
-    print(f"{found.lines} entries in {found.chains} chains are whole; head {found.head}")
+    chains = f"{found.chains} chain{'s' * (found.chains != 1)}"
+    print(f"no change found in {_entries(found.lines)} of {chains}; head {found.head}")
     if found.unchained:
-        print(f"{found.unchained} entries of before version 0.3 have no hash")
+        print(f"without a hash, from before version 0.3: {_entries(found.unchained)}")
     return 0
 
 
@@ -147,8 +161,12 @@ def _export(engine: Engine, options: argparse.Namespace) -> int:
         count = _send(options.export, lines)
     else:
         count = _append(Path(options.export), lines)
-    print(f"{count} entries exported to {options.export}")
+    print(f"{_entries(count)} exported to {options.export}")
     return 0
+
+
+def _entries(count: int) -> str:
+    return f"{count} entr{'y' if count == 1 else 'ies'}"
 
 
 def _read_copy(path: Path) -> Iterator[Audited]:
@@ -224,19 +242,24 @@ def _send(url: str, lines: Iterable[Audited]) -> int:
         address = (None, _PORT)
     if address[0] is None:
         raise InvalidRequest(f"{url!r:.80} names no host. Use syslog://HOST or syslog+tcp://HOST.")
-    stream = asked.scheme == "syslog+tcp"
-    if stream:
-        connection = socket.create_connection(address, _TIMEOUT_S)
-    else:
-        family, kind, _, _, found = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)[0]
-        connection = socket.socket(family, kind)
-        connection.connect(found)
-    count = 0
-    with closing(connection):
-        for one in lines:
-            said = _message(one)
-            connection.sendall(b"%d %b" % (len(said), said) if stream else said)
-            count += 1
+    count, stream = 0, asked.scheme == "syslog+tcp"
+    try:
+        if stream:
+            connection = socket.create_connection(address, _TIMEOUT_S)
+        else:
+            family, kind, _, _, found = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)[0]
+            connection = socket.socket(family, kind)
+            connection.connect(found)
+        with closing(connection):
+            for one in lines:
+                said = _message(one)
+                connection.sendall(b"%d %b" % (len(said), said) if stream else said)
+                count += 1
+    except OSError as error:
+        raise InvalidRequest(
+            f"{url:.80}: {error.strerror or error} after {_entries(count)}. Check host and port of "
+            "the log server, and export again."
+        ) from error
     return count
 
 

@@ -39,7 +39,9 @@ def _change(data: Path, statement: str) -> None:
 @pytest.mark.sqlite_only("changes its file")
 def test_a_changed_line_is_named(sceneprint: Run, data: Path) -> None:
     done = sceneprint("audit", "verify", "--data", data)
-    assert re.fullmatch(r"3 entries in 2 chains are whole; head [0-9a-f]{64}\n", done.stdout)
+    assert re.fullmatch(
+        r"no change found in 3 entries of 2 chains; head [0-9a-f]{64}\n", done.stdout
+    )
     assert sceneprint("audit", "verify", "--data", data).stdout == done.stdout
     _change(data, "UPDATE audit SET map = 'yard' WHERE number = 3")
     found = sceneprint("audit", "verify", "--data", data, expect=1)
@@ -65,19 +67,20 @@ def test_a_file_gets_what_it_lacks_and_is_compared(
         engine.audit.note(KeyChange("edit_map", "screen"))
     with copy.open("a") as file:
         file.write('{"at": "2026')  # whoever wrote it died
-    assert sceneprint(*export).stdout == f"1 entries exported to {copy}\n"
+    assert sceneprint(*export).stdout == f"1 entry exported to {copy}\n"
     lines = [json.loads(line) for line in copy.read_text().splitlines()]
     assert [(one["actor"], one["refused"], one["sequence"]) for one in lines] == [
         ("robot", False, 1), ("screen", True, 1), ("robot", False, 2), ("screen", False, 1),
     ]  # fmt: skip
     against = ("audit", "verify", "--against", copy, "--data", data)
-    assert "4 entries in 3 chains are whole" in sceneprint(*against).stdout
+    assert "no change found in 4 entries of 3 chains; " in sceneprint(*against).stdout
     # somebody rewrites all of it, hashes and all
     for table in ("audit", "audit_chains"):
         _change(data, f"DELETE FROM {table}")
     with Engine(Settings(data_dir=data, database_url=None)) as engine:
         engine.audit.note(KeyChange("create_map", "robot", "192.0.2.7", "hall", at=1e9))
-    assert "1 entries in 1 chains are whole" in sceneprint("audit", "verify", "--data", data).stdout
+    verified = sceneprint("audit", "verify", "--data", data).stdout
+    assert verified.startswith("no change found in 1 entry of 1 chain; ")
     told = sceneprint(*against, expect=1).stdout.splitlines()
     assert [line.rpartition(": ")[2] for line in told] == [
         "its chain is gone", "it is gone", "its chain is gone",
@@ -126,3 +129,25 @@ def test_over_tcp_each_message_has_its_length(sceneprint: Run, data: Path) -> No
 def test_a_log_server_needs_a_host(sceneprint: Run, data: Path, url: str) -> None:
     done = sceneprint("audit", "--export", url, "--data", data, expect=2)
     assert "Use syslog://HOST or syslog+tcp://HOST." in done.stderr
+
+
+def test_a_log_server_that_is_not_there_is_named(sceneprint: Run, data: Path) -> None:
+    with closing(socket.socket()) as unheard:
+        unheard.bind(("127.0.0.1", 0))  # and listens not
+        url = f"syslog+tcp://127.0.0.1:{unheard.getsockname()[1]}"
+        done = sceneprint("audit", "--export", url, "--data", data, expect=2)
+    assert f"{url}: Connection refused after 0 entries. Check host and port" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        (["--against", "copy"], "--against applies to a check only."),
+        (["--since", "1h"], "--since applies to an export only."),
+        (["verify", "--export", "copy"], "`verify` checks and --export copies."),
+    ],
+)
+def test_options_that_would_be_ignored_are_refused(
+    sceneprint: Run, data: Path, given: list[str], why: str
+) -> None:
+    assert why in sceneprint("audit", *given, "--data", data, expect=2).stderr
