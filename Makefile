@@ -16,8 +16,8 @@ unexport PYTHONDONTWRITEBYTECODE
 export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
 	'import os; n = len(os.sched_getaffinity(0)); print(n + (n + 1) // 2)')
 
-.PHONY: help demo test pytest test-thorough test-postgres lint kernels format bench screenshots docs docs-serve soak siege \\
-	models lock sbom advisories clean
+.PHONY: help demo test pytest test-thorough test-postgres lint kernels format bench screenshots docs docs-serve soak siege \
+	fleet models lock sbom advisories clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
