@@ -217,7 +217,8 @@ def test_keys_are_made_shown_once_and_withdrawn(station, page, settle, axe):
     page.get_by_role("button", name="I have stored it").click()
     assert secret not in page.content()
     row = page.get_by_role("row", name="robot/7")
-    assert "building: write" in row.inner_text()
+    cells = row.get_by_role("cell").all_inner_texts()  # its tenant has its name
+    assert (cells[0], "building: write" in cells[1]) == ("robot/7", True)
     row.get_by_role("button", name="Revoke").click()
     page.get_by_role("dialog").get_by_role("textbox").fill("robot/7")
     page.get_by_role("dialog").get_by_role("button", name="Revoke").click()

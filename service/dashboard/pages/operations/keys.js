@@ -10,7 +10,7 @@ import { rows } from "./poll.js";
 /** See operations.js. */
 export async function renderTab(root, { signal, actions }) {
   const body = h("tbody", {});
-  const table = h("table", { class: "table" }, h("thead", {}, h("tr", {}, ["Name", "Permissions", "Created", "Expires", "Last used", ""].map((text) => h("th", { scope: "col" }, text || h("span", { class: "visually-hidden" }, "Actions"))))), body);
+  const table = h("table", { class: "table" }, h("thead", {}, h("tr", {}, ["Name", "Tenant", "Permissions", "Created", "Expires", "Last used", ""].map((text) => h("th", { scope: "col" }, text || h("span", { class: "visually-hidden" }, "Actions"))))), body);
   const card = h("div", { class: "card scroll" }, table);
   const none = h("div", { hidden: true }, empty({ title: "No key yet", text: "Without a key, the service answers only on its own machine. Give the first key admin access to all maps, so that it can create the others." }));
   const more = h("button", { class: "button", type: "button", hidden: true, onClick: () => older() }, "Show more keys");
@@ -51,6 +51,7 @@ function keyRow(key, changed) {
   };
   return h("tr", {},
     h("th", { scope: "row" }, key.name, own && h("span", { class: "muted" }, " (yours)")),
+    h("td", {}, key.tenant),
     h("td", {}, h("span", { class: "chips" }, grants)),
     h("td", {}, time(key.created_at)),
     h("td", {}, key.expires_at === null ? h("span", { class: "muted" }, "never") : time(key.expires_at)),
