@@ -45,6 +45,7 @@ COMMANDS = {
     "events": "inventory",
     "bag": "bag",
     "doctor": "doctor",
+    "migrate": "storage",
     "fsck": "storage",
     "reencode": "storage",
     "thin": "storage",

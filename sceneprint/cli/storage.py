@@ -1,4 +1,4 @@
-"""`sceneprint fsck`: what of a data folder is lost, damaged or left over, and its repair."""
+"""`sceneprint migrate | fsck | index | snapshot | restore | thin | reencode`: care of a store."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from sceneprint.maintenance.snapshot.creation import Snapshot
     from sceneprint.maintenance.thin import Proposal
     from sceneprint.settings import Settings
+    from sceneprint.store import Database
     from sceneprint_client.api import Map
     from sceneprint_client.api.admin import SnapshotFile
 
@@ -38,6 +39,55 @@ if TYPE_CHECKING:
 _COUNTED = (
     "models", "frames", "signatures", "blobs", "files", "generations", "tables",
 )  # fmt: skip
+
+
+def add_migrate(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "migrate",
+        help="create the database's schema, or upgrade it to this version's",
+        description="Create or upgrade the schema of a data folder or of DATABASE_URL, in one "
+        "transaction, and print the revisions. `serve` and `work` do so by themselves when they "
+        "start; use this as a step of its own in a deployment. Where the schema is up to date it "
+        "changes nothing. Exit code 2 if a later version wrote the database, or it cannot be "
+        "reached.",
+    )
+    add_data_option(command)
+    command.add_argument(
+        "--check",
+        action="store_true",
+        help="change nothing; exit code 1 if the schema is not this version's",
+    )
+    command.set_defaults(run=run_migrate)
+
+
+def run_migrate(options: argparse.Namespace) -> int:
+    """Bring the schema up to this version's, and say from which revision to which."""
+    from sceneprint.engine import Engine
+    from sceneprint.store.database import is_there, reach_database
+
+    settings = settings_of(options)
+    database = reach_database(settings.database)
+    try:
+        before, usable = _revisions(database) if is_there(settings.database) else (None, False)
+        shown = f"{database.shown}: schema {before or 'none'}"
+        if options.check:
+            print(shown if usable else f"{shown}; run `sceneprint migrate`")
+            return 0 if usable else 1
+        Engine(settings).close()  # opening it makes or upgrades the schema
+        after, _ = _revisions(database)
+    finally:
+        database.close()
+    print(shown if before == after else f"{shown} -> {after}")
+    return 0
+
+
+def _revisions(database: Database) -> tuple[str | None, bool]:
+    """The revision of a store's schema, and whether this version can use it as it is."""
+    from sceneprint.store.database import current_revision, known_revisions, revision_of
+
+    with database.read() as connection:
+        return revision_of(connection), current_revision(connection) == known_revisions()[0]
 
 
 def add_fsck(commands: Any) -> None:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
+from secrets import token_hex
 
 import pytest
 from sqlalchemy import text
 
+from benchmarks.fleet.postgres import Server
 from sceneprint.errors import NewerSchema
 from sceneprint.store import Store, open_database
 from sceneprint.store.database import LEAST_REVISION, SchemaRange, known_revisions, reach_database
@@ -119,3 +123,40 @@ def test_a_new_store_and_a_migrated_one_allow_the_same(store: Store) -> None:
         found = connection.execute(text("SELECT least_revision FROM schema_range")).scalars().all()
     assert found == [LEAST_REVISION]
     assert known_revisions()[0] >= LEAST_REVISION
+
+
+def migrate_command(url: str, folder: Path, *options: str) -> tuple[int, str, str]:
+    """Exit code, output and error of `sceneprint migrate`."""
+    done = subprocess.run(
+        [sys.executable, "-m", "sceneprint", "migrate", "--data", f"{folder}", *options],
+        env={**os.environ, "SCENEPRINT_DATABASE_URL": url},
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    return done.returncode, done.stdout.strip(), done.stderr.strip()
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_the_command_makes_the_schema_once(
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    if kind == "sqlite":
+        url = f"sqlite:///{tmp_path}/data/sceneprint.db"
+    else:
+        server: Server = request.getfixturevalue("postgres")
+        url = server.create(f"empty_{token_hex(4)}")
+    head = known_revisions()[0]
+    data = tmp_path / "data"
+    code, said, _ = migrate_command(url, data, "--check")
+    assert (code, said.endswith("schema none; run `sceneprint migrate`")) == (1, True)
+    assert not data.exists()
+    code, said, _ = migrate_command(url, data)
+    assert (code, said.endswith(f"schema none -> {head}")) == (0, True)
+    for options in ((), ("--check",)):
+        code, said, _ = migrate_command(url, data, *options)
+        assert (code, said.endswith(f"schema {head}")) == (0, True)
+    _migrate(url, "9999", head)  # later, and this version may still write to it
+    code, said, _ = migrate_command(url, data, "--check")
+    assert (code, said.endswith("schema 9999")) == (0, True)
+    _migrate(url, "9999", "9998")
+    code, _, error = migrate_command(url, data)
+    assert (code, "a later one wrote it" in error) == (2, True)

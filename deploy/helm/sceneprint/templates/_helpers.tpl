@@ -1,0 +1,127 @@
+{{- define "sceneprint.image" -}}
+{{- with .Values.image -}}
+{{- if .digest -}}
+{{ .repository }}@{{ .digest }}
+{{- else -}}
+{{ .repository }}:{{ .tag | default $.Chart.AppVersion }}
+{{- end -}}
+{{- end -}}
+{{- end }}
+
+{{- define "sceneprint.name" -}}
+{{- .Release.Name | trunc 50 | trimSuffix "-" -}}
+{{- end }}
+
+{{/* What never changes of a part, so that an upgrade may change all else: dict root, part */}}
+{{- define "sceneprint.selector" -}}
+app.kubernetes.io/name: sceneprint
+app.kubernetes.io/instance: {{ .root.Release.Name }}
+app.kubernetes.io/component: {{ .part }}
+{{- end }}
+
+{{- define "sceneprint.labels" -}}
+{{ include "sceneprint.selector" . }}
+app.kubernetes.io/version: {{ .root.Chart.AppVersion | quote }}
+app.kubernetes.io/managed-by: {{ .root.Release.Service }}
+helm.sh/chart: {{ printf "%s-%s" .root.Chart.Name .root.Chart.Version }}
+{{- end }}
+
+{{/* The environment of every pod; no ConfigMap, as the migration runs before one would be there. */}}
+{{- define "sceneprint.env" -}}
+- name: SCENEPRINT_DATABASE_URL
+  value: {{ required "set database.url" .Values.database.url | quote }}
+{{- with .Values.database.replicaUrl }}
+- name: SCENEPRINT_REPLICA_URL
+  value: {{ . | quote }}
+{{- end }}
+- name: SCENEPRINT_BLOB_URL
+  value: {{ required "set blobs.url" .Values.blobs.url | quote }}
+{{- range $name, $value := .Values.env }}
+- name: {{ $name }}
+  value: {{ $value | quote }}
+{{- end }}
+{{- end }}
+
+{{/* What every pod has in common: dict root, part, values, and the sizes of its folders. */}}
+{{- define "sceneprint.pod" -}}
+{{- with .root.Values.imagePullSecrets }}
+imagePullSecrets:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- with .root.Values.serviceAccountName }}
+serviceAccountName: {{ . }}
+{{- end }}
+automountServiceAccountToken: false
+enableServiceLinks: false
+# The pause process collects orphans, as an init would.
+shareProcessNamespace: true
+securityContext:
+  runAsNonRoot: true
+  runAsUser: 10001
+  runAsGroup: 10001
+  fsGroup: 10001
+  seccompProfile:
+    type: RuntimeDefault
+{{- end }}
+
+{{- define "sceneprint.container" -}}
+image: {{ include "sceneprint.image" . }}
+imagePullPolicy: {{ .Values.image.pullPolicy }}
+securityContext:
+  allowPrivilegeEscalation: false
+  readOnlyRootFilesystem: true
+  capabilities:
+    drop: [ALL]
+envFrom:
+  - secretRef:
+      name: {{ required "set secret to the name of a Secret with PGPASSWORD" .Values.secret }}
+{{- end }}
+
+{{- define "sceneprint.mounts" -}}
+- name: data
+  mountPath: /data
+- name: cache
+  mountPath: /var/cache/sceneprint
+- name: temporary
+  mountPath: /tmp
+{{- end }}
+
+{{- define "sceneprint.volumes" -}}
+- name: data
+  emptyDir:
+    sizeLimit: {{ .dataSize }}
+- name: cache
+  emptyDir:
+    sizeLimit: 1Gi
+- name: temporary
+  emptyDir:
+    sizeLimit: {{ .temporarySize }}
+{{- end }}
+
+{{/* The image has compiled kernels, in a folder that must be writable: a copy, or each pod compiles. */}}
+{{- define "sceneprint.kernels" -}}
+- name: kernels
+  {{- include "sceneprint.container" . | nindent 2 }}
+  command: [cp, -a, /var/cache/sceneprint/., /cache/]
+  resources:
+    requests: {cpu: 50m, memory: 64Mi}
+    limits: {cpu: 500m, memory: 128Mi}
+  volumeMounts:
+    - name: cache
+      mountPath: /cache
+{{- end }}
+
+{{- define "sceneprint.placement" -}}
+{{- with .nodeSelector }}
+nodeSelector:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- with .tolerations }}
+tolerations:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- with .affinity }}
+affinity:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- end }}

@@ -1,0 +1,221 @@
+"""The Helm chart, rendered by Helm itself and held to the schemas of Kubernetes and to our code."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import kubernetes_validate
+import pytest
+import yaml
+
+from sceneprint import __version__
+from sceneprint.cli import COMMANDS
+from sceneprint.settings import Settings
+from service.metrics import Metrics
+
+CHART = Path(__file__).resolve().parent.parent / "deploy" / "helm" / "sceneprint"
+DASHBOARDS = sorted((CHART / "dashboards").glob("*.json"))
+#: Version of Kubernetes whose schemas the rendered objects are held to.
+KUBERNETES = "1.34"
+#: Kinds that others define: their schemas are not among those of Kubernetes.
+OF_OTHERS = {"ScaledObject", "TriggerAuthentication", "ServiceMonitor"}
+
+REQUIRED = {
+    "database": {"url": "postgresql+psycopg://sceneprint@database/sceneprint"},
+    "blobs": {"url": "s3://bucket/fleet"},
+    "secret": "sceneprint",
+}
+ALL = REQUIRED | {
+    "serviceAccountName": "robots",
+    "imagePullSecrets": [{"name": "registry"}],
+    "image": {"digest": "sha256:" + "a" * 64},
+    "env": {"AWS_REGION": "eu-central-1", "SCENEPRINT_UNDO_S": 60},
+    "api": {"autoscaling": {"enabled": True}, "nodeSelector": {"disk": "ssd"}},
+    "worker": {
+        "autoscaling": {"enabled": True, "targetSeconds": 20},
+        "tolerations": [{"key": "batch", "operator": "Exists"}],
+    },
+    "ingress": {
+        "enabled": True,
+        "host": "places.example",
+        "tlsSecret": "tls",
+        "className": "nginx",
+    },
+    "serviceMonitor": {"enabled": True},
+    "dashboards": {"enabled": True},
+}
+
+
+def run_helm(*arguments: str, values: dict[str, Any], folder: Path) -> tuple[int, str, str]:
+    """Exit code, output and errors of Helm over the chart with these values."""
+    helm = shutil.which("helm")
+    if helm is None:
+        pytest.skip("helm is not installed")
+    path = folder / "values.yaml"
+    path.write_text(yaml.safe_dump(values))
+    command, *others = arguments
+    done = subprocess.run(
+        [helm, command, *others, str(CHART), "--values", str(path)],
+        env={"HOME": str(folder), "PATH": ""}, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
+
+
+def rendered(values: dict[str, Any], folder: Path) -> dict[tuple[str, str], Any]:
+    """The objects of a release `fleet`, by kind and name."""
+    returned, text, error = run_helm("template", "fleet", values=values, folder=folder)
+    assert returned == 0, error
+    objects = [one for one in yaml.safe_load_all(text) if one is not None]
+    found = {(one["kind"], one["metadata"]["name"]): one for one in objects}
+    assert len(found) == len(objects)
+    return found
+
+
+def environment(container: dict[str, Any]) -> dict[str, str]:
+    return {one["name"]: one["value"] for one in container["env"]}
+
+
+@pytest.mark.parametrize("values", [REQUIRED, ALL], ids=["required", "all"])
+def test_helm_and_kubernetes_accept_it(values: dict[str, Any], tmp_path: Path) -> None:
+    returned, text, error = run_helm("lint", "--strict", values=values, folder=tmp_path)
+    assert (returned, "0 chart(s) failed" in text) == (0, True), text + error
+    objects = rendered(values, tmp_path)
+    kinds = {kind for kind, _ in objects}
+    basic = {"Deployment", "Service", "PodDisruptionBudget", "NetworkPolicy", "Job"}
+    more = {"HorizontalPodAutoscaler", "Ingress", "ConfigMap"} | OF_OTHERS
+    assert kinds == (basic | more if values is ALL else basic)
+    for (kind, _), one in objects.items():
+        if kind not in OF_OTHERS:
+            kubernetes_validate.validate(one, KUBERNETES, strict=True)
+    broken = objects["Deployment", "fleet-api"]
+    broken["spec"]["template"]["spec"]["containers"][0]["readynessProbe"] = {}
+    with pytest.raises(kubernetes_validate.ValidationError, match="readynessProbe"):
+        kubernetes_validate.validate(broken, KUBERNETES, strict=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"secret": ""}, "/secret"),
+        ({"database": {"url": ""}}, "/database/url"),
+        ({"database": {"url": "postgresql://sceneprint:hush@db/x"}}, "/database/url"),
+        ({"blobs": {"url": "/mnt/blobs"}}, "/blobs/url"),
+        ({"api": {"replica": 3}}, "replica"),
+        ({"ingress": {"enabled": True}}, "set ingress.host"),
+    ],
+)
+def test_values_that_cannot_work_are_refused(
+    change: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    returned, _, error = run_helm("template", "fleet", values=REQUIRED | change, folder=tmp_path)
+    assert returned != 0
+    assert message in error
+
+
+def test_pods_run_our_commands_with_our_settings(tmp_path: Path) -> None:
+    known = {f"SCENEPRINT_{name.upper()}" for name in Settings.model_fields} | {"AWS_REGION"}
+    objects = rendered(ALL, tmp_path)
+    parts = {
+        "serve": objects["Deployment", "fleet-api"],
+        "work": objects["Deployment", "fleet-worker"],
+        "migrate": objects["Job", "fleet-migration"],
+    }
+    for command, one in parts.items():
+        pod = one["spec"]["template"]["spec"]
+        (container,) = pod["containers"]
+        assert container["args"] == [command]
+        assert command in COMMANDS
+        given = environment(container)
+        assert given.keys() - known == set()
+        own = {k.removeprefix("SCENEPRINT_").lower(): v for k, v in given.items() if k[:3] == "SCE"}
+        settings = Settings(**own)  # type: ignore[arg-type]  # texts, as in the environment
+        assert settings.database == REQUIRED["database"]["url"]
+        assert container["image"] == f"sceneprint@sha256:{'a' * 64}"
+        assert container["envFrom"] == [{"secretRef": {"name": "sceneprint"}}]
+        assert pod["securityContext"]["runAsUser"] == 10001  # that of the Dockerfile
+        assert container["securityContext"]["readOnlyRootFilesystem"] is True
+        mounts = {mount["mountPath"] for mount in container["volumeMounts"]}
+        assert mounts == {"/data", "/var/cache/sceneprint", "/tmp"}
+    assert environment(parts["serve"]["spec"]["template"]["spec"]["containers"][0]).items() >= {
+        ("SCENEPRINT_WORKERS", "0"), ("SCENEPRINT_UNDO_S", "60"),
+    }  # fmt: skip
+
+
+def test_traffic_goes_to_ready_api_pods_alone(tmp_path: Path) -> None:
+    objects = rendered(ALL, tmp_path)
+    api, worker = (objects["Deployment", f"fleet-{part}"]["spec"] for part in ("api", "worker"))
+    selector = objects["Service", "fleet-api"]["spec"]["selector"]
+    assert selector == api["selector"]["matchLabels"]
+    assert selector.items() <= api["template"]["metadata"]["labels"].items()
+    assert not selector.items() <= worker["template"]["metadata"]["labels"].items()
+    assert worker["selector"] != api["selector"]
+    (container,) = api["template"]["spec"]["containers"]
+    assert container["readinessProbe"]["httpGet"]["path"] == "/readyz"
+    assert container["livenessProbe"]["httpGet"]["path"] == "/healthz"
+    assert api["strategy"]["rollingUpdate"]["maxUnavailable"] == 0
+    assert "replicas" not in api  # the autoscalers have them
+    assert "replicas" not in worker
+    by_default = rendered(REQUIRED, tmp_path)
+    assert by_default["Deployment", "fleet-api"]["spec"]["replicas"] == 2
+
+
+def test_the_schema_is_migrated_before_pods_are_replaced(tmp_path: Path) -> None:
+    objects = rendered(REQUIRED, tmp_path)
+    hooks = {
+        name: one["metadata"].get("annotations", {}).get("helm.sh/hook")
+        for (_, name), one in objects.items()
+    }
+    assert hooks.pop("fleet-migration") == "pre-install,pre-upgrade"
+    assert set(hooks.values()) == {None}
+    without = rendered(REQUIRED | {"migration": {"enabled": False}}, tmp_path)
+    assert ("Job", "fleet-migration") not in without
+
+
+def exposed() -> set[str]:
+    """Names of all series that /metrics may have."""
+    found = set()
+    for family in Metrics().registry.collect():
+        found |= {
+            family.name,
+            *(f"{family.name}_{end}" for end in ("total", "bucket", "sum", "count")),
+        }
+    return found | {"sceneprint_replica_used", "sceneprint_replica_behind_seconds"}
+
+
+def test_workers_are_added_by_the_age_of_the_oldest_job(tmp_path: Path) -> None:
+    objects = rendered(ALL, tmp_path)
+    scaled = objects["ScaledObject", "fleet-worker"]["spec"]
+    (trigger,) = scaled["triggers"]
+    assert scaled["scaleTargetRef"]["name"] == "fleet-worker"
+    assert trigger["metadata"]["valueLocation"] in exposed()
+    assert trigger["metadata"]["targetValue"] == "20"
+    assert trigger["metadata"]["url"] == "http://fleet-api.default.svc:8008/metrics"
+    assert trigger["authenticationRef"]["name"] == "fleet-worker"
+    reference = objects["TriggerAuthentication", "fleet-worker"]["spec"]["secretTargetRef"]
+    assert reference == [{"parameter": "token", "name": "sceneprint", "key": "METRICS_KEY"}]
+
+
+@pytest.mark.parametrize("path", DASHBOARDS, ids=lambda path: path.stem)
+def test_dashboards_ask_for_metrics_that_there_are(path: Path) -> None:
+    board, known = json.loads(path.read_text()), exposed()
+    asked = [target["expr"] for panel in board["panels"] for target in panel["targets"]]
+    names = {name for text in asked for name in re.findall(r"sceneprint_\w+", text)}
+    assert len(names) >= 5
+    assert names - known == set()
+    for panel in board["panels"]:
+        assert panel["description"]
+        assert panel["gridPos"]["x"] + panel["gridPos"]["w"] <= 24
+    places = {(each["gridPos"]["x"], each["gridPos"]["y"]) for each in board["panels"]}
+    assert len(places) == len(board["panels"])
+
+
+def test_versions_and_dashboards_are_in_the_chart(tmp_path: Path) -> None:
+    chart = yaml.safe_load((CHART / "Chart.yaml").read_text())
+    assert chart["version"] == chart["appVersion"] == __version__
+    held = rendered(ALL, tmp_path)["ConfigMap", "fleet-dashboards"]["data"]
+    assert held == {f"sceneprint-{path.name}": path.read_text() for path in DASHBOARDS}
