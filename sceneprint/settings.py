@@ -82,6 +82,9 @@ class Settings(BaseSettings):
     import_bytes: int = Field(default=4 << 30, ge=1024)
     #: Seconds for a body of hardly any bytes; each MiB of it may take 4 s more.
     body_s: float = Field(default=30.0, ge=1, le=3600)
+    #: Collector of OpenTelemetry that is sent spans of requests and jobs, over HTTP: such as
+    #: http://127.0.0.1:4318. Needs the extra `traces`; default: nothing is traced.
+    traces_url: str | None = Field(default=None, pattern=r"^https?://[^\s/@]+(/\S*)?$")
     #: Ask callers for a key on a loopback address as well, as behind a proxy.
     require_keys: bool = False
     #: Requests a second of each tenant, weighted by work, over five seconds; 0 for no limit.

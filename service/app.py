@@ -19,6 +19,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.compilation import compile_kernels
 from sceneprint.errors import SceneprintError
 from sceneprint.settings import Settings
+from sceneprint.tracing import tracing
 from sceneprint_client.api import (
     Diversity,
     Filter,
@@ -177,6 +178,12 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        with tracing(settings.traces_url, "sceneprint-service", __version__):
+            async with serving(app):
+                yield
+
+    @asynccontextmanager
+    async def serving(app: FastAPI) -> AsyncIterator[None]:
         engine = await to_thread.run_sync(Engine, settings)
         try:
             gate = Gate(settings.concurrency, settings.waiting, settings.wait_s)

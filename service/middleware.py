@@ -16,6 +16,7 @@ from sceneprint.errors import AmbiguousKey, Busy, SceneprintError
 from sceneprint.process import name_request
 from sceneprint.settings import Settings
 from sceneprint.store.tenants import NOBODY, set_tenant
+from sceneprint.tracing import name_span, span
 from service.audit import note
 from service.browser_security import (
     Headers,
@@ -37,6 +38,8 @@ _ID = re.compile(rb"[\w.-]{1,64}")
 _METHODS = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"))
 #: As noted where the caller hung up before there was an answer.
 _HUNG_UP = 499
+#: What machines ask every few seconds: not traced, and in the log at DEBUG alone.
+_PROBES = ("/healthz", "/readyz", "/metrics")
 #: Requests that are answered at once, those that wait or stream among them.
 _MOST_AT_ONCE = 900
 
@@ -66,6 +69,14 @@ class RequestMiddleware:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
+        if scope["path"] in _PROBES:
+            await self._answer(scope, receive, send)
+            return
+        parent = dict(scope["headers"]).get(b"traceparent", b"").decode("latin-1")
+        with span(scope["method"], parent, "SERVER"):
+            await self._answer(scope, receive, send)
+
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         headers: dict[bytes, bytes] = dict(scope["headers"])
         given = headers.get(b"x-request-id", b"")
         request_id = given.decode() if _ID.fullmatch(given) else uuid.uuid4().hex
@@ -162,7 +173,11 @@ class RequestMiddleware:
         self._metrics.request(method, route, status, seconds, received)
         if status in (401, 403):
             self._note_refusal(scope, request_id, status)
-        level = logging.DEBUG if route in ("/healthz", "/readyz", "/metrics") else logging.INFO
+        name_span(
+            f"{method} {route}", http_request_method=method, http_route=route,
+            http_response_status__code=status, sceneprint_request=request_id,
+        )  # fmt: skip
+        level = logging.DEBUG if route in _PROBES else logging.INFO
         log.log(
             level,
             "request",

@@ -15,7 +15,7 @@ from service.metrics import Metrics
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGE = (DOCS / "operations.md").read_text()
-DASHBOARD = json.loads((DOCS / "grafana.json").read_text())
+DASHBOARD = json.loads((DOCS.parent / "deploy/helm/sceneprint/dashboards/fleet.json").read_text())
 
 
 def section(title: str) -> str:

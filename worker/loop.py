@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from multiprocessing.reduction import DupFd
 from typing import Any
 
+from sceneprint import __version__
 from sceneprint.engine import Engine
 from sceneprint.engine.engine import open_engine
 from sceneprint.errors import NewerSchema, SceneprintError, StoreAway
@@ -25,6 +26,7 @@ from sceneprint.maintenance.snapshot.creation import SNAPSHOT, snapshot_handler
 from sceneprint.process import StopSignal, limit_memory, log_as_json, of_request, raise_descriptors
 from sceneprint.settings import Settings
 from sceneprint.store.wakeup import Listening, process_name
+from sceneprint.tracing import span, tracing
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +69,11 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
         opened = open_engine(settings, math.inf, may_go_on)
     except StoreAway:
         return
-    with opened as engine, engine.bell.listen() as listener:
+    with (
+        tracing(settings.traces_url, "sceneprint-worker", __version__),
+        opened as engine,
+        engine.bell.listen() as listener,
+    ):
         engine.warm()
         engine.tasks.register(SNAPSHOT, snapshot_handler(settings), SNAPSHOT_S)
         limit_memory(settings.worker_bytes)
@@ -125,10 +131,14 @@ class Worker:
             self._engine.put_back(claimed)
             return True
         held = claimed.job
-        asked = (held.data or {}).get("request_id")
+        asked = held.data or {}
         usual_s = self._engine.settings.job_s
         seconds = self._engine.tasks.longest_s(held.kind, usual_s)
-        with of_request(asked), self._trace.job(held.id, held.token, seconds):
+        with (
+            of_request(asked.get("request_id")),
+            span(f"job {held.kind}", asked.get("traceparent"), "CONSUMER", sceneprint_job=held.id),
+            self._trace.job(held.id, held.token, seconds),
+        ):
             self._engine.run(claimed, self._break)
         return True
 

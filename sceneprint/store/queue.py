@@ -70,6 +70,7 @@ from sceneprint.store.tables import (
     tenants,
 )
 from sceneprint.store.tenants import NOBODY, current_tenant, keep_turns
+from sceneprint.tracing import traceparent
 from sceneprint_client.api import JobState
 
 # Jobs, one by one and as a list.
@@ -262,6 +263,8 @@ def job_values(
     made = now(connection)
     if data is None and request_id() is not None:
         data = {"request_id": request_id()}  # whose log its worker's lines belong to
+        if (parent := traceparent()) is not None:
+            data["traceparent"] = parent
     return {
         "id": uuid.uuid4().hex, "kind": kind, "model_id": model_id, "data": data,
         "state": JobState.QUEUED, "priority": priority, "attempts": 0, "failures": 0, "token": 0,

@@ -34,6 +34,7 @@ from sceneprint.store.signatures import (
     replace_signature,
 )
 from sceneprint.store.tables import FrameRow, MapRow
+from sceneprint.tracing import span
 from sceneprint.types import Bytes
 from sceneprint_client.api import FrameState, JobState
 
@@ -132,12 +133,16 @@ def run(
 def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> StoredSignature:
     if work.model_id not in models_of(work.map):
         raise lifecycle.Outdated
-    frame = read_stored(store.blobs.get(work.frame.blob), work.frame)
-    signature, geometry = prepare(frame, signers(work.model_id))
+    with span("decode"):
+        frame = read_stored(store.blobs.get(work.frame.blob), work.frame)
+    with span("sign"):
+        signature, geometry = prepare(frame, signers(work.model_id))
+    with span("artifact"):
+        blob = store.blobs.put(write_geometry(geometry))
     return StoredSignature(
         model_id=signature.model_id,
         vector=signature.vector.tobytes(),
-        geometry=store.blobs.put(write_geometry(geometry)),
+        geometry=blob,
         n_patches=signature.n_patches,
         n_pairs=signature.n_pairs,
     )
@@ -153,7 +158,8 @@ def _store_patiently(
     until = time.monotonic() + AWAY_S
     while True:
         try:
-            return _store(store, signers, readers, work, made)
+            with span("commit"):
+                return _store(store, signers, readers, work, made)
         except errors.StoreAway:
             if time.monotonic() > until:
                 raise

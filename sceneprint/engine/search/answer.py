@@ -51,6 +51,7 @@ from sceneprint.store import Store
 from sceneprint.store.frames import frames_of
 from sceneprint.store.postgres.replica import behind_s
 from sceneprint.store.tables import FrameRow
+from sceneprint.tracing import record_span
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Answer, AnswerStatus, Counts, FrameName, OfMap, Query
 from sceneprint_client.api.query import Cause
@@ -66,6 +67,7 @@ class _Clock:
     def stage(self, name: str) -> None:
         now = time.perf_counter()
         self.spent[name] = round(1e3 * (now - self._since), 2)
+        record_span(name, now - self._since)
         self._since = now
 
 
