@@ -17,6 +17,7 @@ from sceneprint.cli.options import one_line
 from sceneprint.formats.dataset import FrameSequence, find_recordings, find_sequences
 from sceneprint.formats.recording import BagOutline, RecordingOptions, bag_outline
 from sceneprint_client.frame_files import meta_of
+from sceneprint_client.sidecars import Camera
 
 _DEFAULT = RecordingOptions()
 
@@ -92,12 +93,14 @@ def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]
         )
 
 
-def sequences_at(path: Path, options: argparse.Namespace) -> tuple[FrameSequence, ...]:
+def sequences_at(
+    path: Path, options: argparse.Namespace, camera: Camera | None = None
+) -> tuple[FrameSequence, ...]:
     """The sequences at a path, of a recording as the options say; what was left out of one is told
-    on standard error. Raises as `find_sequences`.
+    on standard error. `camera` and what is raised: as of `find_sequences`.
     """
     with recording_options(options) as recording:
-        found = find_sequences(path, recording)
+        found = find_sequences(path, recording, camera)
     for sequence in found:
         tell(sequence)
     return found

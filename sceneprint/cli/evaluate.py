@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -18,12 +19,17 @@ from sceneprint.cli.bag import add_recording_options, sequences_at
 from sceneprint.cli.options import add_judging_options, add_model_options, open_for
 from sceneprint.errors import DatasetError
 from sceneprint.settings import Settings
+from sceneprint.types import Intrinsics
+from sceneprint_client.sidecars import Camera
 
 if TYPE_CHECKING:
     from sceneprint.lab.evaluation.protocol import EvaluationProtocol
     from sceneprint.models import Model
 
 T = TypeVar("T")
+
+#: The camera that the page of 7-Scenes tells for its depth images; the download has no file of it.
+_KINECT = Camera(Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0))
 
 _EXAMPLES = """\
 frames are counted from 0 over all sequences of a PATH, in order; STOP is not included:
@@ -34,6 +40,8 @@ each PATH may have its own ranges, joined by +; all PATHs form one database:
 without ranges, TrainSplit.txt and TestSplit.txt of each scene define the split: one row for
 each scene, and with several also Average and Combine (all scenes in one database):
   sceneprint evaluate 7scenes --db-step 10 --query-step 10
+the benchmark of the paper, on the official download with its archives unpacked:
+  sceneprint evaluate --7scenes 7scenes --db-step 5 --query-step 10
 a scanner that returns to a place after more than 30 m of travel:
   sceneprint evaluate hall --model lidar --gap-m 30 --within 5 --baselines
 """
@@ -50,7 +58,16 @@ def add_evaluate(commands: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.add_argument(
-        "paths", nargs="+", metavar="PATH", help="PATH or PATH@db=RANGES,queries=RANGES"
+        "paths", nargs="*", metavar="PATH", help="PATH or PATH@db=RANGES,queries=RANGES"
+    )
+    command.add_argument(
+        "--7scenes",
+        type=Path,
+        dest="seven_scenes",
+        metavar="DIR",
+        help="evaluate the scenes of 7-Scenes in this folder by their official splits, and print "
+        "the paper's table beside its figures; without intrinsics.json the Kinect's camera is "
+        "taken (585 pixels, centre 320, 240)",
     )
     add_model_options(command)
     _add_frames(command)
@@ -178,7 +195,7 @@ def _metres(text: str) -> float:
 def run_evaluate(options: argparse.Namespace) -> int:
     """Evaluate, print, and write what was asked for."""
     from sceneprint.lab.evaluation.protocol import FrameStore
-    from sceneprint.lab.evaluation.report import figures, table, to_json
+    from sceneprint.lab.evaluation.report import figures, seven_scenes_table, table, to_json
     from sceneprint.lab.evaluation.run import EvaluationSettings, evaluate
 
     protocol = _protocol(options)
@@ -225,6 +242,8 @@ def run_evaluate(options: argparse.Namespace) -> int:
             write_whole(options.json, to_json(found))
         print(f"model {signer.model.label}: {_counts(found)}")
         print("\n".join(table(found)))
+        if options.seven_scenes is not None:
+            print("\n".join(["", *seven_scenes_table(found, evaluation.outcomes[0].scene)]))
         if options.plots is not None:
             from sceneprint.lab.evaluation.plots import save_pictures
 
@@ -242,8 +261,17 @@ def _make_room(options: argparse.Namespace) -> None:
 
 
 def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
-    from sceneprint.lab.evaluation.protocol import choose, parse_part, parse_ranges
+    from sceneprint.lab.evaluation.protocol import PathRanges, choose, parse_part, parse_ranges
 
+    if options.seven_scenes is not None:
+        return choose(
+            [PathRanges(scene) for scene in _seven_scenes(options)],
+            database_step=options.db_step,
+            query_step=options.query_step,
+            find=partial(sequences_at, options=options, camera=_KINECT),
+        )
+    if not options.paths:
+        raise DatasetError("There is nothing to evaluate. Name a PATH, or --7scenes DIR.")
     parts = [parse_part(text) for text in options.paths]
     both = options.db is not None, options.queries is not None
     ranged = [part for part in parts if part.database is None and part.queries is None]
@@ -266,6 +294,34 @@ def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
         shared=options.gap_m is not None,
         find=partial(sequences_at, options=options),
     )
+
+
+def _seven_scenes(options: argparse.Namespace) -> list[Path]:
+    """Folders of the scenes that are there; those that are missing are told on standard error."""
+    from sceneprint.lab.evaluation.report import PAPER
+
+    for given, name in (
+        (options.paths, "PATH"), (options.db, "--db"), (options.queries, "--queries"),
+        (options.distractors, "--distractors"), (options.gap_m, "--gap-m"),
+    ):  # fmt: skip
+        if given:
+            raise DatasetError(
+                f"--7scenes takes database and queries from the splits of its scenes. Leave {name} "
+                "out, or name the scenes as PATHs."
+            )
+    folder: Path = options.seven_scenes
+    names = [name for name in PAPER if name not in ("average", "combine")]
+    found = [folder / name for name in names if (folder / name).is_dir()]
+    missing = [name for name in names if not (folder / name).is_dir()]
+    if not found:
+        raise DatasetError(
+            f"{folder}: There is no folder {', '.join(names[:-1])} or {names[-1]} here. Download "
+            "7-Scenes, unpack the archive of each scene and those of its sequences, and name the "
+            "folder that holds them."
+        )
+    if missing:
+        print(f"not in {folder}: {', '.join(missing)}", file=sys.stderr)
+    return found
 
 
 def _baselines(names: list[str] | None) -> tuple[str, ...]:
@@ -312,6 +368,7 @@ def _settings_of(options: argparse.Namespace, model: Model) -> dict[str, Any]:
         "version": __version__,
         "model_id": model.id,
         **asked,
+        "seven_scenes": None if options.seven_scenes is None else str(options.seven_scenes),
         "distractors": [str(path) for path in options.distractors],
     }
 

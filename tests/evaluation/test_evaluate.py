@@ -249,6 +249,87 @@ def test_the_table_of_several_scenes(
     assert "Combine" in out
 
 
+@pytest.fixture(scope="module")
+def seven_scenes(building: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenes laid out as in the official download: splits, a picture, no intrinsics.json."""
+    folder = tmp_path_factory.mktemp("7scenes")
+    for room, scene in (("room-000", "chess"), ("room-001", "redkitchen")):
+        for number, frames in ((1, range(0, 12, 3)), (2, range(1, 12, 6))):
+            own = folder / scene / f"seq-{number:02d}"
+            own.mkdir(parents=True)
+            for i in frames:
+                for end in ("depth.png", "pose.txt"):
+                    name = f"frame-{i:06d}.{end}"
+                    shutil.copyfile(building / room / "seq-01" / name, own / name)
+        (folder / scene / "TrainSplit.txt").write_text("sequence1\r\n")
+        (folder / scene / "TestSplit.txt").write_text("sequence2\r\n")
+        Image.new("RGB", (4, 4)).save(folder / scene / f"{scene}.png")
+    return folder
+
+
+def test_seven_scenes_beside_the_paper(
+    seven_scenes: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ("--7scenes", seven_scenes, "--model", model_file, "--jobs", 1)
+    found = evaluated(tmp_path, *asked)
+    assert found["counts"] == {"queries": 4, "database": 8, "left_out": 0}
+    assert found["settings"]["seven_scenes"] == str(seven_scenes)
+    shown, told = capsys.readouterr()
+    assert told.splitlines()[0] == f"not in {seven_scenes}: fire, heads, office, pumpkin, stairs"
+    _, _, table = shown.partition("7-Scenes, queries within 5 cm and 5 deg, %\n")
+    head, *lines = table.splitlines()
+    assert head.split() == ["R", "DR", "VDR", "average", "R,", "paper", "VDR,", "paper"]
+    rows = {name: cells for name, *cells in (line.split() for line in lines)}
+    assert list(rows) == ["chess", "redkitchen", "average", "combine"]
+    assert rows["chess"][4:] == ["97.3", "99.5"]
+    assert rows["redkitchen"][4:] == ["87.9", "93.7"]
+    assert rows["average"][4:] == ["84.8", "90.3"]
+    assert rows["combine"][4:] == ["84.8", "90.4"]
+    for name, figures in {**found["scenes"], "combine": found}.items():
+        for cell, row in zip(rows[name], ("R", "DR", "VDR", "pose_average"), strict=False):
+            assert float(cell) == pytest.approx(100 * figures[row]["within_5cm_5deg"], abs=0.05)
+    mean = np.mean([100 * each["VDR"]["within_5cm_5deg"] for each in found["scenes"].values()])
+    assert float(rows["average"][2]) == pytest.approx(mean, abs=0.05)
+
+
+def test_one_of_seven_scenes_is_no_average(
+    seven_scenes: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(seven_scenes / "chess", tmp_path / "own" / "chess")
+    asked = ["--7scenes", tmp_path / "own", "--model", model_file, "--jobs", 1]
+    assert main(["evaluate", *map(str, asked)]) == 0
+    _, _, table = capsys.readouterr().out.partition("7-Scenes, queries")
+    assert [line.split()[0] for line in table.splitlines()[2:]] == ["chess"]
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--db", "0:4"], "Leave --db out"),
+        (["elsewhere"], "Leave PATH out"),
+        (["--distractors", "elsewhere"], "Leave --distractors out"),
+    ],
+)
+def test_seven_scenes_have_splits_of_their_own(
+    more: list[str], message: str, seven_scenes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", *more, "--7scenes", str(seven_scenes)]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_seven_scenes_that_are_not_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", "--7scenes", str(tmp_path)]) == 2
+    assert "There is no folder chess, fire, heads" in capsys.readouterr().err
+    (tmp_path / "chess").mkdir()
+    (tmp_path / "chess" / "seq-01.zip").touch()  # not unpacked yet
+    assert main(["evaluate", "--7scenes", str(tmp_path)]) == 2
+    assert "chess" in capsys.readouterr().err.splitlines()[-1]
+    assert main(["evaluate"]) == 2
+    assert "Name a PATH, or --7scenes DIR" in capsys.readouterr().err
+
+
 def test_what_cannot_be_written_is_said_before_the_work(
     building: Path,
     model_file: Path,

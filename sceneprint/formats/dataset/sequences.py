@@ -99,7 +99,7 @@ def layout_of(files: list[str]) -> Layout | None:
 
 
 def references(
-    folder: Path, files: list[str], layout: Layout, name: str
+    folder: Path, files: list[str], layout: Layout, name: str, camera: Camera | None = None
 ) -> tuple[FrameReference, ...]:
     """Return the frames of a folder.
 
@@ -109,6 +109,7 @@ def references(
     files : names of the files to take, in order, as `list_folder` gives them
     layout : of the folder
     name : of the sequence; frames are named after it
+    camera : of a 7-Scenes sequence without an intrinsics.json; None where it needs one
 
     Raises
     ------
@@ -118,7 +119,7 @@ def references(
     InvalidPose : groundtruth.txt holds a line that is no pose.
     """
     if layout is Layout.SEVEN_SCENES:
-        frames = _seven_scenes(folder, files, name)
+        frames = _seven_scenes(folder, files, name, camera)
     elif layout is Layout.TUM:
         frames = _tum(folder, files, name)
     elif layout is Layout.CLOUDS:
@@ -148,8 +149,15 @@ def _numbered(folder: Path, frame: FrameReference, place: int) -> FrameReference
     )
 
 
-def _seven_scenes(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
-    camera, present, frames = find_camera(folder), set(files), []
+def _seven_scenes(
+    folder: Path, files: list[str], name: str, camera: Camera | None
+) -> tuple[FrameReference, ...]:
+    try:
+        camera = find_camera(folder)
+    except DatasetError:
+        if camera is None:
+            raise
+    present, frames = set(files), []
     for file in files:
         if SEVEN_SCENES.fullmatch(file):
             stem = file.removesuffix(".depth.png")
@@ -256,7 +264,7 @@ _COLOUR_FOLDERS = ("rgb", "color", "colour")
 
 
 def find_sequences(
-    path: Path | str, recording: RecordingOptions | None = None
+    path: Path | str, recording: RecordingOptions | None = None, camera: Camera | None = None
 ) -> tuple[FrameSequence, ...]:
     """Return the sequences at a path or up to 4 folders below it; no frame is read.
 
@@ -271,6 +279,7 @@ def find_sequences(
     ----------
     path : a folder or a file
     recording : what to take of a recording; default: what is found in it
+    camera : of 7-Scenes sequences without an intrinsics.json, which the official download lacks
 
     Returns
     -------
@@ -298,7 +307,7 @@ def find_sequences(
     walked = list(_walk(root))
     if any(layout is Layout.RECORDING for _, _, layout in walked):
         return _recordings(root, walked, recording or ros.RecordingOptions())
-    found = tuple(_sequence(*one, _name(one[0], root)) for one in walked)
+    found = tuple(_sequence(*one, _name(one[0], root), camera) for one in walked)
     if not found:
         raise DatasetError(
             f"{path}: There is no depth image or cloud here or up to {_DEPTH} folders below. Name "
@@ -472,8 +481,10 @@ def is_of_colour(folder: str) -> bool:
     return any(colour in name for colour in _COLOUR_FOLDERS)
 
 
-def _sequence(folder: Path, files: list[str], layout: Layout, name: str) -> FrameSequence:
-    return _sequence_of(folder, layout, name, references(folder, files, layout, name))
+def _sequence(
+    folder: Path, files: list[str], layout: Layout, name: str, camera: Camera | None = None
+) -> FrameSequence:
+    return _sequence_of(folder, layout, name, references(folder, files, layout, name, camera))
 
 
 def _sequence_of(
