@@ -17,7 +17,7 @@ export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
 	'import os; n = len(os.sched_getaffinity(0)); print(n + (n + 1) // 2)')
 
 .PHONY: help demo test pytest test-thorough test-postgres lint kernels format bench screenshots docs docs-serve soak siege \
-	fleet models lock sbom advisories clean
+	fleet models lock sbom advisories dist clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
@@ -35,6 +35,7 @@ help:
 	@echo "make models  train the presets that ship with the package (minutes)"
 	@echo "make lock    write requirements*.lock anew from pyproject.toml [UPGRADE=1 for the newest]"
 	@echo "make sbom    what the service and its image consist of, as CycloneDX, into out/"
+	@echo "make dist    wheels and source distributions of both packages, tried in an empty environment"
 	@echo "make advisories  known vulnerabilities of all locked packages; needs a network"
 
 $(STAMP): requirements-dev.lock pyproject.toml client/pyproject.toml
@@ -149,5 +150,18 @@ advisories: $(TOOLS)/.installed
 			--requirement requirements$$of.lock || failed=1; \
 	done; exit $${failed:-0}
 
+# The wheels are built from the source distributions: a file that these lack shows at once.
+dist: $(STAMP)
+	rm -rf dist
+	for of in client .; do (cd $$of && $(CURDIR)/$(BIN)/python -c \
+		'import sys; from setuptools.build_meta import build_sdist; build_sdist(sys.argv[1])' \
+		$(CURDIR)/dist > /dev/null) || exit 1; done
+	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist dist/*.tar.gz
+	$(PYTHON) -m venv dist/try
+	dist/try/bin/$(PIP) --require-hashes -r requirements.lock
+	dist/try/bin/$(PIP) --no-deps dist/*.whl
+	cd dist && try/bin/sceneprint demo --out demo
+	@rm -rf dist/try dist/demo && ls -l dist
+
 clean:
-	rm -rf $(VENV) build client/build out demo *.egg-info client/*.egg-info tools/javascript/node_modules
+	rm -rf $(VENV) build client/build dist out demo *.egg-info client/*.egg-info tools/javascript/node_modules

@@ -18,6 +18,7 @@ EDITED = [
     "docs/library.md",
     "docs/limits.md",
     "docs/security.md",
+    "docs/upgrading.md",
     "docs/trust.md",
     "docs/dashboard.md",
     "docs/api.md",

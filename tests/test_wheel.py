@@ -177,3 +177,32 @@ def test_another_processor_gets_code_of_its_own(installed: Path, tmp_path: Path)
     )
     assert run(program, installed, tmp_path) == "True"
     assert run(program, installed, tmp_path, NUMBA_CPU_NAME="generic") == "False"
+
+
+@pytest.mark.parametrize(
+    ("folder", "packages"),
+    [(".", ("sceneprint", "service", "worker", "migrations")), ("client", ("sceneprint_client",))],
+)
+def test_a_source_distribution_builds_the_whole_wheel(
+    folder: str, packages: tuple[str, ...], tmp_path: Path
+) -> None:
+    build = "import sys; from setuptools.build_meta import build_sdist; build_sdist(sys.argv[1])"
+    subprocess.run(
+        [sys.executable, "-c", build, str(tmp_path)], cwd=ROOT / folder, check=True,
+        capture_output=True,
+    )  # fmt: skip
+    (source,) = tmp_path.glob("*.tar.gz")
+    subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation",
+         "--wheel-dir", str(tmp_path), str(source)], check=True,
+    )  # fmt: skip
+    (wheel,) = tmp_path.glob("*.whl")
+    kept = subprocess.run(
+        ["git", "ls-files", "-z", *packages], cwd=ROOT / folder, check=True, capture_output=True,
+        text=True,
+    ).stdout.split("\0")[:-1]  # fmt: skip
+    with zipfile.ZipFile(wheel) as opened:
+        held = {name for name in opened.namelist() if not name.split("/")[0].endswith(".dist-info")}
+        assert held == set(kept)
+        for name in kept:
+            assert opened.read(name) == (ROOT / folder / name).read_bytes(), name
