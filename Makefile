@@ -12,9 +12,9 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 # Bytecode is kept: the tests start hundreds of processes, and each would parse our modules anew.
 unexport PYTHONDONTWRITEBYTECODE
-# Tests wait for real processes half of their time: half as many again as there are processors.
+# Tests wait for real processes half of their time: twice as many as there are processors.
 export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
-	'import os; n = len(os.sched_getaffinity(0)); print(n + (n + 1) // 2)')
+	'import os; print(2 * len(os.sched_getaffinity(0)))')
 
 .PHONY: help demo test pytest test-thorough test-postgres lint kernels format bench screenshots docs docs-serve soak siege \
 	fleet models lock sbom advisories dist clean

@@ -58,6 +58,10 @@ class Holdings:
         """Whether a tenant may hold so much more."""
         return tenant == NOBODY or self._held[tenant] + amount <= share(room)
 
+    def by_tenant(self) -> dict[str, int]:
+        """What each tenant holds that holds anything."""
+        return {tenant: self._held[tenant] for tenant in list(self._held)}
+
     def give(self, tenant: str, amount: int) -> None:
         """Take back from a tenant what it held."""
         self._held[tenant] -= amount
@@ -410,6 +414,10 @@ class Spool:
     def give(self, tenant: str, size: int) -> None:
         """Take them off its account: they are removed."""
         self._held.give(tenant, size)
+
+    def by_tenant(self) -> dict[str, int]:
+        """Bytes on disk of each tenant that has any."""
+        return self._held.by_tenant()
 
     def _room(self) -> int:
         """Bytes that all bodies together may have."""

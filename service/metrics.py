@@ -14,7 +14,7 @@ import platform
 import socket
 import threading
 from collections import Counter as Tally
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from typing import Any
 
@@ -27,6 +27,7 @@ from sceneprint.engine.admin.statistics import SERVICE, Figures, Latencies
 from sceneprint.errors import SceneprintError
 from sceneprint.store import Database
 from sceneprint.store.store_counts import add_sample
+from sceneprint.store.tenants import NOBODY
 from sceneprint_client.api import Answer, FrameState, JobState
 from sceneprint_client.api.admin import ReplicaSeen
 
@@ -118,6 +119,51 @@ EVENTS = "/v1/events"
 _SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 #: Maps whose indexes have series of their own: those with the longest tails.
 MOST_MAPS = 20
+#: Tenants with series of their own: the first that a process meets. All others are one, under a
+#: name that no tenant can have.
+MOST_TENANTS, OTHERS = 50, "(others)"
+
+
+class TenantMetrics:
+    """What the tenants of keys ask of one service process, and have waiting in the store."""
+
+    def __init__(self, registry: CollectorRegistry) -> None:
+        self._requests = Counter(
+            "sceneprint_tenant_requests", "Requests answered, of the tenants of keys.",
+            ("tenant", "status"), registry=registry,
+        )  # fmt: skip
+        self._seconds = Counter(
+            "sceneprint_tenant_request_seconds", "Time that their requests took, but for streams.",
+            ("tenant",), registry=registry,
+        )  # fmt: skip
+        self._now = {
+            name: Gauge(f"sceneprint_tenant_{name}", text, ("tenant",), registry=registry)
+            for name, text in (
+                ("requests_in_progress", "Requests that are being answered."),
+                ("spool_bytes", "Bodies of requests on disk."),
+                ("waiting_jobs", "Jobs that wait for a worker."),
+            )
+        }
+        self._named: set[str] = set()
+
+    def request(self, tenant: str, status: int, seconds: float) -> None:
+        """Count a request."""
+        name = self._name(tenant)
+        self._requests.labels(name, str(status)).inc()
+        self._seconds.labels(name).inc(seconds)
+
+    def tell(self, *now: Mapping[str, int]) -> None:
+        """Requests in progress, bytes on disk and jobs that wait, by tenant; NOBODY is left out."""
+        for gauge, by_tenant in zip(self._now.values(), now, strict=True):
+            gauge.clear()  # what a tenant no longer has
+            for tenant, number in by_tenant.items():
+                if tenant != NOBODY:
+                    gauge.labels(self._name(tenant)).inc(number)
+
+    def _name(self, tenant: str) -> str:
+        if tenant not in self._named and len(self._named) < MOST_TENANTS:
+            self._named.add(tenant)
+        return tenant if tenant in self._named else OTHERS
 
 
 class Metrics:
@@ -151,6 +197,7 @@ class Metrics:
             registry=self.registry,
         )  # fmt: skip
         self._told_lost = 0
+        self._by_tenant = TenantMetrics(self.registry)
         self._streams = self._gauge("event_streams", "Streams of events that are open.")
         self._frames = self._gauge("frames", "Frames in each state.", "state")
         self._jobs = self._gauge("jobs", "Jobs in each state.", "state")
@@ -183,10 +230,13 @@ class Metrics:
         return Gauge(f"sceneprint_{name}", text, labels, registry=self.registry)
 
     def request(
-        self, method: str, route: str, status: int, seconds: float, received: int = 0
-    ) -> None:
+        self, method: str, route: str, status: int, seconds: float, received: int = 0,
+        tenant: str = NOBODY,
+    ) -> None:  # fmt: skip
         """Count a request; `route` is a pattern, so that series stay few."""
         self._requests.labels(method, route, str(status)).inc()
+        if tenant != NOBODY:
+            self._by_tenant.request(tenant, status, 0.0 if route == EVENTS else seconds)
         if received:
             self._received.labels(route).inc(received)
         if route != EVENTS:  # a stream takes as long as somebody listens
@@ -211,7 +261,10 @@ class Metrics:
         used.set(seen.used)
         behind.set(math.inf if seen.behind_s is None else seen.behind_s)
 
-    def text(self, figures: Figures, streams: int, lost: int) -> bytes:
+    def text(
+        self, figures: Figures, streams: int, lost: int, held: Mapping[str, int],
+        spool: Mapping[str, int],
+    ) -> bytes:  # fmt: skip
         """All figures in Prometheus' text format.
 
         Parameters
@@ -219,7 +272,9 @@ class Metrics:
         figures : of the store
         streams : of events that are open
         lost : records of queries since this process began
+        held, spool : requests in progress, and bytes of bodies on disk, by tenant
         """
+        self._by_tenant.tell(held, spool, figures.waiting)
         self._lost.inc(lost - self._told_lost)
         self._told_lost = lost
         stats, workers = figures.stats, figures.stats.workers or []

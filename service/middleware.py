@@ -170,7 +170,8 @@ class RequestMiddleware:
         if scope["path"].startswith("/v1/") and not route.startswith(("/v1", "other")):
             route = f"/v1{route}"  # a router's own pattern lacks the prefix it is mounted under
         method = scope["method"] if scope["method"] in _METHODS else "other"
-        self._metrics.request(method, route, status, seconds, received)
+        tenant = scope["state"].get("tenant", NOBODY)
+        self._metrics.request(method, route, status, seconds, received, tenant)
         if status in (401, 403):
             self._note_refusal(scope, request_id, status)
         name_span(

@@ -195,6 +195,12 @@ def count_jobs(connection: Connection, map_number: int | None = None) -> dict[st
     return {row[0]: row[1] for row in connection.execute(asked)}
 
 
+def waiting_by_tenant(connection: Connection) -> dict[str, int]:
+    """How many jobs of each tenant wait; of none that has none."""
+    asked = select(jobs.c.tenant, func.count()).where(jobs.c.state == JobState.QUEUED)
+    return {row[0]: row[1] for row in connection.execute(asked.group_by(jobs.c.tenant))}
+
+
 # The clock by which leases end and jobs are due: of the database, as those of its hosts differ.
 #
 # A SQLite file has one host, and so one clock.

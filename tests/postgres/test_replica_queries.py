@@ -114,13 +114,13 @@ def test_queries_are_answered_from_the_replica_as_from_the_database(
     assert seen.used
     assert seen.behind_s is not None
     figures = engine.operations.statistics.figures()
-    told, counted = Metrics().text(figures, 0, 0).decode(), Metrics()
+    told, counted = Metrics().text(figures, 0, 0, {}, {}).decode(), Metrics()
     without = replace(figures, stats=figures.stats.model_copy(update={"replica": None}))
     assert "sceneprint_replica_used 1.0" in told
-    assert "sceneprint_replica" not in counted.text(without, 0, 0).decode()
+    assert "sceneprint_replica" not in counted.text(without, 0, 0, {}, {}).decode()
     unused = ReplicaSeen(used=False, behind_s=None)
     away = replace(figures, stats=figures.stats.model_copy(update={"replica": unused}))
     for _ in range(2):
-        told = counted.text(away, 0, 0).decode()
+        told = counted.text(away, 0, 0, {}, {}).decode()
         assert "sceneprint_replica_used 0.0" in told
         assert "sceneprint_replica_behind_seconds +Inf" in told

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import socket
 from contextlib import ExitStack
 
 import httpx
 import pytest
+from prometheus_client import CollectorRegistry, generate_latest
 from sqlalchemy import select
 
 from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import create_tenant
 from sceneprint.errors import RateLimited
 from sceneprint.settings import Settings
+from sceneprint.store.queue import enqueue, waiting_by_tenant
 from sceneprint.store.tables import jobs
+from sceneprint.store.tenants import NOBODY, work_of
 from service.limits import IN_MEMORY, Broken, Holdings, RequestBody, Spool, Turns, share
+from service.metrics import MOST_TENANTS, TenantMetrics
 
 
 class Clock:
@@ -194,3 +199,48 @@ def test_a_body_is_charged_before_it_is_written_and_given_back():
     spool.require_room("b", 7 << 20)
     first.close()
     spool.require_room("a", 7 << 20)
+
+
+def test_metrics_tell_tenants_apart(shared, until):
+    assert shared.ask("one", "GET", "/v1/keys/me").status_code == 200
+    assert shared.ask("two", "GET", "/v1/maps/nowhere").status_code == 404
+    noisy = 'tenant="noisy"'
+    with (
+        Engine(Settings(data_dir=shared.server.folder, database_url=None)) as engine,
+        engine.store.database.write() as connection, work_of("noisy"),
+    ):  # fmt: skip
+        waiting = waiting_by_tenant(connection).get("noisy", 0)
+        for _ in range(3):
+            enqueue(connection, "purge", None)
+
+    def series(name: str) -> dict[str, float]:
+        found = shared.ask("victim", "GET", "/metrics").text
+        pattern = rf"^sceneprint_tenant_{name}{{(.*)}} (.*)$"
+        return {one[0]: float(one[1]) for one in re.findall(pattern, found, re.MULTILINE)}
+
+    before = series("requests_total")
+    assert before['status="404",tenant="noisy"'] >= 1
+    assert shared.ask("two", "GET", "/v1/keys/me").status_code == 200
+    assert shared.server.client.get("/v1/maps").status_code == 401  # of nobody
+    after = series("requests_total")
+    assert after['status="200",tenant="noisy"'] == before['status="200",tenant="noisy"'] + 1
+    assert {re.search('tenant="(.*)"', name)[1] for name in after} == {"noisy", "victim"}
+    assert series("request_seconds_total")['tenant="noisy"'] > 0
+    assert series("requests_in_progress") == {'tenant="victim"': 1.0}  # the one that asks
+    assert series("spool_bytes") == {}
+    until(lambda: series("waiting_jobs").get(noisy, 0.0) == waiting + 3)  # seen each second
+
+
+def test_series_of_tenants_stay_few():
+    registry = CollectorRegistry()
+    told = TenantMetrics(registry)
+    for number in range(MOST_TENANTS + 5):
+        told.request(f"t{number}", 200, 0.5)
+    told.tell({"t0": 2, "t51": 3, "t52": 4, NOBODY: 9}, {}, {})
+    text = generate_latest(registry).decode()
+    assert text.count("sceneprint_tenant_requests_total{") == MOST_TENANTS + 1
+    assert 'sceneprint_tenant_requests_total{status="200",tenant="(others)"} 5.0' in text
+    assert 'sceneprint_tenant_requests_in_progress{tenant="t0"} 2.0' in text
+    assert 'sceneprint_tenant_requests_in_progress{tenant="(others)"} 7.0' in text
+    told.tell({}, {}, {})
+    assert "requests_in_progress{" not in generate_latest(registry).decode()

@@ -28,7 +28,7 @@ from sceneprint.store import Blobs, Database, FolderBlobs, Store, frame_queries,
 from sceneprint.store.events import anchor_number, newest_number
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import find_map, list_maps
-from sceneprint.store.queue import count_jobs, read_clock
+from sceneprint.store.queue import count_jobs, read_clock, waiting_by_tenant
 from sceneprint.store.scrub_rows import ScrubRow, read_scrub
 from sceneprint.store.signatures import count_indexed
 from sceneprint.store.tables import MapRow
@@ -285,13 +285,14 @@ SERVICE, WORKER = "service", "worker"
 
 @dataclass(frozen=True)
 class Figures:
-    """How the whole store is: its statistics, workers that began in the last hour, and the number
-    of the newest event.
+    """How the whole store is: its statistics, workers that began in the last hour, the number of
+    the newest event, and the jobs that wait by tenant.
     """
 
     stats: Stats
     began: int
     events: int
+    waiting: Mapping[str, int]
 
 
 class Statistics:
@@ -386,7 +387,8 @@ class Statistics:
         stats = self.tell(minutes=1)
         with self._store.database.read() as connection:
             began = store_counts.count_samples(connection, WORKER, time.time() - HOUR_S)
-            return Figures(stats, began, newest_number(connection))
+            waiting = waiting_by_tenant(connection)
+            return Figures(stats, began, newest_number(connection), waiting)
 
     def workers(self, connection: Connection) -> list[WorkerSeen]:
         """Processes that wait for jobs, with SQLite on this machine, and those that have one."""
