@@ -19,6 +19,8 @@ EDITED = [
     "docs/limits.md",
     "docs/security.md",
     "docs/upgrading.md",
+    "docs/operations.md",
+    "docs/deployment.md",
     "docs/trust.md",
     "docs/dashboard.md",
     "docs/api.md",
