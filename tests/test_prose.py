@@ -21,6 +21,7 @@ EDITED = [
     "docs/upgrading.md",
     "docs/operations.md",
     "docs/deployment.md",
+    "docs/reliability.md",
     "docs/trust.md",
     "docs/dashboard.md",
     "docs/api.md",
