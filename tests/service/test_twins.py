@@ -20,11 +20,15 @@ from sceneprint_client.api.admin import Scope
 KEYS: dict[str, dict[str, Scope]] = {
     "boss": {"*": "admin"}, "admin": {"alpha": "admin"}, "reader": {"alpha": "read"},
 }  # fmt: skip
-#: Ids and seals; times; how long something took, and in which minutes it was.
-CHANCE = re.compile(r"\b[0-9a-f]{32}(?:[0-9a-f]{16})?\b")
+#: Ids and seals, the beginnings of ids in names of files, and cursors; times; how long something
+#: took, and in which minutes it was.
+CHANCE = re.compile(
+    r'\b[0-9a-f]{32}(?:[0-9a-f]{16})?\b|(?<=[-"])[0-9a-f]{12}(?=[-.])'
+    r'|(?<="next_cursor":")[0-9a-f]{64}(?=")'
+)
 TIMES = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|\+00:00)")
 TOOK = re.compile(
-    r'"milliseconds":{[^}]*}|"oldest_waiting_s":[\d.e-]+|"(minutes|buckets)":\[[^]]*\]'
+    r'"milliseconds":(?:{[^}]*}|[\d.e-]+)|"oldest_waiting_s":[\d.e-]+|"(minutes|buckets)":\[[^]]*\]'
 )
 OWN_HEADERS = ("date", "x-request-id", "content-length")
 
@@ -47,7 +51,10 @@ class Twin:
     sent: int = 0
 
     def ask(self, key: str, method: str, path: str, **request: Any) -> Any:
-        return self.house.ask(key, method, path, **request)
+        answer = self.house.ask(key, method, path, **request)
+        # records of queries are written when there is time, and their events tell when that was
+        assert self.house.engine.history.flush(60)
+        return answer
 
     def disturb(self) -> None:
         """What would show, if anything of it did: rows of every table that others number too."""
