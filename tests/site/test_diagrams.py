@@ -132,8 +132,8 @@ def test_figures_of_the_pages_are_whole_and_nothing_overlaps(page: str, text: st
     assert picture.findtext(f"{svg}title") == diagram.title
 
 
-def test_four_figures_are_drawn() -> None:
-    assert [page for page, _ in FIGURES] == ["architecture.md"] * 3 + ["trust.md"]
+def test_which_figures_are_drawn() -> None:
+    assert [page for page, _ in FIGURES] == ["architecture.md"] * 3 + ["deployment.md", "trust.md"]
 
 
 def test_an_arrow_ends_at_the_border_of_its_node() -> None:

@@ -109,7 +109,7 @@ def test_nothing_is_loaded_from_another_host(site: Path, read: dict[Path, PageRe
 
 def test_figures_are_drawn_while_the_site_is_built(read: dict[Path, PageReader]) -> None:
     texts = [path.read_text() for path in read]
-    assert sum(text.count('<figure class="diagram"') for text in texts) == 4
+    assert sum(text.count('<figure class="diagram"') for text in texts) == 5
     assert not any('class="mermaid"' in text for text in texts)
 
 
