@@ -322,7 +322,7 @@ def _described_import() -> dict[str, Any]:
 
 
 @imports_router.post(
-    "", status_code=202, responses=declared(400, 404, 413, 415, 422),
+    "", status_code=202, responses=declared(400, 404, 409, 413, 415, 422),
     openapi_extra=_described_import(),
     dependencies=[Depends(may_write)],
 )  # fmt: skip

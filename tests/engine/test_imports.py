@@ -18,7 +18,7 @@ from sceneprint.engine.ingest import uploads as uploading
 from sceneprint.engine.jobs.lifecycle import cancel, list_jobs
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
-from sceneprint.errors import LostLease, UnknownMap, UnusableStore
+from sceneprint.errors import Conflict, LostLease, UnknownMap
 from sceneprint.formats.archive import Archive
 from sceneprint.store.queue import files_of
 from sceneprint.store.tables import jobs
@@ -196,7 +196,7 @@ def test_an_archive_that_was_swept_before_its_job_was_there_is_not_acknowledged(
         receiver.write(packed(uploads[:1]))
         archive = receiver.end()
     collect_blobs(empty.store, [archive.blob])  # an import of the same archive ends at this moment
-    with pytest.raises(UnusableStore, match="Send the archive again"):
+    with pytest.raises(Conflict, match="Send the archive again"):
         empty.imports.begin("hall", archive, ImportOptions())
     assert list(list_jobs(empty.store).items) == []
 

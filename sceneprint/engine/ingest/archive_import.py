@@ -246,13 +246,16 @@ class Imports:
         Raises
         ------
         UnknownMap, IdempotencyConflict : see `Tasks.begin`; the archive is removed.
-        UnusableStore : an import of the same archive has just ended, and removed it.
+        Conflict : an import of the same archive has just ended, and removed it.
         """
         data = options.model_dump(mode="json")
         try:
             job, again = self._tasks.begin(KIND, map_name, data, options.priority, [archive], once)
         except Swept as error:
-            raise errors.UnusableStore(f"{error} Send the archive again.") from error
+            raise errors.Conflict(
+                "An import of the same archive ended while this one was received, and its bytes "
+                "were removed with it. Send the archive again."
+            ) from error
         except errors.SceneprintError:
             collect_deleted_blobs(self._store, [archive.blob])
             raise
