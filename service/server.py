@@ -402,6 +402,9 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     server = _Server(config, lambda: ready(url, read_only), lambda: _close_feed(app))
     try:
         server.run(sockets=[listening])
+    except KeyboardInterrupt:  # uvicorn raises the signal again by which `Front` stopped it
+        if app.error is None:
+            raise
     finally:
         gc.enable()
     if app.error is not None:

@@ -56,7 +56,7 @@ def add_migrate(commands: Any) -> None:
     command.add_argument(
         "--check",
         action="store_true",
-        help="change nothing; exit code 1 if the schema is not this version's",
+        help="change nothing; exit code 1 if the schema must first be created or upgraded",
     )
     command.set_defaults(run=run_migrate)
 

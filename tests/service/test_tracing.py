@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import os
 import subprocess
 import sys
 import threading
@@ -145,16 +146,23 @@ def test_a_collector_that_is_away_costs_no_answer(begin, make_map, shots, collec
 WITHOUT = """
 import sys
 sys.modules["opentelemetry.sdk.resources"] = None
-from sceneprint.tracing import tracing
-with tracing("http://127.0.0.1:1", "test", "0"):
-    pass
+from service.__main__ import main
+sys.exit(main())
 """
 
 
-def test_without_opentelemetry_it_says_what_to_install():
-    done = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "pip install 'sceneprint[traces]'" in done.stderr
+def test_a_service_without_opentelemetry_ends_and_says_what_to_install(tmp_path):
+    settings = {
+        "SCENEPRINT_DATA_DIR": f"{tmp_path}", "SCENEPRINT_PORT": "0",
+        "SCENEPRINT_TRACES_URL": "http://127.0.0.1:1",
+    }  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT], env=os.environ | settings, capture_output=True, text=True,
+        timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 2  # found only once it listens
+    (line,) = [one for one in done.stderr.splitlines() if one.startswith("service: ")]
+    assert "pip install 'sceneprint[traces]'" in line
 
 
 def test_nothing_of_it_is_loaded_unless_asked():
