@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import unquote, urlsplit
@@ -156,6 +157,13 @@ class Settings(BaseSettings):
     def _holds_objects(cls, given: SecretStr | str | None) -> SecretStr | str | None:
         if given is not None:
             _require_objects(given if isinstance(given, str) else given.get_secret_value())
+        return given
+
+    @field_validator("traces_url")
+    @classmethod
+    def _can_trace(cls, given: str | None) -> str | None:
+        if given is not None and find_spec("opentelemetry") is None:
+            raise ValueError("it needs OpenTelemetry: run `pip install 'sceneprint[traces]'`")
         return given
 
     @field_validator("cors_origins", mode="before")

@@ -10,17 +10,15 @@ that queued it, so that an upload and its signing are one trace over processes a
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from sceneprint.errors import InvalidRequest
-
 if TYPE_CHECKING:
-    from opentelemetry.trace import Span, Tracer
+    from opentelemetry.trace import Tracer
 
-#: What an attribute may hold.
-Attribute = str | int | float | bool
+#: Attributes of a span, by OpenTelemetry's names, such as `http.route`.
+Attributes = Mapping[str, str | int]
 #: Milliseconds between two messages to the collector, and for one of them at most.
 EVERY_MS, TIMEOUT_MS = 2000, 5000
 
@@ -37,25 +35,16 @@ def tracing(url: str | None, process: str, version: str) -> Iterator[None]:
     ----------
     url : of a collector that speaks OTLP over HTTP, such as http://127.0.0.1:4318; None for none
     process, version : what spans say of this process
-
-    Raises
-    ------
-    InvalidRequest : OpenTelemetry is not installed.
     """
     global _tracer  # one for each process, as that of OpenTelemetry is
     if url is None:
         yield
         return
-    try:
-        from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
-        from opentelemetry.sdk.resources import Resource
-        from opentelemetry.sdk.trace import TracerProvider
-        from opentelemetry.sdk.trace.export import BatchSpanProcessor
-    except ImportError as error:
-        raise InvalidRequest(
-            f"SCENEPRINT_TRACES_URL is set, but {error.name} is not installed. Run `pip install "
-            "'sceneprint[traces]'`, or unset it."
-        ) from None
+    from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+    from opentelemetry.sdk.resources import Resource
+    from opentelemetry.sdk.trace import TracerProvider
+    from opentelemetry.sdk.trace.export import BatchSpanProcessor
+
     exporter = OTLPSpanExporter(f"{url.rstrip('/')}/v1/traces", timeout=TIMEOUT_MS / 1e3)
     about = {"service.name": process, "service.version": version}
     provider = TracerProvider(resource=Resource.create(about), shutdown_on_exit=False)
@@ -74,47 +63,40 @@ def tracing(url: str | None, process: str, version: str) -> Iterator[None]:
 
 @contextmanager
 def span(
-    name: str, parent: str | None = None, kind: str = "INTERNAL", **attributes: Attribute
-) -> Iterator[Span | None]:
-    """A span of what is done meanwhile, below the current one; None where nothing is traced.
+    name: str,
+    parent: str | None = None,
+    kind: str = "INTERNAL",
+    attributes: Attributes | None = None,
+) -> Iterator[None]:
+    """A span of what is done meanwhile, below the current one; nothing where nothing is traced.
 
     Parameters
     ----------
     name : short, of few kinds
-    parent : `traceparent` of another process; what is none is passed over
+    parent : `traceparent` of another process; an invalid one is ignored
     kind : of OpenTelemetry: SERVER, CONSUMER or INTERNAL
-    attributes : of the span; in their names _ stands for a dot, and __ for _
+    attributes : of the span
     """
     if _tracer is None:
-        yield None
+        yield
         return
     from opentelemetry.trace import SpanKind
     from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
     given = None if parent is None else {"traceparent": parent}
     context = None if given is None else TraceContextTextMapPropagator().extract(given)
-    with _tracer.start_as_current_span(
-        name, context, SpanKind[kind],
-        attributes=_dotted(attributes),
-    ) as made:  # fmt: skip
-        yield made
+    with _tracer.start_as_current_span(name, context, SpanKind[kind], attributes):
+        yield
 
 
-def name_span(name: str, **attributes: Attribute) -> None:
-    """Name the current span anew, and describe it: see `span`."""
+def name_span(name: str, attributes: Attributes) -> None:
+    """Rename and describe the current span: a request's route is known only at its end."""
     if _tracer is not None:
         from opentelemetry.trace import get_current_span
 
         current = get_current_span()
         current.update_name(name)
-        current.set_attributes(_dotted(attributes))
-
-
-def _dotted(attributes: dict[str, Attribute]) -> dict[str, Attribute]:
-    return {
-        name.replace("__", "\0").replace("_", ".").replace("\0", "_"): value
-        for name, value in attributes.items()
-    }
+        current.set_attributes(attributes)
 
 
 def record_span(name: str, seconds: float) -> None:

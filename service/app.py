@@ -178,12 +178,6 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        with tracing(settings.traces_url, "sceneprint-service", __version__):
-            async with serving(app):
-                yield
-
-    @asynccontextmanager
-    async def serving(app: FastAPI) -> AsyncIterator[None]:
         engine = await to_thread.run_sync(Engine, settings)
         try:
             gate = Gate(settings.concurrency, settings.waiting, settings.wait_s)
@@ -201,7 +195,8 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
             loading = warming(engine) if warm else nullcontext()
             app.state.refusals = RefusalFilter()
             async with housekeeping(engine, figures.sampler), loading:
-                yield
+                with tracing(settings.traces_url, "sceneprint-service", __version__):
+                    yield
             feed.close()
         finally:
             await to_thread.run_sync(engine.close)

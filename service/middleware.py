@@ -174,10 +174,11 @@ class RequestMiddleware:
         self._metrics.request(method, route, status, seconds, received, tenant)
         if status in (401, 403):
             self._note_refusal(scope, request_id, status)
-        name_span(
-            f"{method} {route}", http_request_method=method, http_route=route,
-            http_response_status__code=status, sceneprint_request=request_id,
-        )  # fmt: skip
+        about: dict[str, str | int] = {
+            "http.request.method": method, "http.route": route,
+            "http.response.status_code": status, "sceneprint.request": request_id,
+        }  # fmt: skip
+        name_span(f"{method} {route}", about)
         level = logging.DEBUG if route in _PROBES else logging.INFO
         log.log(
             level,

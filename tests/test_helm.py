@@ -115,6 +115,19 @@ def test_values_that_cannot_work_are_refused(
     assert message in error
 
 
+@pytest.mark.parametrize(
+    "url",
+    [
+        "postgresql+psycopg://sceneprint@/x?host=a:5432&host=b:5432&target_session_attrs=read-write",
+        "postgresql://database:5432/x",
+    ],
+)
+def test_urls_without_a_password_are_taken(url: str, tmp_path: Path) -> None:
+    objects = rendered(REQUIRED | {"database": {"url": url}}, tmp_path)
+    pod = objects["Job", "fleet-migration"]["spec"]["template"]["spec"]
+    assert environment(pod["containers"][0])["SCENEPRINT_DATABASE_URL"] == url
+
+
 def test_pods_run_our_commands_with_our_settings(tmp_path: Path) -> None:
     known = {f"SCENEPRINT_{name.upper()}" for name in Settings.model_fields} | {"AWS_REGION"}
     objects = rendered(ALL, tmp_path)

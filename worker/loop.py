@@ -136,7 +136,12 @@ class Worker:
         seconds = self._engine.tasks.longest_s(held.kind, usual_s)
         with (
             of_request(asked.get("request_id")),
-            span(f"job {held.kind}", asked.get("traceparent"), "CONSUMER", sceneprint_job=held.id),
+            span(
+                f"job {held.kind}",
+                asked.get("traceparent"),
+                "CONSUMER",
+                {"sceneprint.job": held.id},
+            ),
             self._trace.job(held.id, held.token, seconds),
         ):
             self._engine.run(claimed, self._break)

@@ -19,7 +19,6 @@ from sceneprint.cli.bag import add_recording_options, sequences_at
 from sceneprint.cli.options import add_judging_options, add_model_options, open_for
 from sceneprint.errors import DatasetError
 from sceneprint.settings import Settings
-from sceneprint.types import Intrinsics
 from sceneprint_client.sidecars import Camera
 
 if TYPE_CHECKING:
@@ -27,9 +26,6 @@ if TYPE_CHECKING:
     from sceneprint.models import Model
 
 T = TypeVar("T")
-
-#: The camera that the page of 7-Scenes tells for its depth images; the download has no file of it.
-_KINECT = Camera(Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0))
 
 _EXAMPLES = """\
 frames are counted from 0 over all sequences of a PATH, in order; STOP is not included:
@@ -264,11 +260,13 @@ def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
     from sceneprint.lab.evaluation.protocol import PathRanges, choose, parse_part, parse_ranges
 
     if options.seven_scenes is not None:
+        from sceneprint.lab.synth import KINECT  # the camera of 7-Scenes, by its page
+
         return choose(
             [PathRanges(scene) for scene in _seven_scenes(options)],
             database_step=options.db_step,
             query_step=options.query_step,
-            find=partial(sequences_at, options=options, camera=_KINECT),
+            find=partial(sequences_at, options=options, camera=Camera(KINECT)),
         )
     if not options.paths:
         raise DatasetError("There is nothing to evaluate. Name a PATH, or --7scenes DIR.")
@@ -310,9 +308,9 @@ def _seven_scenes(options: argparse.Namespace) -> list[Path]:
                 "out, or name the scenes as PATHs."
             )
     folder: Path = options.seven_scenes
-    names = [name for name in PAPER if name not in ("average", "combine")]
+    names = list(PAPER)
     found = [folder / name for name in names if (folder / name).is_dir()]
-    missing = [name for name in names if not (folder / name).is_dir()]
+    missing = [name for name in names if folder / name not in found]
     if not found:
         raise DatasetError(
             f"{folder}: There is no folder {', '.join(names[:-1])} or {names[-1]} here. Download "

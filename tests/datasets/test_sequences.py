@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.errors import DatasetError, InvalidPose, UnreadableFrame
+from sceneprint.errors import DatasetError, InvalidIntrinsics, InvalidPose, UnreadableFrame
 from sceneprint.formats.dataset import (
     Camera,
     FrameSequence,
@@ -65,6 +65,16 @@ def test_a_scene(kitchen: Path) -> None:
     np.testing.assert_array_equal(frame.pose, pose_at(1))
     assert frame.name == "seq-02/frame-000001"
     assert found[1].frames[1].timestamp is None
+
+
+def test_a_camera_that_is_given_stands_in_for_a_missing_one_alone(kitchen: Path) -> None:
+    given = Camera(Intrinsics(8, 6, 7.0, 7.0, 4.0, 3.0))
+    assert {f.camera for s in find_sequences(kitchen, camera=given) for f in s.frames} == {CAMERA}
+    (kitchen / "intrinsics.json").unlink()
+    assert {f.camera for s in find_sequences(kitchen, camera=given) for f in s.frames} == {given}
+    (kitchen / "intrinsics.json").write_text("{}")
+    with pytest.raises(InvalidIntrinsics):
+        find_sequences(kitchen, camera=given)
 
 
 def test_a_folder_of_scenes(kitchen: Path) -> None:

@@ -307,6 +307,8 @@ def test_one_of_seven_scenes_is_no_average(
     [
         (["--db", "0:4"], "Leave --db out"),
         (["elsewhere"], "Leave PATH out"),
+        (["--queries", "0:4"], "Leave --queries out"),
+        (["--gap-m", "3"], "Leave --gap-m out"),
         (["--distractors", "elsewhere"], "Leave --distractors out"),
     ],
 )

@@ -191,6 +191,7 @@ def test_a_body_is_charged_before_it_is_written_and_given_back():
     with pytest.raises(RateLimited, match="more than 6 MiB of the service's temporary folder"):
         spool.require_room("a", (7 << 20) + 1)
     asyncio.run(read(first, 12))  # six more on disk
+    assert spool.by_tenant() == {"a": 6 << 20}
     with pytest.raises(Broken):
         asyncio.run(read(first, 1))
     assert isinstance(first.fault, RateLimited)
@@ -242,5 +243,9 @@ def test_series_of_tenants_stay_few():
     assert 'sceneprint_tenant_requests_total{status="200",tenant="(others)"} 5.0' in text
     assert 'sceneprint_tenant_requests_in_progress{tenant="t0"} 2.0' in text
     assert 'sceneprint_tenant_requests_in_progress{tenant="(others)"} 7.0' in text
+    told.tell({}, {"t1": 5}, {"t2": 6})
+    text = generate_latest(registry).decode()
+    assert 'sceneprint_tenant_spool_bytes{tenant="t1"} 5.0' in text
+    assert 'sceneprint_tenant_waiting_jobs{tenant="t2"} 6.0' in text
     told.tell({}, {}, {})
     assert "requests_in_progress{" not in generate_latest(registry).decode()

@@ -143,32 +143,27 @@ def test_a_collector_that_is_away_costs_no_answer(begin, make_map, shots, collec
     assert server.end(15) == 0
 
 
-WITHOUT = """
-import sys
-sys.modules["opentelemetry.sdk.resources"] = None
-from service.__main__ import main
-sys.exit(main())
-"""
-
-
-def test_a_service_without_opentelemetry_ends_and_says_what_to_install(tmp_path):
-    settings = {
-        "SCENEPRINT_DATA_DIR": f"{tmp_path}", "SCENEPRINT_PORT": "0",
-        "SCENEPRINT_TRACES_URL": "http://127.0.0.1:1",
-    }  # fmt: skip
+@pytest.mark.parametrize("package", ["service", "worker"])
+def test_without_opentelemetry_nothing_starts_and_it_says_what_to_install(package, tmp_path):
+    code = (
+        "import sys; sys.modules['opentelemetry'] = None; "
+        f"from {package}.__main__ import main; sys.exit(main())"
+    )
+    settings = {"SCENEPRINT_DATA_DIR": f"{tmp_path}", "SCENEPRINT_TRACES_URL": "http://127.0.0.1:1"}
     done = subprocess.run(
-        [sys.executable, "-c", WITHOUT], env=os.environ | settings, capture_output=True, text=True,
+        [sys.executable, "-c", code], env=os.environ | settings, capture_output=True, text=True,
         timeout=120,
     )  # fmt: skip
-    assert done.returncode == 2  # found only once it listens
-    (line,) = [one for one in done.stderr.splitlines() if one.startswith("service: ")]
+    (line,) = done.stderr.splitlines()
+    assert (done.returncode, done.stdout) == (2, "")
     assert "pip install 'sceneprint[traces]'" in line
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_nothing_of_it_is_loaded_unless_asked():
     code = (
         "import sys, sceneprint.tracing as t\n"
-        "with t.span('x', 'y'): t.record_span('z', 1.0); t.name_span('n', a=1)\n"
+        "with t.span('x', 'y'): t.record_span('z', 1.0); t.name_span('n', {'a': 1})\n"
         "assert t.traceparent() is None\n"
         "assert not [name for name in sys.modules if name.startswith('opentelemetry')]"
     )

@@ -29,13 +29,13 @@ helm.sh/chart: {{ printf "%s-%s" .root.Chart.Name .root.Chart.Version }}
 {{/* The environment of every pod; no ConfigMap, as the migration runs before one would be there. */}}
 {{- define "sceneprint.env" -}}
 - name: SCENEPRINT_DATABASE_URL
-  value: {{ required "set database.url" .Values.database.url | quote }}
+  value: {{ .Values.database.url | quote }}
 {{- with .Values.database.replicaUrl }}
 - name: SCENEPRINT_REPLICA_URL
   value: {{ . | quote }}
 {{- end }}
 - name: SCENEPRINT_BLOB_URL
-  value: {{ required "set blobs.url" .Values.blobs.url | quote }}
+  value: {{ .Values.blobs.url | quote }}
 {{- range $name, $value := .Values.env }}
 - name: {{ $name }}
   value: {{ $value | quote }}
@@ -74,7 +74,7 @@ securityContext:
     drop: [ALL]
 envFrom:
   - secretRef:
-      name: {{ required "set secret to the name of a Secret with PGPASSWORD" .Values.secret }}
+      name: {{ .Values.secret }}
 {{- end }}
 
 {{- define "sceneprint.mounts" -}}
