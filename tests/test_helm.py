@@ -157,6 +157,33 @@ def test_pods_run_our_commands_with_our_settings(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+def test_pods_take_the_kernels_that_the_image_compiled(tmp_path: Path) -> None:
+    cache = "/var/cache/sceneprint"
+    assert f"NUMBA_CACHE_DIR={cache}/numba" in (CHART.parents[2] / "Dockerfile").read_text()
+    objects = rendered(REQUIRED, tmp_path)
+    for part in ("api", "worker"):
+        pod = objects["Deployment", f"fleet-{part}"]["spec"]["template"]["spec"]
+        (first,), (container,) = pod["initContainers"], pod["containers"]
+        assert first["image"] == container["image"]
+        (copied,) = first["volumeMounts"]
+        assert first["command"] == ["cp", "-a", f"{cache}/.", f"{copied['mountPath']}/"]
+        assert {"name": copied["name"], "mountPath": cache} in container["volumeMounts"]
+
+
+def test_others_reach_the_port_of_the_api_alone(tmp_path: Path) -> None:
+    own = {"podSelector": {}}
+    proxy = {"namespaceSelector": {"matchLabels": {"name": "ingress"}}}
+    for values, allowed in (({}, own), ({"networkPolicy": {"from": [proxy]}}, proxy)):
+        objects = rendered(REQUIRED | values, tmp_path)
+        policy = objects["NetworkPolicy", "fleet"]["spec"]
+        assert policy["ingress"] == [{"from": [allowed], "ports": [{"port": "http"}]}]
+        for part in ("api", "worker"):
+            labels = objects["Deployment", f"fleet-{part}"]["spec"]["template"]["metadata"][
+                "labels"
+            ]
+            assert policy["podSelector"]["matchLabels"].items() <= labels.items()
+
+
 def test_traffic_goes_to_ready_api_pods_alone(tmp_path: Path) -> None:
     objects = rendered(ALL, tmp_path)
     api, worker = (objects["Deployment", f"fleet-{part}"]["spec"] for part in ("api", "worker"))

@@ -15,6 +15,7 @@ from PIL import Image
 import sceneprint as sp
 from sceneprint.cli import main
 from sceneprint.geometry.rigid import difference
+from sceneprint.lab.evaluation.report import seven_scenes_table
 from sceneprint.models import Model, save_model
 
 ROW = {"within_5cm_5deg", "within_10cm_10deg", "median_translation_m", "median_rotation_deg"}
@@ -290,6 +291,27 @@ def test_seven_scenes_beside_the_paper(
             assert float(cell) == pytest.approx(100 * figures[row]["within_5cm_5deg"], abs=0.05)
     mean = np.mean([100 * each["VDR"]["within_5cm_5deg"] for each in found["scenes"].values()])
     assert float(rows["average"][2]) == pytest.approx(mean, abs=0.05)
+
+
+def test_the_table_of_seven_scenes_by_hand() -> None:
+    def shares(*given: float | None) -> dict[str, Any]:
+        rows = ("R", "DR", "VDR", "pose_average", "VR")
+        return {row: {"within_5cm_5deg": share} for row, share in zip(rows, given, strict=True)}
+
+    found = shares(0.1, 0.2, 0.3, 0.4, 0.9) | {
+        "scenes": {
+            "fire": shares(0.5, 0.6, 0.7, 0.8, 0.9),
+            "stairs": shares(0, 1, None, 0.25, 0.9),
+        },
+        "average": shares(0.25, 0.8, 0.7, 0.525, 0.9),
+    }
+    assert [line.split() for line in seven_scenes_table(found, "fire")[2:]] == [
+        ["fire", "50.0", "60.0", "70.0", "80.0", "92.3", "97.8"],
+        ["stairs", "0.0", "100.0", "-", "25.0", "54.8", "61.0"],
+        ["average", "25.0", "80.0", "70.0", "52.5", "84.8", "90.3"],
+        ["combine", "10.0", "20.0", "30.0", "40.0", "84.8", "90.4"],
+    ]
+    assert len(seven_scenes_table(shares(0, 0, 0, 0, 0), "office")) == 3
 
 
 def test_one_of_seven_scenes_is_no_average(
