@@ -17,7 +17,7 @@ from benchmarks.siege.__main__ import (
     neighbours,
     table,
 )
-from benchmarks.siege.contract import ContractFigures, try_contract
+from benchmarks.siege.contract import ContractFigures, read_report, try_contract
 from benchmarks.siege.mutations import MutationFigures, besiege, mutated
 from benchmarks.siege.neighbours import (
     ATTACKS,
@@ -103,6 +103,23 @@ def test_mutations_are_the_same_each_time_and_break_things(every: list[Shot]) ->
     assert first != [mutated(every, 4, number) for number in range(50)]
     sound = {(one.png, one.meta.model_dump_json()) for one in every}
     assert sum((one.data, one.meta) not in sound for one in first) >= 48
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "figures", "sound"),
+    [
+        ("15575 generated, 1 found 1 unique failure", 1, (15575, 15574), False),
+        ("90 generated, 7 found 2 unique failures", 1, (90, 83), False),
+        ("15330 generated, 15330 passed", 0, (15330, 15330), True),
+        ("15330 generated, 15330 passed", 1, (15330, 0), False),
+        ("no test cases were generated", 0, (0, 0), False),
+    ],
+)
+def test_what_schemathesis_counted(
+    line: str, code: int, figures: tuple[int, int], sound: bool
+) -> None:
+    found = read_report(f"  Tested: 104\n\nTest cases:\n  {line}\n", code)
+    assert (found.requests, found.passed, found.sound) == (*figures, sound)
 
 
 def test_the_page_tells_what_was_measured(tmp_path: Path) -> None:

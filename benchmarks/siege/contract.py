@@ -19,7 +19,7 @@ CHECKS = (
 )  # fmt: skip
 #: Streams of events have no end: so many are read.
 _EVENTS = 2
-_COUNTED = re.compile(r"(\d+) generated(?:, (\d+) passed)?")
+_COUNTED = re.compile(r"(\d+) generated(?:, (\d+) found \d+ unique failures?)?(?:, (\d+) passed)?")
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,17 @@ def try_contract(
     if known:
         command += ["--exclude-method", "DELETE"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    report = done.stdout + done.stderr
+    return read_report(done.stdout + done.stderr, done.returncode)
+
+
+def read_report(report: str, code: int) -> ContractFigures:
+    """What schemathesis counted; with an exit code that it does not explain, nothing passed."""
     counted, tested = _COUNTED.search(report), re.search(r"Tested: (\d+)", report)
     if counted is None or tested is None:
         return ContractFigures(0, 0, 0, report)
-    passed = int(counted[2] or 0) if done.returncode == 0 else 0
-    return ContractFigures(int(tested[1]), int(counted[1]), passed, report)
+    requests, failed, passed = (int(one or 0) for one in counted.groups())
+    if failed:
+        passed = requests - failed
+    elif code != 0:
+        passed = 0
+    return ContractFigures(int(tested[1]), requests, passed, report)
