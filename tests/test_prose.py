@@ -17,6 +17,7 @@ EDITED = [
     "docs/getting_started.md",
     "docs/library.md",
     "docs/limits.md",
+    "docs/reference.md",
     "docs/security.md",
     "docs/upgrading.md",
     "docs/operations.md",
