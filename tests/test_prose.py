@@ -16,6 +16,8 @@ EDITED = [
     "README.md",
     "docs/getting_started.md",
     "docs/library.md",
+    "docs/dependencies.md",
+    "docs/architecture.md",
     "docs/limits.md",
     "docs/reference.md",
     "docs/security.md",
