@@ -45,21 +45,21 @@ class AdminMethods(JobMethods):
         self, name: str, grants: Mapping[str, Scope], expires_at: datetime | None = None,
         tenant: str | None = None,
     ) -> MadeKey:  # fmt: skip
-        """Make a key; only what is returned has its secret.
+        """Create a key. Only the returned record contains its secret.
 
         Parameters
         ----------
-        name : who it is for; unique
-        grants : `read`, `write` or `admin` by name of a map, `*` for all
-        expires_at : when it opens nothing any more, with a zone; default: never
-        tenant : whom it belongs to, which must be there; default: one of the key's name
+        name : unique name of its user
+        grants : map name to `read`, `write` or `admin`; `*` for all maps
+        expires_at : when it expires, with a time zone; default: never
+        tenant : an existing tenant that owns it; default: a new one with the key's name
 
         Raises
         ------
-        InvalidRequest : a name or grant that is none.
-        Conflict : there is a key of that name.
-        UnknownTenant : there is no such tenant.
-        Forbidden : the key of this client is not for `admin` of all.
+        InvalidRequest : an invalid name or grant.
+        Conflict : a key of that name exists.
+        UnknownTenant : no such tenant.
+        Forbidden : this client's key does not have `admin` for `*`.
         """
         new = checked(
             NewKey, "The key", name=name, grants=dict(grants), expires_at=expires_at,
@@ -68,42 +68,42 @@ class AdminMethods(JobMethods):
         return self._ask(MadeKey, "POST", "/v1/keys", json=new.model_dump(mode="json"))
 
     def keys(self) -> list[Key]:
-        """All keys by name, without their secrets."""
+        """All keys by name, without secrets."""
         return list(self._items(Page[Key], "/v1/keys"))
 
     def rotate_key(self, name: str, overlap_s: float = 3600.0) -> MadeKey:
-        """Give a key a new secret; only what is returned has it. The one before ends later.
+        """Give a key a new secret, which only the returned record contains.
 
         Parameters
         ----------
         name : of the key
-        overlap_s : seconds for which the secret before still works, up to 30 days; 0: it ends now.
-            Called again within that time, it keeps its end, and the secret between ends
+        overlap_s : seconds for which the old secret still works, up to 30 days; 0: none.
+            A second call within that time keeps its end, and revokes the secret in between
 
         Raises
         ------
-        UnknownKey : there is none of that name.
-        Forbidden : the key of this client is not for `admin` of all.
-        InvalidRequest : an overlap that is none.
+        UnknownKey : it does not exist.
+        Forbidden : this client's key does not have `admin` for `*`.
+        InvalidRequest : an invalid overlap.
         """
         path = f"/v1/keys/{quote(name, safe='')}/rotate"
         return self._ask(MadeKey, "POST", path, params={"overlap_s": overlap_s})
 
     def revoke_key(self, name: str) -> None:
-        """Let a key open nothing any more; UnknownKey where there is none of that name."""
+        """Revoke a key; UnknownKey if there is none of that name."""
         self._delete(f"/v1/keys/{quote(name, safe='')}")
 
     def me(self) -> Me:
-        """What the key of this client may do."""
+        """What this client's key may do."""
         return self._ask(Me, "GET", "/v1/keys/me")
 
     def audit(self, actor: str | None = None, map_name: str | None = None) -> Iterator[Audited]:
-        """Who changed what, the newest first.
+        """Who changed what, newest first.
 
         Parameters
         ----------
-        actor : name of the key that made the changes; default: of all, and of none
-        map_name : that was changed; default: any, and none
+        actor : name of the key that made the changes; default: any, or none
+        map_name : the map that was changed; default: any, or none
         """
         return self._items(Page[Audited], "/v1/audit", actor=actor, map=map_name)
 
@@ -113,25 +113,25 @@ class AdminMethods(JobMethods):
         self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
         follow: bool = True,
     ) -> Iterator[Event]:  # fmt: skip
-        """Events in the order in which they happened: those that are kept, and those to come.
+        """Events in order: those that are kept, then new ones as they happen.
 
-        A stream that breaks is taken up again where it broke, for as long as it takes: nothing is
-        lost, and nothing comes twice. Where events are no longer kept, one of the kind
-        `events.missed` stands in their place.
+        A broken stream is resumed where it broke, however long that takes: no event is
+        lost or repeated. If events are no longer kept, one of the kind
+        `events.missed` replaces them.
 
         Parameters
         ----------
         map_name : only of this map
-        kinds : beginnings of the kinds that are wanted, such as `frame.`; default: all
-        after : id of the event to begin behind, "0" for all that are kept; default: these, or the
-            newest where they are followed
-        follow : go on for ever with what happens; else end with what has happened
+        kinds : prefixes of the kinds to return, such as `frame.`; default: all
+        after : return events after this id; "0": all that are kept. Default: all that are kept,
+            or with `follow` only new ones
+        follow : wait for new events forever; else end with the last kept one
 
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : a kind that cannot be one, or an id of no event.
-        Unreachable : there is no service, when this is asked first.
+        InvalidRequest : an invalid kind, or an id that is no event's.
+        Unreachable : the service did not answer the first request.
         """
         if follow:
             wanted = given(map=map_name, kind=list(kinds))
@@ -142,7 +142,7 @@ class AdminMethods(JobMethods):
         self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
         cursor: str | None = None, limit: int = 100, newest_first: bool = True,
     ) -> EventPage:  # fmt: skip
-        """Some of the events that are kept, the newest first; `cursor` is that of another page."""
+        """A page of kept events, newest first; `cursor` comes from the page before."""
         asked = given(
             map=map_name, kind=list(kinds), after=after, cursor=cursor, limit=limit,
             order="newest" if newest_first else "oldest",
@@ -164,7 +164,7 @@ class AdminMethods(JobMethods):
                 return
 
     def stats(self, map_name: str | None = None, *, minutes: int = 60) -> Stats:
-        """How the service, or one map, does now and did in the last minutes, at most 60.
+        """Statistics of the service or one map, now and for up to 60 minutes.
 
         Raises
         ------
@@ -179,25 +179,25 @@ class AdminMethods(JobMethods):
         return self._ask(Stats, "GET", "/v1/stats", params=given(minutes=minutes, map=map_name))
 
     def models(self) -> list[ModelInfo]:
-        """Models that maps can be signed with: those that ship, and those that maps have or had."""
+        """Models for maps: those that ship, and those that maps have or had."""
         return self._ask(Page[ModelInfo], "GET", "/v1/models").items
 
     # snapshots
 
     def take_snapshot(self, *, wait_s: float | None = None) -> Job:
-        """Have a snapshot taken of all maps: one state of database and uploads, in one archive.
+        """Take a snapshot of all maps: one state of database and uploads, in one archive.
 
         Parameters
         ----------
-        wait_s : seconds to wait until it is taken; default: none
+        wait_s : seconds to wait for it; default: none
 
         Returns
         -------
-        job : `result` is a SnapshotFile when it has succeeded
+        job : `result` is a SnapshotFile once it has succeeded
 
         Raises
         ------
-        Forbidden : the key is no administrator's.
+        Forbidden : the key is not an administrator's.
         """
         job = self._ask(Job, "POST", "/v1/snapshots")
         if wait_s is None:
@@ -205,23 +205,23 @@ class AdminMethods(JobMethods):
         return self.wait([job.job_id], timeout_s=wait_s)[0]
 
     def snapshots(self) -> list[SnapshotFile]:
-        """Snapshots that the service keeps, the newest first."""
+        """Snapshots that the service keeps, newest first."""
         return self._ask(Page[SnapshotFile], "GET", "/v1/snapshots").items
 
     def download_snapshot(self, snapshot_id: str, path: str | Path) -> SnapshotFile:
-        """Fetch a snapshot, for `sceneprint restore`; its checksum is compared.
+        """Download a snapshot for `sceneprint restore`, and check it against its checksum.
 
         Parameters
         ----------
         snapshot_id : of `snapshots`
-        path : of the archive to write; nothing is overwritten
+        path : of the new archive; nothing is overwritten
 
         Raises
         ------
-        UnknownSnapshot : there is none, or no longer.
-        SnapshotError : the path is taken.
-        DamagedSnapshot : what came is not what was taken.
-        OSError : it cannot be written.
+        UnknownSnapshot : it does not exist, or no longer.
+        SnapshotError : the path exists.
+        DamagedSnapshot : the checksum does not match.
+        OSError : the file cannot be written.
         """
         path = Path(path)
         # asked first: an unknown one leaves nothing behind
@@ -243,7 +243,7 @@ class AdminMethods(JobMethods):
         return known[snapshot_id]
 
     def delete_snapshot(self, snapshot_id: str) -> None:
-        """Remove a snapshot; UnknownSnapshot where there is none."""
+        """Delete a snapshot; UnknownSnapshot if it does not exist."""
         self._delete(snapshot_path(snapshot_id))
 
     def _fetch_snapshot(self, snapshot_id: str, file: BinaryIO) -> None:

@@ -72,21 +72,21 @@ class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMetho
 
     @classmethod
     def embedded(cls, path: str | Path) -> Self:
-        """A client that needs no service: it runs in this process, on a data folder.
+        """A client without a service: everything runs in this process, on a data folder.
 
-        Frames are signed in this process too, while somebody waits for them (`wait`, or
-        `upload` with `wait_s`). All is kept in the folder, whatever SCENEPRINT_DATABASE_URL
-        says, and `sceneprint serve --data` may serve it at the same time. Until it is closed,
-        BLAS and OpenMP run one thread in this process: sums then have one order.
+        Frames are signed in this process, while you wait for them (`wait`, or
+        `upload` with `wait_s`). Everything is in the folder, whatever SCENEPRINT_DATABASE_URL
+        says, and `sceneprint serve --data` may serve it at the same time. Until you close it,
+        BLAS and OpenMP use one thread in this process, so that sums have one order.
 
         Parameters
         ----------
-        path : the folder, made where missing
+        path : the folder, created if missing
 
         Raises
         ------
-        UnusableStore, NewerSchema : it cannot be opened.
-        MissingDependency : sceneprint is not installed, only its client.
+        UnusableStore, NewerSchema : the folder cannot be opened.
+        MissingDependency : only the client is installed, not sceneprint.
         """
         if find_spec("sceneprint") is None:
             raise MissingDependency(
@@ -109,11 +109,11 @@ class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMetho
         self.close()
 
     def status(self) -> Status:
-        """Version, and how many frames and jobs are in each state."""
+        """The version, and the number of frames and jobs in each state."""
         return self._ask(Status, "GET", "/readyz")
 
     def healthy(self) -> bool:
-        """Whether it answers; asked once, without patience."""
+        """Whether the service answers; asks once, with a short timeout."""
         try:
             timeout = min(self._timeout_s, _HEALTHY_S)
             response = self._http.get("/healthz", timeout=timeout)

@@ -105,7 +105,7 @@ class ServiceConnection:
         logging.getLogger("httpx").addFilter(self._log_filter)
 
     def close(self) -> None:
-        """Give back what was opened."""
+        """Close connections and files."""
         logging.getLogger("httpx").removeFilter(self._log_filter)
         self._http.close()
 

@@ -77,47 +77,47 @@ class JobMethods(ServiceConnection):
     """Jobs, and what is begun as one."""
 
     def job(self, job_id: str) -> Job:
-        """A job; UnknownJob where there is none."""
+        """A job; UnknownJob if it does not exist."""
         return self._ask(Job, "GET", job_path(job_id))
 
     def jobs(self, state: JobState | None = None) -> Iterator[Job]:
-        """Jobs of all maps, the newest first; those in one state where asked for."""
+        """Jobs of all maps, newest first, optionally only those in one state."""
         return self._items(Page[Job], "/v1/jobs", state=state)
 
     def cancel_job(self, job_id: str) -> Job:
-        """Give up a job that is not over; its frame is `failed` then.
+        """Cancel a job that has not ended; its frame becomes `failed`.
 
         Raises
         ------
-        UnknownJob : there is none.
-        JobOver : there is nothing left to give up.
+        UnknownJob : it does not exist.
+        JobOver : it has ended already.
         """
         return self._ask(Job, "POST", f"{job_path(job_id)}/cancel")
 
     def retry_job(self, job_id: str) -> Job:
-        """Try again what was given up: dead, cancelled or failed.
+        """Retry a job that is dead, cancelled or failed.
 
         Returns
         -------
-        job : a new one, or the one that is trying again already
+        job : a new one, or the retry that exists already
 
         Raises
         ------
-        UnknownJob : there is none.
-        CannotRetry : it was not given up, or there is nothing to try again.
+        UnknownJob : it does not exist.
+        CannotRetry : it did not fail, or there is nothing to retry.
         """
         return self._ask(Job, "POST", f"{job_path(job_id)}/retry")
 
     def retry_dead_jobs(self, map_name: str | None = None) -> Iterator[RetriedJobs]:
-        """Try again all dead jobs, or those of a map; those that were tried since stay.
+        """Retry all dead jobs, or those of a map, except those already retried.
 
         Yields
         ------
-        done : of a page of them, as it is done
+        done : result of each page of jobs
 
         Raises
         ------
-        UnknownMap : there is no map of that name.
+        UnknownMap : no such map.
         """
         cursor: str | None = None
         while True:
@@ -132,21 +132,21 @@ class JobMethods(ServiceConnection):
         self, job_ids: Iterable[str], *, timeout_s: float = 600.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> list[Job]:  # fmt: skip
-        """Wait until jobs are over.
+        """Wait until jobs have ended.
 
         Parameters
         ----------
         job_ids : of uploads
-        timeout_s : after which they are returned as they are
-        progress : called with the number of jobs that are over, and of all
+        timeout_s : seconds after which they are returned as they are
+        progress : called with the number of ended jobs and the total
 
         Returns
         -------
-        jobs : in the order given; `job.state.over` is False where the time ran out
+        jobs : in the order given; `job.state.over` is False if the time ran out
 
         Raises
         ------
-        UnknownJob : there is no job of one of the ids.
+        UnknownJob : one of them does not exist.
         """
         order, known = list(job_ids), dict[str, Job]()
         waiting = list(dict.fromkeys(order))
@@ -195,23 +195,23 @@ class JobMethods(ServiceConnection):
     def import_archive(
         self, map_name: str, archive: Path | BinaryIO, options: ImportOptions | None = None
     ) -> Job:
-        """Take an archive of sequences into a map; a worker takes its frames one by one.
+        """Import an archive of sequences into a map; a worker reads its frames one by one.
 
         Parameters
         ----------
         map_name : of the map
         archive : a zip, or a tar (plain, .gz, .bz2 or .xz), of a 7-Scenes scene or sequence, a TUM
             RGB-D folder, or depth images with their intrinsics.json
-        options : what is said of all its frames; default: named as the file is
+        options : metadata of all its frames; default: a name from the file's
 
         Returns
         -------
-        job : wait for it with `wait`, and see what came of it with `import_items`
+        job : wait for it with `wait`; `import_items` lists the results
 
         Raises
         ------
         UnknownMap : no such map.
-        UnreadableArchive : no archive, or the file cannot be read.
+        UnreadableArchive : not an archive, or the file cannot be read.
         """
         if not isinstance(archive, Path):
             return self._send_archive(map_name, archive, options or ImportOptions())
@@ -226,11 +226,11 @@ class JobMethods(ServiceConnection):
             ) from error
 
     def import_job(self, map_name: str, job_id: str) -> Job:
-        """An import of a map; UnknownMap or UnknownJob where there is none."""
+        """An import of a map; UnknownMap or UnknownJob if it does not exist."""
         return self._ask(Job, "GET", _import_path(map_name, job_id))
 
     def import_items(self, map_name: str, job_id: str) -> Iterator[ImportItem]:
-        """What came of each member of an archive so far, in their order."""
+        """Results for the members of an archive so far, in their order."""
         return self._items(Page[ImportItem], f"{_import_path(map_name, job_id)}/items")
 
     def _send_archive(self, map_name: str, archive: BinaryIO, options: ImportOptions) -> Job:
@@ -260,31 +260,31 @@ class JobMethods(ServiceConnection):
         validation: ValidationOptions | Mapping[str, Any] | None = None, timeout_s: float = 3600.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> Association:  # fmt: skip
-        """Find where two sessions see the same places, or one session comes back to some.
+        """Find where two sessions see the same places, or where one session returns to a place.
 
         Parameters
         ----------
         map_name : of the map
-        session : each of its frames is looked up
-        other : among the frames of this one; default: among the session's own, taken before it
-        robots : who took each of them, needed where several robots call their sessions alike
-        filter : only frames that pass it are taken
-        apart, not_within_s : of one session, frames or seconds that come between
-        k, candidates, seed : accepted edges wanted of each frame, among so many candidates
-        min_overlap : least overlap of an edge that is kept
-        validation : what an edge must stand
-        timeout_s : for its end; 0 to return at once. It goes on, whoever waits
-        progress : called with the number of frames that are done, and of all
+        session : each of its frames is a query
+        other : the session to search; default: earlier frames of the same session
+        robots : of each session; required if several robots have sessions of that name
+        filter : use only frames that pass it
+        apart, not_within_s : within one session, least number of frames or seconds between two
+        k, candidates, seed : accepted edges wanted for each frame, candidates to try, random seed
+        min_overlap : least overlap of an edge to keep
+        validation : when an edge is accepted
+        timeout_s : seconds to wait; 0 returns at once. The job continues in any case
+        progress : called with the number of finished frames and the total
 
         Returns
         -------
-        association : `association.state.over` is False where the time ran out
+        association : `association.state.over` is False if the time ran out
 
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : a session without frames, of several robots, or with too many frames; or
-            an option out of its range.
+        InvalidRequest : a session has no frames, several robots, or too many frames; or
+            an option is out of range.
         """
         sessions = [session] if other is None else [session, other]
         fields = given(
@@ -305,40 +305,40 @@ class JobMethods(ServiceConnection):
         self, association: Association, *, timeout_s: float = 3600.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> Association:  # fmt: skip
-        """An association once it is over, or as it is when the time has come; see `associate`."""
+        """An association once it has ended, or when the time ran out; see `associate`."""
         return self._until_over(
             association, lambda: self.association(association.map, association.association_id),
             timeout_s, progress,
         )  # fmt: skip
 
     def association(self, map_name: str, association_id: str) -> Association:
-        """An association; UnknownMap or UnknownJob where there is none."""
+        """An association; UnknownMap or UnknownJob if it does not exist."""
         return self._ask(Association, "GET", association_path(map_name, association_id))
 
     def delete_association(self, map_name: str, association_id: str) -> None:
-        """Forget an association with its edges; UnknownMap or UnknownJob where there is none."""
+        """Delete an association with its edges; UnknownMap or UnknownJob if it does not exist."""
         self._delete(association_path(map_name, association_id))
 
     def associations(self, map_name: str) -> Iterator[Association]:
-        """Associations of a map, the newest first; UnknownMap."""
+        """Associations of a map, newest first; UnknownMap if it does not exist."""
         return self._items(Page[Association], f"{map_path(map_name)}/associations")
 
     def edges(
         self, map_name: str, association_id: str, *, min_overlap: float = 0.0,
         consistent: bool | None = None,
     ) -> Iterator[Edge]:  # fmt: skip
-        """Edges of an association in the order in which they were found.
+        """Edges of an association in the order they were found.
 
         Parameters
         ----------
         map_name, association_id : of the association
         min_overlap : least overlap
-        consistent : those that loops confirm, or those that were outvoted; default: all
+        consistent : only edges that loops confirm (True) or contradict (False); default: all
 
         Raises
         ------
-        UnknownMap, UnknownJob : there is none.
-        InvalidRequest : an overlap out of its range.
+        UnknownMap, UnknownJob : it does not exist.
+        InvalidRequest : an overlap out of range.
         """
         _check_overlap(min_overlap)
         return self._items(
@@ -357,14 +357,14 @@ class JobMethods(ServiceConnection):
         map_name, association_id : of the association
         kind : g2o, tum or json
         min_overlap : least overlap of an edge
-        odometry : with an edge between each two consecutive frames, from their poses
-        consistent : only edges that loops confirm; else all that were not outvoted
+        odometry : add an edge between consecutive frames, from their poses
+        consistent : only edges that loops confirm; else all that loops do not contradict
 
         Raises
         ------
-        UnknownMap, UnknownJob : there is none.
-        NotIndexed : it is not over, or did not succeed.
-        InvalidRequest : there is no such file, or an overlap out of its range.
+        UnknownMap, UnknownJob : it does not exist.
+        NotIndexed : it has not ended, or did not succeed.
+        InvalidRequest : there is no such file, or an overlap out of range.
         """
         known = get_args(GraphFormat)
         if kind not in known:
@@ -389,32 +389,32 @@ class JobMethods(ServiceConnection):
         cell_m: float | None = None, seed: int = 0, like: MapCoverage | None = None,
         timeout_s: float = 3600.0, progress: Callable[[int, int], None] | None = None,
     ) -> MapCoverage:  # fmt: skip
-        """Measure where in a map a robot would be found: query frames of it against the rest.
+        """Measure where in a map a robot would be found: query its frames against the rest.
 
         Parameters
         ----------
         map_name : of the map
         session, robot : query only frames of these
-        every, most : every n-th frame, and at most so many
-        not_within_s : leave out frames of the queried frame's session taken within so many
+        every, most : query every n-th frame, and at most this many
+        not_within_s : leave out frames of the queried frame's session taken within this many
             seconds; default: 10
-        other_sessions : leave out all of its session
-        tolerance_m, tolerance_deg : within which a pose that was found is right
-        cell_m : width of the plans' cells; default: one that fits
+        other_sessions : leave out its whole session
+        tolerance_m, tolerance_deg : a pose within both is right
+        cell_m : width of a plan's cells; default: from the map's size
         seed : of the queries
-        like : an earlier result, whose options are taken in place of all above, and the width of
-            its cells: `coverage_changes` can compare the two
-        timeout_s : for its end; 0 to return at once. It goes on, whoever waits
-        progress : called with the number of frames that are done, and of all
+        like : an earlier result, whose options and width of cells replace all of the above:
+            `coverage_changes` can then compare the two
+        timeout_s : seconds to wait; 0 returns at once. The job continues in any case
+        progress : called with the number of finished frames and the total
 
         Returns
         -------
-        coverage : `coverage.state.over` is False where the time ran out
+        coverage : `coverage.state.over` is False if the time ran out
 
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : it has no such frames, or an option is out of its range.
+        InvalidRequest : it has no such frames, or an option is out of range.
         """
         wanted = checked(
             NewMapCoverage, "The coverage", every=every, most=most, tolerance_m=tolerance_m,
@@ -434,39 +434,39 @@ class JobMethods(ServiceConnection):
         self, coverage: MapCoverage, *, timeout_s: float = 3600.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> MapCoverage:  # fmt: skip
-        """A coverage job once it is over, or as it is when the time has come; see `coverage`."""
+        """A coverage job once it has ended, or when the time ran out; see `coverage`."""
         return self._until_over(
             coverage, lambda: self.coverage_result(coverage.map, coverage.coverage_id), timeout_s,
             progress,
         )  # fmt: skip
 
     def coverage_result(self, map_name: str, coverage_id: str) -> MapCoverage:
-        """A coverage job as it is now; UnknownMap or UnknownJob where there is none."""
+        """A coverage job as it is now; UnknownMap or UnknownJob if it does not exist."""
         return self._ask(MapCoverage, "GET", coverage_path(map_name, coverage_id))
 
     def coverage_jobs(self, map_name: str) -> Iterator[MapCoverage]:
-        """Coverage jobs of a map without their plans, the newest first; UnknownMap."""
+        """Coverage jobs of a map without plans, newest first; UnknownMap if it does not exist."""
         return self._items(Page[MapCoverage], f"{map_path(map_name)}/coverage")
 
     def coverage_frames(
         self, map_name: str, coverage_id: str, outcome: CoverageOutcome | None = None
     ) -> Iterator[CoverageFrame]:
-        """Queried frames of a coverage job; those of one outcome where asked for.
+        """Queried frames of a coverage job, optionally only those with one outcome.
 
         Raises
         ------
-        UnknownMap, UnknownJob : there is none.
+        UnknownMap, UnknownJob : it does not exist.
         """
         path = f"{coverage_path(map_name, coverage_id)}/frames"
         return self._items(Page[CoverageFrame], path, outcome=outcome)
 
     def coverage_changes(self, map_name: str, coverage_id: str, since: str) -> CoverageChanges:
-        """Which cells became better or worse since an earlier result of the same options.
+        """Which cells became better or worse since an earlier result with the same options.
 
         Raises
         ------
-        UnknownMap, UnknownJob : one of them is not there.
-        NotIndexed : one of them is not over, or did not succeed.
+        UnknownMap, UnknownJob : one of them does not exist.
+        NotIndexed : one of them has not ended, or did not succeed.
         InvalidRequest : they cannot be compared.
         """
         path = f"{coverage_path(map_name, coverage_id)}/changes"
@@ -475,19 +475,19 @@ class JobMethods(ServiceConnection):
     def coverage_plan(
         self, map_name: str, coverage_id: str, parent_frame: str | None = None
     ) -> bytes:
-        """A plan of a coverage job as a PNG file: of most queried frames, or of a parent frame.
+        """A plan of a coverage job as PNG: of the given parent frame, else the most common one.
 
         Raises
         ------
-        UnknownMap, UnknownJob : there is none.
-        NotIndexed : it is not over, did not succeed, or no queried frame has a pose.
-        InvalidRequest : it has no plan of that parent frame.
+        UnknownMap, UnknownJob : it does not exist.
+        NotIndexed : it has not ended, did not succeed, or no queried frame has a pose.
+        InvalidRequest : it has no plan for that parent frame.
         """
         path = f"{coverage_path(map_name, coverage_id)}/plan.png"
         return self._bytes(path, params=given(parent_frame=parent_frame))
 
     def delete_coverage(self, map_name: str, coverage_id: str) -> None:
-        """Delete a coverage job with its result; UnknownMap or UnknownJob where there is none."""
+        """Delete a coverage job with its result; UnknownMap or UnknownJob if it does not exist."""
         self._delete(coverage_path(map_name, coverage_id))
 
     # differences of sessions
@@ -503,17 +503,17 @@ class JobMethods(ServiceConnection):
         map_name : of the map
         before, after : the earlier and the later session
         parent_frame : of the poses; default: the one that most frames of both share
-        timeout_s : for its end; 0 to return at once. It goes on, whoever waits
-        progress : called with the number of steps that are done, and of all
+        timeout_s : seconds to wait; 0 returns at once. The job continues in any case
+        progress : called with the number of finished steps and the total
 
         Returns
         -------
-        difference : `difference.state.over` is False where the time ran out
+        difference : `difference.state.over` is False if the time ran out
 
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : one session twice or one that is not there, or the two share no parent
+        InvalidRequest : both are the same, one does not exist, or they share no parent
             frame.
         """
         wanted = checked(
@@ -529,29 +529,29 @@ class JobMethods(ServiceConnection):
         )
 
     def difference(self, map_name: str, difference_id: str) -> Difference:
-        """A difference as it is now; UnknownMap or UnknownJob where there is none."""
+        """A difference as it is now; UnknownMap or UnknownJob if it does not exist."""
         return self._ask(Difference, "GET", difference_path(map_name, difference_id))
 
     def differences(self, map_name: str) -> Iterator[Difference]:
-        """Differences of a map, the newest first; UnknownMap."""
+        """Differences of a map, newest first; UnknownMap if it does not exist."""
         return self._items(Page[Difference], f"{map_path(map_name)}/differences")
 
     def difference_points(self, map_name: str, difference_id: str) -> SurfacePoints:
-        """Cells of both sessions as points. `patches` says what each is: SAME, GONE, NEW,
+        """Cells of both sessions as points. `patches` gives the kind of each: SAME, GONE, NEW,
         UNSEEN_AFTER or UNSEEN_BEFORE of `sceneprint_client.api.sessions`.
 
         Raises
         ------
-        UnknownMap, UnknownJob : there is none.
-        NotIndexed : it is not over, or did not succeed.
-        Refused : the service is of another version.
+        UnknownMap, UnknownJob : it does not exist.
+        NotIndexed : it has not ended, or did not succeed.
+        Refused : the service has another version.
         """
         from sceneprint_client.surface_encoding import decode_points  # loads numpy
 
         return decode_points(self._bytes(f"{difference_path(map_name, difference_id)}/points"))
 
     def delete_difference(self, map_name: str, difference_id: str) -> None:
-        """Delete a difference with its points; UnknownMap or UnknownJob where there is none."""
+        """Delete a difference with its points; UnknownMap or UnknownJob if it does not exist."""
         self._delete(difference_path(map_name, difference_id))
 
     # reconstructions
@@ -562,22 +562,22 @@ class JobMethods(ServiceConnection):
         voxel_m: float | None = None, output: Literal["mesh", "cloud"] = "mesh",
         wait_s: float | None = None,
     ) -> Reconstruction:  # fmt: skip
-        """Fuse the accepted matches of an answer to a surface, in the query's camera frame.
+        """Fuse the accepted matches of an answer into a surface, in the query's camera frame.
 
         Parameters
         ----------
         query : the answer, or the id of its query; answers are kept for an hour
         frames, strength, include_query, voxel_m, output : see NewReconstruction
-        wait_s : seconds to wait until it is done; default: none
+        wait_s : seconds to wait for it; default: none
 
         Returns
         -------
-        reconstruction : `coverage` is there when its state is `succeeded`; `error` says why not
+        reconstruction : has `coverage` when its state is `succeeded`; else `error` says why
 
         Raises
         ------
         UnknownQuery : the answer is not kept, or no longer.
-        InvalidRequest : it has no accepted match, or not those that are named.
+        InvalidRequest : it has no accepted match, or lacks a named one.
         """
         chosen = None if frames is None else tuple(frames)
         wanted = checked(
@@ -594,25 +594,25 @@ class JobMethods(ServiceConnection):
         return self._until_over(begun, lambda: self.reconstruction(begun.job_id), wait_s)
 
     def reconstruction(self, job_id: str) -> Reconstruction:
-        """A reconstruction as it is now; UnknownJob where there is none."""
+        """A reconstruction as it is now; UnknownJob if it does not exist."""
         return self._ask(Reconstruction, "GET", reconstruction_path(job_id))
 
     def reconstruction_mesh(self, job_id: str) -> bytes:
-        """Its surface as a PLY file.
+        """The surface of a reconstruction as a PLY file.
 
         Raises
         ------
-        UnknownJob : there is no such reconstruction.
-        NotIndexed : it is not done, or has failed.
+        UnknownJob : it does not exist.
+        NotIndexed : it has not ended, or failed.
         """
         return self._bytes(f"{reconstruction_path(job_id)}/mesh.ply")
 
     def reconstruction_picture(self, job_id: str) -> bytes:
-        """Its picture as a PNG file; see `reconstruction_mesh`."""
+        """The picture of a reconstruction as a PNG file; see `reconstruction_mesh`."""
         return self._bytes(f"{reconstruction_path(job_id)}/picture.png")
 
     def delete_reconstruction(self, job_id: str) -> None:
-        """Remove a reconstruction with its files; UnknownJob where there is none."""
+        """Delete a reconstruction with its files; UnknownJob if it does not exist."""
         self._delete(reconstruction_path(job_id))
 
 

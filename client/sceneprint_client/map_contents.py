@@ -59,20 +59,20 @@ class MapMethods(ServiceConnection):
         self, name: str, title: str | None = None, model: str = "depth",
         up: Sequence[float] | None = None, **limits: float | None,
     ) -> Map:  # fmt: skip
-        """Make a map, or find that it is there as wanted.
+        """Create a map, or confirm that it exists as requested.
 
         Parameters
         ----------
         name, title, model : of the map
         up : unit vector in the parent frames of its poses; default: learnt from its frames
-        limits : `quota_frames` and `quota_bytes`, which are the operator's to set, and
+        limits : `quota_frames` and `quota_bytes`, which only an operator may set, and
             `retention_days`; see NewMap
 
         Raises
         ------
-        InvalidRequest : the name is no slug, or there is no such model or limit.
-        MapExists : there is one of that name with another title or model, or other limits.
-        Forbidden : a quota is given, and the key has not `admin` for `*`.
+        InvalidRequest : the name is not a slug, or there is no such model or limit.
+        MapExists : a map of that name has another title, model or limits.
+        Forbidden : a quota is given, and the key does not have `admin` for `*`.
         """
         known: dict[str, Any] = limits if up is None else {**limits, "up": list(up)}
         new = checked(NewMap, "The map", name=name, title=title, model=model, **known)
@@ -83,18 +83,18 @@ class MapMethods(ServiceConnection):
         return self._ask(Page[Map], "GET", "/v1/maps").items
 
     def map(self, name: str) -> Map:
-        """A map; UnknownMap where there is none."""
+        """A map; UnknownMap if it does not exist."""
         return self._ask(Map, "GET", map_path(name))
 
     def edit_map(
         self, map_name: str, changes: Mapping[str, Any], if_match: str | None = None, *,
         dry_run: bool = False,
     ) -> Map:  # fmt: skip
-        """Change title, limits and up of a map; parameters and errors as of `edit_frame`.
+        """Edit title, limits and up of a map; parameters and errors as for `edit_frame`.
 
-        Quotas are the operator's: they ask for a key with `admin` for `*`, else Forbidden. With
-        `dry_run` nothing is changed, and the map told as it would be: `overdue` is how many frames
-        its retention would delete at once.
+        Quotas require a key with `admin` for `*`, else Forbidden. With
+        `dry_run` nothing changes, and the map is returned as it would be: `overdue` is how many
+        frames its retention would delete at once.
         """
         parameters = {"dry_run": "true"} if dry_run else {}
         return self._ask(
@@ -102,11 +102,11 @@ class MapMethods(ServiceConnection):
         )
 
     def delete_map(self, name: str) -> None:
-        """Remove a map with all that is in it, for good; UnknownMap where there is none."""
+        """Delete a map with everything in it, permanently; UnknownMap if it does not exist."""
         self._delete(map_path(name))
 
     def reencode(self, map_name: str, model: str) -> Map:
-        """Have a map signed with another model, to which it switches when all frames are.
+        """Sign a map again with another model; the map switches when all frames are signed.
 
         Parameters
         ----------
@@ -117,33 +117,33 @@ class MapMethods(ServiceConnection):
         ------
         UnknownMap : no such map.
         InvalidRequest : no such model.
-        Conflict : it is the map's model, or the map is being signed with a third one.
+        Conflict : the map has this model, or is being signed with a third one.
         """
         return self._ask(Map, "POST", f"{map_path(map_name)}/reencoding", json={"model": model})
 
     def cancel_reencoding(self, map_name: str) -> Map:
-        """Let a map keep the model that it has.
+        """Cancel a re-encoding: the map keeps its model.
 
         Raises
         ------
         UnknownMap : no such map.
-        Conflict : no other model is on its way.
+        Conflict : the map is not being re-encoded.
         """
         return self._ask(Map, "DELETE", f"{map_path(map_name)}/reencoding")
 
     def growth(self, map_name: str, by: By = "day", last: int = 30) -> Growth:
-        """How many frames a map has by the hour or the day (UTC) in which they were indexed.
+        """Number of frames by the hour or day (UTC) in which they were indexed.
 
         Parameters
         ----------
         map_name : of the map
-        by : what is counted by
-        last : hours or days, with the one that is not over; at most 400
+        by : "hour" or "day"
+        last : number of hours or days, including the present one; at most 400
 
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : neither hours nor days, or too many.
+        InvalidRequest : an unknown `by`, or too many.
         """
         wanted = checked(GrowthOf, "The growth", by=by, last=last)
         path = f"{map_path(map_name)}/growth"
@@ -152,7 +152,7 @@ class MapMethods(ServiceConnection):
     # frames
 
     def frame(self, map_name: str, frame_id: str) -> Frame:
-        """A frame; UnknownMap or UnknownFrame where there is none."""
+        """A frame; UnknownMap or UnknownFrame if it does not exist."""
         return self._ask(Frame, "GET", frame_path(map_name, frame_id))
 
     def frames(
@@ -164,30 +164,30 @@ class MapMethods(ServiceConnection):
         has_pose: bool | None = None, content_id: str | None = None, name: str | None = None,
         find: str | None = None, order: Literal["asc", "desc", "taken"] = "asc",
     ) -> Iterator[Frame]:  # fmt: skip
-        """Frames of a map in the order they came; deleted ones only where asked for.
+        """Frames of a map in order of arrival; deleted ones only on request.
 
-        All that is given must hold; a frame that lacks what is asked about is left out.
+        A frame must meet all conditions. Frames without the field are left out.
 
         Parameters
         ----------
         map_name : of the map
-        state : in this one
-        robot, session : by this one, or one of these
-        tags : it has all of them
-        captured_after, captured_before : taken then or later, then or earlier; with a time zone
-        received_after, received_before : uploaded then or later, then or earlier
-        parent_frame : its pose leads there
+        state : in this state
+        robot, session : this one, or one of these
+        tags : the frame has all of them
+        captured_after, captured_before : taken at that time or later, or earlier; with a zone
+        received_after, received_before : uploaded at that time or later, or earlier
+        parent_frame : of its pose
         has_pose : whether it has one
-        content_id : of its samples and camera, or points and viewpoint
-        name : its name begins so, such as "frame-000123"
-        find : its id, its name or its session begins so
-        order : "desc" for the newest first; "taken", of one session, in the order in which its
+        content_id : hash of its samples and camera, or points and viewpoint
+        name : prefix of its name, such as "frame-000123"
+        find : prefix of its id, name or session
+        order : "desc": newest first; "taken", with one session: in the order in which its
             frames were taken
 
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : a name that none can be, or a time without zone.
+        InvalidRequest : an invalid name, or a time without a zone.
         """
         wanted = checked(
             FrameListing, "The list", state=state, robot=_names(robot), session=_names(session),
@@ -203,26 +203,26 @@ class MapMethods(ServiceConnection):
         self, map_name: str, frame_id: str, changes: Mapping[str, Any],
         if_match: str | None = None,
     ) -> Frame:  # fmt: skip
-        """Change the metadata of a frame; filters see it at once.
+        """Edit the metadata of a frame; filters see the change at once.
 
         Parameters
         ----------
         map_name, frame_id : of the frame
-        changes : as JSON has them, see FrameEdit: what is left out stays, None removes
-        if_match : `etag` of the frame as it was read; None to overwrite whatever came since
+        changes : fields of FrameEdit: omitted ones stay, None removes
+        if_match : `etag` of the frame when you read it; None overwrites later edits
 
         Raises
         ------
-        UnknownMap, UnknownFrame : there is none, or it was deleted.
-        InvalidRequest, InvalidPose : a field is unknown, no metadata, or not as it should be.
-        PreconditionFailed : it has been edited since.
+        UnknownMap, UnknownFrame : it does not exist, or was deleted.
+        InvalidRequest, InvalidPose : a field is unknown, cannot be edited, or is invalid.
+        PreconditionFailed : it was edited since.
         """
         return self._ask(
             Frame, "PATCH", frame_path(map_name, frame_id), **_edit_request(changes, if_match)
         )
 
     def delete_frame(self, map_name: str, frame_id: str) -> None:
-        """Take a frame out of its map; UnknownMap or UnknownFrame where there is none."""
+        """Delete a frame from its map; UnknownMap or UnknownFrame if it does not exist."""
         self._delete(frame_path(map_name, frame_id))
 
     def restore_frame(self, map_name: str, frame_id: str) -> Frame:
@@ -230,7 +230,7 @@ class MapMethods(ServiceConnection):
 
         Raises
         ------
-        UnknownMap, UnknownFrame : there is none, or it cannot be restored any more.
+        UnknownMap, UnknownFrame : it does not exist, or can no longer be restored.
         Conflict : another frame has its id or its content.
         QuotaExceeded : the map has no room for it.
         """
@@ -247,12 +247,12 @@ class MapMethods(ServiceConnection):
         Parameters
         ----------
         map_name : of the map
-        frame_ids : at most 1000; those that no frame has are passed over
-        filter : conditions as of `frames`, at least one
+        frame_ids : at most 1000; unknown ones are skipped
+        filter : conditions as for `frames`, at least one
 
         Returns
         -------
-        count : how many were deleted
+        count : number of deleted frames
         deletions : for `restore_frames`
 
         Raises
@@ -285,13 +285,13 @@ class MapMethods(ServiceConnection):
 
         Returns
         -------
-        count : how many were changed
-        inverse : arguments of the calls that undo it
+        count : number of edited frames
+        inverse : arguments for the calls that undo it
 
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : nothing is to be changed, or a frame would have too many tags.
+        InvalidRequest : there is nothing to change, or a frame would have too many tags.
         """
         body = given(frame_ids=_listed(frame_ids), filter=filter) | changes
         count, inverse = 0, list[dict[str, Any]]()
@@ -311,12 +311,12 @@ class MapMethods(ServiceConnection):
         Parameters
         ----------
         map_name : of the map
-        deletion_id : of `deletions`, `delete_frames` or `delete_session`
-        frame_ids : in place of it, at most 1000
+        deletion_id : from `deletions`, `delete_frames` or `delete_session`
+        frame_ids : instead of it, at most 1000
 
         Raises
         ------
-        UnknownMap, UnknownDeletion : there is none, or it cannot be undone any more.
+        UnknownMap, UnknownDeletion : it does not exist, or can no longer be undone.
         QuotaExceeded : the map has no room for the frames.
         """
         body = given(deletion_id=deletion_id, frame_ids=_listed(frame_ids))
@@ -330,13 +330,13 @@ class MapMethods(ServiceConnection):
                 return done.model_copy(update=told)
 
     def deletions(self, map_name: str) -> Iterator[FrameDeletion]:
-        """Deletions of frames that can still be undone, the newest first; UnknownMap."""
+        """Deletions that can still be undone, newest first; UnknownMap if there is no map."""
         return self._items(Page[FrameDeletion], f"{map_path(map_name)}/deletions")
 
     # sessions
 
     def sessions(self, map_name: str) -> Iterator[Session]:
-        """Runs of a map by session and robot: how many frames, when, where their poses lead.
+        """Sessions of a map by robot: number of frames, times, parent frames of poses.
 
         Raises
         ------
@@ -345,16 +345,16 @@ class MapMethods(ServiceConnection):
         return self._items(Page[Session], f"{map_path(map_name)}/sessions")
 
     def delete_session(self, map_name: str, session: str, robot: str | None = None) -> int:
-        """Delete all frames of a session; how many. `deletions` and `restore_frames` undo it.
+        """Delete all frames of a session and return their number; `restore_frames` undoes it.
 
         Parameters
         ----------
         map_name, session : of the frames
-        robot : only those that it took; default: of all robots
+        robot : only frames of this robot; default: of all
 
         Raises
         ------
-        UnknownMap, UnknownSession : there is none.
+        UnknownMap, UnknownSession : it does not exist.
         """
         path, deleted = f"{map_path(map_name)}/sessions", 0
         while True:
@@ -369,20 +369,20 @@ class MapMethods(ServiceConnection):
         rename_robot: str | None = None, add_tags: Sequence[str] = (),
         remove_tags: Sequence[str] = (), robot: str | None = None,
     ) -> int:  # fmt: skip
-        """Rename a session or its robot, and add or remove tags, on all its frames; how many.
+        """Rename a session or its robot, and add or remove tags; return the number of its frames.
 
         Parameters
         ----------
         map_name, session : of the frames
-        rename : new name; one that another session has joins the two
-        rename_robot : who took the frames
-        add_tags, remove_tags : of all frames
-        robot : only the frames that it took; default: of all robots
+        rename : new name; the name of another session joins the two
+        rename_robot : new robot of the frames
+        add_tags, remove_tags : for all frames
+        robot : only frames of this robot; default: of all
 
         Raises
         ------
-        UnknownMap, UnknownSession : there is none.
-        InvalidRequest : nothing is to be changed, or a frame would have too many tags.
+        UnknownMap, UnknownSession : it does not exist.
+        InvalidRequest : there is nothing to change, or a frame would have too many tags.
         """
         path, edited, after = f"{map_path(map_name)}/sessions", 0, None
         changes = {
@@ -403,23 +403,23 @@ class MapMethods(ServiceConnection):
         captured_before: datetime | None = None, most: int | None = None,
         clock: Clock = "taken",
     ) -> Trajectory:  # fmt: skip
-        """The poses of a run in the order in which they were taken.
+        """The poses of a session in the order they were taken.
 
         Parameters
         ----------
         map_name : of the map
         session : of the run
-        robot : needed where several called a run so
-        parent_frame : needed where the poses lead to several
-        captured_after, captured_before : a part of it; with a time zone
-        clock : by what poses are stamped: "captured" (`captured_at`), "sequence", or "received",
-            which every frame has; "taken": `captured_at`, and where none has one `sequence`
-        most : poses, evenly taken along it, at most so many; `posed` tells how many there are
+        robot : required if several robots have a session of that name
+        parent_frame : required if its poses have several
+        captured_after, captured_before : only this part; with a time zone
+        clock : time stamps: "captured" (`captured_at`), "sequence", or "received",
+            which every frame has; "taken": `captured_at`, or `sequence` if none has one
+        most : at most this many poses, evenly spaced; `posed` is the number of all
 
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : it is not clear which run is meant, or it is too long for one answer.
+        InvalidRequest : the session is not unique, or too long for one answer.
         """
         run = _run(session, robot, parent_frame, captured_after, captured_before, most, clock)
         return self._ask(Trajectory, "GET", **_run_request(map_name, run, "application/json"))
@@ -430,25 +430,25 @@ class MapMethods(ServiceConnection):
         captured_before: datetime | None = None, most: int | None = None,
         clock: Clock = "taken",
     ) -> str:  # fmt: skip
-        """As `trajectory`, as text of a TUM file."""
+        """Like `trajectory`, as the text of a TUM file."""
         run = _run(session, robot, parent_frame, captured_after, captured_before, most, clock)
         return self._bytes(**_run_request(map_name, run, "text/plain")).decode()
 
     # what is made of a frame
 
     def cloud(self, map_name: str, frame_id: str, within: CloudFrame = "optical") -> bytes:
-        """The surface that a frame saw, points and normals as PLY.
+        """The surface that a frame saw: points and normals as PLY.
 
         Parameters
         ----------
         map_name, frame_id : of an indexed frame
-        within : its coordinates: "optical" of the sensor, "parent" of its pose, "base" of the
+        within : coordinates: "optical" of the sensor, "parent" of its pose, "base" of the
             robot
 
         Raises
         ------
-        UnknownMap, UnknownFrame : there is none, or it was deleted.
-        NotIndexed : nothing has been made of it, or not yet.
+        UnknownMap, UnknownFrame : it does not exist, or was deleted.
+        NotIndexed : it is not indexed, or not yet.
         InvalidRequest : it has no pose, or no base.
         """
         if within not in CLOUD_FRAMES:
@@ -459,12 +459,12 @@ class MapMethods(ServiceConnection):
         self, map_name: str, frame_id: str, within: CloudFrame = "optical",
         limit: int = MOST_DRAWN,
     ) -> SurfacePoints:  # fmt: skip
-        """The points of `cloud` as arrays, in a third of its bytes. Errors as of `cloud`.
+        """The points of `cloud` as arrays, in a third of the bytes. Errors as for `cloud`.
 
         Parameters
         ----------
         map_name, frame_id, within : see `cloud`
-        limit : most points; of more, always the same ones
+        limit : most points; if there are more, always the same subset
         """
         from sceneprint_client.surface_encoding import decode_points  # it takes numpy
 
@@ -476,7 +476,7 @@ class MapMethods(ServiceConnection):
     def preview(
         self, map_name: str, frame_id: str, view: View = "depth", width: int = WIDTH
     ) -> bytes:
-        """A picture of an indexed frame as PNG: "depth", "normals" or "patches". Errors as of
+        """A picture of an indexed frame as PNG: "depth", "normals" or "patches". Errors as for
         `cloud`.
         """
         if view not in VIEWS:
@@ -491,19 +491,19 @@ class MapMethods(ServiceConnection):
         )
 
     def patches(self, map_name: str, frame_id: str) -> FramePatches:
-        """The surface patches of an indexed frame. Errors as of `cloud`."""
+        """The surface patches of an indexed frame. Errors as for `cloud`."""
         return self._ask(FramePatches, "GET", f"{frame_path(map_name, frame_id)}/patches")
 
     def signature(self, map_name: str, frame_id: str) -> FrameSignature:
-        """The signature of an indexed frame. Errors as of `cloud`."""
+        """The signature of an indexed frame. Errors as for `cloud`."""
         return self._ask(FrameSignature, "GET", f"{frame_path(map_name, frame_id)}/signature")
 
     def upload_of(self, map_name: str, frame_id: str) -> bytes:
-        """A frame's upload, byte for byte as it came.
+        """A frame's upload, byte for byte.
 
         Raises
         ------
-        UnknownMap, UnknownFrame : there is none, or it was deleted.
+        UnknownMap, UnknownFrame : it does not exist, or was deleted.
         NotIndexed : it was not kept.
         """
         return self._bytes(f"{frame_path(map_name, frame_id)}/upload")
@@ -553,13 +553,13 @@ class SurfaceMethods(ServiceConnection):
     """Surfaces of maps."""
 
     def surface(self, map_name: str) -> MapSurface:
-        """What the posed frames of a map saw, fused, as it is now; UnknownMap."""
+        """The fused surface of a map's posed frames; UnknownMap if it does not exist."""
         return self._ask(MapSurface, "GET", surface_path(map_name))
 
     def begin_surface(self, map_name: str) -> MapSurface:
-        """Have the surface of a map built, or what came since added, now.
+        """Build the surface of a map now, or add new frames to it.
 
-        Workers do so by themselves, unless they are told to wait until they are asked.
+        Workers do this by themselves, unless `SCENEPRINT_SURFACES` is `asked`.
 
         Raises
         ------
@@ -569,18 +569,18 @@ class SurfaceMethods(ServiceConnection):
         return self._ask(MapSurface, "POST", surface_path(map_name))
 
     def delete_surface(self, map_name: str) -> None:
-        """Remove the surface of a map until somebody asks for it again; UnknownMap."""
+        """Delete the surface of a map until it is requested again; UnknownMap if it is missing."""
         self._delete(surface_path(map_name))
 
     def surface_tiles(
         self, map_name: str, parent: str | None = None, level: int = 0
     ) -> Iterator[SurfaceTile]:
-        """Tiles of a level by column, row and floor; `surface` tells which levels there are.
+        """Tiles of a level by column, row and floor; `surface` lists the levels.
 
         Parameters
         ----------
         map_name : of the map
-        parent : parent frame; default: the one of most frames
+        parent : parent frame; default: the most common one
         level : 0 for the finest
 
         Raises
@@ -596,7 +596,7 @@ class SurfaceMethods(ServiceConnection):
         Raises
         ------
         UnknownMap : no such map.
-        NotFound : it changed since, or was removed: list the tiles again.
+        NotFound : it changed or was removed: list the tiles again.
         """
         return self._bytes(surface_tile_path(map_name, digest))
 
@@ -604,20 +604,20 @@ class SurfaceMethods(ServiceConnection):
         self, map_name: str, at: Sequence[float] | None = None, *, radius: float | None = None,
         box: Sequence[float] | None = None, parent: str | None = None,
     ) -> Iterator[SurfaceSighting]:  # fmt: skip
-        """Frames that saw a spot, from the nearest viewpoint on; or those taken in a box.
+        """Frames that saw a spot, nearest viewpoint first; or those taken in a box.
 
         Parameters
         ----------
         map_name : of the map
         at : x, y, z of the spot, metres
-        radius : how near to it they must have seen something, metres; default: two cells
+        radius : they saw something within this distance of it, metres; default: two cells
         box : x, y, z of two corners, metres; instead of `at`
-        parent : parent frame; default: the one of most frames
+        parent : parent frame; default: the most common one
 
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : neither or both of `at` and `box`, or numbers out of their range.
+        InvalidRequest : neither or both of `at` and `box`, or numbers out of range.
         """
         asked: dict[str, Any] = given(
             at=None if at is None else ",".join(map(repr, map(float, at))),
@@ -630,19 +630,19 @@ class SurfaceMethods(ServiceConnection):
         self, map_name: str, parent: str | None = None, *, width: int = PLAN_WIDTH,
         low: float | None = None, high: float | None = None,
     ) -> bytes:  # fmt: skip
-        """A surface seen from above as a PNG file, transparent where nothing is.
+        """A surface seen from above as a PNG file, transparent where it is empty.
 
         Parameters
         ----------
         map_name : of the map
-        parent : parent frame; default: the one of most frames
+        parent : parent frame; default: the most common one
         width : of the longer side, pixels
         low, high : only what lies between these heights, metres along up
 
         Raises
         ------
         UnknownMap : no such map.
-        NotFound : there is no surface in that parent frame.
+        NotFound : no surface has that parent frame.
         """
         if not PLAN_WIDTHS[0] <= width <= PLAN_WIDTHS[1]:
             raise InvalidRequest(

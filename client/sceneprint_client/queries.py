@@ -77,21 +77,21 @@ class QueryMethods(ServiceConnection):
         ----------
         map_name : of the map
         frame, meta : as for `upload`
-        frame_id : of a frame of the map, in place of `frame`; it does not find itself
-        maps : names of maps of one model that are asked as one, or `*` for all, in place of
-            `map_name`; with `frame_id`, `map_name` says which map that frame is of
-        up : unit vector in the sensor's axes, of an IMU; default: as `meta` or a sidecar says
-        robot : who asks, for the record of the query; default: as `meta` says
-        how : k, stages, exact, filter, seed and the rest of the fields of Query; a filter, and
-            what else has fields, as a dictionary or a record
+        frame_id : a frame of the map, instead of `frame`; it does not find itself
+        maps : names of maps of one model to search together, or `*` for all, instead of
+            `map_name`; with `frame_id`, `map_name` is the map of that frame
+        up : unit vector in the sensor's axes, from an IMU; default: from `meta` or a sidecar
+        robot : who asks, for the record of the query; default: from `meta`
+        how : k, stages, exact, filter, seed and the other fields of Query; a filter, and
+            other options with fields, as a dictionary or a record
 
         Raises
         ------
-        UnknownMap, UnknownFrame : there is none.
+        UnknownMap, UnknownFrame : it does not exist.
         FrameError, DatasetError : the frame cannot be read, or nothing in it can be signed.
-        InvalidRequest : an option is out of its range, the frame of the map is not indexed, or
-            the maps are of several models.
-        TypeError : not one of `frame` and `frame_id`, no map, or an option that there is not.
+        InvalidRequest : an option is out of range, the frame of the map is not indexed, or
+            the maps have different models.
+        TypeError : not exactly one of `frame` and `frame_id`, no map, or an unknown option.
         """
         if maps is None:
             name, wanted = named_or_sent(map_name, frame, meta, frame_id, up)
@@ -136,7 +136,7 @@ class QueryMethods(ServiceConnection):
 
         Raises
         ------
-        InvalidRequest : too few or too many frames, not as many metadata, or no odometry.
+        InvalidRequest : too few or too many frames, another number of metadata, or no odometry.
         """
         if metas is not None and len(metas) != len(frames):
             raise InvalidRequest(
@@ -155,19 +155,19 @@ class QueryMethods(ServiceConnection):
         validation: ValidationOptions | dict[str, Any] | None = None, seed: int = 0,
         model: str | None = None,
     ) -> Similarity:  # fmt: skip
-        """How alike are two frames, and do they see one place?
+        """How similar are two frames, and do they see the same place?
 
         Parameters
         ----------
         a, b : each a frame as for `upload`, or a stored one: (map, frame id)
-        meta_a, meta_b : what is known of those that are not stored
+        meta_a, meta_b : metadata of those that are not stored
         validate, validation, seed, model : see Comparison
 
         Raises
         ------
-        UnknownMap, UnknownFrame : there is none.
+        UnknownMap, UnknownFrame : it does not exist.
         FrameError, DatasetError : a frame cannot be read, or nothing in it can be signed.
-        InvalidRequest : an option is out of its range, or the frames are of two models.
+        InvalidRequest : an option is out of range, or the frames have different models.
         """
         how = checked(
             Comparison, "The comparison", validate=validate, validation=validation, seed=seed,
@@ -195,20 +195,20 @@ class QueryMethods(ServiceConnection):
         since: datetime | str | None = None, until: datetime | str | None = None,
         kept: bool = False,
     ) -> Iterator[QueryRecord]:  # fmt: skip
-        """Queries that came, the newest first: a small record of each, kept for 30 days by default.
+        """Past queries, newest first: a small record of each, kept for 30 days by default.
 
         Parameters
         ----------
-        map_name : only of this map; default: of all that the key may read
-        status : only with this one, or one of these
+        map_name : only of this map; default: all that the key may read
+        status : this one, or one of these
         robot : only of this robot
-        since, until : that came at that time or later, and before that one; with a zone
-        kept : only those whose answers are kept, see `keep_answer`
+        since, until : from that time on, and before that time; with a zone
+        kept : only those with kept answers, see `keep_answer`
 
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : a status or time that is none.
+        InvalidRequest : an invalid status or time.
         """
         statuses = [status] if isinstance(status, str) else list(status)
         return self._items(
@@ -217,19 +217,19 @@ class QueryMethods(ServiceConnection):
         )  # fmt: skip
 
     def delete_queries(self, map_name: str) -> None:
-        """Remove the records of all queries of a map, for good.
+        """Delete the records of all queries of a map, permanently.
 
         Raises
         ------
         UnknownMap : no such map.
-        Forbidden : the key is not for `admin` of it.
+        Forbidden : the key does not have `admin` for it.
         """
         self._send("DELETE", "/v1/queries", params={"map": map_name})
 
     # what can be looked at after a query
 
     def answer(self, query_id: str) -> Answer:
-        """The answer to a query once more, for about an hour, or while it is kept.
+        """The answer to an earlier query: for about an hour, or while it is kept.
 
         Raises
         ------
@@ -240,60 +240,60 @@ class QueryMethods(ServiceConnection):
     def keep_answer(
         self, query_id: str, title: str | None = None, until: datetime | str | None = None
     ) -> AnswerRetention:
-        """Keep an answer until it is released; of one that is kept, change title and end.
+        """Keep an answer until it is released, or change title and end of a kept one.
 
         Parameters
         ----------
         query_id : of the answer
-        title : for people
-        until : when it is released by itself, with a zone; default: never
+        title : a label for people
+        until : time of its automatic release, with a zone; default: never
 
         Raises
         ------
-        UnknownQuery : it is not there any more.
-        QuotaExceeded : a map has as many kept answers as it may have.
-        InvalidRequest : a title that is too long, or an end that has passed.
+        UnknownQuery : it is no longer there.
+        QuotaExceeded : a map has too many kept answers.
+        InvalidRequest : the title is too long, or `until` has passed.
         """
         body = given(title=title, until=_as_text(until))
         return self._ask(AnswerRetention, "POST", f"{query_path(query_id)}/keep", json=body)
 
     def release_answer(self, query_id: str) -> None:
-        """Keep an answer no longer; UnknownQuery where it is not kept."""
+        """Release a kept answer; UnknownQuery if it is not kept."""
         self._send("DELETE", f"{query_path(query_id)}/keep")
 
     def answer_retention(self, query_id: str) -> AnswerRetention:
-        """For how long an answer can be looked at; UnknownQuery where it cannot."""
+        """How long an answer is available; UnknownQuery if it is not."""
         return self._ask(AnswerRetention, "GET", f"{query_path(query_id)}/keep")
 
     def query_cloud(self, query_id: str) -> bytes:
-        """The surface that a query saw, points and normals as PLY, in its sensor's frame.
+        """The surface that a query saw: points and normals as PLY, in its sensor's frame.
 
         Raises
         ------
         UnknownQuery : it is not kept, or no longer.
-        NotIndexed : it was asked without validation.
+        NotIndexed : it ran without validation.
         """
         return self._bytes(f"{query_path(query_id)}/cloud.ply")
 
     def query_points(self, query_id: str, limit: int = MOST_DRAWN) -> SurfacePoints:
-        """The points of `query_cloud` as arrays, at most so many. Errors as of `query_cloud`."""
+        """The points of `query_cloud` as arrays, at most `limit`. Errors as for `query_cloud`."""
         from sceneprint_client.surface_encoding import decode_points  # it takes numpy
 
         path = f"{query_path(query_id)}/points"
         return decode_points(self._bytes(path, params={"limit": limit}))
 
     def similarities(self, query_id: str, limit: int = 50) -> Similarities:
-        """How alike a query and its nearest frames are, each to each.
+        """Pairwise similarities of a query and its nearest frames.
 
         Parameters
         ----------
         query_id : of an answer
-        limit : how many of the ranking, 1 to 200
+        limit : how many frames of the ranking, 1 to 200
 
         Raises
         ------
         UnknownQuery : it is not kept, or no longer.
-        InvalidRequest : a limit out of its range.
+        InvalidRequest : a limit out of range.
         """
         if not 1 <= limit <= _MOST_ALIKE:
             raise InvalidRequest(
@@ -307,18 +307,18 @@ class QueryMethods(ServiceConnection):
     def match_details(
         self, query_id: str, frame_id: str, map_name: str | None = None
     ) -> MatchDetails:
-        """One match of a query, validated once more, with what its figures were counted on.
+        """One match of a query, validated again, with the data behind its figures.
 
         Parameters
         ----------
-        query_id, frame_id : of an answer and of one of its matches
-        map_name : where matches of several maps have that id; default: the first of them
+        query_id, frame_id : of an answer, and of one of its matches
+        map_name : if matches from several maps have that id; default: the first of them
 
         Raises
         ------
         UnknownQuery : it is not kept, or no longer.
         UnknownMap, UnknownFrame : no match has that id, or it was deleted since.
-        NotIndexed : the query was asked without validation, or the map has another model now.
+        NotIndexed : the query ran without validation, or the map has another model now.
         """
         return self._ask(
             MatchDetails, "GET", match_path(query_id, frame_id), params=given(map=map_name)
@@ -328,18 +328,18 @@ class QueryMethods(ServiceConnection):
         self, query_id: str, frame_id: str, map_name: str | None = None,
         color: OverlayColour = "source", transform: OverlayTransform = "aligned",
     ) -> bytes:  # fmt: skip
-        """A query's points and a match's in the match's sensor's frame, coloured, as PLY.
+        """Points of a query and a match, coloured, as PLY in the match's sensor frame.
 
         Parameters
         ----------
         query_id, frame_id, map_name : see `match_details`
         color : by "source", "normal" or "residual"
-        transform : "aligned" as it was found, "rival" as the next best, or "none"
+        transform : "aligned" (the accepted one), "rival" (the next best), or "none"
 
         Raises
         ------
         UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : see `match_details`.
-        InvalidRequest : there is no such transform, or no such way to colour.
+        InvalidRequest : no such transform or color.
         """
         for name, value, known in (("color", color, COLOURS), ("transform", transform, TRANSFORMS)):
             if value not in known:

@@ -35,7 +35,7 @@ class UploadMethods(ServiceConnection):
         *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> Added:  # fmt: skip
-        """Take a frame into a map; it is safe when this returns, and signed soon after.
+        """Upload a frame into a map. It is durable when this returns, and signed soon after.
 
         Parameters
         ----------
@@ -43,25 +43,25 @@ class UploadMethods(ServiceConnection):
         frame : a path, the content of a PNG or NPY file or of a cloud, a frame of
             `find_sequences`, or an array: (H, W) depth, uint16 in stored units or floating in
             metres, or (N, 3) points
-        meta : what is known of it; default: what `meta_of` finds. Or its camera alone:
-            CameraIntrinsics, and of an array a (3, 3) matrix or (fx, fy, cx, cy)
+        meta : metadata; default: what `meta_of` finds. Or only the camera:
+            CameraIntrinsics, or for an array a (3, 3) matrix or (fx, fy, cx, cy)
         wait_s : seconds to wait until it is signed; default: none
-        priority : from -10 to 10; frames of a greater one are signed first
-        if_novel : keep it only if the map lacks the place: if its nearest frame is farther than
-            this share of the distance of unrelated frames, or than 0.3 of it where just True;
-            else the frame ends `redundant`, and `reason` says which frame is near
-        up : unit vector in the sensor's axes, of an IMU; default: as `meta` or a sidecar says
+        priority : -10 to 10; frames of higher priority are signed first
+        if_novel : keep it only if its place is new to the map: its nearest frame is farther than
+            this share of the distance between unrelated frames (True: 0.3);
+            else the frame becomes `redundant`, and `reason` names the near frame
+        up : unit vector in the sensor's axes, from an IMU; default: from `meta` or a sidecar
 
         Returns
         -------
-        added : its state tells whether it is signed yet
+        added : its state says whether it is signed yet
 
         Raises
         ------
         UnknownMap : no such map.
-        FrameError, DatasetError : the frame cannot be read, or its camera or pose is none.
+        FrameError, DatasetError : the frame cannot be read, or its camera or pose is invalid.
         FrameConflict : the map has the same content with other metadata.
-        InvalidRequest : a priority or `if_novel` out of its range.
+        InvalidRequest : a priority or `if_novel` out of range.
         """
         until = time.monotonic() + (wait_s or 0.0)
         added, _ = self.add(
@@ -74,9 +74,9 @@ class UploadMethods(ServiceConnection):
         *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> tuple[Added, bool]:  # fmt: skip
-        """As `upload`, with a flag: False where the map had the frame already.
+        """Like `upload`, with a flag: False if the map already had the frame.
 
-        The wait may end early; `upload` goes on to the end of it.
+        The wait may end early; `upload` waits until the end.
         """
         return self._upload(
             "POST", f"{map_path(map_name)}/frames", frame, meta, wait_s or 0.0,
@@ -88,7 +88,7 @@ class UploadMethods(ServiceConnection):
         meta: MetaInput | None = None, *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> Added:  # fmt: skip
-        """Take a frame into a map under an id of your own; sent again, it is the one there.
+        """Upload a frame under an id of your own; sending it again has no further effect.
 
         Parameters
         ----------
@@ -99,9 +99,9 @@ class UploadMethods(ServiceConnection):
 
         Raises
         ------
-        UnknownMap, FrameError, DatasetError : as `upload`.
-        FrameConflict : there is a frame of that id with other content or metadata.
-        InvalidRequest : an id that is none; a priority or `if_novel` out of its range.
+        UnknownMap, FrameError, DatasetError : as for `upload`.
+        FrameConflict : that id has a frame with other content or metadata.
+        InvalidRequest : an invalid id; a priority or `if_novel` out of range.
         """
         check_frame_id(frame_id)
         until = time.monotonic() + (wait_s or 0.0)
@@ -116,23 +116,23 @@ class UploadMethods(ServiceConnection):
         metas: Sequence[MetaInput] | FrameMeta | None = None, *, priority: int = 0,
         if_novel: float | bool | None = None,
     ) -> list[BatchItem]:  # fmt: skip
-        """Take up to 64 frames into a map in one commit; what is wrong with one costs no other.
+        """Upload up to 64 frames in one commit; an invalid frame does not affect the others.
 
         Parameters
         ----------
         map_name : of the map
         frames, metas : as for `upload`; one for all, or one for each
-        priority, if_novel : of all
+        priority, if_novel : for all
 
         Returns
         -------
-        items : of each frame in their order
+        items : one for each frame, in order
 
         Raises
         ------
         UnknownMap : no such map.
-        UnreadableFrame, DatasetError : a file cannot be read; nothing was sent.
-        InvalidRequest : too many frames, or not as many metadata.
+        UnreadableFrame, DatasetError : a file cannot be read, and nothing was sent.
+        InvalidRequest : too many frames, or another number of metadata.
         """
         if isinstance(metas, FrameMeta):
             metas = [metas] * len(frames)
