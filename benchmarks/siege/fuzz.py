@@ -16,8 +16,10 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from benchmarks.siege.__main__ import besieged, known_of
 from benchmarks.siege.contract import CHECKS
@@ -32,7 +34,7 @@ MORE_CHECKS = (
     "use_after_free",
 )  # fmt: skip
 _EVENTS = 2
-_WALLS = {"host": "0.0.0.0", "requests_per_s": 0}
+_WALLS: dict[str, object] = {"host": "0.0.0.0", "requests_per_s": 0}
 
 
 @dataclass(frozen=True)
@@ -55,10 +57,11 @@ class Sequences:
     code: int
 
 
-def follow_sequences(
-    of: str, url: str, folder: Path, key: str, seconds: int, known: dict[str, str], seed: int
-) -> Sequences:
-    """Let schemathesis follow sequences of requests for a time.
+def fuzz_requests(
+    of: str, url: str, folder: Path, key: str, seconds: int, seed: int,
+    known: dict[str, str] | None = None, phases: str = "examples,coverage,fuzzing,stateful",
+) -> Sequences:  # fmt: skip
+    """Let schemathesis ask a service for a time.
 
     Parameters
     ----------
@@ -67,9 +70,10 @@ def follow_sequences(
     folder : for configuration and report
     key : to show
     seconds : for how long
+    seed : of what is generated
     known : parameters of paths, such as path.map_name: what is there. Nothing is deleted then;
         without, everything that the key may do is done
-    seed : of what is generated
+    phases : of schemathesis; those with no end are repeated until the time is over
     """
     place = folder / of
     place.mkdir(parents=True)
@@ -80,7 +84,7 @@ def follow_sequences(
     command = [
         str(Path(sys.executable).parent / "schemathesis"), "--config-file", "schemathesis.toml",
         "run", f"{url}/openapi.json", "--max-time", str(seconds), "--seed", str(seed),
-        "--phases", "examples,coverage,fuzzing,stateful", "--max-examples", "50", "--no-shrink",
+        "--phases", phases, "--max-examples", "50", "--no-shrink",
         "--checks", ",".join((*CHECKS, *MORE_CHECKS)), "--continue-on-failure",
         "--generation-database", "none", "--suppress-health-check", "all", "--no-color",
         "--warnings", "off", "--workers", "1", "--header", f"Authorization: Bearer {key}",
@@ -91,34 +95,36 @@ def follow_sequences(
     with report.open("w") as out:
         done = subprocess.run(command, cwd=place, stdout=out, stderr=subprocess.STDOUT)
     text = report.read_text()
-    cases = [int(n) for n in re.findall(r"(\d+) (?:generated|test cases)", text)]
-    return Sequences(of, max(cases, default=0), time.monotonic() - start, text, done.returncode)
+    cases = re.search(r"(\d+) generated", text)
+    return Sequences(
+        of, int(cases[1]) if cases else 0, time.monotonic() - start, text, done.returncode
+    )
 
 
 def fuzz_http(folder: Path, seconds: int, seed: int) -> list[Sequences]:
-    """Two services at once: one where everything may happen, one whose frames stay."""
-    every = shots(8)
-    keys = {}
-    for name in ("free", "known"):
-        (folder / name).mkdir(parents=True)
-        with Engine(Settings(data_dir=folder / name, database_url=None)) as engine:
-            keys[name] = engine.create_key("fuzzer").secret
-    maps = ("siege", "other")
-    with (
-        besieged(folder / "free", every, maps, keys["free"], **_WALLS) as (free, _),
-        besieged(folder / "known", every, maps, keys["known"], **_WALLS) as (kept, _),
-        ThreadPoolExecutor(2) as pool,
-    ):
-        known = known_of(kept, key=keys["known"])
+    """Three services at once: one where everything may happen, one whose frames stay, and one that
+    gets sequences of requests alone, each made of answers to those before it.
+    """
+    every, maps = shots(8), ("siege", "other")
+    with ExitStack() as stack:
+        urls, keys = {}, {}
+        for of in ("everything", "what is there", "sequences"):
+            data = folder / f"data of {of}"
+            data.mkdir(parents=True)
+            with Engine(Settings(data_dir=data, database_url=None)) as engine:
+                keys[of] = engine.create_key("fuzzer").secret
+            urls[of], _ = stack.enter_context(besieged(data, every, maps, keys[of], **_WALLS))
+        more: dict[str, dict[str, Any]] = {
+            "what is there": {"known": known_of(urls["what is there"], key=keys["what is there"])},
+            "sequences": {"phases": "stateful"},
+        }
+        pool = stack.enter_context(ThreadPoolExecutor(len(urls)))
         runs = [
             pool.submit(
-                follow_sequences, "everything", free, folder, keys["free"], seconds, {}, seed
-            ),
-            pool.submit(
-                follow_sequences, "frames that are there", kept, folder, keys["known"], seconds,
-                known, seed + 1,
-            ),
-        ]  # fmt: skip
+                fuzz_requests, of, url, folder, keys[of], seconds, seed + i, **more.get(of, {})
+            )
+            for i, (of, url) in enumerate(urls.items())
+        ]
         return [one.result() for one in runs]
 
 
