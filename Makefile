@@ -29,7 +29,7 @@ help:
 	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
 	@echo "make docs    the documentation as a site, into out/site; a dead link is an error"
 	@echo "make docs-serve  the same at http://127.0.0.1:8009, made anew when a page changes"
-	@echo "make soak    200 kills, and a crowd of writers and readers; rewrites its part of docs/reliability.md"
+	@echo "make soak    200 kills [KILLS=n], and a crowd of writers and readers; rewrites its part of docs/reliability.md"
 	@echo "make siege   broken uploads, fuzzing, ten times too many requests, noisy neighbours; likewise"
 	@echo "make fleet   robots, services, workers and PostgreSQL with a standby, parts killed; likewise"
 	@echo "make models  train the presets that ship with the package (minutes)"
@@ -102,7 +102,7 @@ docs-serve: $(STAMP)
 	$(BIN)/python -m mkdocs serve --dev-addr 127.0.0.1:8009 --watch tools/site
 
 soak: $(STAMP)
-	$(BIN)/python -m benchmarks.soak --page docs/reliability.md
+	$(BIN)/python -m benchmarks.soak --page docs/reliability.md $(if $(KILLS),--kills $(KILLS))
 
 siege: $(STAMP)
 	$(BIN)/python -m benchmarks.siege --page docs/reliability.md

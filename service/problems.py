@@ -193,13 +193,12 @@ def _invalid(found: Sequence[dict[str, Any]], what: str) -> errors.InvalidReques
 
 
 def _allowed(app: FastAPI, path: str) -> list[str]:
-    """Methods of a path."""
-    return sorted(
-        method.upper()
-        for pattern, operations in app.openapi()["paths"].items()
-        if re.fullmatch(re.sub(r"\{\w+\}", "[^/]+", pattern), path)
-        for method in operations
-    ) or ["GET"]  # what is not in the document is read only
+    """Methods of a path: of `/v1/keys/me` its own, not those of `/v1/keys/{key_name}`."""
+    paths = app.openapi()["paths"]
+    found = [one for one in paths if re.fullmatch(re.sub(r"\{\w+\}", "[^/]+", one), path)]
+    if not found:
+        return ["GET"]  # what is not in the document is read only
+    return sorted(method.upper() for method in paths[min(found, key=lambda one: one.count("{"))])
 
 
 def _id(request: Request) -> str:

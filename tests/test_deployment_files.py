@@ -64,6 +64,17 @@ def test_systemd_takes_the_units(path: Path, tmp_path: Path) -> None:
     assert "Restrat" in said_of_unit(text.replace("Restart=", "Restrat="), path.name, tmp_path)
 
 
+@pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
+def test_units_confine_what_they_run(path: Path) -> None:
+    lines = set(path.read_text().splitlines())
+    assert lines >= {
+        "SystemCallFilter=@system-service", "SystemCallFilter=~@privileged", "ProtectClock=yes",
+        "ProtectKernelLogs=yes", "ProtectHostname=yes", "ProtectProc=invisible",
+        "RestrictRealtime=yes", "NoNewPrivileges=yes", "CapabilityBoundingSet=", "UMask=0077",
+    }  # fmt: skip
+    assert {"MemoryMax", "TasksMax"} <= {line.partition("=")[0] for line in lines}
+
+
 def settings_of(text: str) -> dict[str, str]:
     """NAME=value of a unit's `Environment=` lines, or of a file of the environment."""
     found = []

@@ -119,6 +119,20 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert heading in marks, target
 
 
+def test_every_attack_that_succeeded_has_its_test() -> None:
+    page = (ROOT / "docs/security.md").read_text()
+    _, found, table = page.partition("## Attacks that once succeeded")
+    assert found
+    rows = [line for line in table.splitlines() if line.startswith("| ")][1:]
+    assert len(rows) == 16
+    for row in rows:
+        named = re.findall(r"`([\w/]+\.py)`: `(test_\w+)`", row)
+        assert named, row
+        for path, name in named:
+            text = (ROOT / "tests" / path).read_text()
+            assert re.search(rf"^(async )?def {name}\(", text, re.MULTILINE), (path, name)
+
+
 def test_every_dependency_has_a_reason() -> None:
     import tomllib
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.pages import put_between
+from benchmarks.siege import decoders
 from benchmarks.siege.__main__ import (
     ASKED_OF,
     BEGIN,
@@ -18,6 +19,7 @@ from benchmarks.siege.__main__ import (
     table,
 )
 from benchmarks.siege.contract import ContractFigures, read_report, try_contract
+from benchmarks.siege.fuzz import Fuzzed, decoder_table, http_table
 from benchmarks.siege.mutations import MutationFigures, besiege, mutated
 from benchmarks.siege.neighbours import (
     ATTACKS,
@@ -27,6 +29,7 @@ from benchmarks.siege.neighbours import (
 )
 from benchmarks.siege.overload import OverloadFigures, overload
 from benchmarks.soak.load import Shot, shots
+from sceneprint.errors import UnreadableModel
 
 
 @pytest.fixture(scope="module")
@@ -150,3 +153,47 @@ def test_the_page_tells_what_was_measured(tmp_path: Path) -> None:
 )
 def test_a_contract_that_was_not_tried_is_not_kept(changed: dict[str, int], sound: bool) -> None:
     assert replace(ContractFigures(3, 10, 10, ""), **changed).sound is sound
+
+
+@pytest.mark.parametrize("name", decoders.TARGETS)
+def test_what_a_fuzzer_begins_with_is_sound(name: str, tmp_path: Path) -> None:
+    """So that mutations go deep; of a model and a sidecar the first is not whole on purpose."""
+    decoders.write_seeds(name, tmp_path)
+    inputs = [one.read_bytes() for one in (tmp_path / "corpus").iterdir()]
+    assert 2 <= len(inputs) == len(decoders.TARGETS[name].seeds())
+    assert max(map(len, inputs)) <= decoders.TARGETS[name].most or name in ("archive", "bag")
+    read = decoders.TARGETS[name].reader()
+    for data in inputs:
+        if name == "model" and data[:1] == b"\0":
+            with pytest.raises(UnreadableModel):
+                read(data)
+        else:
+            read(data)
+
+
+def test_a_fuzzers_findings_are_noted_once_a_place(tmp_path: Path) -> None:
+    (tmp_path / "findings").mkdir()
+
+    def read(data: bytes) -> object:
+        if data == b"stated":
+            raise UnreadableModel("it is none")
+        return data[9] / 0 if data else 1 / 0
+
+    assert decoders._unstated(read, b"stated") is None
+    for data in (b"short", b"other", b""):
+        why = decoders._unstated(read, data)
+        assert why is not None
+        decoders._note(tmp_path, "unstated", data, why)
+    files = list((tmp_path / "findings").iterdir())
+    told = sorted(one.read_text().partition(":")[0] for one in files if one.suffix == ".txt")
+    assert told == ["IndexError in test_siege.py", "ZeroDivisionError in test_siege.py"]
+    assert sorted(one.read_bytes() for one in files if not one.suffix) == [b"", b"short"]
+
+
+def test_the_tables_of_fuzzers() -> None:
+    found = [Fuzzed("ply", 70, 5.4, ["x"], {"edges": 9, "s": 0.126, "bytes": 3 << 20})]
+    assert decoder_table(found)[-1] == "| ply | 70 | 5 | 9 | 0.13 | 3.0 | **1** |"
+    assert http_table(found)[-1] == "| ply | 70 | 5 | **1** |"
+    assert not found[0].sound
+    assert not Fuzzed("ply", 0, 5.0, []).sound
+    assert Fuzzed("ply", 1, 5.0, []).sound

@@ -61,7 +61,7 @@ def besieged(
     settings : as for Settings
     """
     port = free_port()
-    part = service(data, port, workers=1, **settings)
+    part = service(data, port, 1, None, **settings)
     part.begin()
     url = f"http://127.0.0.1:{port}"
     try:

@@ -14,7 +14,7 @@ from sqlalchemy import func, select
 from benchmarks.soak.load import MAP
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
-from sceneprint.store.tables import frames, jobs, signatures
+from sceneprint.store.tables import frames, jobs, maps, signatures
 from sceneprint_client import Client
 from sceneprint_client.api import Answer
 
@@ -48,7 +48,8 @@ def state_of(data: Path, url: str | None) -> State:
         rows = connection.execute(
             select(frames.c.id, frames.c.content_id, signatures.c.vector)
             .join(signatures, signatures.c.frame_number == frames.c.number)
-            .where(frames.c.state == "indexed")
+            .join(maps, maps.c.number == frames.c.map_number)
+            .where(frames.c.state == "indexed", maps.c.name == MAP)
             .order_by(frames.c.content_id)
         ).all()
         tries = int(connection.execute(select(func.max(jobs.c.attempts))).scalar_one())

@@ -81,7 +81,7 @@ def kill(folder: Path, shots: list[Shot], n_kills: int, seed: int) -> KillFigure
     seed : of victims and moments
     """
     calm, data = folder / "calm", folder / "killed"
-    _undisturbed(calm, shots)
+    run_undisturbed(calm, shots)
     write_shots(shots, folder / "shots.json")
     with Client.embedded(data) as client:
         client.create_map(MAP, model=MODEL)
@@ -98,12 +98,12 @@ def kill(folder: Path, shots: list[Shot], n_kills: int, seed: int) -> KillFigure
             writer.start()
         kills, seconds = _kill(parts, embedded, plan, n_kills, random.Random(seed))
         plan.release(len(shots) + 4)
-        _until(lambda: not any(one.is_alive() for one in (*remote, *embedded)), "writers end")
+        wait_until(lambda: not any(one.is_alive() for one in (*remote, *embedded)), "writers end")
         if len(plan.acknowledged) != len(shots):
             raise AssertionError("a writer ended before all of its frames were acknowledged")
         with Client(url) as client:
-            _until(lambda: _idle(client), "all jobs are over")
-        leftovers, half_written = _fsck(data)
+            wait_until(lambda: is_idle(client), "all jobs are over")
+        leftovers, half_written = check_files(data)
         found, wanted = state_of(data, url), state_of(calm, None)
     finally:
         for part in parts:
@@ -140,7 +140,8 @@ def figures(
     )
 
 
-def _undisturbed(data: Path, shots: list[Shot]) -> None:
+def run_undisturbed(data: Path, shots: list[Shot]) -> None:
+    """Upload all shots, delete those that are to be deleted, and wait for the rest."""
     with Client.embedded(data) as client:
         client.create_map(MAP, model=MODEL)
         jobs = []
@@ -191,7 +192,8 @@ def _kill(
     return done, time.monotonic() - start
 
 
-def _until(what: Callable[[], bool], said: str) -> None:
+def wait_until(what: Callable[[], bool], said: str) -> None:
+    """Wait for something; AssertionError where it does not come to it within END_S."""
     end = time.monotonic() + END_S
     while not what():
         if time.monotonic() > end:
@@ -199,7 +201,8 @@ def _until(what: Callable[[], bool], said: str) -> None:
         time.sleep(0.2)
 
 
-def _idle(client: Client) -> bool:
+def is_idle(client: Client) -> bool:
+    """Whether the service answers, and no job waits or runs."""
     try:
         jobs = client.status().jobs or {}
     except SceneprintError:
@@ -207,7 +210,7 @@ def _idle(client: Client) -> bool:
     return not jobs.get("queued", 0) and not jobs.get("running", 0)
 
 
-def _fsck(data: Path) -> tuple[int, int]:
+def check_files(data: Path) -> tuple[int, int]:
     """Files that nothing refers to, and all other findings; the former are removed."""
     command = [sys.executable, "-m", "sceneprint", "fsck", "--data", str(data), "--json"]
     report = data.with_suffix(".fsck.json")

@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,15 +88,21 @@ class Part:
     name : of the part
     arguments : of the command
     log : file that its standard error is appended to
+    environment : beside this process's
     settings : as for Settings
     """
 
-    def __init__(self, name: str, arguments: list[str], log: Path, **settings: object) -> None:
+    def __init__(
+        self, name: str, arguments: list[str], log: Path,
+        environment: Mapping[str, str] | None = None, **settings: object,
+    ) -> None:  # fmt: skip
         self.name = name
         self._arguments, self._log = arguments, log
-        self._environment = os.environ | {
-            f"SCENEPRINT_{key.upper()}": str(value) for key, value in settings.items()
-        }
+        self._environment = (
+            os.environ
+            | dict(environment or {})
+            | {f"SCENEPRINT_{key.upper()}": str(value) for key, value in settings.items()}
+        )
         self._process: subprocess.Popen[bytes] | None = None
 
     def begin(self) -> None:
@@ -144,16 +151,20 @@ class Part:
             self._process = None
 
 
-def service(data: Path, port: int, workers: int = 0, **settings: object) -> Part:
-    """`sceneprint serve` on a data folder; `settings`: as for Settings."""
+def service(
+    data: Path, port: int, workers: int = 0, environment: Mapping[str, str] | None = None,
+    **settings: object,
+) -> Part:  # fmt: skip
+    """`sceneprint serve` on a data folder; `environment`, `settings`: as for `Part`."""
     given = ["--port", str(port), "--data", str(data), "--workers", str(workers)]
     log = data.with_suffix(".service.log")
-    return Part("service", ["sceneprint", "serve", *given], log, **settings)
+    return Part("service", ["sceneprint", "serve", *given], log, environment, **settings)
 
 
-def workers(data: Path, n: int) -> Part:
-    """`sceneprint work` on a data folder."""
+def workers(data: Path, n: int, environment: Mapping[str, str] | None = None) -> Part:
+    """`sceneprint work` on a data folder; `environment`: as for `Part`."""
     given = ["--data", str(data), "--workers", str(n)]
     log = data.with_suffix(".workers.log")
     # soon enough to publish, and to give up what a killed group of workers held
-    return Part("workers", ["sceneprint", "work", *given], log, lease_s=2, tail_frames=50)
+    settings = {"lease_s": 2, "tail_frames": 50}
+    return Part("workers", ["sceneprint", "work", *given], log, environment, **settings)

@@ -16,13 +16,15 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
 from sceneprint_client.api.frames import CloudFormat
 from sceneprint_client.errors import FrameError, SceneprintError, UnreadableCloud, naming
 
+#: Bytes that are read at once.
+_PIECE = 1 << 20
 #: Most samples a depth image may have (an 8-megapixel sensor); more is refused unread.
 MAXIMUM_SAMPLES = 8_388_608
 
@@ -46,7 +48,7 @@ def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
         if not stat.S_ISREG(status.st_mode):
             raise error(f"{path}: This is no regular file. Name a file that holds the data.")
         with path.open("rb") as file:
-            data = file.read(limit + 1)
+            data = _read_some(file, limit + 1)
     except (OSError, ValueError) as cause:  # ValueError: a NUL in the name
         reason = getattr(cause, "strerror", None) or cause
         raise error(
@@ -58,6 +60,15 @@ def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
             "Check that it is the file you meant."
         )
     return data
+
+
+def _read_some(file: BinaryIO, most: int) -> bytes:
+    """At most so many bytes; `file.read(most)` would allocate as many for a file of ten."""
+    pieces, left = [], most
+    while piece := file.read(min(left, _PIECE)):
+        pieces.append(piece)
+        left -= len(piece)
+    return b"".join(pieces)
 
 
 def read_text(path: Path, limit: int, error: type[SceneprintError]) -> str:

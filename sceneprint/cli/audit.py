@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
+import re
 import socket
 import sys
+from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from datetime import UTC, datetime
@@ -19,6 +22,7 @@ from sceneprint.cli.serve import add_data_option, settings_of
 
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
+    from sceneprint.store.blobs.object_client import Objects
     from sceneprint_client.api.admin import Audited
 
 #: Facility `log audit`, severity `notice`, as RFC 5424 numbers them.
@@ -26,6 +30,10 @@ _PRIORITY = 13 * 8 + 5
 _PORT = 514
 #: Seconds that a log server may take to answer.
 _TIMEOUT_S = 10.0
+#: Most lines of an object.
+_OBJECT_LINES = 1000
+#: Objects by their names: a hash of the tenant and which chain, first and last place in it.
+_OBJECT = re.compile(r"audit/([0-9a-f]{32})-(changes|refusals)/(\d{12})-(\d{12})\.jsonl")
 #: Most lines that differ which `verify` names.
 _MOST_NAMED = 10
 
@@ -45,16 +53,17 @@ def add_audit(commands: Any) -> None:
     )
     command.add_argument(
         "--against",
-        metavar="FILE",
-        type=Path,
-        help="with verify: compare with an exported file too, which finds a log that was "
-        "rewritten with all its hashes",
+        metavar="COPY",
+        help="with verify: compare with an exported file or object store too, which finds a log "
+        "that was rewritten with all its hashes",
     )
     command.add_argument(
         "--export",
         metavar="TARGET",
-        help="append the entries that FILE does not have yet to it, as JSON lines; or send all "
-        "to syslog://HOST[:PORT] (UDP) or syslog+tcp://HOST[:PORT], as RFC 5424",
+        help="append the entries that FILE does not have yet to it, as JSON lines; or put those "
+        "that an object store does not have yet into new objects (s3://BUCKET/PREFIX, gs://..., "
+        "az://...); or send all to syslog://HOST[:PORT] (UDP) or syslog+tcp://HOST[:PORT], as RFC "
+        "5424",
     )
     command.add_argument(
         "--since",
@@ -113,6 +122,12 @@ def _check_options(options: argparse.Namespace) -> None:
         raise InvalidRequest("--against applies to a check only. Use it with `audit verify`.")
     if options.since is not None and options.export is None:
         raise InvalidRequest("--since applies to an export only. Use it with --export.")
+    if options.export is not None and _is_object_store(options.export):
+        for name in ("since", "actor", "map"):
+            if getattr(options, name) is not None:
+                raise InvalidRequest(
+                    f"--{name} would leave gaps in the chains of an object store. Export all."
+                )
 
 
 def _audit_line(one: Audited) -> str:
@@ -123,7 +138,7 @@ def _audit_line(one: Audited) -> str:
     return one_line(f"{one.at:%Y-%m-%dT%H:%M:%SZ}  {who}{whence}{refused}  {what}")
 
 
-def _verify(engine: Engine, copy: Path | None) -> int:
+def _verify(engine: Engine, copy: str | None) -> int:
     """Check all chains, and a copy against them; returns 1 where something does not fit."""
     found = engine.audit.verify()
     for one in found.broken:
@@ -159,6 +174,8 @@ def _export(engine: Engine, options: argparse.Namespace) -> int:
     scheme = options.export.partition("://")[0]
     if scheme in ("syslog", "syslog+tcp"):
         count = _send(options.export, lines)
+    elif _is_object_store(options.export):
+        count = _put(_open_objects(options.export), lines)
     else:
         count = _append(Path(options.export), lines)
     print(f"{_entries(count)} exported to {options.export}")
@@ -169,21 +186,122 @@ def _entries(count: int) -> str:
     return f"{count} entr{'y' if count == 1 else 'ies'}"
 
 
-def _read_copy(path: Path) -> Iterator[Audited]:
+def _read_copy(copy: str | Path) -> Iterator[Audited]:
+    """Entries of an exported file, or of an object store."""
+    if isinstance(copy, str) and _is_object_store(copy):
+        yield from _read_objects(_open_objects(copy))
+        return
+    with Path(copy).open(encoding="utf-8") as file:
+        yield from _entries_of(str(copy), file)
+
+
+def _entries_of(place: str, texts: Iterable[str]) -> Iterator[Audited]:
     from pydantic import ValidationError
 
     from sceneprint.errors import InvalidRequest
     from sceneprint_client.api.admin import Audited
 
-    with path.open(encoding="utf-8") as file:
-        for number, text in enumerate(file, 1):
-            try:
-                yield Audited.model_validate_json(text)
-            except ValidationError:
-                raise InvalidRequest(
-                    f"{path}, line {number}: it is not an exported audit entry. Name a file that "
-                    "`sceneprint audit --export` wrote."
-                ) from None
+    for number, text in enumerate(texts, 1):
+        try:
+            yield Audited.model_validate_json(text)
+        except ValidationError:
+            raise InvalidRequest(
+                f"{place}, line {number}: it is not an exported audit entry. Name what "
+                "`sceneprint audit --export` wrote."
+            ) from None
+
+
+def _is_object_store(target: str) -> bool:
+    from sceneprint.store.blobs.object_client import VARIABLES
+
+    scheme, found, _ = target.partition("://")
+    return bool(found) and scheme.lower() in VARIABLES
+
+
+def _open_objects(url: str) -> Objects:
+    from sceneprint.store.blobs.object_client import open_objects
+
+    return open_objects(url, "--export")
+
+
+def _put(objects: Objects, lines: Iterable[Audited]) -> int:
+    """Put those entries that an object store does not have yet into new objects; returns how many.
+
+    An object holds successive entries of one chain and is named after them. It is put in one step
+    and never changed, so an export that was killed goes on with the first entry that is missing.
+    """
+    there: dict[str, list[tuple[int, int]]] = {}
+    for chain, first, last, _ in _objects(objects):  # each with the greatest end up to it
+        ranges = there.setdefault(chain, [])
+        ranges.append((first, max(last, ranges[-1][1] if ranges else 0)))
+    count = 0
+    waiting: dict[str, list[Audited]] = {}
+    for one in lines:
+        if one.sequence is None:
+            continue  # of before version 0.3: in no chain, and without a place to name it by
+        chain = _chain_name(one)
+        part = waiting.get(chain, [])
+        ranges = there.get(chain, [])
+        below = bisect_right(ranges, one.sequence, key=lambda ends: ends[0])
+        held = below > 0 and one.sequence <= ranges[below - 1][1]
+        if part and (held or len(part) == _OBJECT_LINES or part[-1].sequence != one.sequence - 1):
+            count += _put_object(objects, chain, waiting.pop(chain))
+        if not held:
+            waiting.setdefault(chain, []).append(one)
+    return count + sum(_put_object(objects, chain, part) for chain, part in waiting.items())
+
+
+def _put_object(objects: Objects, chain: str, lines: list[Audited]) -> int:
+    """Put entries of one chain, unless they are there; returns how many were put."""
+    key = f"audit/{chain}/{lines[0].sequence:012d}-{lines[-1].sequence:012d}.jsonl"
+    text = "".join(f"{one.model_dump_json()}\n" for one in lines)
+    return len(lines) if objects.put(key, text.encode(), create=True) else 0
+
+
+def _chain_name(one: Audited) -> str:
+    """Folder of a chain: names of tenants hold what keys of objects must not."""
+    digest = hashlib.sha256((one.tenant or "").encode()).hexdigest()[:32]
+    return f"{digest}-{'refusals' if one.refused else 'changes'}"
+
+
+def _objects(objects: Objects) -> list[tuple[str, int, int, str]]:
+    """Chain, first and last place, and key of each object, in this order."""
+    found = []
+    for one in objects.list("audit/"):
+        name = _OBJECT.fullmatch(one.key)
+        if name is not None:
+            found.append((f"{name[1]}-{name[2]}", int(name[3]), int(name[4]), one.key))
+    return sorted(found)
+
+
+def _read_objects(objects: Objects) -> Iterator[Audited]:
+    """All entries of an object store, each once.
+
+    Raises
+    ------
+    InvalidRequest : an object does not hold what its name says, or one is missing between others.
+    """
+    from sceneprint.errors import InvalidRequest
+
+    before, end = "", 0
+    for chain, first, last, key in _objects(objects):
+        place = f"{objects.url}/{key}"
+        lines = list(_entries_of(place, objects.get(key).decode("utf-8", "replace").splitlines()))
+        wanted = list(range(first, last + 1))
+        if [one.sequence for one in lines] != wanted or {*map(_chain_name, lines)} != {chain}:
+            raise InvalidRequest(
+                f"{place}: it does not hold the entries that its name says. Restore the object "
+                "from a version or copy of it."
+            )
+        if chain == before and first > end + 1:
+            raise InvalidRequest(
+                f"{place}: the {first - end - 1} entries before it are missing. Export again; "
+                "where the log has them no longer, restore the object, or begin with another "
+                "prefix."
+            )
+        end = end if chain == before else 0
+        yield from (one for one in lines if one.sequence is not None and one.sequence > end)
+        before, end = chain, max(end, last)
 
 
 def _append(path: Path, lines: Iterable[Audited]) -> int:

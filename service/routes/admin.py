@@ -72,7 +72,10 @@ async def healthz() -> Health:
 
 
 @router.head("/readyz", include_in_schema=False)
-@router.get("/readyz", responses=declared(), response_model_exclude_defaults=True)
+@router.get(
+    "/readyz", responses=declared(), response_model_exclude_defaults=True,
+    openapi_extra={"security": [{}]},  # besides a key: none
+)  # fmt: skip
 def readyz(here: Here, asking: Guest) -> Readiness:
     """Answers while the database and the object store do; 503 while one does not, while kernels are
     being compiled, and for good once a later version has migrated the store. No key is asked for.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import socket
@@ -14,9 +15,11 @@ from typing import Any
 
 import pytest
 
+from sceneprint.cli import audit, main
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint.store.audit_chain import KeyChange
+from sceneprint.store.blobs.object_client import Objects, open_objects
 
 Run = Callable[..., Any]
 
@@ -90,6 +93,84 @@ def test_a_file_gets_what_it_lacks_and_is_compared(
     assert "line 1: it is not an exported audit entry" in done.stderr
 
 
+def _stored(objects: Objects) -> dict[str, list[tuple[str | None, int | None]]]:
+    """Actor and place of the entries of each object, by its key."""
+    found = {}
+    for one in objects.list(""):
+        lines = [json.loads(line) for line in objects.get(one.key).splitlines()]
+        found[one.key] = [(line["actor"], line["sequence"]) for line in lines]
+    return found
+
+
+def _chain(tenant: str, kind: str) -> str:
+    return f"audit/{hashlib.sha256(tenant.encode()).hexdigest()[:32]}-{kind}"
+
+
+def test_an_object_store_gets_each_entry_once(
+    sceneprint: Run, data: Path, bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = f"{bucket}/log"
+    export = ("audit", "--export", url, "--data", data)
+    assert sceneprint(*export).stdout == f"3 entries exported to {url}\n"
+    objects = open_objects(url)
+    robot, screen = _chain("robot", "changes"), _chain("screen", "refusals")
+    first = {
+        f"{robot}/000000000001-000000000002.jsonl": [("robot", 1), ("robot", 2)],
+        f"{screen}/000000000001-000000000001.jsonl": [("screen", 1)],
+    }
+    assert _stored(objects) == first
+    assert sceneprint(*export).stdout == f"0 entries exported to {url}\n"
+    with Engine(Settings(data_dir=data, database_url=None)) as engine:
+        for _ in range(5):
+            engine.audit.note(KeyChange("edit_map", "robot"))
+    monkeypatch.setattr(audit, "_OBJECT_LINES", 2)
+    put = Objects.put
+
+    def die(*given: Any, **how: Any) -> bool:
+        """As a process that is killed between two objects."""
+        monkeypatch.setattr(Objects, "put", _killed)
+        return put(*given, **how)
+
+    def _killed(*_: Any, **__: Any) -> bool:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Objects, "put", die)
+    assert main([str(one) for one in export]) == 130
+    monkeypatch.setattr(Objects, "put", put)
+    assert sceneprint(*export).stdout == f"3 entries exported to {url}\n"
+    assert _stored(objects) == first | {
+        f"{robot}/{a:012d}-{b:012d}.jsonl": [("robot", n) for n in range(a, b + 1)]
+        for a, b in ((3, 4), (5, 6), (7, 7))
+    }
+    objects.delete(f"{robot}/000000000005-000000000006.jsonl")
+    against = ("audit", "verify", "--against", url, "--data", data)
+    assert "the 2 entries before it are missing" in sceneprint(*against, expect=2).stderr
+    assert sceneprint(*export).stdout == f"2 entries exported to {url}\n"
+    assert "no change found in 8 entries of 2 chains; " in sceneprint(*against).stdout
+
+
+@pytest.mark.sqlite_only("changes its file")
+def test_the_objects_reveal_a_log_that_was_rewritten(
+    sceneprint: Run, data: Path, bucket: str
+) -> None:
+    sceneprint("audit", "--export", bucket, "--data", data)
+    against = ("audit", "verify", "--against", bucket, "--data", data)
+    assert sceneprint(*against).stdout.startswith("no change found in 3 entries of 2 chains; ")
+    for table in ("audit", "audit_chains"):
+        _change(data, f"DELETE FROM {table}")
+    with Engine(Settings(data_dir=data, database_url=None)) as engine:
+        engine.audit.note(KeyChange("create_map", "robot", "192.0.2.7", "yard", at=1e9))
+    told = sceneprint(*against, expect=1).stdout.splitlines()
+    assert sorted(line.rpartition(": ")[2] for line in told) == [
+        "it has another hash", "it is gone", "its chain is gone",
+    ]  # fmt: skip
+    objects = open_objects(bucket)
+    key = f"{_chain('robot', 'changes')}/000000000001-000000000002.jsonl"
+    objects.put(key, objects.get(key).splitlines(keepends=True)[0])
+    done = sceneprint(*against, expect=2)
+    assert f"{bucket}/{key}: it does not hold the entries that its name says" in done.stderr
+
+
 def test_a_log_server_gets_messages_of_rfc_5424(sceneprint: Run, data: Path) -> None:
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as server:
         server.settimeout(30)
@@ -144,6 +225,7 @@ def test_a_log_server_that_is_not_there_is_named(sceneprint: Run, data: Path) ->
     [
         (["--against", "copy"], "--against applies to a check only."),
         (["--since", "1h"], "--since applies to an export only."),
+        (["--export", "s3://bucket", "--actor", "robot"], "--actor would leave gaps"),
         (["verify", "--export", "copy"], "`verify` checks and --export copies."),
     ],
 )

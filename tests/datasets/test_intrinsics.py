@@ -1,12 +1,14 @@
 """intrinsics.json: where it is looked for, what it may say, what is said about bad ones."""
 
 import json
+import tracemalloc
 from pathlib import Path
 
 import pytest
 
 from sceneprint.errors import DatasetError, InvalidIntrinsics
 from sceneprint.formats.dataset import Camera, find_camera, read_camera, write_intrinsics
+from sceneprint.formats.dataset.frame_reference import read_trajectory
 from sceneprint.types import Intrinsics
 
 GOOD = {"width": 640, "height": 480, "fx": 525, "fy": 526.5, "cx": 319.5, "cy": 239}
@@ -21,6 +23,18 @@ def write(path: Path, fields: object) -> Path:
 def test_the_least_that_is_needed(tmp_path: Path) -> None:
     camera = read_camera(write(tmp_path / "intrinsics.json", GOOD))
     assert camera == Camera(Intrinsics(640, 480, 525.0, 526.5, 319.5, 239.0), 1000.0, False)
+
+
+def test_a_short_file_takes_no_more_memory_than_it_needs(tmp_path: Path) -> None:
+    """Not the 64 MiB that a trajectory may have."""
+    path = tmp_path / "groundtruth.txt"
+    path.write_text("1.0 0 0 0 0 0 0 1\n")
+    tracemalloc.start()
+    try:
+        assert read_trajectory(path).stamps.tolist() == [1.0]
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    finally:
+        tracemalloc.stop()
 
 
 def test_all_that_may_be_said(tmp_path: Path) -> None:

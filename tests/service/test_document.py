@@ -133,4 +133,5 @@ def test_keys_are_asked_for_by_all_but_health(document):
     """`/readyz` answers without one, and tells more to who has one."""
     for (_, path), operation in operations(document).items():
         assert ("security" in operation) is (path != "/healthz"), path
+        assert ({} in operation.get("security", ())) is (path == "/readyz"), path
     assert document["components"]["securitySchemes"]["HTTPBearer"]["scheme"] == "bearer"

@@ -6,12 +6,19 @@ import asyncio
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from anyio import fail_after, to_thread
+from fastapi.security import HTTPAuthorizationCredentials
+from starlette.requests import Request
 
 from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import list_keys
 from sceneprint.settings import Settings
+from service.app import create_app
+from service.auth import caller
+from service.limits import RequestBody
 from service.metrics import Sampler, housekeeping
 
 BELOW = (
@@ -135,3 +142,34 @@ def test_who_uses_a_key_waits_for_no_note_of_it(tmp_path):
 
         asyncio.run(serve())
         assert used() == {"busy": True, "idle": False}
+
+
+def test_a_key_is_looked_up_while_every_shared_thread_is_taken(tmp_path):
+    """Slow requests of some keep nobody from being told who they are."""
+    app = create_app(Settings(data_dir=tmp_path, host="0.0.0.0", workers=0))
+
+    async def ask() -> str:
+        async with app.router.lifespan_context(app):
+            here = app.state.context
+            secret = here.engine.create_key("robot").secret
+            shared = to_thread.current_default_thread_limiter()
+            slow = [object() for _ in range(int(shared.total_tokens))]
+            for one in slow:
+                shared.acquire_on_behalf_of_nowait(one)
+            body = RequestBody(Request({"type": "http"}).receive, 0, 1.0)
+            request = Request(
+                {
+                    "type": "http", "app": app, "method": "GET", "path": "/v1/keys/me",
+                    "query_string": b"", "headers": [], "route": SimpleNamespace(endpoint=ask),
+                    "state": {"forwarded": None, "at_end": [], "body": body},
+                }
+            )  # fmt: skip
+            shown = HTTPAuthorizationCredentials(scheme="Bearer", credentials=secret)
+            try:
+                with fail_after(30):
+                    return (await caller(request, here, shown)).name
+            finally:
+                for one in slow:
+                    shared.release_on_behalf_of(one)
+
+    assert asyncio.run(ask()) == "robot"

@@ -214,6 +214,9 @@ def test_a_map_that_cannot_be_is_refused(served, refused, content, headers, stat
         ("POST", "/v1/maps/refusals", 405, "method-not-allowed", "DELETE, GET, PATCH"),
         ("GET", "/v1/maps/refusals/queries", 405, "method-not-allowed", "POST"),
         ("BREW", "/healthz", 405, "method-not-allowed", "GET"),
+        ("PUT", "/v1/keys/me", 405, "method-not-allowed", "GET"),  # not those of a key's name
+        ("OPTIONS", "/v1/maps/hall/frames/batch", 405, "method-not-allowed", "POST"),
+        ("PUT", "/v1/jobs/retry", 405, "method-not-allowed", "POST"),
     ],
 )  # fmt: skip
 def test_what_is_not_there_is_said_so(served, hall, refused, method, path, status, kind, allow):
