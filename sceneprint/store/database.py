@@ -140,7 +140,11 @@ def require_schema(connection: Connection, *, locked: bool = False) -> None:
     NewerSchema : it has, since this process opened it; nothing may be written.
     """
     row = connection.exec_driver_sql(f"{_RANGE} FOR KEY SHARE" if locked else _RANGE).one()
-    found, own = SchemaRange(*row), known_revisions()[0]
+    _allow_schema(connection, SchemaRange(*row))
+
+
+def _allow_schema(connection: Connection, found: SchemaRange) -> None:
+    own = known_revisions()[0]
     if not found.allows(own):
         raise _outdated(connection, found, own)
 
@@ -426,9 +430,7 @@ class Database:
                     connection.detach()  # nobody else gets a connection that does not look
                 writing = connection.execution_options(**options)
                 with writing.begin():
-                    self._held = False
-                    if self._guarded and not unchecked:
-                        require_schema(writing)
+                    self._begin_writing(writing, wait_s, checked=self._guarded and not unchecked)
                     yield writing
                 if not self.is_sqlite:
                     postgres.require_synchronous(writing)
@@ -437,6 +439,17 @@ class Database:
             raise
         finally:
             self._turn.release()
+
+    def _begin_writing(self, writing: Connection, wait_s: float, *, checked: bool) -> None:
+        """Have the turn, which SQLite gave with the transaction, and see that it may be used."""
+        row = None
+        if not self.is_sqlite:
+            row = postgres.take_turn(writing, wait_s, _RANGE if checked else None)
+        self._held = False
+        if row is not None:
+            _allow_schema(writing, SchemaRange(*row))
+        elif checked:
+            require_schema(writing)
 
     def shrink_log(self) -> bool:
         """Leave nothing of what was deleted in SQLite's log; False where that has to wait."""

@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Connection, Select, delete, insert, select, update
+from sqlalchemy import Connection, Select, delete, insert, select, tuple_, update
+from sqlalchemy.dialects import postgresql, sqlite
 
 from sceneprint.errors import Conflict, IdempotencyConflict, UnknownKey
 from sceneprint.store.events import record_event
@@ -262,13 +263,32 @@ class IdempotentRequest:
         return data
 
     def keep(self, connection: Connection, data: dict[str, Any]) -> None:
-        """Remember what came of it, in the transaction that stores that; old ones go."""
-        mine = (idempotency.c.actor == self.actor) & (idempotency.c.key == self.key)
-        old = idempotency.c.created_at <= time.time() - KEPT_S
-        connection.execute(delete(idempotency).where(old | mine))
-        connection.execute(
-            insert(idempotency).values(
-                actor=self.actor, key=self.key, fingerprint=self.fingerprint, data=data,
-                created_at=time.time(),
-            )
-        )  # fmt: skip
+        """Remember what came of it, in the transaction that stores that.
+
+        One statement, as others wait meanwhile. What was remembered before gives way: it is older
+        than a day, or of a map that was deleted since.
+        """
+        own = {"actor": self.actor, "key": self.key}
+        known = {"fingerprint": self.fingerprint, "data": data, "created_at": time.time()}
+        kind: Any = sqlite if connection.dialect.name == "sqlite" else postgresql
+        made = kind.insert(idempotency).values(**own, **known)
+        connection.execute(made.on_conflict_do_update(index_elements=list(own), set_=known))
+
+
+#: Keys that are removed in one transaction: others wait meanwhile.
+_REMOVED_AT_ONCE = 5_000
+
+
+def remove_old_requests(database: Database) -> int:
+    """Forget requests of more than a day ago, in short transactions; how many."""
+    old = idempotency.c.created_at <= time.time() - KEPT_S
+    some = select(idempotency.c.actor, idempotency.c.key).where(old).limit(_REMOVED_AT_ONCE)
+    removed = 0
+    with database.read() as connection:
+        due = connection.execute(some.limit(1)).first() is not None
+    while due:
+        with database.write() as connection:
+            those = tuple_(idempotency.c.actor, idempotency.c.key).in_(some)
+            count = connection.execute(delete(idempotency).where(those)).rowcount
+        removed, due = removed + count, count == _REMOVED_AT_ONCE
+    return removed

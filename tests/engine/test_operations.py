@@ -18,11 +18,12 @@ from sceneprint.engine.admin import statistics
 from sceneprint.engine.admin import statistics as measuring
 from sceneprint.engine.admin.statistics import Latencies, anchors, bin_of
 from sceneprint.engine.search import local_index
-from sceneprint.errors import Conflict, InvalidRequest, UnknownMap
+from sceneprint.errors import Conflict, IdempotencyConflict, InvalidRequest, UnknownMap
 from sceneprint.models import PRESETS, read_model
 from sceneprint.store.events import Wanted, record_event
+from sceneprint.store.keys import IdempotentRequest, remove_old_requests
 from sceneprint.store.store_counts import add_sample, samples_since
-from sceneprint.store.tables import events, jobs, samples
+from sceneprint.store.tables import events, idempotency, jobs, samples
 from sceneprint_client.api import NewMap, Query
 from sceneprint_client.api.admin import IndexRecall
 
@@ -174,6 +175,36 @@ def test_samples_are_forgotten_after_two_hours(make_engine):
         add_sample(connection, "service", "a", {"ago": -1})
         found = [one.data["ago"] for one in samples_since(connection, "service", 0.0)]
     assert found == [7100.0, 0.0, -1]
+
+
+def test_requests_are_remembered_for_a_day_and_their_keys_then_removed(make_engine):
+    engine = make_engine()
+    database, day = engine.store.database, 86_400.0
+    asked = [IdempotentRequest("robot", f"key {i}", f"{i}" * 64) for i in range(3)]
+    with database.write() as connection:
+        for one in asked:
+            one.keep(connection, {"job_id": one.key})
+        asked[0].keep(connection, {"job_id": "again"})  # of a map that was made anew since
+        for one, ago in zip(asked, (day - 60, day + 1, 2 * day), strict=True):
+            connection.execute(
+                update(idempotency)
+                .where(idempotency.c.key == one.key)
+                .values(created_at=time.time() - ago)
+            )
+        found = [one.found(connection) for one in asked]
+        assert found == [{"job_id": "again"}, None, None]
+        # what is forgotten gives way though it was not removed yet: another request may have it
+        other = IdempotentRequest("robot", "key 1", "f" * 64)
+        other.keep(connection, {"job_id": "other"})
+        assert other.found(connection) == {"job_id": "other"}
+    assert remove_old_requests(database) == 1
+    assert remove_old_requests(database) == 0
+    with database.read() as connection:
+        left = connection.execute(select(idempotency.c.key).order_by(idempotency.c.key)).scalars()
+        assert list(left) == ["key 0", "key 1"]
+        assert asked[0].found(connection) == {"job_id": "again"}
+        with pytest.raises(IdempotencyConflict, match="'key 1' was sent with another request"):
+            asked[1].found(connection)
 
 
 def test_events_that_are_not_kept_go_and_no_index_is_doubted(data, make_engine):

@@ -186,7 +186,8 @@ class OperatorTasks:
         return EventPage(items=items, next_cursor=more, newest=seals.seal("event", newest))
 
     def tidy(self) -> int:
-        """Remove events that are no longer kept, if it is time; returns how many.
+        """Remove events that are no longer kept, if it is time; returns how many. Requests whose
+        keys are not remembered any more go with them.
 
         Where that cannot be written, nothing is lost: it is tried again the next time.
         """
@@ -194,6 +195,7 @@ class OperatorTasks:
             return 0
         self._tidied = time.monotonic()
         try:
+            stored.remove_old_requests(self._store.database)
             return self.remove_spent()
         except SceneprintError as error:
             log.warning("event removal failed", extra={"error": str(error)})

@@ -76,7 +76,6 @@ def open_postgres(url: URL) -> Engine:
         pool_timeout=BUSY_S,
     )
     event.listen(engine, "connect", configure)
-    event.listen(engine, "begin", _begin)
     event.listen(engine, "connect", _watch_commits)
     event.listen(engine, "commit", _forget_warnings)
     event.listen(engine, "handle_error", _leave_behind)
@@ -157,23 +156,45 @@ def allow(connection: Connection, seconds: float) -> None:
             )
 
 
-def _begin(connection: Connection) -> None:
-    """Begin a transaction: of a writer with its turn, for which it waits so long."""
-    wait_s: float | None = connection.get_execution_options().get("sceneprint_write")
-    if wait_s is None:
-        return
+def take_turn(connection: Connection, wait_s: float, asked: str | None = None) -> Any:
+    """Wait for a writer's turn, at the beginning of its transaction.
+
+    All of it is one message, of which each statement sees what was committed before it: once the
+    turn is there, nobody else writes until what is sent next has come, and that takes a round trip.
+
+    Parameters
+    ----------
+    connection : of a transaction that has only just begun
+    wait_s : seconds to wait
+    asked : a query of one row, answered when it is its turn
+
+    Returns
+    -------
+    row : of `asked`
+    """
     # a COMMIT that waits for its standby would be cut off by the limit of statements, and be
-    # acknowledged although the standby may lack it; what waits so goes on when there is one again
-    turn = f"SET LOCAL statement_timeout = 0; SELECT pg_advisory_xact_lock({LOCKS}, {TURN})"
+    # acknowledged although the standby may lack it; what waits so goes on when there is one again.
+    # It is a SELECT, and the first: a message that begins without rows is taken to have none
+    message = ["SELECT set_config('statement_timeout', '0', true)"]
+    turn = f"SELECT pg_advisory_xact_lock({LOCKS}, {TURN})"
     if wait_s == BUSY_S:
-        connection.exec_driver_sql(turn)
-        return
-    # what is waited for so long is done without haste; others find the usual time again
-    after = "0" if wait_s > BUSY_S else _milliseconds(BUSY_S)
-    connection.exec_driver_sql(f"SET LOCAL lock_timeout = {_milliseconds(wait_s)}; {turn}")
-    connection.exec_driver_sql(f"SET LOCAL lock_timeout = {after}")
+        message.append(turn)
+    else:
+        # what is waited for so long is done without haste; others find the usual time again
+        after = "0" if wait_s > BUSY_S else _milliseconds(BUSY_S)
+        message += [f"SET LOCAL lock_timeout = {_milliseconds(wait_s)}", turn]
+        message.append(f"SET LOCAL lock_timeout = {after}")
+    if asked is not None:
+        message.append(asked)
+    answer = connection.exec_driver_sql("; ".join(message))
+    cursor: Any = answer.cursor
+    while asked is not None and cursor.nextset():
+        pass  # to that of the last statement
+    row = None if asked is None else cursor.fetchone()
+    answer.close()
     if wait_s > BUSY_S:
         allow(connection, 0)
+    return row
 
 
 def require_synchronous(connection: Connection) -> None:

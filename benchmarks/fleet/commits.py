@@ -1,0 +1,186 @@
+"""Commits in a second of many writers, with a network between them and PostgreSQL.
+
+`python -m benchmarks.fleet.commits [--maps N] [--clients N] [--delay-ms X] [--commits N]`: uploads,
+then the index commits of the same frames, as services and workers make them. Each client has a
+database of its own, as each is a process of a fleet; they are threads here, so that the
+interpreter's lock counts too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import socket
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing import get_context
+from multiprocessing.connection import Connection as Pipe
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import TypeVar
+
+from benchmarks.fleet.postgres import Server
+from sceneprint.store import Database, open_database, queue
+from sceneprint.store.events import record_event
+from sceneprint.store.frames import frame_of, receive_frame
+from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.signatures import StoredSignature, index_frame
+from sceneprint.store.tables import FrameRow, JobRow, MapRow
+from sceneprint_client.api import JobState
+
+T = TypeVar("T")
+
+MODEL, LEASE_S = "ab" * 32, 3600.0
+MADE = StoredSignature(MODEL, bytes(400), "00" * 32, [1], [1])
+#: What is known of each frame beside its content.
+KNOWN: dict[str, object] = {
+    "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1}, "depth_scale": 1000.0,
+    "depth_along_ray": False, "robot": None, "session": None, "captured_at": None, "tags": [],
+    "pose_parent": None, "pose": None, "name": None, "sequence": None,
+}  # fmt: skip
+
+
+def measure(n_maps: int, n_clients: int, delay_ms: float, commits: int) -> tuple[float, float]:
+    """Uploads and index commits in a second.
+
+    Parameters
+    ----------
+    n_maps : that the frames are spread over
+    n_clients : writers at once
+    delay_ms : that each message takes, in either direction
+    commits : of each kind
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        server = Server(Path(folder) / "server", durable=True)
+        server.start()
+        try:
+            server.create("commits")
+            near = open_database(server.url("commits"))
+            rows = _maps(near, n_maps)
+            port, process = _delaying_proxy(server.port, delay_ms / 1e3)
+            far = server.url("commits").replace(f":{server.port}/", f":{port}/")
+            clients = [open_database(far) for _ in range(n_clients)]
+            try:
+                uploads = [(rows[i % n_maps], i) for i in range(commits)]
+                uploaded = _timed(clients, uploads, _upload)
+                ended = _timed(clients, [_claim(near) for _ in range(commits)], _index)
+            finally:
+                for one in (*clients, near):
+                    one.close()
+                process.kill()
+                process.join()
+        finally:
+            server.kill()
+    return commits / uploaded, commits / ended
+
+
+def _maps(database: Database, n: int) -> list[MapRow]:
+    with database.write() as connection:
+        keep_model(connection, MODEL, "toy", b"the file of a model")
+        return [add_map(connection, f"map-{i}", None, MODEL) for i in range(n)]
+
+
+def _upload(database: Database, work: tuple[MapRow, int]) -> None:
+    row, number = work
+    with database.write() as connection:
+        if receive_frame(connection, row, {**KNOWN, "content_id": f"{number:064x}"}, 0) is None:
+            raise RuntimeError("an upload was not taken")
+
+
+def _claim(database: Database) -> tuple[JobRow, FrameRow]:
+    with database.write(turn=False) as connection:
+        held = queue.claim(connection, "commits", LEASE_S)
+        if held is None:
+            raise RuntimeError("a job is missing")
+        return held, frame_of(connection, held.frame)
+
+
+def _index(database: Database, work: tuple[JobRow, FrameRow]) -> None:
+    held, frame = work
+    with database.write() as connection:
+        queue.finish(connection, held, JobState.SUCCEEDED)
+        index_frame(connection, frame, MADE)
+        record_event(connection, "frame.indexed", "map", frame.id, held.id)
+
+
+def _timed(clients: list[Database], works: list[T], do: Callable[[Database, T], None]) -> float:
+    """Seconds until all is done by the clients at once."""
+    waiting, errors = SimpleQueue[T](), list[Exception]()
+    for work in works:
+        waiting.put(work)
+
+    def run(database: Database) -> None:
+        try:
+            while True:
+                do(database, waiting.get_nowait())
+        except Empty:
+            return
+        except Exception as error:
+            errors.append(error)
+
+    for client in clients:  # a first connection costs more than a commit
+        with client.read():
+            pass
+    threads = [threading.Thread(target=run, args=[one]) for one in clients]
+    begun = time.perf_counter()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise errors[0]
+    return time.perf_counter() - begun
+
+
+def _delaying_proxy(port: int, delay_s: float) -> tuple[int, BaseProcess]:
+    """A process of its own that hands on what comes to a port, later; its port."""
+    context = get_context("spawn")
+    told, tell = context.Pipe(duplex=False)
+    process = context.Process(target=_hand_on, args=(tell, port, delay_s), daemon=True)
+    process.start()
+    return told.recv(), process
+
+
+def _hand_on(tell: Pipe, port: int, delay_s: float) -> None:
+    with socket.create_server(("127.0.0.1", 0), backlog=256) as listener:
+        tell.send(listener.getsockname()[1])
+        while True:
+            near, _ = listener.accept()
+            far = socket.create_connection(("127.0.0.1", port))
+            for one in (near, far):
+                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            for pair in ((near, far), (far, near)):
+                threading.Thread(target=_pump, args=(*pair, delay_s), daemon=True).start()
+
+
+def _pump(source: socket.socket, to: socket.socket, delay_s: float) -> None:
+    with suppress(OSError):
+        while data := source.recv(1 << 16):
+            time.sleep(delay_s)
+            to.sendall(data)
+    with suppress(OSError):
+        to.shutdown(socket.SHUT_WR)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--maps", type=int, default=50)
+    parser.add_argument("--clients", type=int, default=32)
+    parser.add_argument("--delay-ms", type=float, default=0.5)
+    parser.add_argument("--commits", type=int, default=1000)
+    asked = parser.parse_args(arguments)
+    uploads, ends = measure(asked.maps, asked.clients, asked.delay_ms, asked.commits)
+    print(
+        f"{asked.maps} maps, {asked.clients} clients, {asked.delay_ms:g} ms: "
+        f"{uploads:.1f} uploads/s, {ends:.1f} index commits/s"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

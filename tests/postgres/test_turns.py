@@ -1,0 +1,85 @@
+"""A writer's turn on PostgreSQL: what is seen when it comes, and what it costs."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from sqlalchemy import func, insert, select, text
+
+from sceneprint.errors import NewerSchema, StoreLocked
+from sceneprint.store import Store
+from sceneprint.store.postgres import connection as postgres
+from sceneprint.store.tables import events
+
+#: Writers of other processes that wait for the turn.
+_WAITING = text(
+    "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted "
+    "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
+)
+
+
+def waiting(store: Store) -> int:
+    with store.database.read() as connection:
+        return int(connection.execute(_WAITING).scalar_one())
+
+
+def write(store: Store) -> None:
+    with store.database.write() as connection:
+        connection.execute(insert(events).values(at=0.0, kind="late", data={}))
+
+
+def test_who_waited_for_a_migration_finds_its_schema_and_writes_nothing(
+    server_store: Store, until: Callable[[Callable[[], Any]], Any]
+) -> None:
+    raised = list[Exception]()
+
+    def late() -> None:
+        try:
+            write(server_store)
+        except NewerSchema as error:
+            raised.append(error)
+
+    writer = threading.Thread(target=late)
+    with server_store.database._engine.begin() as other:  # as another process would
+        postgres.take_turn(other, 10.0)
+        writer.start()
+        until(lambda: waiting(server_store) == 1)
+        other.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+        other.exec_driver_sql("UPDATE schema_range SET least_revision = '9999'")
+    writer.join(60)
+    assert [str(one).partition("schema ")[2][:4] for one in raised] == ["9999"]
+    with server_store.database.read() as connection:
+        late_ones = select(func.count()).where(events.c.kind == "late")
+        assert connection.execute(late_ones).scalar_one() == 0
+
+
+@pytest.mark.parametrize(
+    ("wait_s", "after"), [(0.1, ("10s", "0")), (10.0, ("10s", "0")), (60.0, ("0", "0"))]
+)
+def test_a_turn_answers_the_last_question_and_leaves_the_usual_limits(
+    server_store: Store, wait_s: float, after: tuple[str, str]
+) -> None:
+    limits = "SELECT current_setting('lock_timeout'), current_setting('statement_timeout')"
+    engine = server_store.database._engine
+    with engine.begin() as connection:
+        assert tuple(postgres.take_turn(connection, wait_s, "SELECT 7, 'x'")) == (7, "x")
+        assert tuple(connection.exec_driver_sql(limits).one()) == after
+    with engine.begin() as connection:
+        assert tuple(connection.exec_driver_sql(limits).one()) == ("10s", "1min")
+
+
+def test_a_turn_that_does_not_come_in_time_is_said_and_given_up(server_store: Store) -> None:
+    database = server_store.database
+    with database._engine.begin() as other:
+        postgres.take_turn(other, 10.0)
+        database._held = True  # somebody has waited in vain before: two seconds are enough
+        with pytest.raises(StoreLocked):
+            write(server_store)
+        assert waiting(server_store) == 0
+    write(server_store)
+    with database.read() as connection:
+        late_ones = select(func.count()).where(events.c.kind == "late")
+        assert connection.execute(late_ones).scalar_one() == 1
