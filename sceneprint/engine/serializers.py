@@ -18,7 +18,7 @@ from sceneprint.formats.dataset import rigid_transform
 from sceneprint.store.deletion import DAY_S, count_old
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import model_names
-from sceneprint.store.queue import jobs_of
+from sceneprint.store.queue import job_ids_of
 from sceneprint.store.reencoding_rows import switch_progress
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
 from sceneprint.types import Floats
@@ -46,9 +46,13 @@ EDITABLE = (
 )  # fmt: skip
 
 
+#: As `json.dumps(parts, sort_keys=True)`, which makes an encoder each time.
+_encode = json.JSONEncoder(sort_keys=True).encode
+
+
 def tag_of(*parts: object) -> str:
     """32 digits of what can be told as JSON: the same for the same parts."""
-    told = json.dumps(parts, sort_keys=True)
+    told = _encode(parts)
     return hashlib.sha256(told.encode()).hexdigest()[:32]
 
 
@@ -192,7 +196,7 @@ def map_record(connection: Connection, row: MapRow) -> Map:
 
 def frame_records(connection: Connection, row: MapRow, found: list[FrameRow]) -> list[Frame]:
     """Frames of one map."""
-    jobs = jobs_of(connection, [frame.number for frame in found])
+    jobs = job_ids_of(connection, [frame.number for frame in found])
     return [_frame(row, frame, jobs[frame.number]) for frame in found]
 
 
@@ -226,7 +230,7 @@ def job_record(
     )
 
 
-def _frame(row: MapRow, frame: FrameRow, job: JobRow) -> Frame:
+def _frame(row: MapRow, frame: FrameRow, job_id: str) -> Frame:
     pose = None
     if frame.pose is not None and frame.pose_parent is not None:
         pose = transform(np.array(frame.pose), frame.pose_parent, sensor_of(frame))
@@ -238,7 +242,7 @@ def _frame(row: MapRow, frame: FrameRow, job: JobRow) -> Frame:
         map=row.name,
         state=frame.state,
         reason=frame.reason,
-        job_id=job.id,
+        job_id=job_id,
         content_id=frame.content_id,
         bytes=frame.bytes,
         **_sensor_record(frame),

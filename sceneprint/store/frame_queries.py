@@ -27,11 +27,12 @@ from sqlalchemy import (
 
 from sceneprint.store.maps import ROOMLESS
 from sceneprint.store.tables import (
+    FRAME_COLUMNS,
     FrameRow,
     MapRow,
     count_rows,
     deleted_frames,
-    frame_row,
+    frame_rows,
     frame_tags,
     frames,
     job_files,
@@ -218,8 +219,8 @@ def list_frames(
     chosen = list(connection.execute(numbers.limit(limit)).scalars())
     if not chosen:
         return []
-    found = connection.execute(select(frames).where(frames.c.number.in_(chosen))).mappings()
-    rows = {row["number"]: frame_row(row) for row in found}
+    found = connection.execute(select(*FRAME_COLUMNS).where(frames.c.number.in_(chosen)))
+    rows = {row.number: row for row in frame_rows(found)}
     return [rows[one] for one in chosen]
 
 

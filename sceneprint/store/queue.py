@@ -58,11 +58,13 @@ from sqlalchemy import (
 from sceneprint.errors import JobOver, LostLease, UnknownJob
 from sceneprint.process import request_id
 from sceneprint.store.tables import (
+    JOB_COLUMNS,
     JobRow,
     count_rows,
     frames,
     job_files,
     job_items,
+    job_of_columns,
     job_row,
     jobs,
     maps,
@@ -113,7 +115,7 @@ def list_jobs(
     )  # fmt: skip
     asked = (
         select(
-            jobs, frames.c.id.label("frame_id"), maps.c.name.label("map_name"),
+            *JOB_COLUMNS, frames.c.id.label("frame_id"), maps.c.name.label("map_name"),
             last.label("followed_by"),
         )
         .join(frames, frames.c.number == jobs.c.frame_number, isouter=True)
@@ -129,12 +131,8 @@ def list_jobs(
         asked = asked.where(jobs.c.number < before)
     if state is not None:
         asked = asked.where(jobs.c.state == state)
-    found = []
-    for row in connection.execute(asked).mappings():
-        own = {column.name: row[column.name] for column in jobs.columns}
-        found.append(Listed(JobRow(**{**own, "state": JobState(own["state"])}),
-                            row["frame_id"], row["map_name"], row["followed_by"]))  # fmt: skip
-    return found
+    found: list[Any] = list(connection.execute(asked))
+    return [Listed(job_of_columns(row), *row[len(JOB_COLUMNS) :]) for row in found]
 
 
 def find_job(connection: Connection, job_id: str) -> JobRow:
@@ -180,11 +178,13 @@ def last_of(
     return None if row is None else job_row(row)
 
 
-def jobs_of(connection: Connection, frame_numbers: list[int]) -> dict[int, JobRow]:
+def job_ids_of(connection: Connection, frame_numbers: list[int]) -> dict[int, str]:
     """The latest job of each frame that is to have it indexed, not those that sign it again."""
-    asked = select(jobs).where(jobs.c.kind == "sign").order_by(jobs.c.number)
-    found = rows_among(connection, asked, jobs.c.frame_number, frame_numbers)
-    return {row.frame_number: job_row(row._mapping) for row in found}
+    asked = select(jobs.c.frame_number, jobs.c.id).where(jobs.c.kind == "sign")
+    found = rows_among(
+        connection, asked.order_by(jobs.c.number), jobs.c.frame_number, frame_numbers
+    )
+    return {row[0]: row[1] for row in found}
 
 
 def count_jobs(connection: Connection, map_number: int | None = None) -> dict[str, int]:

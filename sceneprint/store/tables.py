@@ -7,7 +7,7 @@ Times are seconds since 1970. `number` orders rows as they came and is never giv
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import islice
 from typing import Any
 
@@ -25,6 +25,7 @@ from sqlalchemy import (
     Integer,
     LargeBinary,
     MetaData,
+    Row,
     RowMapping,
     Select,
     String,
@@ -713,6 +714,30 @@ def frame_row(row: RowMapping) -> FrameRow:
     return FrameRow(**{**row, "state": FrameState(row["state"])})
 
 
+def frame_rows(found: Iterable[Row[Any]]) -> list[FrameRow]:
+    """Rows of `FRAME_COLUMNS`; by their places, which costs a third of `frame_row`."""
+    rows = []
+    for row in found:
+        values = list(row)
+        values[_FRAME_STATE] = FrameState(values[_FRAME_STATE])
+        rows.append(FrameRow(*values))
+    return rows
+
+
 def job_row(row: RowMapping) -> JobRow:
     """A row of the table `jobs`."""
     return JobRow(**{**row, "state": JobState(row["state"])})
+
+
+def job_of_columns(row: Sequence[Any]) -> JobRow:
+    """A row that begins with `JOB_COLUMNS`."""
+    values = list(row[: len(JOB_COLUMNS)])
+    values[_JOB_STATE] = JobState(values[_JOB_STATE])
+    return JobRow(*values)
+
+
+#: Columns of `frames` and of `jobs` in the order of the fields of their rows.
+FRAME_COLUMNS = tuple(frames.c[one.name] for one in fields(FrameRow))
+JOB_COLUMNS = tuple(jobs.c[one.name] for one in fields(JobRow))
+_FRAME_STATE = [column.name for column in FRAME_COLUMNS].index("state")
+_JOB_STATE = [column.name for column in JOB_COLUMNS].index("state")

@@ -217,7 +217,9 @@ def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(
     with store.database.read() as connection:
         assert [row.name for row in stored_maps.list_maps(connection)] == ["other"]
         assert stored.frames_of(connection, [mine.number, theirs.number]).keys() == {theirs.number}
-        assert queue.jobs_of(connection, [mine.number, theirs.number]) == {theirs.number: kept}
+        assert queue.job_ids_of(connection, [mine.number, theirs.number]) == {
+            theirs.number: kept.id
+        }
         assert job.number != kept.number
         assert stored.refers_to(connection, "11" * 32)
         assert signed.stored_vector(connection, mine.number, hall.model_id) is None

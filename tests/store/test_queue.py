@@ -22,7 +22,9 @@ Queued = Callable[..., JobRow]
 Turned = Callable[..., None]
 
 
-def test_a_job_is_queued_as_it_should_be(store: Store, hand: Any, queued: Queued) -> None:
+def test_a_job_is_queued_as_it_should_be(
+    store: Store, hall: MapRow, hand: Any, queued: Queued
+) -> None:
     before = time.time()
     job = queued("a", 3)
     assert (job.kind, job.state, job.priority, job.attempts, job.token) == (
@@ -33,10 +35,13 @@ def test_a_job_is_queued_as_it_should_be(store: Store, hand: Any, queued: Queued
     assert (job.started_at, job.finished_at) == (None, None)
     assert hand.row(job) == job
     with store.database.read() as connection:
-        assert queue.jobs_of(connection, [job.frame_number]) == {job.frame_number: job}
+        assert queue.job_ids_of(connection, [job.frame_number]) == {job.frame_number: job.id}
         assert queue.count_jobs(connection) == {"queued": 1}
         with pytest.raises(UnknownJob, match="no job 'nobody'"):
             queue.find_job(connection, "nobody")
+        # a page of jobs is read by the places of the columns
+        [listed] = queue.list_jobs(connection, None, 9, None)
+        assert (listed.job, listed.map_name, listed.followed_by) == (job, hall.name, None)
 
 
 def test_what_matters_more_comes_first_and_of_equals_what_came_first(

@@ -33,7 +33,7 @@ from sceneprint.store.frames import (
 )
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map, require_room
-from sceneprint.store.queue import enqueue, jobs_of
+from sceneprint.store.queue import enqueue, job_ids_of
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Added, FrameMeta, FrameState
@@ -165,8 +165,8 @@ def item_of(outcome: UploadResult) -> BatchItem:
 
 def upload_response(connection: Connection, frame: FrameRow) -> Added:
     """A frame as uploads are answered."""
-    job = jobs_of(connection, [frame.number])[frame.number]
-    return Added(frame_id=frame.id, job_id=job.id, state=frame.state, reason=frame.reason)
+    job_id = job_ids_of(connection, [frame.number])[frame.number]
+    return Added(frame_id=frame.id, job_id=job_id, state=frame.state, reason=frame.reason)
 
 
 def replayed(
