@@ -2,6 +2,7 @@
 
     SceneprintError, and all of sceneprint_client.errors
       x DamagedIndex            a cache file of the index that is missing or damaged
+      x DecoderFailure          an upload that its decoder crashes of, or cannot decode within limits
       x BusyIndex               another process is building this index
       x StoreError
         - LostLease             the job has been given to another worker
@@ -85,6 +86,7 @@ __all__ = [
     "DamagedSignature",
     "DamagedSnapshot",
     "DatasetError",
+    "DecoderFailure",
     "Forbidden",
     "ForeignOrigin",
     "FrameConflict",
@@ -145,6 +147,12 @@ __all__ = [
 
 class DamagedIndex(SceneprintError):
     """A cache file of the index is missing or damaged."""
+
+
+class DecoderFailure(SceneprintError):
+    """A decoder crashed of an upload, took too long, or needed too much memory. Its text goes on
+    from "it": who catches it says of what.
+    """
 
 
 class BusyIndex(SceneprintError):

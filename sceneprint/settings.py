@@ -101,6 +101,15 @@ class Settings(BaseSettings):
     #: Memory that a worker may take for its work, bytes, beyond what it has when it is ready;
     #: 0 for no limit. What needs more fails, and no other process is killed for it.
     worker_bytes: int = Field(default=2 << 30, ge=0)
+    #: Processes that uploads are decoded in, of the service at most; a worker has one of its own.
+    #: They may do nothing but compute. 0: uploads are decoded in the service and the workers.
+    decoders: int = Field(
+        default_factory=lambda: min(max(os.cpu_count() or 1, 2), 8), ge=0, le=256
+    )
+    #: Memory that a decoder may take for an upload, bytes; 0 for no limit.
+    decoder_bytes: int = Field(default=2 << 30, ge=0)
+    #: Processor time that a decoder may take for an upload, seconds.
+    decoder_s: float = Field(default=30.0, ge=0.1, le=3600)
     #: Frames newer than the index above which a worker publishes a new one.
     tail_frames: int = Field(default=1000, ge=1, le=100_000)
     #: Snapshots taken over the service that are kept; the oldest are removed.

@@ -160,6 +160,7 @@ def _warm(engine: Engine, stop: threading.Event) -> None:
         engine.signers.release()
     if stop.is_set():
         return
+    engine.store.decoders.start()
     try:
         engine.warm()
     except SceneprintError as error:  # the first requests load what they need, or say the same

@@ -39,13 +39,14 @@ def embedded_settings(path: Path) -> Settings:
     """The settings of a service that one process has for itself.
 
     A folder was named, so nothing goes elsewhere, whatever the environment says; nobody else
-    asks, so no key is needed and nobody is sent away.
+    asks, so no key is needed and nobody is sent away. Frames are the program's own, so they are
+    decoded here: no other process is started.
     """
     return Settings(
         data_dir=path.absolute(), database_url=None, replica_url=None, index_dir=None,
         host="127.0.0.1", require_keys=False, cors_origins=(), requests_per_s=0,
         waiting=_MOST_WAITING, wait_s=_LONGEST_WAIT_S, upload_bytes=_MOST_BYTES,
-        event_streams=_MOST_STREAMS,
+        event_streams=_MOST_STREAMS, decoders=0,
     )  # fmt: skip
 
 

@@ -72,10 +72,13 @@ def check(
 
 def _signed(shots: list[Shot]) -> Bytes:
     """Signatures of all shots, by the library alone."""
+    from sceneprint.decoders import LocalDecoders
     from sceneprint.engine.ingest.frame_decoder import read_upload
 
-    signer = open_signer(MODEL)
-    return np.stack([sign(read_upload(one.png, one.meta).frame, signer).vector for one in shots])
+    signer, decoders = open_signer(MODEL), LocalDecoders(1)
+    return np.stack(
+        [sign(read_upload(one.png, one.meta, decoders).frame, signer).vector for one in shots]
+    )
 
 
 def faults(

@@ -9,6 +9,8 @@ from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 
+from sceneprint.decoders import Decoders, LocalDecoders
+from sceneprint.decoders.pool import DecoderPool
 from sceneprint.engine.admin import operations
 from sceneprint.engine.admin.operations import Audit, OperatorTasks
 from sceneprint.engine.ingest.archive_import import Imports
@@ -56,7 +58,7 @@ from sceneprint.store.database_errors import PATIENCE_S, open_patiently
 from sceneprint.store.deletion import remove_map
 from sceneprint.store.reencoding_rows import models_of
 from sceneprint.store.tables import MapRow
-from sceneprint.store.tenants import work_of
+from sceneprint.store.tenants import current_tenant, work_of
 from sceneprint.store.undo_rows import UndoLimits
 from sceneprint.store.wakeup import Notices, Wakeup
 from sceneprint_client.api import (
@@ -79,6 +81,15 @@ from sceneprint_client.api.listing import FrameListing
 log = logging.getLogger(__name__)
 
 
+def decoders_of(settings: Settings) -> Decoders:
+    """Where uploads are decoded, by the settings; processes start with the first upload."""
+    if settings.decoders == 0:
+        return LocalDecoders(settings.concurrency)
+    return DecoderPool(
+        settings.decoders, settings.decoder_bytes, settings.decoder_s, current_tenant
+    )
+
+
 class Engine:
     """Maps, frames, queries and jobs over one store; safe to share between threads.
 
@@ -95,7 +106,7 @@ class Engine:
         self.store = open_store(
             settings.database, settings.blobs,
             None if replica is None else replica.get_secret_value(), settings.replica_lag_s,
-            settings.geometry_bytes,
+            settings.geometry_bytes, decoders_of(settings),
         )  # fmt: skip
         self.signers = Signers(self.store.database, settings.cache_dir)
         self._upkeep = Upkeep(
@@ -118,7 +129,7 @@ class Engine:
         self._limits = threadpool_limits(1)
         server = not self.store.database.is_sqlite
         self.bell = Notices(self.store.database) if server else Wakeup(settings.bell_dir)
-        self.uploads = Uploads(self.store, self.bell, settings.concurrency)
+        self.uploads = Uploads(self.store, self.bell)
         self.tasks = Tasks(self.store, self.bell)
         self.imports = Imports(self.store, self.tasks, self.uploads, settings.import_bytes)
         self.associations = AssociationJobs(self.store, self.tasks)

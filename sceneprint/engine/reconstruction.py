@@ -202,7 +202,7 @@ def _read(store: Store, view: JobView, model_id: str, asked_at: float) -> tuple[
         raise _no_image(view.frame_id)
     T = np.array(view.transform)
     try:
-        found = read_stored(store.blobs.get(frame.blob), frame)
+        found = read_stored(store.blobs.get(frame.blob), frame, store.decoders)
         assert isinstance(found, DepthFrame)
         return DepthFrame(found.depth, found.intrinsics, view.frame_id, T), "upload"
     except DamagedBlob:

@@ -9,7 +9,7 @@ import io
 import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -32,6 +32,9 @@ from sceneprint_client.files import (
 )
 from sceneprint_client.ros_messages import TRANSPORT_BYTES
 from sceneprint_client.sidecars import rigid_transform
+
+#: What a depth image is stored as: whole numbers of some unit, or metres.
+Samples = NDArray[np.uint16] | Floats32
 
 #: Most bytes a frame may have: all samples as float64, and room for a header.
 _MAXIMUM_CHUNKS = 65_536  # 16 megapixels in pieces of 1 KB; each costs time even if empty
@@ -222,7 +225,7 @@ def has_transport_header(data: bytes) -> bool:
     return data.startswith(PNG_SIGNATURE, TRANSPORT_BYTES)
 
 
-def _decode_transported(data: bytes) -> NDArray[np.uint16] | Floats32:
+def _decode_transported(data: bytes) -> Samples:
     """Samples of a 16UC1 image as they are, metres of one of 32FC1, by what the header says."""
     samples = decode_png(data[TRANSPORT_BYTES:])
     a, b = struct.unpack_from("<ff", data, 4)
@@ -261,7 +264,7 @@ _SHAPES = (
 )
 
 
-def decode_npy(data: bytes) -> NDArray[np.uint16] | Floats32:
+def decode_npy(data: bytes) -> Samples:
     """Return the samples of an NPY file: floating ones in metres, uint16 in stored units.
 
     Parameters
@@ -424,25 +427,35 @@ def decode_frame(
     along_ray: bool = False,
     name: str = "",
     pose: Floats | None = None,
+    samples_of: Callable[[bytes], Samples] | None = None,
 ) -> DepthFrame:
     """Return the frame of the bytes of a PNG or NPY file.
 
     Parameters
     ----------
     data : the whole file; the rest as for `make_frame`
+    samples_of : decodes the file elsewhere; default: `decode_samples`
 
     Raises
     ------
     UnreadableFrame : neither PNG nor NPY; and as `decode_png`, `decode_npy` and `make_frame`.
     """
     with naming(name):
+        samples = (samples_of or decode_samples)(data)
         frame = make_frame(
-            _decode(data), intrinsics, depth_scale=depth_scale, along_ray=along_ray, pose=pose
+            samples, intrinsics, depth_scale=depth_scale, along_ray=along_ray, pose=pose
         )
     return replace(frame, name=name)
 
 
-def _decode(data: bytes) -> NDArray[np.uint16] | Floats32:
+def decode_samples(data: bytes) -> Samples:
+    """Return the samples (H, W) of a PNG, NPY or compressedDepth image: uint16 in stored units, or
+    float32 metres.
+
+    Raises
+    ------
+    UnreadableFrame : none of these; and as `decode_png` and `decode_npy`.
+    """
     if not data:
         raise UnreadableFrame("The file is empty. Copy or write it again.")
     if data.startswith(PNG_SIGNATURE):

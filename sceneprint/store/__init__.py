@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError
 
 from sceneprint.atomic_files import make_folder
+from sceneprint.decoders import Decoders, LocalDecoders
 from sceneprint.errors import StoreAway, UnusableStore
 from sceneprint.store.blobs.folder import Blobs, FileLocks, FolderBlobs, Locks
 from sceneprint.store.blobs.object_client import open_objects
@@ -37,12 +38,20 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Store:
-    """Database and blobs, opened."""
+    """Database and blobs, opened.
+
+    Parameters
+    ----------
+    database, blobs, replica : see there
+    geometry_bytes : see GeometryCache
+    decoders : that bytes of uploads are decoded by
+    """
 
     database: Database
     blobs: Blobs
     replica: Replica | None = None
     geometry_bytes: int = 0
+    decoders: Decoders = field(default_factory=lambda: LocalDecoders(1))
 
     @property
     def queried(self) -> Database:
@@ -66,7 +75,8 @@ class Store:
         return OpaqueIds(self.database)
 
     def close(self) -> None:
-        """Give back all connections."""
+        """Give back all connections, and end the decoders."""
+        self.decoders.close()
         if self.replica is not None:
             self.replica.close()
         self.blobs.close()
@@ -75,7 +85,7 @@ class Store:
 
 def open_store(
     url: str, blobs: Path | str, replica_url: str | None = None, replica_lag_s: float = 0.0,
-    geometry_bytes: int = 0,
+    geometry_bytes: int = 0, decoders: Decoders | None = None,
 ) -> Store:  # fmt: skip
     """Open both, made where both are missing.
 
@@ -88,12 +98,16 @@ def open_store(
     blobs : folder, or URL of an object store
     replica_url, replica_lag_s : see Replica; it need not be there
     geometry_bytes : see GeometryCache
+    decoders : see Store; default: one upload at a time in this process
 
     Raises
     ------
     UnusableStore, NewerSchema : see `open_database`, `open_blobs` and Replica.
     """
-    opened = replace(_open_store(url, blobs), geometry_bytes=geometry_bytes)
+    opened = replace(
+        _open_store(url, blobs), geometry_bytes=geometry_bytes,
+        decoders=decoders or LocalDecoders(1),
+    )  # fmt: skip
     if replica_url is None:
         return opened
     try:

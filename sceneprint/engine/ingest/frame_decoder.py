@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from sceneprint import errors
+from sceneprint.decoders import Decoder, Decoders
 from sceneprint.engine.serializers import pose_matrix
 from sceneprint.formats.dataset import decode_frame
 from sceneprint.formats.depth_file import has_transport_header
@@ -49,37 +50,73 @@ class Read:
         return "depth" if self.cloud is None else "cloud"
 
 
-def read_upload(data: bytes, meta: FrameMeta) -> Read:
+def read_upload(data: bytes, meta: FrameMeta, decoders: Decoders) -> Read:
     """The frame of an upload, checked as far as can be without signing it.
+
+    Parameters
+    ----------
+    data, meta : of the upload
+    decoders : one of which decodes it
 
     Raises
     ------
     FrameError : undecodable samples, a camera that is none or of another image, a pose or
-        T_base_sensor that is not rigid, or no sample at all.
+        T_base_sensor that is not rigid, no sample at all, or a file that its decoder fails at.
     InvalidRequest : a depth image without a camera, a cloud with one, or what has no meaning for
         the kind it is; UnsupportedType where what unpacks it is not installed.
+    Busy : no decoder gets free, or none can be started.
     """
+    with decoders.place() as decoder:
+        return _read(data, meta, decoder)
+
+
+def _read(data: bytes, meta: FrameMeta, decoder: Decoder) -> Read:
     pose = None if meta.pose is None else pose_matrix(meta.pose)
     base = None if meta.T_base_sensor is None else base_of(meta.T_base_sensor, None)
     if pose is not None and base is not None and meta.pose is not None and meta.pose.of == "base":
         pose = pose @ base[1]
     if _is_cloud(data, meta):
-        return _read_cloud(data, meta, pose)
+        return _read_cloud(data, meta, pose, decoder)
     _refuse(meta, "depth image", {"viewpoint": "file", "units_per_metre": 1.0, "format": None})
     if meta.intrinsics is None:
         raise _without_camera(data)
-    frame = decode_frame(
-        data,
-        _camera(meta.intrinsics),
-        depth_scale=meta.depth_scale,
-        along_ray=meta.depth_along_ray,
-        pose=pose,
-    )
+    try:
+        frame = decode_frame(
+            data,
+            _camera(meta.intrinsics),
+            depth_scale=meta.depth_scale,
+            along_ray=meta.depth_along_ray,
+            pose=pose,
+            samples_of=decoder.samples,
+        )
+    except errors.DecoderFailure as error:
+        raise errors.UnreadableFrame(_failed(error)) from error
     return Read(frame, None, base)
 
 
-def read_stored(data: bytes, row: FrameRow) -> AnyFrame:
-    """The frame of an upload that was let in before."""
+def _failed(error: errors.DecoderFailure) -> str:
+    return f"The file cannot be decoded: {error}. Write it again, or send it in another format."
+
+
+def read_stored(data: bytes, row: FrameRow, decoders: Decoders) -> AnyFrame:
+    """The frame of an upload that was let in before.
+
+    Raises
+    ------
+    DamagedBlob : a decoder fails at it, as it did not before.
+    Busy : no decoder gets free, or none can be started.
+    """
+    try:
+        with decoders.place() as decoder:
+            return _read_stored(data, row, decoder)
+    except errors.DecoderFailure as error:
+        raise errors.DamagedBlob(
+            f"The upload of frame {row.id} cannot be decoded: {error}. Try again; if it stays so, "
+            "send the frame again."
+        ) from error
+
+
+def _read_stored(data: bytes, row: FrameRow, decoder: Decoder) -> AnyFrame:
     if row.cloud is not None:
         # a lost upload may have come again, packed otherwise
         return decode_cloud(
@@ -88,6 +125,7 @@ def read_stored(data: bytes, row: FrameRow) -> AnyFrame:
             viewpoint=viewpoint_of(row),
             units_per_metre=row.cloud["units_per_metre"],
             name=row.id,
+            points_of=decoder.points,
         )
     return decode_frame(
         data,
@@ -95,6 +133,7 @@ def read_stored(data: bytes, row: FrameRow) -> AnyFrame:
         depth_scale=row.depth_scale,
         along_ray=row.depth_along_ray,
         name=row.id,
+        samples_of=decoder.samples,
     )
 
 
@@ -192,7 +231,7 @@ def _is_cloud(data: bytes, meta: FrameMeta) -> bool:
     return found is not None and (found != "npy" or meta.intrinsics is None)
 
 
-def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None) -> Read:
+def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None, decoder: Decoder) -> Read:
     _refuse(
         meta, "point cloud", {"intrinsics": None, "depth_scale": 1000.0, "depth_along_ray": False}
     )
@@ -205,7 +244,10 @@ def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None) -> Read:
             viewpoint=said,
             units_per_metre=meta.units_per_metre,
             pose=pose,
+            points_of=decoder.points,
         )
+    except errors.DecoderFailure as error:
+        raise errors.UnreadableCloud(_failed(error)) from error
     except (
         errors.MissingDependency
     ) as error:  # of this machine, and yet it is the file that asks for it

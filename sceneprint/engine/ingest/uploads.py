@@ -8,7 +8,6 @@ When an upload is answered, nothing can lose it. The disk is waited for by many 
 from __future__ import annotations
 
 import hashlib
-import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -253,13 +252,10 @@ class Uploads:
     Parameters
     ----------
     store, bell : see there
-    decoding : uploads that are decoded at once, which takes processors and memory; any number
-        may wait for the disk
     """
 
-    def __init__(self, store: Store, bell: Wakeup, decoding: int) -> None:
+    def __init__(self, store: Store, bell: Wakeup) -> None:
         self._store, self._bell = store, bell
-        self._decoding = threading.BoundedSemaphore(decoding)
         self._writes = Grouping(store.database)
 
     def add(
@@ -337,9 +333,8 @@ class Uploads:
     def _prepared(self, upload: Upload) -> _Prepared:
         if upload.frame_id is not None:
             check_frame_id(upload.frame_id)
-        with self._decoding:
-            read = read_upload(upload.data, upload.meta)
-            content = content_id(read)
+        read = read_upload(upload.data, upload.meta, self._store.decoders)
+        content = content_id(read)
         blob = hashlib.sha256(upload.data).hexdigest()
         known = {**columns(upload.meta, read.frame.pose, read.base), "cloud": read.cloud}
         return _Prepared(upload, blob, content, known)

@@ -134,7 +134,7 @@ def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> StoredSignatu
     if work.model_id not in models_of(work.map):
         raise lifecycle.Outdated
     with span("decode"):
-        frame = read_stored(store.blobs.get(work.frame.blob), work.frame)
+        frame = read_stored(store.blobs.get(work.frame.blob), work.frame, store.decoders)
     with span("sign"):
         signature, geometry = prepare(frame, signers(work.model_id))
     with span("artifact"):

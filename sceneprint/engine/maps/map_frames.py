@@ -567,7 +567,9 @@ class FrameFiles:
     def _hierarchy(self, found: IndexedFrame) -> tuple[Surface, Hierarchy]:
         """As it was signed: of the upload, as the artifact's points are rounded."""
         p = self._signers(found.row.model_id).model.parameters
-        frame = read_stored(self._store.blobs.get(found.frame.blob), found.frame)
+        frame = read_stored(
+            self._store.blobs.get(found.frame.blob), found.frame, self._store.decoders
+        )
         seen = see(frame, p)
         return seen, hierarchy_of(seen, p, found.frame.id)
 

@@ -152,7 +152,7 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
             if isinstance(side, NamedFrame):
                 ready.append(prepare_stored(store, signers, side.map, side.frame_id, query))
             else:
-                ready.append(prepare_upload(*side, signer, query))
+                ready.append(prepare_upload(*side, signer, query, store.decoders))
         check_model(ready[0].model_id, ready[1].model_id)
         return _compared(ready[0], ready[1], signer, how)
 
@@ -269,7 +269,8 @@ class Queries:
         def ask(rows: list[MapRow]) -> Answer:
             self._check_models(rows)
             signer = self._signers(rows[0].model_id)
-            return self.answer(rows, prepare_upload(data, meta, signer, query), query, deadline)
+            ready = prepare_upload(data, meta, signer, query, self._store.decoders)
+            return self.answer(rows, ready, query, deadline)
 
         return self._steadily(maps, ask)
 
@@ -297,7 +298,8 @@ class Queries:
 
         def ask(rows: list[MapRow]) -> Answer:
             signer = self._signers(rows[0].model_id)
-            *before, last = [prepare_upload(*one, signer, query) for one in frames]
+            decoders = self._store.decoders
+            *before, last = [prepare_upload(*one, signer, query, decoders) for one in frames]
             earlier = [
                 SequenceFrame(one, inverse(_odometry(last)) @ _odometry(one)) for one in before
             ]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint import errors
+from sceneprint.decoders import Decoders
 from sceneprint.engine.ingest.frame_decoder import read_upload
 from sceneprint.engine.search.map_view import MapView, Stored, search_stored
 from sceneprint.engine.search.up_vectors import known_ups
@@ -74,7 +75,9 @@ class PreparedQuery:
     pose: Floats | None = None
 
 
-def prepare_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -> PreparedQuery:
+def prepare_upload(
+    data: bytes, meta: FrameMeta, signer: Signer, query: Query, decoders: Decoders
+) -> PreparedQuery:
     """Make an uploaded frame ready.
 
     Raises
@@ -87,7 +90,7 @@ def prepare_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -
     start = time.perf_counter()
     at = None if meta.captured_at is None else meta.captured_at.timestamp()
     taken = check_taken(QueryOrigin(meta.robot, meta.session, at), query)
-    read = read_upload(data, meta)
+    read = read_upload(data, meta, decoders)
     kind, base = read.kind, read.base
     up = None if meta.up is None else np.array(meta.up.unit)
     if "validate" not in query.stages:

@@ -111,7 +111,7 @@ def rebuild_frame(store: Store, signer: Signer, frame: FrameRow) -> tuple[Bytes,
     DamagedBlob : its upload is lost or damaged too.
     FrameError : nothing in it can be signed.
     """
-    read = read_stored(store.blobs.get(frame.blob), frame)
+    read = read_stored(store.blobs.get(frame.blob), frame, store.decoders)
     signature, geometry = prepare(read, signer)
     return signature.vector, write_geometry(geometry)
 

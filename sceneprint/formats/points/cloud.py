@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import secrets
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -183,6 +184,26 @@ _READERS = {
 
 
 @dataclass(frozen=True, eq=False)
+class ReadPoints:
+    """What a file of points holds.
+
+    Parameters
+    ----------
+    points : (n, 3) float32, metres from the viewpoint; finite, none beyond `FARTHEST_M`
+    viewpoint : metres in the file's axes; None where there is none
+    given : how many points the file has, missing ones too
+    """
+
+    points: Floats32
+    viewpoint: Position | None
+    given: int
+
+
+#: As `read_points`.
+PointsOf = Callable[[bytes, CloudFormat, Position | Unsaid | None, float], ReadPoints]
+
+
+@dataclass(frozen=True, eq=False)
 class Scan:
     """A cloud, and how it was read.
 
@@ -208,6 +229,7 @@ def decode_cloud(
     units_per_metre: float = 1.0,
     name: str = "",
     pose: Floats | None = None,
+    points_of: PointsOf | None = None,
 ) -> Cloud:
     """Return the cloud of a file's bytes; as `decode_scan`."""
     return decode_scan(
@@ -217,6 +239,7 @@ def decode_cloud(
         units_per_metre=units_per_metre,
         name=name,
         pose=pose,
+        points_of=points_of,
     ).cloud
 
 
@@ -228,6 +251,7 @@ def decode_scan(
     units_per_metre: float = 1.0,
     name: str = "",
     pose: Floats | None = None,
+    points_of: PointsOf | None = None,
 ) -> Scan:
     """Return the cloud of a PLY, PCD, KITTI, NPY, LAS or LAZ file, or of a PointCloud2 in CDR.
 
@@ -240,6 +264,7 @@ def decode_scan(
     units_per_metre : of the file's coordinates, 1000 for millimetres
     name : what to call the frame in lines and errors
     pose : (4, 4) T_parent_sensor, or None where unknown
+    points_of : reads the file elsewhere; default: `read_points`
 
     Returns
     -------
@@ -262,14 +287,11 @@ def decode_scan(
                 "Thin the cloud out, or send it in parts."
             )
         found = _format(data, file_format)
-        raw = _READERS[found](data)
-        place = _place(viewpoint, raw, units_per_metre)
-        # lengths are checked above: a header of twenty million points has bytes for them
-        points = _from(raw, place or (0.0, 0.0, 0.0), units_per_metre)
-        missing = raw.count - len(points)
+        raw = (points_of or read_points)(data, found, viewpoint, units_per_metre)
+        points, missing = raw.points, raw.given - len(raw.points)
         if len(points) < FEWEST_POINTS:
             raise UselessFrame(
-                f"{missing} of {raw.count} points are missing, and the {len(points)} left are "
+                f"{missing} of {raw.given} points are missing, and the {len(points)} left are "
                 f"fewer than {FEWEST_POINTS}. Check that the sensor saw something."
             )
         note = f"{missing} missing points left out" if missing else ""
@@ -285,12 +307,26 @@ def decode_scan(
                 )
         cloud = Cloud(
             points,
-            has_viewpoint=place is not None,
+            has_viewpoint=raw.viewpoint is not None,
             name=name,
             pose=None if pose is None else rigid_transform(pose),
             note=note,
         )
-        return Scan(cloud, found, place, raw.count)
+        return Scan(cloud, found, raw.viewpoint, raw.given)
+
+
+def read_points(
+    data: bytes,
+    file_format: CloudFormat,
+    viewpoint: Position | Unsaid | None,
+    units_per_metre: float,
+) -> ReadPoints:
+    """Read the points of a file; parameters and errors as of `decode_scan`, of a known format."""
+    raw = _READERS[file_format](data)
+    place = _place(viewpoint, raw, units_per_metre)
+    # lengths were checked: a header of twenty million points has bytes for them
+    points = _from(raw, place or (0.0, 0.0, 0.0), units_per_metre)
+    return ReadPoints(points, place, raw.count)
 
 
 def _format(data: bytes, told: CloudFormat | None) -> CloudFormat:

@@ -1,0 +1,81 @@
+"""Decoders of uploads in processes of their own, which may do nothing but compute.
+
+bytes of a stranger  --Decoders.place-->  Decoder  --samples | points-->  arrays, checked again
+
+`DecoderPool` (pool.py) runs them apart; `LocalDecoders` here, for data that is the program's own.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Protocol
+
+from sceneprint.formats.depth_file import Samples, decode_samples
+from sceneprint.formats.points.cloud import ReadPoints, read_points
+from sceneprint_client.api.frames import CloudFormat
+from sceneprint_client.sidecars import Position, Unsaid
+
+
+class Decoder(Protocol):
+    """Turns bytes of an upload into arrays."""
+
+    def samples(self, data: bytes) -> Samples:
+        """Samples of a depth image; see `decode_samples`."""
+
+    def points(
+        self, data: bytes, file_format: CloudFormat, viewpoint: Position | Unsaid | None,
+        units_per_metre: float,
+    ) -> ReadPoints:  # fmt: skip
+        """Points of a cloud; see `read_points`."""
+
+
+class Decoders(Protocol):
+    """A number of decoders; safe to share between threads."""
+
+    def place(self) -> AbstractContextManager[Decoder]:
+        """Wait for a decoder, and have it to oneself. What is made of the arrays is made meanwhile:
+        so memory and processors are bounded too.
+        """
+
+    def start(self) -> None:
+        """Begin what the first upload would have to wait for."""
+
+    def close(self) -> None:
+        """End all of them."""
+
+
+class LocalDecoders:
+    """Decodes in this process.
+
+    Parameters
+    ----------
+    count : of uploads that are decoded at once
+    """
+
+    def __init__(self, count: int) -> None:
+        self._places = threading.BoundedSemaphore(count)
+
+    @contextmanager
+    def place(self) -> Iterator[Decoder]:
+        """See Decoders."""
+        with self._places:
+            yield self
+
+    def samples(self, data: bytes) -> Samples:
+        """See Decoder."""
+        return decode_samples(data)
+
+    def points(
+        self, data: bytes, file_format: CloudFormat, viewpoint: Position | Unsaid | None,
+        units_per_metre: float,
+    ) -> ReadPoints:  # fmt: skip
+        """See Decoder."""
+        return read_points(data, file_format, viewpoint, units_per_metre)
+
+    def start(self) -> None:
+        """Nothing has to be."""
+
+    def close(self) -> None:
+        """Nothing is open."""

@@ -1,0 +1,471 @@
+"""A pool of decoders' processes: started when needed, shared fairly, replaced when they fail.
+
+    DecoderPool.place  -->  a decoder for one upload  --samples | points-->  arrays
+
+A decoder that was taken over can say anything. So its replies are JSON and plain arrays, copied out
+of the shared memory before they are checked. It cannot shrink that memory, which would crash us.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import math
+import mmap
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint import errors
+from sceneprint.decoders.process import MESSAGE_BYTES, SHARED_BYTES
+from sceneprint.decoders.sandbox import Protections
+from sceneprint.errors import DecoderFailure
+from sceneprint.formats.depth_file import Samples, decode_samples
+from sceneprint.formats.points.cloud import FARTHEST_M, ReadPoints
+from sceneprint.formats.points.rows import MAXIMUM_POINTS
+from sceneprint.types import MAXIMUM_SAMPLES, Floats32
+from sceneprint_client.api.frames import CloudFormat
+from sceneprint_client.files import MAXIMUM_IMAGE_BYTES
+from sceneprint_client.sidecars import Position, Unsaid
+
+log = logging.getLogger(__name__)
+
+PROGRAM = "sceneprint.decoders.process"
+#: Formats whose decoders are compiled: their process takes 1 s and 140 MB more.
+_COMPILED = ("ply", "pcd")
+#: What a decoder may say of an upload.
+_ERRORS = {
+    one.__name__: one
+    for one in (
+        errors.UnreadableFrame, errors.UnreadableCloud, errors.UselessFrame,
+        errors.InvalidIntrinsics, errors.MissingDependency,
+    )
+}  # fmt: skip
+#: Seconds until a process is ready, which may have to compile first; between two looks at its
+#: processor time; and until an upload gets a decoder.
+_BEGIN_S, _LOOK_S, _WAIT_S = 300.0, 0.25, 60.0
+#: How much longer than its processor time a task may take on a busy machine.
+_PATIENCE = 8
+#: Shared memory beyond which it is given back after a task.
+_KEPT_BYTES = 8 << 20
+#: Variables that a decoder needs to find its code, and no other: they may be secrets.
+_ENVIRONMENT = (
+    "PATH", "LANG", "LC_ALL", "HOME", "USER", "TMPDIR", "XDG_CACHE_HOME", "PYTHONPATH",
+    "PYTHONHOME", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "NUMBA_CPU_NAME",
+    "NUMBA_CPU_FEATURES", "PYTHONDONTWRITEBYTECODE",
+)  # fmt: skip
+#: Seconds after its last upload in which a tenant counts as one to share decoders with.
+_PRESENT_S = 60.0
+
+
+class _Ended(Exception):
+    """The process is gone; its text says of what."""
+
+
+class _Process:
+    """One process, and what it shares with this one. It has one task at a time.
+
+    Parameters
+    ----------
+    program : module that it runs
+    more_bytes : that it may take for its work; 0 for no limit
+    compiled : whether it loads kernels
+    """
+
+    def __init__(self, program: str, more_bytes: int, *, compiled: bool) -> None:
+        self.compiled = compiled
+        self.protections = Protections(no_new_privileges=False, seccomp=False, landlock=0)
+        memory = os.memfd_create("sceneprint-decoder", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            os.ftruncate(memory, SHARED_BYTES)
+            seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
+            fcntl.fcntl(memory, fcntl.F_ADD_SEALS, seals)
+            self._shared = mmap.mmap(memory, SHARED_BYTES)
+            given = (theirs.fileno(), memory, os.getpid(), more_bytes)
+            kind = "kernels" if compiled else "plain"
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", program, *map(str, given), kind],
+                env={name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
+                | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
+                pass_fds=given[:2], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+        except BaseException:
+            self._socket.close()
+            raise
+        finally:
+            theirs.close()
+            os.close(memory)
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    def await_ready(self) -> None:
+        """Wait until it has closed itself in; _Ended where it cannot."""
+        reply = self._receive(_BEGIN_S)
+        walls = reply.get("ready")
+        if not isinstance(walls, dict):
+            raise _Ended(str(reply.get("broke", reply))[-2000:])
+        self.protections = Protections(
+            walls["no_new_privileges"] is True, walls["seccomp"] is True, int(walls["landlock"])
+        )
+
+    def run(self, request: dict[str, Any], data: bytes, seconds: float) -> dict[str, Any]:
+        """Have it do a task; its reply, unchecked. The array is in `array_of`.
+
+        Raises
+        ------
+        _Ended : it died of the task.
+        DecoderFailure : it took too long.
+        """
+        self._shared[: len(data)] = data
+        try:
+            self._socket.send(json.dumps({**request, "bytes": len(data)}).encode())
+        except OSError as error:
+            raise _Ended(self._cause()) from error
+        return self._receive(seconds * _PATIENCE, seconds)
+
+    def array_of(self, kind: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        """A copy of the array that came with a reply."""
+        count = math.prod(shape)
+        found = np.frombuffer(self._shared, kind, count).copy()
+        return found.reshape(shape)
+
+    def forget(self, size: int) -> None:
+        """Give memory back that a large upload took."""
+        if size > _KEPT_BYTES:
+            self._shared.madvise(mmap.MADV_REMOVE)
+
+    def end(self) -> None:
+        """Kill it."""
+        self._process.kill()
+        self._process.wait()
+        self._socket.close()
+        with suppress(BufferError):
+            self._shared.close()
+
+    def _receive(self, longest_s: float, cpu_s: float = math.inf) -> dict[str, Any]:
+        begun, until = self._cpu_s(), time.monotonic() + longest_s
+        waiting = select.poll()
+        waiting.register(self._socket, select.POLLIN)
+        while not waiting.poll(1e3 * _LOOK_S):
+            if self._cpu_s() - begun > cpu_s or time.monotonic() > until:
+                raise DecoderFailure(f"it takes longer than {cpu_s:g} s to decode")
+        try:
+            message = self._socket.recv(MESSAGE_BYTES)
+        except OSError:
+            message = b""
+        if not message:
+            raise _Ended(self._cause())
+        try:
+            reply = json.loads(message)
+        except (ValueError, RecursionError) as error:
+            raise _Ended("its answer is no JSON") from error
+        if not isinstance(reply, dict):
+            raise _Ended("its answer is no record")
+        return reply
+
+    def _cpu_s(self) -> float:
+        """Processor time that it took, seconds."""
+        with suppress(OSError):  # it is gone, as its socket will tell
+            return time.clock_gettime((~self._process.pid << 3) | 2)
+        return 0.0
+
+    def _cause(self) -> str:
+        code = self._process.wait()
+        if code < 0:
+            return f"signal {-code}, {signal.strsignal(-code)}"
+        return f"exit code {code}"
+
+
+class _Slot:
+    """A place for a process, and the decoder that who holds it uses."""
+
+    def __init__(self, pool: DecoderPool) -> None:
+        self._pool = pool
+        self.process: _Process | None = None
+
+    def samples(self, data: bytes) -> Samples:
+        """See Decoder."""
+        if len(data) > MAXIMUM_IMAGE_BYTES:  # refused by its length, unread
+            return decode_samples(data)
+
+        def checked(process: _Process, reply: dict[str, Any]) -> Samples:
+            kind, shape = reply["type"], _shape(reply, MAXIMUM_SAMPLES)
+            if kind not in ("<u2", "<f4"):
+                raise ValueError(f"type {kind!r:.40}")
+            return process.array_of(kind, shape)
+
+        return self.run({"task": "samples"}, data, checked)
+
+    def points(
+        self, data: bytes, file_format: CloudFormat, viewpoint: Position | Unsaid | None,
+        units_per_metre: float,
+    ) -> ReadPoints:  # fmt: skip
+        """See Decoder."""
+        told = viewpoint.value if isinstance(viewpoint, Unsaid) else viewpoint
+        request = {
+            "task": "points", "format": file_format, "viewpoint": told,
+            "units_per_metre": units_per_metre,
+        }  # fmt: skip
+
+        def checked(process: _Process, reply: dict[str, Any]) -> ReadPoints:
+            shape, given = _shape(reply, 3 * MAXIMUM_POINTS), int(reply["given"])
+            if shape[1] != 3 or not shape[0] <= given <= MAXIMUM_POINTS:
+                raise ValueError(f"{shape} points of {given}")
+            place = reply["viewpoint"]
+            if place is not None:
+                x, y, z = map(float, place)
+                if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+                    raise ValueError("no viewpoint")
+                place = x, y, z
+            points: Floats32 = process.array_of("<f4", shape)
+            # kernels index by them; a comparison with NaN is false
+            if len(points) and not (-FARTHEST_M <= points.min() and points.max() <= FARTHEST_M):
+                raise ValueError("points beyond reach")
+            return ReadPoints(points, place, given)
+
+        return self.run(request, data, checked, compiled=file_format in _COMPILED)
+
+    def run(
+        self, request: dict[str, Any], data: bytes,
+        checked: Callable[[_Process, dict[str, Any]], Any], *, compiled: bool = False,
+    ) -> Any:  # fmt: skip
+        """Have a task done; once more in another process if the first died, perhaps not of it.
+
+        Parameters
+        ----------
+        request : task and its parameters
+        data : of an upload
+        checked : makes the result of a reply that it has looked at; any error: a lie
+        compiled : whether kernels are needed
+
+        Raises
+        ------
+        DecoderFailure : it crashed twice, took too long, or needed too much memory.
+        FrameError, MissingDependency : what the decoder found.
+        Busy : no process can be started.
+        """
+        try:
+            return self._run(request, data, checked, compiled=compiled)
+        except _Ended as first:
+            self._pool.note(self, str(first))
+            try:
+                return self._run(request, data, checked, compiled=compiled)
+            except _Ended as again:
+                self._pool.note(self, str(again))
+                raise DecoderFailure(f"it crashes the decoder ({again})") from again
+        except DecoderFailure as error:
+            self._pool.note(self, str(error))
+            raise
+
+    def end(self) -> None:
+        """End the process, if there is one."""
+        process, self.process = self.process, None
+        if process is not None:
+            process.end()
+
+    def _run(
+        self, request: dict[str, Any], data: bytes,
+        checked: Callable[[_Process, dict[str, Any]], Any], *, compiled: bool,
+    ) -> Any:  # fmt: skip
+        process = self.process
+        if process is None or (compiled and not process.compiled):
+            self.end()
+            process = self.process = self._pool.begin(compiled=compiled)
+        reply = process.run(request, data, self._pool.seconds)
+        if reply.get("memory") is True:
+            raise DecoderFailure(
+                f"it needs more than {self._pool.more_bytes >> 20} MiB of memory to decode"
+            )
+        if "broke" in reply:
+            text = str(reply["broke"])
+            log.error("decoder failed", extra={"pid": process.pid, "traceback": text})
+            raise RuntimeError(f"A decoder failed: {text.strip().rpartition(chr(10))[2][:200]}")
+        if "error" in reply:
+            raise _error_of(reply)
+        try:
+            found = checked(process, reply)
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+            raise _Ended(f"its answer is no result: {str(error)[:80]}") from error
+        size = getattr(found, "nbytes", len(data))
+        process.forget(max(size, len(data)))
+        return found
+
+
+class DecoderPool:
+    """Decoders in processes of their own; see Decoders.
+
+    A place goes to the tenant that holds fewest, and of equals to the one served the longest ago.
+    Beside another tenant one has half of the places at most.
+
+    Parameters
+    ----------
+    count : of processes at most
+    more_bytes : memory of each for its work, bytes; 0 for no limit
+    seconds : processor time of an upload
+    whose : names the tenant that this thread works for
+    program : module that decoders run
+    """
+
+    def __init__(
+        self, count: int, more_bytes: int, seconds: float, whose: Callable[[], str] = str,
+        program: str = PROGRAM,
+    ) -> None:  # fmt: skip
+        self.more_bytes, self.seconds = more_bytes, seconds
+        self._count, self._whose, self._program = count, whose, program
+        self._changed = threading.Condition()
+        self._free = [_Slot(self) for _ in range(count)]
+        self._slots = tuple(self._free)
+        self._held: Counter[str] = Counter()
+        self._waiting: dict[str, deque[object]] = {}
+        # when each tenant came last, and the number of its latest turn
+        self._seen: OrderedDict[str, tuple[float, int]] = OrderedDict()
+        self._given, self._closed = 0, False
+        # a process ends with the thread that started it, so one thread starts all of them
+        self._starter = ThreadPoolExecutor(1, "decoder-starter")
+        self._compiling = threading.Lock()
+        #: What stands around the processes; None before the first is ready.
+        self.protections: Protections | None = None
+
+    @contextmanager
+    def place(self) -> Iterator[_Slot]:
+        """See Decoders; Busy where no decoder gets free in time."""
+        tenant = self._whose()
+        slot = self._take(tenant)
+        try:
+            yield slot
+        finally:
+            with self._changed:
+                self._held[tenant] -= 1
+                self._free.append(slot)  # the last is taken first: the others need not be started
+                self._changed.notify_all()
+
+    def start(self) -> None:
+        """Start one process."""
+        with self.place() as slot, suppress(errors.Busy):
+            if slot.process is None:
+                slot.process = self.begin(compiled=False)
+
+    def pids(self) -> list[int]:
+        """Processes that there are."""
+        return [one.process.pid for one in self._slots if one.process is not None]
+
+    def close(self) -> None:
+        """End all processes; uploads in hand fail."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        for slot in self._slots:
+            slot.end()
+        self._starter.shutdown()
+
+    def begin(self, *, compiled: bool) -> _Process:
+        """Start a process and wait until it is ready; Busy where that fails."""
+        try:
+            if self._closed:
+                raise _Ended("the service stops")
+            begin = self._starter.submit(
+                _Process, self._program, self.more_bytes, compiled=compiled
+            )
+            process = begin.result()
+            try:
+                if compiled:  # the first may compile, and the others find that on disk
+                    with self._compiling:
+                        process.await_ready()
+                else:
+                    process.await_ready()
+            except BaseException:
+                process.end()
+                raise
+        except (_Ended, DecoderFailure, OSError, RuntimeError) as error:
+            log.error("decoder cannot be started", extra={"error": str(error)})
+            raise errors.Busy(
+                "No decoder can be started for this upload; the service's log says why. Nothing "
+                "was stored. Retry in a minute."
+            ) from error
+        if self.protections is None:
+            walls = process.protections
+            level = logging.INFO if walls.seccomp else logging.WARNING
+            log.log(level, "decoders are confined", extra={"protections": walls.text})
+        self.protections = process.protections
+        return process
+
+    def note(self, slot: _Slot, reason: str) -> None:
+        """Log that a decoder failed, and end it."""
+        process = slot.process
+        about = {"pid": None if process is None else process.pid, "error": reason}
+        log.warning("decoder replaced", extra={**about, "tenant": self._whose()})
+        slot.end()
+
+    def _take(self, tenant: str) -> _Slot:
+        turn = object()
+        until = time.monotonic() + _WAIT_S
+        with self._changed:
+            now = time.monotonic()
+            self._seen[tenant] = now, self._seen.pop(tenant, (now, 0))[1]
+            while self._seen[next(iter(self._seen))][0] < now - _PRESENT_S:
+                self._seen.popitem(last=False)
+            queue = self._waiting.setdefault(tenant, deque())
+            queue.append(turn)
+            try:
+                while not (self._free and self._next() == tenant and queue[0] is turn):
+                    if self._closed or not self._changed.wait(until - time.monotonic()):
+                        raise errors.Busy(
+                            f"No decoder is free within {_WAIT_S:g} s. Nothing was stored. Retry "
+                            "in a minute."
+                        )
+            finally:
+                queue.remove(turn)
+                if not queue:
+                    del self._waiting[tenant]
+                self._changed.notify_all()
+            self._given += 1
+            self._held[tenant] += 1
+            self._seen[tenant] = now, self._given
+            return self._free.pop()
+
+    def _next(self) -> str | None:
+        """Tenant that is to have the next free place."""
+        most = self._count if len(self._seen) < 2 else max(self._count // 2, 1)
+        may = [
+            (self._held[one], self._seen.get(one, (0.0, 0))[1], one)
+            for one in self._waiting
+            if self._held[one] < most
+        ]
+        return min(may)[2] if may else None
+
+
+def _shape(reply: dict[str, Any], most: int) -> tuple[int, int]:
+    """Shape of an array with two dimensions and so many numbers at most."""
+    height, width = reply["shape"]
+    if not (type(height) is int and type(width) is int and height >= 0 and width >= 1):
+        raise ValueError("no shape")
+    if height * width > most:
+        raise ValueError(f"shape {height} x {width}")
+    return height, width
+
+
+def _error_of(reply: dict[str, Any]) -> errors.SceneprintError:
+    kind = _ERRORS.get(str(reply["error"]))
+    if kind is None:
+        raise _Ended(f"it raised {str(reply['error'])[:40]!r}")
+    text = reply.get("text")
+    return kind(text if isinstance(text, str) else "")

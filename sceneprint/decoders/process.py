@@ -1,0 +1,196 @@
+"""A decoder's process: loads what it needs, gives up everything else, and decodes until told to end.
+
+    python -m sceneprint.decoders.process CONTROL MEMORY PARENT BYTES plain|kernels
+
+CONTROL is a socket with a JSON message each way per task. MEMORY is shared with the parent: bytes of
+the upload before, array after. Nothing of it is pickled: the parent believes no word that it reads.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import mmap
+import os
+import signal
+import struct
+import sys
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.decoders.sandbox import close_process, die_with_parent
+from sceneprint.errors import SceneprintError
+from sceneprint.formats.depth_file import decode_samples, encode_png
+from sceneprint.formats.points import pcd, ply, rows
+from sceneprint.formats.points.cloud import read_points
+from sceneprint.geometry.kernel import Kernel
+from sceneprint_client.sidecars import UNSAID
+
+#: Bytes of the shared memory: the largest upload; arrays that are made of it are smaller.
+SHARED_BYTES = 512 << 20
+#: Most bytes of a message, and characters of an error or traceback in it.
+MESSAGE_BYTES, MOST_TEXT = 1 << 16, 8000
+
+#: bytes, request -> reply, and the array that comes with it
+Task = Callable[[bytes, dict[str, Any]], tuple[dict[str, Any], NDArray[Any] | None]]
+
+
+def _samples(data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], NDArray[Any]]:
+    found = decode_samples(data)
+    return {"type": found.dtype.str, "shape": found.shape}, found
+
+
+def _points(data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], NDArray[Any]]:
+    told = request["viewpoint"]
+    viewpoint = UNSAID if told == UNSAID.value else None if told is None else tuple(told)
+    found = read_points(data, request["format"], viewpoint, request["units_per_metre"])
+    reply = {"shape": found.points.shape, "viewpoint": found.viewpoint, "given": found.given}
+    return reply, found.points
+
+
+TASKS: Mapping[str, Task] = {"samples": _samples, "points": _points}
+
+
+def serve(tasks: Mapping[str, Task]) -> None:
+    """Be a decoder until the parent closes the socket, or is gone."""
+    control, memory, parent, more_bytes = map(int, sys.argv[1:5])
+    # signals that stop a service reach its whole group, and it still has uploads in hand
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    if not die_with_parent(parent):
+        return
+    shared = mmap.mmap(memory, SHARED_BYTES)
+    try:
+        _warm(kernels=sys.argv[5] == "kernels")
+        _to_nowhere()
+        protections = asdict(close_process(more_bytes))
+    except Exception:
+        _tell(control, {"broke": traceback.format_exc()[-MOST_TEXT:]})
+        return
+    _tell(control, {"ready": protections})
+    while message := os.read(control, MESSAGE_BYTES):
+        _tell(control, _done(tasks, json.loads(message), shared))
+
+
+def _done(tasks: Mapping[str, Task], request: dict[str, Any], shared: mmap.mmap) -> dict[str, Any]:
+    """Do a task; what is wrong with the upload is a reply too."""
+    try:
+        reply, array = tasks[request["task"]](shared[: request["bytes"]], request)
+        if array is not None:
+            size = array.nbytes
+            np.frombuffer(shared, np.uint8, size)[:] = np.ascontiguousarray(array).view(
+                np.uint8
+            ).reshape(-1)
+    except SceneprintError as error:
+        return {"error": type(error).__name__, "text": str(error)[:MOST_TEXT]}
+    except MemoryError:
+        return {"memory": True}
+    except Exception:
+        return {"broke": traceback.format_exc()[-MOST_TEXT:]}
+    return reply
+
+
+def _tell(control: int, reply: dict[str, Any]) -> None:
+    os.write(control, json.dumps(reply).encode())
+
+
+def _to_nowhere() -> None:
+    """Leave no file open but those two."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for number in (0, 1, 2):
+        os.dup2(nowhere, number)
+    os.close(nowhere)
+
+
+# What is imported or compiled on first use, used once: afterwards no file can be read.
+
+
+def _warm(*, kernels: bool) -> None:
+    for data in _images():
+        decode_samples(data)
+    for data, form in _arrays():
+        read_points(data, form, UNSAID, 1.0)
+    try:
+        import lazrs  # noqa: F401
+    except ImportError:  # an extra; a LAZ file says what is missing
+        pass
+    for wrong in (b"\x89PNG\r\n\x1a\n" + bytes(40), b"\x93NUMPY\x01\x00\x02\x00{}", b"no image"):
+        try:
+            decode_samples(wrong)
+        except SceneprintError:
+            pass
+    if not kernels:
+        return
+    for data, form in _texts():
+        read_points(data, form, UNSAID, 1.0)
+    for module in (rows, pcd, ply):
+        for one in vars(module).values():
+            if isinstance(one, Kernel):  # what was not compiled by now never is: a clean error
+                one.compiler.disable_compile()
+
+
+def _images() -> list[bytes]:
+    found = [encode_png(np.ones((2, 2), np.uint16))]
+    found.append(bytes(12) + found[0])  # compressedDepth
+    for kind in ("f2", "f4", "f8", "u2"):
+        found.append(_npy(np.ones((2, 2), kind)))
+    return found
+
+
+def _arrays() -> list[tuple[bytes, Any]]:
+    points = np.ones((12, 3), np.float32)
+    header = bytearray(227)
+    struct.pack_into("<4s", header, 0, b"LASF")
+    header[24:26] = 1, 2
+    struct.pack_into("<HI", header, 94, 227, 227)
+    struct.pack_into("<BHI", header, 104, 0, 20, 12)
+    struct.pack_into("<6d", header, 131, 1, 1, 1, 0, 0, 0)
+    return [(_npy(points), "npy"), (bytes(16 * 12), "kitti"), (bytes(header) + bytes(240), "las")]
+
+
+def _texts() -> list[tuple[bytes, Any]]:
+    """Files whose decoders are compiled: PCD and PLY."""
+    row = b"1 2 3\n"
+    head = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 12\nHEIGHT 1\n"
+    head += b"POINTS 12\nDATA "
+    plain = bytes(12 * 12)
+    packed = b"".join(bytes([31]) + plain[i : i + 32] for i in range(0, 128, 32))
+    packed += bytes([15]) + plain[128:]
+    sizes = struct.pack("<II", len(packed), len(plain))
+    vertex = b"element vertex 12\nproperty float x\nproperty float y\nproperty float z\n"
+    listed = b"property list uchar int n\n"
+    other = b"element other 1\nproperty list uchar int n\n"
+    found: list[tuple[bytes, Any]] = [
+        (head + b"ascii\n" + 12 * row, "pcd"),
+        (head + b"binary\n" + plain, "pcd"),
+        (head + b"binary_compressed\n" + sizes + packed, "pcd"),
+    ]
+    for form in (b"ascii", b"binary_little_endian", b"binary_big_endian"):
+        begin = b"ply\nformat " + form + b" 1.0\n"
+        text = form == b"ascii"
+        body, lists, before = 12 * row, 12 * b"1 2 3 1 7\n", b"2 5 6\n"
+        if not text:
+            order = "<" if b"little" in form else ">"
+            body = struct.pack(f"{order}3f", 1, 2, 3) * 12
+            lists = struct.pack(f"{order}3fBi", 1, 2, 3, 1, 7) * 12
+            before = struct.pack(f"{order}B2i", 2, 5, 6)
+        end = b"end_header\n"
+        found.append((begin + vertex + end + body, "ply"))
+        found.append((begin + vertex + listed + end + lists, "ply"))
+        found.append((begin + other + vertex + end + before + body, "ply"))
+    return found
+
+
+def _npy(array: NDArray[Any]) -> bytes:
+    out = io.BytesIO()
+    np.save(out, array)
+    return out.getvalue()
+
+
+if __name__ == "__main__":
+    serve(TASKS)

@@ -1,0 +1,176 @@
+"""What a process gives up before it reads bytes of strangers: files, network, processes, memory.
+
+close_process  -->  Protections: which walls this kernel has put up
+
+The walls are independent of each other, and a kernel or container may lack some: limits of the
+process (setrlimit), no new privileges, a filter of system calls (seccomp), and rules for files,
+TCP and signals (Landlock). What is open stays open: import and load everything first.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import resource
+import signal
+import struct
+from dataclasses import dataclass
+
+from sceneprint.process import limit_memory
+
+_LIBC = ctypes.CDLL(None, use_errno=True)
+_PR_SET_PDEATHSIG, _PR_SET_NO_NEW_PRIVS = 1, 38
+
+
+@dataclass(frozen=True)
+class Protections:
+    """Which walls stand around a process, besides limits on memory, files and processes.
+
+    Parameters
+    ----------
+    no_new_privileges : no program that it could start would have more rights
+    seccomp : only system calls for memory, time and its two pipes work
+    landlock : version of Landlock's rules that forbid files, TCP and signals; 0 without
+    """
+
+    no_new_privileges: bool
+    seccomp: bool
+    landlock: int
+
+    @property
+    def text(self) -> str:
+        """The walls as a list for people."""
+        walls = ["limits on memory and time"]
+        walls += ["no new privileges"] if self.no_new_privileges else []
+        walls += ["seccomp"] if self.seccomp else []
+        walls += [f"Landlock {self.landlock}"] if self.landlock else []
+        return ", ".join(walls)
+
+
+def die_with_parent(parent: int) -> bool:
+    """End this process when the thread that started it ends; False if that is gone already."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    return os.getppid() == parent
+
+
+def close_process(more_bytes: int) -> Protections:
+    """Give up everything but computing and what is open; it cannot be taken back.
+
+    Parameters
+    ----------
+    more_bytes : that this process may take beyond what it has; 0 for no limit
+    """
+    limit_memory(more_bytes)
+    no_new = _LIBC.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0
+    # both need no new privileges; the filter last, as nothing of this is on its list
+    landlock = _restrict_by_landlock() if no_new else 0
+    for what in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE,
+                 resource.RLIMIT_NPROC):  # fmt: skip
+        resource.setrlimit(what, (0, 0))
+    return Protections(no_new, no_new and _filter_system_calls(), landlock)
+
+
+# Landlock: an empty set of rules, so that all that it knows is forbidden.
+
+_CREATE_RULESET, _RESTRICT_SELF = 444, 446  #: system calls, the same on all processors
+_ASK_VERSION = 1
+#: Bits of what each version forbids of files: how many there are.
+_FILE_BITS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
+
+
+def _restrict_by_landlock() -> int:
+    """Forbid all that this kernel's Landlock knows; its version, or 0."""
+    version = int(_LIBC.syscall(_CREATE_RULESET, None, 0, _ASK_VERSION))
+    if version < 1:
+        return 0
+    files = (1 << _FILE_BITS[min(version, max(_FILE_BITS))]) - 1
+    network = 3 if version >= 4 else 0  # bind, connect
+    scoped = 3 if version >= 6 else 0  # abstract sockets and signals of others
+    rules = struct.pack("=QQQ", files, network, scoped)
+    size = 24 if version >= 6 else 16 if version >= 4 else 8
+    ruleset = int(_LIBC.syscall(_CREATE_RULESET, rules, size, 0))
+    if ruleset < 0:
+        return 0
+    closed = _LIBC.syscall(_RESTRICT_SELF, ruleset, 0) == 0
+    os.close(ruleset)
+    return version if closed else 0
+
+
+# seccomp: a program of classic BPF over (number, architecture, arguments) of a system call.
+
+_SECCOMP = {"x86_64": 317, "aarch64": 277}
+_ARCHITECTURE = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
+#: Calls that stay: reading and writing what is open, memory, time, and ending.
+_ALLOWED = {
+    "x86_64": {
+        "read": 0, "write": 1, "close": 3, "fstat": 5, "munmap": 11, "brk": 12,
+        "rt_sigaction": 13, "rt_sigprocmask": 14, "rt_sigreturn": 15, "sched_yield": 24,
+        "mremap": 25, "madvise": 28, "nanosleep": 35, "getpid": 39, "exit": 60,
+        "gettimeofday": 96, "sigaltstack": 131, "gettid": 186, "futex": 202,
+        "restart_syscall": 219, "clock_gettime": 228, "clock_nanosleep": 230,
+        "exit_group": 231, "getrandom": 318, "rseq": 334,
+    },
+    "aarch64": {
+        "read": 63, "write": 64, "close": 57, "fstat": 80, "munmap": 215, "brk": 214,
+        "rt_sigaction": 134, "rt_sigprocmask": 135, "rt_sigreturn": 139, "sched_yield": 124,
+        "mremap": 216, "madvise": 233, "nanosleep": 101, "getpid": 172, "exit": 93,
+        "gettimeofday": 169, "sigaltstack": 132, "gettid": 178, "futex": 98,
+        "restart_syscall": 128, "clock_gettime": 113, "clock_nanosleep": 115,
+        "exit_group": 94, "getrandom": 278, "rseq": 293,
+    },
+}  # fmt: skip
+#: mmap and mprotect, which stay for memory that is not executable.
+_MAPPING = {"x86_64": (9, 10), "aarch64": (222, 226)}
+_PROT_EXEC = 4
+_FIRST_X32 = 0x40000000  #: other names of x86-64's calls
+_LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
+_NUMBER, _ARCH, _THIRD_ARGUMENT = 0, 4, 32
+_ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050000 | 1, 0x80000000  #: refuse: EPERM
+_SET_FILTER, _ALL_THREADS = 1, 1
+
+
+def filter_program(machine: str) -> list[tuple[int, int, int, int]]:
+    """The filter as instructions of BPF: code, jump if true, jump if false, operand.
+
+    Parameters
+    ----------
+    machine : as `platform.machine()` names the processor; x86_64 or aarch64
+    """
+    allowed, mapping = sorted(_ALLOWED[machine].values()), _MAPPING[machine]
+    program = [
+        (_LOAD, 0, 0, _ARCH),
+        (_EQUAL, 1, 0, _ARCHITECTURE[machine]),
+        (_RETURN, 0, 0, _KILL),
+        (_LOAD, 0, 0, _NUMBER),
+        (_AT_LEAST, 0, 1, _FIRST_X32),
+        (_RETURN, 0, 0, _KILL),
+    ]
+    rest = len(allowed)
+    # behind the list: refuse, allow, and what looks at the protection of a mapping
+    program += [(_EQUAL, rest + 1 - i + 2, 0, number) for i, number in enumerate(mapping)]
+    program += [(_EQUAL, rest - i, 0, number) for i, number in enumerate(allowed)]
+    program += [
+        (_RETURN, 0, 0, _REFUSE),
+        (_RETURN, 0, 0, _ALLOW),
+        (_LOAD, 0, 0, _THIRD_ARGUMENT),
+        (_ANY_BIT, 0, 1, _PROT_EXEC),
+        (_RETURN, 0, 0, _REFUSE),
+        (_RETURN, 0, 0, _ALLOW),
+    ]
+    return program
+
+
+class _Program(ctypes.Structure):
+    _fields_ = (("length", ctypes.c_ushort), ("instructions", ctypes.c_char_p))
+
+
+def _filter_system_calls() -> bool:
+    machine = platform.machine()
+    if machine not in _ALLOWED or struct.calcsize("P") != 8:
+        return False
+    code = b"".join(struct.pack("=HBBI", *one) for one in filter_program(machine))
+    program = _Program(len(code) // 8, code)
+    return bool(
+        _LIBC.syscall(_SECCOMP[machine], _SET_FILTER, _ALL_THREADS, ctypes.byref(program)) == 0
+    )
