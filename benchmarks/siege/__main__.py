@@ -13,16 +13,15 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from itertools import cycle, product
 from pathlib import Path
-
-import httpx
 
 from benchmarks.machine import describe_machine
 from benchmarks.pages import put_between
+from benchmarks.siege.attacks import ATTACKS, SESSION, Order, attacker
 from benchmarks.siege.contract import ContractFigures, try_contract
 from benchmarks.siege.mutations import MutationFigures, besiege
 from benchmarks.siege.neighbours import (
-    ATTACKS,
     NeighbourFigures,
     besiege_neighbour,
     neighbour_table,
@@ -32,8 +31,11 @@ from benchmarks.siege.overload import OverloadFigures, overload
 from benchmarks.soak.load import MODEL, Part, Shot, free_port, service, shots
 from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import create_tenant
+from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.settings import Settings
+from sceneprint.store import queue
 from sceneprint_client import Client
+from sceneprint_client.api import FrameMeta
 
 #: Seconds in which a service has to begin, on a machine that others use too.
 _BEGIN_S = 90.0
@@ -127,25 +129,79 @@ def neighbours(
     folder: Path, frames: list[Shot], seconds: float, counts: Sequence[int] = (1, 2, 10),
     attacks: Iterable[str] = tuple(ATTACKS), database_url: str | None = None,
 ) -> list[NeighbourFigures]:  # fmt: skip
-    """Every attack, with so many keys of one tenant each, while another tenant works."""
+    """Every attack, with so many keys of one tenant each, while another tenant works.
+
+    What an attack leaves in the queue is cancelled before the next.
+    """
     folder.mkdir()
     where = {} if database_url is None else {"database_url": database_url}
-    with Engine(Settings.model_validate({"data_dir": folder, "database_url": database_url})) as e:
-        every, victim = (e.create_key(name).secret for name in ("operator", "victim"))
-        create_tenant(e.store, "noisy")
+    settings = Settings.model_validate({"data_dir": folder, "database_url": database_url})
+    with Engine(settings) as engine:
+        every, victim = (engine.create_key(name).secret for name in ("operator", "victim"))
+        create_tenant(engine.store, "noisy")
         noisy = [
-            e.create_key(f"noisy-{i}", {"noisy": "admin"}, tenant="noisy").secret
+            engine.create_key(f"noisy-{i}", {"noisy": "admin"}, tenant="noisy").secret
             for i in range(max(counts))
         ]
     maps = ("noisy", "victim")
-    with besieged(folder, frames, maps, every, host="0.0.0.0", **where) as (url, _):
-        work_as_victim(httpx.URL(url), victim, frames, 0.0)  # what is loaded once
-        calm = work_as_victim(httpx.URL(url), victim, frames, seconds)
-        return [
-            besiege_neighbour(url, name, noisy[:count], victim, frames, seconds, calm)
-            for name in attacks
-            for count in counts
+    with (
+        besieged(folder, frames, maps, every, host="0.0.0.0", **where) as (url, _),
+        attacker() as (begin, stop),
+        Engine(settings) as engine,
+    ):
+        _fill_noisy(engine, frames)
+        work_as_victim(url, victim, frames, 0.0)  # what is loaded once
+        found = []
+        for name, count in product(attacks, counts):
+            order = Order(name, url, noisy[:count], frames)
+            found.append(besiege_neighbour(order, begin, stop, victim, seconds))
+            _empty_queue(engine)
+        return found
+
+
+#: Frames of `noisy` that are never signed, so that a page of it is full, and those that have poses.
+_ROWS, _POSED = 1000, 16
+
+
+def _fill_noisy(engine: Engine, frames: list[Shot]) -> None:
+    """Give `noisy` a full page of frames, and a session of frames with poses that are indexed."""
+    for start in range(0, _ROWS, 50):
+        rows = [
+            Upload(one.png, one.meta, frame_id=f"row-{start + i}")
+            for i, one in zip(range(50), cycle(frames))
         ]
+        engine.uploads.add_all("noisy", rows)
+    _empty_queue(engine)
+    posed = []
+    for i, one in zip(range(_POSED), cycle(frames)):
+        matrix = [[1, 0, 0, 0.1 * i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        pose = {"parent_frame": "map", "matrix": matrix}
+        told = one.meta.model_dump() | {"session": SESSION, "sequence": i, "pose": pose}
+        posed.append(Upload(one.png, FrameMeta.model_validate(told), frame_id=f"posed-{i}"))
+    engine.uploads.add_all("noisy", posed)
+    _await_idle(engine)
+
+
+def _empty_queue(engine: Engine) -> None:
+    """Cancel what waits or runs."""
+    with engine.store.database.write() as connection:
+        queue.cancel_jobs(connection)
+    _await_idle(engine)
+
+
+def _await_idle(engine: Engine) -> None:
+    """Wait until no job waits or runs; TimeoutError where some still do after long."""
+    until = time.monotonic() + _BEGIN_S
+    while _pending(engine):
+        if time.monotonic() > until:
+            raise TimeoutError(f"jobs still wait or run after {_BEGIN_S:g} s")
+        time.sleep(0.1)
+
+
+def _pending(engine: Engine) -> int:
+    with engine.store.database.read() as connection:
+        counts = queue.count_jobs(connection)
+    return sum(counts.get(state, 0) for state in queue.PENDING)
 
 
 def table(
@@ -198,11 +254,13 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=120, help="of too many requests")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--neighbours", type=float, default=15, help="seconds of each attack of a neighbour"
+        "--neighbours", type=float, default=2.5, help="seconds of each attack of a neighbour"
     )
     parser.add_argument(
         "--only-neighbours", action="store_true", help="print the table of noisy neighbours alone"
     )
+    parser.add_argument("--attacks", nargs="+", choices=list(ATTACKS), default=list(ATTACKS))
+    parser.add_argument("--keys", nargs="+", type=int, default=[1, 2, 10])
     parser.add_argument("--database-url", help="of noisy neighbours; default: SQLite")
     parser.add_argument("--page", type=Path, help="whose figures to replace")
     options = parser.parse_args()
@@ -211,7 +269,7 @@ def main() -> int:
     if options.only_neighbours:
         with tempfile.TemporaryDirectory(prefix="sceneprint-siege-") as name:
             met = neighbours(
-                Path(name) / "data", every[:8], options.neighbours,
+                Path(name) / "data", every[:8], options.neighbours, options.keys, options.attacks,
                 database_url=options.database_url,
             )  # fmt: skip
         print("\n".join(neighbour_table(met)))
