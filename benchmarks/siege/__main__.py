@@ -221,7 +221,10 @@ def table(
         f"| answers | {answers} |",
         f"| **5xx, or no answer** | **{len(mutations.failed)}** |",
         f"| **processes that ended** | **{mutations.crashed}** |",
-        f"| most memory of a process | {mutations.peak_bytes / 2**20:.0f} MiB |",
+        f"| most memory of service, worker or reader of recordings | "
+        f"{mutations.peak_bytes / 2**20:.0f} MiB |",
+        f"| most memory of a decoder | {mutations.decoder_bytes / 2**20:.0f} MiB |",
+        f"| decoders replaced | {mutations.replaced} |",
         "",
         f"### Every operation of the OpenAPI document ({contracts[0].operations})",
         "",
