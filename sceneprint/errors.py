@@ -2,7 +2,7 @@
 
     SceneprintError, and all of sceneprint_client.errors
       x DamagedIndex            a cache file of the index that is missing or damaged
-      x DecoderFailure          an upload that its decoder crashes of, or cannot decode within limits
+      x DecoderFailure          an upload that crashes its decoder, or exceeds its limits
       x BusyIndex               another process is building this index
       x StoreError
         - LostLease             the job has been given to another worker

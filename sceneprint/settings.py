@@ -103,9 +103,7 @@ class Settings(BaseSettings):
     worker_bytes: int = Field(default=2 << 30, ge=0)
     #: Processes that uploads are decoded in, of the service at most; a worker has one of its own.
     #: They may do nothing but compute. 0: uploads are decoded in the service and the workers.
-    decoders: int = Field(
-        default_factory=lambda: min(max(os.cpu_count() or 1, 2), 8), ge=0, le=256
-    )
+    decoders: int = Field(default_factory=lambda: min(max(os.cpu_count() or 1, 2), 8), ge=0, le=256)
     #: Memory that a decoder may take for an upload, bytes; 0 for no limit.
     decoder_bytes: int = Field(default=2 << 30, ge=0)
     #: Processor time that a decoder may take for an upload, seconds.

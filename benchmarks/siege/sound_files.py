@@ -132,9 +132,7 @@ def _header(types: Any) -> Any:
 
 def _cloud_message(types: Any) -> Any:
     fields = [
-        _message(
-            types, "sensor_msgs/msg/PointField", name=name, offset=4 * i, datatype=7, count=1
-        )
+        _message(types, "sensor_msgs/msg/PointField", name=name, offset=4 * i, datatype=7, count=1)
         for i, name in enumerate("xyz")
     ]
     return _message(

@@ -213,7 +213,8 @@ class _Slot:
                 raise ValueError(f"type {kind!r:.40}")
             return process.array_of(kind, shape)
 
-        return self.run({"task": "samples"}, data, checked)
+        found: Samples = self.run({"task": "samples"}, data, checked)
+        return found
 
     def points(
         self, data: bytes, file_format: CloudFormat, viewpoint: Position | Unsaid | None,
@@ -238,11 +239,12 @@ class _Slot:
                 place = x, y, z
             points: Floats32 = process.array_of("<f4", shape)
             # kernels index by them; a comparison with NaN is false
-            if len(points) and not (-FARTHEST_M <= points.min() and points.max() <= FARTHEST_M):
+            if len(points) and not (points.min() >= -FARTHEST_M and points.max() <= FARTHEST_M):
                 raise ValueError("points beyond reach")
             return ReadPoints(points, place, given)
 
-        return self.run(request, data, checked, compiled=file_format in _COMPILED)
+        read: ReadPoints = self.run(request, data, checked, compiled=file_format in _COMPILED)
+        return read
 
     def run(
         self, request: dict[str, Any], data: bytes,

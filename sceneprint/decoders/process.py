@@ -1,9 +1,9 @@
-"""A decoder's process: loads what it needs, gives up everything else, and decodes until told to end.
+"""A decoder's process: loads what it needs, gives up everything else, decodes until it is ended.
 
     python -m sceneprint.decoders.process CONTROL MEMORY PARENT BYTES plain|kernels
 
-CONTROL is a socket with a JSON message each way per task. MEMORY is shared with the parent: bytes of
-the upload before, array after. Nothing of it is pickled: the parent believes no word that it reads.
+CONTROL is a socket with a JSON message each way for each task. MEMORY is shared with the parent: it
+holds the bytes of the upload, then the array. Nothing is pickled: the parent checks every reply.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import struct
 import sys
 import traceback
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -83,9 +84,9 @@ def _done(tasks: Mapping[str, Task], request: dict[str, Any], shared: mmap.mmap)
         reply, array = tasks[request["task"]](shared[: request["bytes"]], request)
         if array is not None:
             size = array.nbytes
-            np.frombuffer(shared, np.uint8, size)[:] = np.ascontiguousarray(array).view(
-                np.uint8
-            ).reshape(-1)
+            np.frombuffer(shared, np.uint8, size)[:] = (
+                np.ascontiguousarray(array).view(np.uint8).reshape(-1)
+            )
     except SceneprintError as error:
         return {"error": type(error).__name__, "text": str(error)[:MOST_TEXT]}
     except MemoryError:
@@ -115,15 +116,11 @@ def _warm(*, kernels: bool) -> None:
         decode_samples(data)
     for data, form in _arrays():
         read_points(data, form, UNSAID, 1.0)
-    try:
+    with suppress(ImportError):  # an extra; a LAZ file says what is missing
         import lazrs  # noqa: F401
-    except ImportError:  # an extra; a LAZ file says what is missing
-        pass
     for wrong in (b"\x89PNG\r\n\x1a\n" + bytes(40), b"\x93NUMPY\x01\x00\x02\x00{}", b"no image"):
-        try:
+        with suppress(SceneprintError):
             decode_samples(wrong)
-        except SceneprintError:
-            pass
     if not kernels:
         return
     for data, form in _texts():
@@ -138,9 +135,7 @@ def _warm(*, kernels: bool) -> None:
 def _images() -> list[bytes]:
     found = [encode_png(np.ones((2, 2), np.uint16))]
     found.append(bytes(12) + found[0])  # compressedDepth
-    for kind in ("f2", "f4", "f8", "u2"):
-        found.append(_npy(np.ones((2, 2), kind)))
-    return found
+    return found + [_npy(np.ones((2, 2), kind)) for kind in ("f2", "f4", "f8", "u2")]
 
 
 def _arrays() -> list[tuple[bytes, Any]]:
