@@ -1,0 +1,62 @@
+"""A decoder's process with tasks that do what no decoder should; see test_decoders.py."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sceneprint.decoders.process import TASKS, serve
+
+
+def _errno_of(do: Callable[[], object]) -> int:
+    """Number of the error that it ends with; 0 if it works."""
+    try:
+        do()
+    except OSError as error:
+        return error.errno or -1
+    return 0
+
+
+def _escape(_data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+    """Try to get out; the errors of each way."""
+    tried = {
+        "socket": lambda: socket.socket(socket.AF_INET),
+        "read": lambda: Path("/etc/passwd").read_bytes(),
+        "write": lambda: Path(request["path"]).write_bytes(b"x"),
+        "fork": os.fork,
+        "exec": lambda: os.execv("/bin/true", ["true"]),
+        "signal": lambda: os.kill(os.getppid(), signal.SIGTERM),
+        "list": lambda: list(Path("/").iterdir()),
+    }
+    return {name: _errno_of(do) for name, do in tried.items()}, None
+
+
+def _crash(_data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+    ctypes.string_at(0)
+    return {}, None
+
+
+def _hang(_data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+    while True:
+        pass
+
+
+def _hoard(_data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+    return {"sum": float(np.ones(request["numbers"]).sum())}, None
+
+
+def _fail(_data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+    raise ZeroDivisionError("a bug of ours")
+
+
+if __name__ == "__main__":
+    serve(TASKS | {
+        "escape": _escape, "crash": _crash, "hang": _hang, "hoard": _hoard, "fail": _fail,
+    })  # fmt: skip

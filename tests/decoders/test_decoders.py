@@ -1,0 +1,247 @@
+"""Decoders in processes of their own: equal arrays, walls, limits, replacement, fair shares."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint import errors
+from sceneprint.decoders import LocalDecoders
+from sceneprint.decoders.pool import DecoderPool
+from sceneprint.decoders.process import _arrays, _images, _texts
+from sceneprint.decoders.sandbox import filter_program
+from sceneprint_client.sidecars import UNSAID
+
+HERE = Path(__file__).resolve().parent
+#: Memory beyond what a process has when it is ready, and processor time of a task.
+MORE_BYTES, SECONDS = 256 << 20, 0.5
+
+
+@pytest.fixture(scope="module")
+def pool() -> Iterator[DecoderPool]:
+    """One process, which also has the tasks of decoder_tasks.py."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("PYTHONPATH", str(HERE))
+        pool = DecoderPool(1, MORE_BYTES, SECONDS, program="decoder_tasks")
+        yield pool
+        pool.close()
+
+
+def do(pool: DecoderPool, task: str, **request: Any) -> dict[str, Any]:
+    """Have a task done; its reply."""
+    with pool.place() as slot:
+        reply: dict[str, Any] = slot.run({"task": task, **request}, b"", lambda _, said: said)
+        return reply
+
+
+def await_end(pid: int) -> None:
+    """Wait until a process is gone, at most a minute."""
+    try:
+        handle = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return
+    try:
+        assert select.select([handle], [], [], 60)[0], f"process {pid} lives"
+    finally:
+        os.close(handle)
+
+
+def test_arrays_are_the_same_as_in_this_process(pool: DecoderPool) -> None:
+    local = LocalDecoders(1)
+    with pool.place() as slot:
+        for data in _images():
+            here, there = local.samples(data), slot.samples(data)
+            assert (here.dtype, here.tobytes()) == (there.dtype, there.tobytes())
+        for data, form in (*_arrays(), *_texts()):
+            near, far = (one.points(data, form, UNSAID, 0.5) for one in (local, slot))
+            assert near.points.tobytes() == far.points.tobytes()
+            assert (near.viewpoint, near.given) == (far.viewpoint, far.given)
+
+
+@pytest.mark.parametrize("data", [b"", b"no image", b"\x89PNG\r\n\x1a\n" + bytes(40)])
+def test_errors_are_the_same_as_in_this_process(pool: DecoderPool, data: bytes) -> None:
+    with pytest.raises(errors.UnreadableFrame) as here:
+        LocalDecoders(1).samples(data)
+    with pool.place() as slot, pytest.raises(errors.UnreadableFrame) as there:
+        slot.samples(data)
+    assert str(there.value) == str(here.value)
+
+
+def test_a_decoder_reaches_nothing(pool: DecoderPool, tmp_path: Path) -> None:
+    found = do(pool, "escape", path=str(tmp_path / "escaped"))
+    walls = pool.protections
+    assert walls is not None
+    assert walls.no_new_privileges
+    assert walls.seccomp == Path("/proc/sys/kernel/seccomp/actions_avail").exists()
+    if not walls.seccomp:
+        pytest.skip(f"this kernel has no seccomp: {walls.text}")
+    assert found == dict.fromkeys(
+        ("socket", "read", "write", "fork", "exec", "signal", "list"), errno.EPERM
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_crash_is_an_error_of_the_upload_and_the_process_is_replaced(pool: DecoderPool) -> None:
+    do(pool, "hoard", numbers=1)
+    (before,) = pool.pids()
+    with pytest.raises(errors.DecoderFailure, match=r"crashes the decoder \(signal 11"):
+        do(pool, "crash")
+    assert do(pool, "hoard", numbers=7) == {"sum": 7.0}
+    assert pool.pids() != [before]
+    await_end(before)
+
+
+def test_memory_is_limited(pool: DecoderPool) -> None:
+    assert do(pool, "hoard", numbers=MORE_BYTES // 16) == {"sum": float(MORE_BYTES // 16)}
+    with pytest.raises(errors.DecoderFailure, match="more than 256 MiB of memory"):
+        do(pool, "hoard", numbers=MORE_BYTES // 4)
+    assert do(pool, "hoard", numbers=2) == {"sum": 2.0}
+
+
+def test_processor_time_is_limited(pool: DecoderPool) -> None:
+    with pytest.raises(errors.DecoderFailure, match=r"longer than 0\.5 s"):
+        do(pool, "hang")
+    assert do(pool, "hoard", numbers=3) == {"sum": 3.0}
+
+
+def test_a_bug_is_not_an_error_of_the_upload(pool: DecoderPool) -> None:
+    with pytest.raises(RuntimeError, match="ZeroDivisionError: a bug of ours"):
+        do(pool, "fail")
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        {"type": "<u2", "shape": [1 << 20, 1 << 20]}, {"type": "|O", "shape": [2, 2]},
+        {"type": "<u2", "shape": [-1, 2]}, {"type": "<u2", "shape": "22"}, {},
+    ],
+)  # fmt: skip
+def test_a_reply_that_lies_is_no_result(
+    pool: DecoderPool, reply: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    do(pool, "hoard", numbers=1)
+    with pool.place() as slot:
+        process = slot.process
+        assert process is not None
+        monkeypatch.setattr(type(process), "run", lambda *_: reply)
+        with pytest.raises(errors.DecoderFailure, match="its answer is no result"):
+            slot.samples(_images()[0])
+
+
+def test_processes_end_with_the_pool_and_with_a_killed_parent() -> None:
+    pool = DecoderPool(2, 0, 10.0)
+    pool.start()
+    (pid,) = pool.pids()
+    pool.close()
+    await_end(pid)
+    program = (
+        "from sceneprint.decoders.pool import DecoderPool\n"
+        "pool = DecoderPool(1, 0, 10.0); pool.start()\n"
+        "print(*pool.pids(), flush=True); input()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        os.kill(parent.pid, signal.SIGKILL)
+        parent.wait()
+    await_end(child)
+
+
+def test_a_tenant_alone_has_all_places_and_beside_another_half() -> None:
+    who = threading.local()
+    pool = DecoderPool(4, 0, 10.0, lambda: str(who.name))
+    who.name = "a"
+    held = [pool.place() for _ in range(4)]
+    for one in held:
+        one.__enter__()
+    asked, served, release = threading.Event(), threading.Event(), threading.Event()
+
+    def other() -> None:
+        who.name = "b"
+        asked.set()
+        with pool.place():
+            served.set()
+            release.wait(60)
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    assert asked.wait(60)
+    assert not served.is_set()
+    held.pop().__exit__(None, None, None)  # goes to b, though a might ask first
+    assert served.wait(60)
+    # a holds three of four, more than half: a place that b gives back is not for a
+    done = threading.Event()
+
+    def again() -> None:
+        who.name = "a"
+        with pool.place():
+            done.set()
+
+    waiting = threading.Thread(target=again)
+    waiting.start()
+    release.set()
+    thread.join(60)
+    assert not done.is_set()
+    held.pop().__exit__(None, None, None)
+    held.pop().__exit__(None, None, None)
+    assert done.wait(60)
+    waiting.join(60)
+    held.pop().__exit__(None, None, None)
+    pool.close()
+
+
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
+def test_the_filter_decides_as_its_list_says(machine: str) -> None:
+    architecture = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}[machine]
+    run = interpreter(filter_program(machine))
+    allow, refuse, kill = 0x7FFF0000, 0x00050001, 0x80000000
+    read, openat, socket_, mmap = {
+        "x86_64": (0, 257, 41, 9), "aarch64": (63, 56, 198, 222)
+    }[machine]  # fmt: skip
+    assert run(read, architecture, 0) == allow
+    assert run(openat, architecture, 0) == run(socket_, architecture, 0) == refuse
+    assert run(mmap, architecture, 3) == allow  # to read and write
+    assert run(mmap, architecture, 4) == run(mmap, architecture, 7) == refuse  # to execute
+    assert run(read, architecture ^ 1, 0) == kill
+    assert run(read | 0x40000000, architecture, 0) == kill
+
+
+def interpreter(program: list[tuple[int, int, int, int]]) -> Callable[[int, int, int], int]:
+    """What a program of classic BPF returns for (number, architecture, third argument)."""
+
+    def run(number: int, architecture: int, third: int) -> int:
+        words, at, value = {0: number, 4: architecture, 32: third}, 0, 0
+        while True:
+            code, true, false, k = program[at]
+            at += 1
+            if code == 0x06:
+                return k
+            if code == 0x20:
+                value = words[k]
+                continue
+            holds = {0x15: value == k, 0x35: value >= k, 0x45: bool(value & k)}[code]
+            at += true if holds else false
+
+    return run
+
+
+def test_samples_come_back_in_the_size_of_a_large_image(pool: DecoderPool) -> None:
+    from sceneprint.formats.depth_file import encode_png
+
+    depth = np.arange(4_000_000, dtype=np.uint16).reshape(2000, 2000)
+    with pool.place() as slot:
+        assert np.array_equal(slot.samples(encode_png(depth)), depth)
+        assert slot.samples(_images()[0]).shape == (2, 2)
