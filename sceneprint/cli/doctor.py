@@ -413,6 +413,7 @@ def machine(settings: Settings) -> Iterator[Check]:
     if found.verdict != "WRONG":
         yield from server(settings)
     yield from object_stores(settings)
+    yield _decoders(settings)
     yield _embree()
     yield _open3d()
 
@@ -445,6 +446,28 @@ def _kernels() -> Check:
         "Set NUMBA_CACHE_DIR to a writable folder."
     )
     return Check("note", "kernels", text)
+
+
+def _decoders(settings: Settings) -> Check:
+    """Start a decoder, and say how it is confined."""
+    if settings.decoders == 0:
+        text = "uploads are decoded in service and workers (SCENEPRINT_DECODERS is 0)"
+        return Check("note", "decoders", text)
+    from sceneprint.decoders.pool import DecoderPool
+
+    pool = DecoderPool(1, settings.decoder_bytes, settings.decoder_s)
+    try:
+        pool.start()
+        found = pool.protections
+    finally:
+        pool.close()
+    if found is None:
+        text = "none can be started, so every upload gets 503; the log of the service says why"
+        return Check("WRONG", "decoders", text)
+    if not found.seccomp:
+        text = f"{found.text}. This kernel has no seccomp filter: confine the service itself"
+        return Check("note", "decoders", text)
+    return Check("ok", "decoders", found.text)
 
 
 def _tables(cache_dir: Path) -> Iterator[Check]:
