@@ -18,11 +18,11 @@ from benchmarks.siege.__main__ import (
     neighbours,
     table,
 )
+from benchmarks.siege.attacks import ATTACKS
 from benchmarks.siege.contract import ContractFigures, read_report, try_contract
 from benchmarks.siege.fuzz import Fuzzed, decoder_table, http_table
 from benchmarks.siege.mutations import MutationFigures, besiege, mutated
 from benchmarks.siege.neighbours import (
-    ATTACKS,
     NeighbourFigures,
     VictimFigures,
     neighbour_table,
@@ -38,17 +38,18 @@ def every() -> list[Shot]:
 
 
 def test_broken_uploads_are_answered(every: list[Shot], tmp_path: Path) -> None:
-    with besieged(tmp_path / "data", every[:2]) as (url, part):
+    with besieged(tmp_path / "data", every[:2], decoders=2) as (url, part):
         found = besiege(url, [part], every, n=60, seed=5)
-    assert (found.failed, found.crashed) == ([], 0)
+    assert (found.failed, found.crashed, found.replaced) == ([], 0, 0)
     assert sum(found.statuses.values()) == 60
     assert {202, 422} <= set(found.statuses)
     assert found.peak_bytes < 1 << 30
+    assert 0 < found.decoder_bytes < 1 << 30
 
 
 @pytest.mark.thorough
 def test_broken_uploads_and_every_operation_are_answered(every: list[Shot], tmp_path: Path) -> None:
-    with besieged(tmp_path / "data", every[:2]) as (url, part):
+    with besieged(tmp_path / "data", every[:2], decoders=2) as (url, part):
         found = besiege(url, [part], every, n=300, seed=5)
         assert (found.failed, found.crashed) == ([], 0)
         assert sum(found.statuses.values()) == 300
@@ -83,7 +84,7 @@ def test_the_table_of_neighbours_tells_the_99th_percentile() -> None:
     calm = VictimFigures([0.01] * 99 + [0.02], [0.5])
     found = [NeighbourFigures("x", 2, calm, VictimFigures([0.03], [1.5], 4), 9, 7)]
     assert neighbour_table(found)[2] == (
-        "| x | 2 | 10 ms | 30 ms | 500 ms | 1500 ms | **4** | 9 | 7 |"
+        "| x | 2 | 10 ms | 30 ms | 3.0 | 500 ms | 1500 ms | 3.0 | **4** | 9 | 7 |"
     )
 
 
@@ -126,7 +127,9 @@ def test_what_schemathesis_counted(
 
 
 def test_the_page_tells_what_was_measured(tmp_path: Path) -> None:
-    mutations = MutationFigures({"png": 3, "tar": 1}, {202: 1, 422: 3}, ["x"], 2, 3 << 20, 7.0)
+    mutations = MutationFigures(
+        {"png": 3, "tar": 1}, {202: 1, 422: 3}, ["x"], 2, 3 << 20, 5 << 20, 6, 7.0
+    )
     contract = ContractFigures(41, 10, 9, "")
     overloaded = OverloadFigures(
         50.0, 500.0, 4.0, {200: 3, 503: 9}, 1, (10.0, 20.0), (1.0, 2.0), 5, 1, 0.5
@@ -141,7 +144,7 @@ def test_the_page_tells_what_was_measured(tmp_path: Path) -> None:
     assert "old" not in text
     for part in (
         "4 broken uploads within 7 s", "3 png, 1 tar", "1 of 202, 3 of 422", "| **1** |",
-        "| **2** |", "3 MiB", "(41)", "| no key | 9 of 10 |", "500 requests a second where 50",
+        "| **2** |", "3 MiB", "5 MiB", "replaced | 6 |", "(41)", "| no key | 9 of 10 |", "500 requests a second where 50",
         "5, **1**", "0.5 s",
     ):  # fmt: skip
         assert part in text, part

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint import errors
-from sceneprint.decoders.process import MESSAGE_BYTES, SHARED_BYTES
+from sceneprint.decoders.child_process import MESSAGE_BYTES, SHARED_BYTES
 from sceneprint.decoders.sandbox import Protections
 from sceneprint.errors import DecoderFailure
 from sceneprint.formats.depth_file import Samples, decode_samples
@@ -44,7 +44,7 @@ from sceneprint_client.sidecars import Position, Unsaid
 
 log = logging.getLogger(__name__)
 
-PROGRAM = "sceneprint.decoders.process"
+PROGRAM = "sceneprint.decoders.child_process"
 #: Formats whose decoders are compiled: their process takes 1 s and 140 MB more.
 _COMPILED = ("ply", "pcd")
 #: What a decoder may say of an upload.

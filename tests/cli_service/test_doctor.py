@@ -63,7 +63,7 @@ def test_a_sound_machine(sceneprint: Run, data_folder: Path, working: str) -> No
     found = verdicts(done.stdout)
     assert list(found) == [
         "python", "sqlite", "kernels", "table depth", "table lidar", "table paper", "data folder",
-        "disk", "database", "embreex", "open3d libraries", *SERVICE,
+        "disk", "database", "decoders", "embreex", "open3d libraries", *SERVICE,
     ]  # fmt: skip
     for needed in ("python", "sqlite", "data folder", "database", "service", "workers"):
         assert found[needed] == "ok"
@@ -188,6 +188,14 @@ def test_databases_of_other_versions(tmp_path: Path) -> None:
         connection.execute("DELETE FROM alembic_version")
     connection.close()
     assert found_in(settings)["database"].verdict == "note"
+
+
+def test_a_decoder_is_tried(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path, decoders=1)
+    finding = found_in(settings)["decoders"]
+    assert (finding.verdict, "seccomp" in finding.text) == ("ok", True)
+    finding = found_in(settings.model_copy(update={"decoders": 0}))["decoders"]
+    assert (finding.verdict, "SCENEPRINT_DECODERS is 0" in finding.text) == ("note", True)
 
 
 def content(folder: Path) -> dict[str, bytes]:

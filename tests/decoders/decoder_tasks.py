@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sceneprint.decoders.process import TASKS, serve
+from sceneprint.decoders.child_process import TASKS, serve
 
 
 def _errno_of(do: Callable[[], object]) -> int:

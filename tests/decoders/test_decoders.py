@@ -18,8 +18,8 @@ import pytest
 
 from sceneprint import errors
 from sceneprint.decoders import LocalDecoders
+from sceneprint.decoders.child_process import _arrays, _images, _texts
 from sceneprint.decoders.pool import DecoderPool
-from sceneprint.decoders.process import _arrays, _images, _texts
 from sceneprint.decoders.sandbox import filter_program
 from sceneprint_client.sidecars import UNSAID
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
+from sceneprint.decoders import LocalDecoders
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.frame_decoder import content_id, read_upload
 from sceneprint.engine.reconstruction import JobView, fused
@@ -29,6 +30,7 @@ from sceneprint_client.api.surface import NewReconstruction
 WorkOff = Callable[[Engine], list[JobState | None]]
 #: Where clouds were seen from, metres in their own coordinates.
 VIEWPOINT = np.array((2.0, -1.0, 0.5))
+HERE = LocalDecoders(1)
 
 
 def points_of(frame: DepthFrame) -> Floats:
@@ -64,13 +66,13 @@ def test_what_could_not_be_read_again_is_not_let_in() -> None:
     """A format that only its caller knows is lost with him."""
     odd = write_ply(np.eye(3)[np.arange(12) % 3]).replace(b"ply\n", b"ply\t\n", 1)
     with pytest.raises(UnreadableCloud, match="does not start like one"):
-        read_upload(odd, said(format="ply"))
+        read_upload(odd, said(format="ply"), HERE)
 
 
 def test_minus_nought_is_no_other_viewpoint() -> None:
     data = write_ply(np.eye(3)[np.arange(12) % 3])
-    mine = read_upload(data, said(viewpoint={"x": -0.0, "y": 0, "z": -0.0}))
-    assert content_id(mine) == content_id(read_upload(data, said()))
+    mine = read_upload(data, said(viewpoint={"x": -0.0, "y": 0, "z": -0.0}), HERE)
+    assert content_id(mine) == content_id(read_upload(data, said(), HERE))
 
 
 def test_a_lost_cloud_comes_again_packed_otherwise_and_is_signed_with_another_model(
@@ -96,7 +98,8 @@ def test_a_lost_cloud_comes_again_packed_otherwise_and_is_signed_with_another_mo
     assert empty.get_map("hall").model.startswith("paper-")
     signer = open_signer("paper")
     for one, data, known in ((frame_id, first, meta), (other_id, other, of_many)):
-        assert vector(empty, one) == sign(read_upload(data, known).frame, signer).vector.tobytes()
+        frame = read_upload(data, known, HERE).frame
+        assert vector(empty, one) == sign(frame, signer).vector.tobytes()
 
 
 def test_what_a_caller_asks_of_matches_is_asked_without_free_space_too() -> None:

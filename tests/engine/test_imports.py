@@ -212,11 +212,11 @@ def test_a_frame_that_memory_does_not_do_for_costs_no_other(
             raise MemoryError
         return read(archive, reference)
 
-    def decoded(data: bytes, meta: Any) -> Any:
+    def decoded(data: bytes, meta: Any, decoders: Any) -> Any:
         asked.append(data)
         if data == uploads[2].data:
             raise MemoryError
-        return decode(data, meta)
+        return decode(data, meta, decoders)
 
     monkeypatch.setattr(Archive, "data_of", data_of)
     monkeypatch.setattr(uploading, "read_upload", decoded)

@@ -176,7 +176,8 @@ def test_signatures_of_two_models_are_not_compared_whatever_their_length(
     full: Engine, uploads: Any, whitened_model: Model, signer: Signer
 ) -> None:
     row = full._row("hall")
-    asked = query.prepare_upload(uploads[0].data, uploads[0].meta, signer, R)
+    decoders = full.store.decoders
+    asked = query.prepare_upload(uploads[0].data, uploads[0].meta, signer, R, decoders)
     given = ([row], asked, R, Deadline(None))
     assert full.queries.answer(*given).matches[0].distance == 0
     with pytest.raises(ModelMismatch, match="two models cannot be compared"):

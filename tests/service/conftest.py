@@ -215,7 +215,7 @@ def begin(starter: Callable[..., Server]) -> Iterator[Callable[..., Server]]:
 @pytest.fixture(scope="session")
 def served(starter: Callable[..., Server], folder_stack: ExitStack) -> Server:
     """One server for all tests that leave it as it was but for maps of their own."""
-    return starter(folder_stack, cors_origins=FLEET)
+    return starter(folder_stack, cors_origins=FLEET, decoders=2)
 
 
 @dataclass(frozen=True)

@@ -221,7 +221,7 @@ def test_everything_that_the_client_offers_is_described(pages: dict[str, Generat
     }
     assert len(methods) > 90
     assert "embedded(path: str | Path) -> Self" in methods["embedded"]
-    assert ["`UnknownMap`, `UnknownFrame`", "there is none."] in rows(methods["query"])
+    assert ["`UnknownMap`, `UnknownFrame`", "it does not exist."] in rows(methods["query"])
     assert set(sections(found["Tracker"], 3)) >= {"update"}
 
 

@@ -25,6 +25,7 @@ _COMPUTED = {
     "default_data_dir": "`sceneprint` in the user's data folder",
     "os.cpu_count() or 1": "number of processors",
     "max(os.cpu_count() or 1, 2)": "number of processors, at least 2",
+    "min(max(os.cpu_count() or 1, 2), 8)": "number of processors, from 2 to 8",
 }
 
 

@@ -1,6 +1,6 @@
 """A decoder's process: loads what it needs, gives up everything else, decodes until it is ended.
 
-    python -m sceneprint.decoders.process CONTROL MEMORY PARENT BYTES plain|kernels
+    python -m sceneprint.decoders.child_process CONTROL MEMORY PARENT BYTES plain|kernels
 
 CONTROL is a socket with a JSON message each way for each task. MEMORY is shared with the parent: it
 holds the bytes of the upload, then the array. Nothing is pickled: the parent checks every reply.
