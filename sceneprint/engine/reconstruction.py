@@ -15,7 +15,7 @@ import numpy as np
 from sqlalchemy import Connection
 
 from sceneprint.engine.ingest.frame_decoder import read_stored
-from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept, Tasks
 from sceneprint.engine.maps.map_frames import living
 from sceneprint.engine.results.stored_results import ResultValidity, StoredResult
 from sceneprint.engine.serializers import when
@@ -341,9 +341,9 @@ class ReconstructionJobs:
                 self.delete(job.id)
         return len(gone)
 
-    def _fuse(self, task: LongJob, until: float) -> SliceResult:
+    def _fuse(self, task: LongJob, is_over: IsOver) -> SliceResult:
         """Do it, in one slice: at most 32 views of bounded size take seconds."""
-        del until
+        del is_over
         data = task.data
         wanted = NewReconstruction.model_validate(data["request"])
         views = [JobView(**view) for view in data["views"]]

@@ -312,14 +312,11 @@ def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
     lease_s : seconds until it must be renewed
     """
     at = now(connection)
-    # "+ 0.0" keeps SQLite to the index that has the order: it would sort all that is due
-    due_at = jobs.c.run_after + 0.0
-    is_due = or_(due_at <= at, due_at > at + LONGEST_PAUSE_S)
-    waiting = jobs.c.state == JobState.QUEUED, is_due
+    waiting = _waiting(at)
     silent = jobs.c.state == JobState.RUNNING, _lease_over(at)
     found = None
-    for tenant, turn in _tenants_due(connection, *waiting):  # the first's may all be locked
-        found = _lock_first(connection, turn, *waiting, jobs.c.tenant == tenant)
+    for one in _tenants_due(connection, *waiting):  # the first's may all be locked
+        found = _lock_first(connection, one.turn, *waiting, jobs.c.tenant == one.tenant)
         if found is not None:
             break
     # of those that fell silent, which are few, one is locked only where its turn is before
@@ -403,8 +400,17 @@ def _turns_of(tenant: ColumnElement[str]) -> tuple[Label[int | None], Label[int 
     return served.scalar_subquery().label("served"), kept.scalar_subquery().label("kept")
 
 
-def _tenants_due(connection: Connection, *due: ColumnElement[bool]) -> list[tuple[str, int]]:
-    """Tenants that have a queued job due, and their latest turns, in the order of the next.
+class _TenantDue(NamedTuple):
+    """A tenant with a queued job that is due: the least is next."""
+
+    upkeep: bool
+    turn: int  # its latest
+    tenant: str
+    priority: int  # of its first job
+
+
+def _tenants_due(connection: Connection, *due: ColumnElement[bool]) -> list[_TenantDue]:
+    """Tenants that have a queued job due, in the order of the next.
 
     The index is asked once for each tenant with a queued job, however many jobs there are.
     """
@@ -434,11 +440,30 @@ def _tenants_due(connection: Connection, *due: ColumnElement[bool]) -> list[tupl
         names.c.tenant.is_not(None)
     )
     rows = (row for row in connection.execute(asked) if row.best is not None)
-    ordered = sorted(
-        (_is_upkeep(row.tenant, row.best), _latest(row.served, row.kept), row.tenant)
+    return sorted(
+        _TenantDue(
+            _is_upkeep(row.tenant, row.best), _latest(row.served, row.kept), row.tenant, row.best
+        )
         for row in rows
     )
-    return [(tenant, turn) for _, turn, tenant in ordered]
+
+
+def waits_before(connection: Connection, held: JobRow) -> bool:
+    """Whether a job waits that goes before another slice of this one, once that is put back: one of
+    another tenant, or of a higher priority.
+    """
+    return any(
+        one.tenant != held.tenant or one.priority > held.priority
+        for one in _tenants_due(connection, *_waiting(now(connection)))
+        if not one.upkeep
+    )
+
+
+def _waiting(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
+    """Jobs that are due to be claimed."""
+    # "+ 0.0" keeps SQLite to the index that has the order: it would sort all that is due
+    due_at = jobs.c.run_after + 0.0
+    return jobs.c.state == JobState.QUEUED, or_(due_at <= at, due_at > at + LONGEST_PAUSE_S)
 
 
 def _last_turn(connection: Connection) -> int:

@@ -222,6 +222,11 @@ def test_every_nth_frame_and_at_most_so_many(engine: Engine) -> None:
     assert chosen(every=2, most=100) == order[::2]
 
 
+def at_once() -> bool:
+    """The end of a slice after its first step."""
+    return True
+
+
 def stored(engine: Engine, coverage_id: str) -> list[Any]:
     with engine.store.database.read() as connection:
         own = select(jobs.c.number).where(jobs.c.id == coverage_id).scalar_subquery()
@@ -240,12 +245,12 @@ def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
     while True:  # a frame a slice, and each is lost once
         lost = engine.claim("dies")
         assert isinstance(lost, LongJob)
-        first = handler(lost, 0.0)
+        first = handler(lost, at_once)
         due_now(engine)
         again = engine.claim("lives")
         assert isinstance(again, LongJob)
         assert engine.tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
-        second = handler(again, 0.0)
+        second = handler(again, at_once)
         assert asdict(first) == asdict(second)
         engine.tasks._keep(again, second)
         slices += 1
@@ -267,7 +272,7 @@ def test_an_upload_goes_before_the_next_slice(
     handler = CoverageHandler(engine.store, engine.signers, engine.queries)
     task = engine.claim("w")
     assert isinstance(task, LongJob)
-    engine.tasks._keep(task, handler(task, 0.0))
+    engine.tasks._keep(task, handler(task, at_once))
     engine.add_frame("pair", uploads[9].data, uploads[9].meta, -10)  # of the least priority
     frame = engine.claim("w")
     assert isinstance(frame, Work)
@@ -354,7 +359,7 @@ def test_frames_that_went_meanwhile_are_skipped(
     task = engine.claim("w")
     assert isinstance(task, LongJob)
     handler = CoverageHandler(engine.store, engine.signers, engine.queries)
-    engine.tasks._keep(task, handler(task, 0.0))
+    engine.tasks._keep(task, handler(task, at_once))
     last = [one for one in engine.list_frames("hall").items if one.session == "c"][-1]
     engine.delete_frame("hall", last.frame_id)
     due_now(engine)

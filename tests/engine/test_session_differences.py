@@ -97,12 +97,12 @@ def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
     while not engine.differences.get("hall", begun.difference_id).state.over:
         lost = engine.claim("dies")
         assert isinstance(lost, LongJob)
-        first = handler(lost, 0.0)
+        first = handler(lost, lambda: True)
         due_now(engine)
         again = engine.claim("lives")
         assert isinstance(again, LongJob)
         assert engine.tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
-        second = handler(again, 0.0)
+        second = handler(again, lambda: True)
         assert asdict(first) == asdict(second)
         engine.tasks._keep(again, second)
         slices += 1

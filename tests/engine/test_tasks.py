@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -10,11 +11,12 @@ from sqlalchemy import select, update
 
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import list_jobs
-from sceneprint.engine.jobs.tasks import LongJob, SliceResult
+from sceneprint.engine.jobs.tasks import SLICE_S, Handler, IsOver, LongJob, SliceResult
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
 from sceneprint.store.queue import JobFile, files_of, find_job, items_of, remove_job
 from sceneprint.store.tables import events, jobs
+from sceneprint.store.tenants import work_of
 from sceneprint_client.api import Job, JobState, NewMap
 
 
@@ -25,10 +27,10 @@ def engine(make_engine: Callable[..., Engine]) -> Engine:
     return engine
 
 
-def count_to(engine: Engine, most: int) -> Callable[[LongJob, float], SliceResult]:
+def count_to(engine: Engine, most: int) -> Handler:
     """A handler that finds one number a slice, and keeps a file of each."""
 
-    def handle(task: LongJob, _until: float) -> SliceResult:
+    def handle(task: LongJob, _: IsOver) -> SliceResult:
         done = task.progress.get("done", 0)
         blob = engine.store.blobs.put(f"part {done}".encode())
         return SliceResult(
@@ -86,10 +88,10 @@ def test_a_slice_of_a_worker_that_fell_silent_counts_once(engine, work_off):
 def test_what_cannot_be_done_fails_at_once_and_goes_on_when_retried(engine, work_off):
     able = False
 
-    def handle(task: LongJob, until: float) -> SliceResult:
+    def handle(task: LongJob, is_over: IsOver) -> SliceResult:
         if task.progress and not able:
             raise InvalidRequest("the second step is impossible")
-        return count_to(engine, 3)(task, until)
+        return count_to(engine, 3)(task, is_over)
 
     engine.tasks.register("count", handle)
     job, _ = engine.tasks.begin("count", "hall", {})
@@ -107,7 +109,7 @@ def test_what_cannot_be_done_fails_at_once_and_goes_on_when_retried(engine, work
 
 
 def test_what_breaks_down_is_tried_again_until_it_is_dead(engine, work_off):
-    def handle(_task: LongJob, _until: float) -> SliceResult:
+    def handle(_task: LongJob, _: IsOver) -> SliceResult:
         raise RuntimeError("no luck")
 
     engine.tasks.register("count", handle)
@@ -185,10 +187,10 @@ def test_tries_before_a_slice_that_came_through_count_no_more(engine: Engine) ->
 def test_a_job_that_is_removed_while_a_slice_runs_is_no_fault_of_its_worker(
     engine: Engine,
 ) -> None:
-    def handle(task: LongJob, until: float) -> SliceResult:
+    def handle(task: LongJob, is_over: IsOver) -> SliceResult:
         with engine.store.database.write() as connection:
             remove_job(connection, find_job(connection, task.job.id))
-        return count_to(engine, 2)(task, until)
+        return count_to(engine, 2)(task, is_over)
 
     engine.tasks.register("count", handle)
     engine.tasks.begin("count", "hall", {})
@@ -205,8 +207,8 @@ def test_a_file_that_a_deletion_swept_is_made_again(
 ) -> None:
     swept: list[str] = []
 
-    def handle(task: LongJob, until: float) -> SliceResult:
-        outcome = count_to(engine, 1)(task, until)
+    def handle(task: LongJob, is_over: IsOver) -> SliceResult:
+        outcome = count_to(engine, 1)(task, is_over)
         if not swept:  # another job that had made the same is removed at this moment
             swept.append(outcome.files[0].blob)
             collect_blobs(engine.store, swept)
@@ -227,3 +229,28 @@ def test_a_file_that_another_takes_the_place_of_is_removed(
     work_off(engine)
     [blob] = engine.store.blobs.digests()
     assert engine.store.blobs.get(blob) == b"part 2"
+
+
+def test_a_slice_ends_when_another_tenant_waits(engine: Engine) -> None:
+    took: list[float] = []
+
+    def handle(_: LongJob, is_over: IsOver) -> SliceResult:
+        with work_of("other"):
+            engine.tasks.begin("count", "hall", {})
+        begun = time.monotonic()
+        while not is_over():
+            pass
+        took.append(time.monotonic() - begun)
+        return SliceResult(over=False, progress={"done": 1, "total": 2})
+
+    engine.tasks.register("endless", handle)
+    engine.tasks.register("count", count_to(engine, 1))
+    with work_of("own"):
+        engine.tasks.begin("endless", "hall", {})
+    held = engine.claim("w")
+    assert held is not None
+    assert engine.run(held) == JobState.QUEUED
+    assert took[0] < SLICE_S / 2
+    following = engine.claim("w")
+    assert following is not None
+    assert (following.job.kind, following.job.tenant) == ("count", "other")

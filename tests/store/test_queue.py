@@ -198,6 +198,32 @@ def test_between_two_turns_of_a_tenant_each_other_has_at_most_one(
     assert "".join(hand.taken().tenant for _ in range(6)) == "cacaca"
 
 
+def test_a_long_job_makes_way_for_other_tenants_and_for_higher_priorities(
+    store: Store, hand: Any, hall: MapRow
+) -> None:
+    queue_jobs(store, hall, "long", 1)
+    held = hand.taken()
+
+    def makes_way() -> bool:
+        with store.database.read() as connection:
+            return queue.waits_before(connection, held)
+
+    assert not makes_way()
+    queue_jobs(store, hall, "long", 1, priority=0)  # an equal comes when this has ended
+    queue_jobs(store, hall, "", 1, queue.UPKEEP)
+    assert not makes_way()
+    queue_jobs(store, hall, "long", 1, priority=1)
+    assert makes_way()
+    assert hand.taken().priority == 1
+    assert not makes_way()
+    queue_jobs(store, hall, "other", 1, priority=-10)
+    assert makes_way()
+    with store.database.write() as connection:  # it is not due yet
+        later = update(jobs).where(jobs.c.tenant == "other")
+        connection.execute(later.values(run_after=time.time() + 60))
+    assert not makes_way()
+
+
 def test_priority_decides_within_a_tenant(store: Store, hand: Any, hall: MapRow) -> None:
     for tenant in ("a", "b"):
         for priority in (0, 10, -10):

@@ -19,7 +19,7 @@ from sceneprint import errors
 from sceneprint.engine.ingest.uploads import Upload, Uploads, item_of
 from sceneprint.engine.ingest.uploads import UploadResult as UploadOutcome
 from sceneprint.engine.jobs.lifecycle import get_job
-from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept, Tasks
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.formats.archive import Archive, Inflater, open_archive
 from sceneprint.formats.dataset import FrameReference
@@ -292,8 +292,8 @@ class Imports:
             items=[ImportItem(**one) for one in found[:limit]], next_cursor=more
         )
 
-    def handle(self, task: LongJob, until: float) -> SliceResult:
-        """Import a part of an archive: frames until the time is over, at least some."""
+    def handle(self, task: LongJob, is_over: IsOver) -> SliceResult:
+        """Import a part of an archive: frames until the slice is over, at least some."""
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
             file = queue.files_of(connection, task.job.number).get(FILE)
@@ -304,7 +304,7 @@ class Imports:
             )
         try:
             with self._opened(file, options.name) as archive:
-                return self._slice(task, archive, options, until)
+                return self._slice(task, archive, options, is_over)
         except errors.UnreadableArchive:  # trying again cannot help, and it may be large
             with self._store.database.write() as connection:
                 number = task.job.number
@@ -352,13 +352,13 @@ class Imports:
             raise unusable("The archive cannot be unpacked", error) from error
 
     def _slice(
-        self, task: LongJob, archive: Archive, options: ImportOptions, until: float
+        self, task: LongJob, archive: Archive, options: ImportOptions, is_over: IsOver
     ) -> SliceResult:
         steps = list(steps_of(archive, options.every, options.session))
         progress = {"done": 0, "received": 0, "there": 0, "refused": 0} | task.progress
         progress["total"] = len(steps)
         items: list[dict[str, Any]] = []
-        while progress["done"] < len(steps) and (not items or time.monotonic() < until):
+        while progress["done"] < len(steps) and (not items or not is_over()):
             some = next_of(archive, steps, progress["done"])
             for item in take(self._uploads, task, archive, some, options):
                 items.append(item.model_dump(mode="json"))

@@ -108,16 +108,24 @@ class SliceResult:
     blobs: Collection[str] = ()
 
 
-#: Does a slice of a job until the time of `time.monotonic` that is given; may be done again.
-Handler = Callable[[LongJob, float], SliceResult]
+#: Whether a slice is to end at its next step, as its time is over or somebody else waits.
+IsOver = Callable[[], bool]
+#: Does a slice of a job until it is to end, at least a step of it; may be done again.
+Handler = Callable[[LongJob, IsOver], SliceResult]
 
 
 log = logging.getLogger(__name__)
 
-#: Seconds of a slice: frames that wait to be signed come between two.
-SLICE_S = 15.0
+#: Seconds of a slice at most, and between two looks whether another job waits that goes before.
+SLICE_S, LOOK_S = 15.0, 0.1
 #: Errors that trying again cannot help: what was asked for cannot be done.
 HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, SnapshotError)
+
+
+def ends_within(is_over: IsOver, seconds: float) -> IsOver:
+    """The end of a slice that takes no longer than that from now."""
+    until = time.monotonic() + seconds
+    return lambda: time.monotonic() >= until or is_over()
 
 
 class Tasks:
@@ -205,7 +213,7 @@ class Tasks:
                         f"This process cannot run jobs of kind {job.kind!r}. Run a worker with "
                         "`sceneprint serve` or `sceneprint work`."
                     )
-                outcome = handler(task, time.monotonic() + SLICE_S)
+                outcome = handler(task, self._end_of_slice(job))
                 state = self._keep(task, outcome)
         except LostLease as error:
             log.warning("lease lost", extra=_about(task, error=str(error)))
@@ -225,6 +233,21 @@ class Tasks:
         milliseconds = round(1e3 * (time.perf_counter() - start), 1)
         log.info("job %s", state, extra=_about(task, state=state, milliseconds=milliseconds))
         return state
+
+    def _end_of_slice(self, job: JobRow) -> IsOver:
+        """When a slice of a job ends that begins now."""
+        until, look_at = time.monotonic() + SLICE_S, 0.0
+
+        def is_over() -> bool:
+            nonlocal look_at
+            now = time.monotonic()
+            if now < until and now >= look_at:
+                look_at = now + LOOK_S
+                with self._store.database.read() as connection:
+                    return queue.waits_before(connection, job)
+            return now >= until
+
+        return is_over
 
     def put_back(self, task: LongJob, after_s: float = 0.0) -> None:
         """Return a claimed job undone."""

@@ -9,7 +9,6 @@ session. The answers are those that a robot would get; none is kept.
 from __future__ import annotations
 
 import math
-import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.tasks import LongJob, MapJobs, SliceResult, Tasks
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, MapJobs, SliceResult, Tasks, ends_within
 from sceneprint.engine.maps.map_frames import Output
 from sceneprint.engine.maps.map_plans import (
     DrawnFrame,
@@ -408,10 +407,10 @@ class CoverageHandler:
     def __init__(self, store: Store, signers: Signers, queries: Queries) -> None:
         self._store, self._signers, self._queries = store, signers, queries
 
-    def __call__(self, task: LongJob, until: float) -> SliceResult:
+    def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
         """A slice: at least one frame, or the conclusion."""
         asked = NewMapCoverage.model_validate(task.data)
-        until = min(until, time.monotonic() + SLICE_S)
+        is_over = ends_within(is_over, SLICE_S)
         progress = dict(task.progress) or self._begin(task, asked)
         items: list[dict[str, Any]] = []
         while progress["done"] < progress["total"]:
@@ -421,7 +420,7 @@ class CoverageHandler:
             else:
                 items.append(item)
             progress["done"] += 1
-            if time.monotonic() >= until:
+            if is_over():
                 return SliceResult(False, progress, items)
         return self._conclude(task, asked, progress, items)
 

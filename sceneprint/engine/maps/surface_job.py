@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.tasks import LongJob, SliceResult
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, ends_within
 from sceneprint.engine.search.up_vectors import parent_axes
 from sceneprint.engine.serializers import tag_of
 from sceneprint.engine.signers import Signers
@@ -154,9 +154,9 @@ class SurfaceHandler:
     def __init__(self, store: Store, signers: Signers) -> None:
         self._store, self._signers = store, signers
 
-    def __call__(self, task: LongJob, until: float) -> SliceResult:
+    def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
         """A slice: some frames added or taken out, some tiles made anew, or the conclusion."""
-        until = min(until, time.monotonic() + SLICE_S)
+        is_over = ends_within(is_over, SLICE_S)
         with self._store.database.read() as connection:
             row = living_map(connection, task.of_map)
             surface = stored.find_surface(connection, row.number)
@@ -174,7 +174,7 @@ class SurfaceHandler:
         with self._store.database.read() as connection:
             rebuilt = stored.tiles_to_rebuild(connection, row.number, _TILES)
         if rebuilt:
-            return self._rebuild(surface, progress, rebuilt, until)
+            return self._rebuild(surface, progress, rebuilt, is_over)
         with self._store.database.read() as connection:
             rescaled = stored.tiles_of_other_scale(connection, surface, _TILES)
         if rescaled:
@@ -182,7 +182,7 @@ class SurfaceHandler:
         with self._store.database.read() as connection:
             new = stored.frames_to_fuse(connection, surface, progress["after"], _FRAMES)
         if new:
-            return self._add(row, surface, progress, new, until)
+            return self._add(row, surface, progress, new, is_over)
         if progress["after"]:
             return SliceResult(False, progress | {"after": 0})  # of lower numbers, edited since
         return self._conclude(row, surface, progress)
@@ -220,8 +220,9 @@ class SurfaceHandler:
         return SliceResult(False, _told(progress), write=write)
 
     def _rebuild(
-        self, surface: SurfaceRow, progress: dict[str, Any], tiles: Sequence[TileRow], until: float
-    ) -> SliceResult:
+        self, surface: SurfaceRow, progress: dict[str, Any], tiles: Sequence[TileRow],
+        is_over: IsOver,
+    ) -> SliceResult:  # fmt: skip
         """Make tiles anew from the frames that touch them, as far as the time goes."""
         tiles = _first_cells(tiles)
         last = tiles[0].rebuilt_to or 0
@@ -246,14 +247,14 @@ class SurfaceHandler:
                     if key in sums:
                         sums[key].append(cells)
                 last = one.number
-                if time.monotonic() >= until:
+                if is_over():
                     over = over and one is found[-1]
                     break
             else:
                 last = touching[-1] if touching else last
             for key, parts in sums.items():
                 sums[key] = [fused(parts)]
-            if time.monotonic() >= until:
+            if is_over():
                 break
         done = _Slice()
         if over:
@@ -274,7 +275,7 @@ class SurfaceHandler:
 
     def _add(
         self, row: MapRow, surface: SurfaceRow, progress: dict[str, Any],
-        new: Sequence[FusedFrame], until: float,
+        new: Sequence[FusedFrame], is_over: IsOver,
     ) -> SliceResult:  # fmt: skip
         """Fuse frames into the tiles they touch, as far as the time goes."""
         times = [one.captured_at for one in new if one.captured_at is not None]
@@ -292,7 +293,7 @@ class SurfaceHandler:
                 touches.append((key, one.number))
                 held += len(cells)
             added.append(one)
-            if time.monotonic() >= until or held > _CELLS or len(parts) > _TILES:
+            if is_over() or held > _CELLS or len(parts) > _TILES:
                 break
         done = _Slice()
         with self._store.database.read() as connection:

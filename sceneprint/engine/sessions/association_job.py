@@ -6,14 +6,13 @@ plan  -->  frames, a slice at a time  -->  edges  --finish_association-->  verdi
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.engine.jobs.tasks import LongJob, SliceResult
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult
 from sceneprint.engine.search.local_index import Readers
 from sceneprint.engine.search.map_view import MapView
 from sceneprint.engine.search.up_vectors import known_ups
@@ -153,7 +152,7 @@ class Associating:
     def __init__(self, store: Store, signers: Signers, readers: Readers) -> None:
         self._store, self._signers, self._readers = store, signers, readers
 
-    def __call__(self, task: LongJob, until: float) -> SliceResult:
+    def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
         """A slice: at least one frame, or the conclusion."""
         asked = NewAssociation.model_validate(task.data)
         progress = dict(task.progress) or self._begin(task, asked)
@@ -165,7 +164,7 @@ class Associating:
             progress["validated"] += tried or 0
             progress["skipped"] += tried is None
             progress["done"] += 1
-            if time.monotonic() >= until:
+            if is_over():
                 return SliceResult(False, progress, items)
         with self._store.database.read() as connection:
             found = items_of(connection, task.job.number) + items

@@ -10,7 +10,6 @@ far it came in one file of the job.
 from __future__ import annotations
 
 import io
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Literal
@@ -18,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.tasks import LongJob, MapJobs, SliceResult, Tasks
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, MapJobs, SliceResult, Tasks, ends_within
 from sceneprint.engine.maps.surface_job import cell_width, surface_points
 from sceneprint.engine.search.up_vectors import parent_axes
 from sceneprint.engine.serializers import job_progress, when
@@ -197,10 +196,10 @@ class DifferenceHandler:
     def __init__(self, store: Store, signers: Signers) -> None:
         self._store, self._signers = store, signers
 
-    def __call__(self, task: LongJob, until: float) -> SliceResult:
+    def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
         """A slice: at least one frame fused, or one that judges cells; the last concludes."""
         asked = NewDifference.model_validate(task.data)
-        until = min(until, time.monotonic() + SLICE_S)
+        is_over = ends_within(is_over, SLICE_S)
         with self._store.database.read() as connection:
             row = living_map(connection, task.of_map)
         parameters = self._signers(row.model_id).model.parameters  # while no connection is held
@@ -213,17 +212,17 @@ class DifferenceHandler:
                 progress, file = _begin(connection, row, asked, cell_m), None
         state = _State() if file is None else _State.read(self._store.blobs.get(file.blob))
         if progress["done"] < progress["total"] // 2:
-            self._fuse(row, progress, state, until)
+            self._fuse(row, progress, state, is_over)
             if max(map(count_cells, state.cells.values())) > MOST_CELLS:
                 progress |= {"done": 0, "skipped": 0, "cell_m": 2 * progress["cell_m"]}
                 return SliceResult(False, progress, drop=(STATE,))
         else:
-            self._judge(row, progress, state, until, parameters.validation.agreement)
+            self._judge(row, progress, state, is_over, parameters.validation.agreement)
         if progress["done"] < progress["total"]:
             return SliceResult(False, progress, files=[self._file(STATE, state.data())])
         return self._conclude(row, progress, state)
 
-    def _fuse(self, row: MapRow, progress: dict[str, Any], state: _State, until: float) -> None:
+    def _fuse(self, row: MapRow, progress: dict[str, Any], state: _State, is_over: IsOver) -> None:
         """Add what frames saw to the cells of their sessions, as far as the time goes."""
         views: dict[Side, list[SessionCells]] = {side: [] for side in SIDES}
         held = 0
@@ -237,14 +236,14 @@ class DifferenceHandler:
                 views[side].append(seen_cells(points, progress["cell_m"], stamp))
                 held += count_cells(views[side][-1])
             progress["done"] += 1
-            if time.monotonic() >= until or held > _HELD:
+            if is_over() or held > _HELD:
                 break
         for side in SIDES:
             state.cells[side] = add_views(state.cells[side], views[side])
             state.counts[side] = no_verdicts(count_cells(state.cells[side]))
 
     def _judge(
-        self, row: MapRow, progress: dict[str, Any], state: _State, until: float,
+        self, row: MapRow, progress: dict[str, Any], state: _State, is_over: IsOver,
         p: OverlapParameters,
     ) -> None:  # fmt: skip
         """Have frames judge the cells of the other session, as far as the time goes."""
@@ -257,7 +256,7 @@ class DifferenceHandler:
                 said = frame_verdicts(positions[other], posed[0].surface, posed[1], p)
                 state.counts[other].add(said)
             progress["done"] += 1
-            if time.monotonic() >= until:
+            if is_over():
                 break
 
     def _posed(self, row: MapRow, number: int, parent: str) -> tuple[Geometry, Floats] | None:

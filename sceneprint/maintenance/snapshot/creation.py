@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, BinaryIO, Literal
 from pydantic import ValidationError
 
 from sceneprint.atomic_files import create_private, make_folder, sync_folder, write_durable
-from sceneprint.engine.jobs.tasks import LongJob, SliceResult
+from sceneprint.engine.jobs.tasks import Handler, IsOver, LongJob, SliceResult
 from sceneprint.errors import DamagedBlob, SnapshotError, UnknownSnapshot, UnusableStore
 from sceneprint.maintenance.fsck.findings import opened_blobs
 from sceneprint.maintenance.snapshot import database_copy
@@ -533,11 +533,11 @@ def new_snapshot_id() -> str:
     return f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(4)}"
 
 
-def snapshot_handler(settings: Settings) -> Callable[[LongJob, float], SliceResult]:
+def snapshot_handler(settings: Settings) -> Handler:
     """What does jobs of kind `snapshot`, in one slice each."""
 
-    def handle(task: LongJob, until: float) -> SliceResult:
-        del until
+    def handle(task: LongJob, is_over: IsOver) -> SliceResult:
+        del is_over
         job = task.job
         begun = datetime.fromtimestamp(job.created_at, UTC)
         made = SnapshotCatalog(settings).take(f"{begun:%Y%m%dT%H%M%SZ}-{job.id[:8]}")
