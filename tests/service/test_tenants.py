@@ -118,7 +118,7 @@ def test_a_tenant_holds_three_quarters_at_most_and_gives_it_back():
 def test_turns_alternate_between_tenants_and_leave_half_to_others():
     async def test() -> list[str]:
         clock = Clock()
-        turns, order = Turns(4, clock), []
+        turns, order = Turns(4, clock=clock), []
 
         async def ask(tenant: str, weight: int = 1) -> None:
             await turns.acquire(tenant, weight)
