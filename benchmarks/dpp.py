@@ -7,14 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.encode import Clock
-from sceneprint.geometry.retrieval.distance import (
+from sceneprint.geometry.retrieval.ranking import (
+    DiversityParameters,
     Ints64,
     Ranking,
     distances,
+    diversify,
+    kernel_matrix,
     pairwise_distances,
     rank,
 )
-from sceneprint.geometry.retrieval.dpp import DiversityParameters, diversify, kernel_matrix
 from sceneprint.types import Bytes
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.encode import Clock
-from sceneprint.geometry.retrieval.distance import cross_distances, distances
+from sceneprint.geometry.retrieval.ranking import cross_distances, distances
 
 #: Queries that share one pass over the database.
 TOGETHER = 8

@@ -20,7 +20,7 @@ from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.formats.recording import RecordingOptions
 from sceneprint.types import Floats
 from sceneprint_client import Client, Tracker
-from sceneprint_client.requests import DEFAULT_URL
+from sceneprint_client.http import DEFAULT_URL
 from sceneprint_client.tracker import State
 
 

@@ -72,7 +72,6 @@ from sceneprint_client.errors import (
     UnusableStore,
     UselessFrame,
     kebab_case,
-    naming,
 )
 
 __all__ = [
@@ -141,7 +140,6 @@ __all__ = [
     "UnusableStore",
     "UselessFrame",
     "kebab_case",
-    "naming",
 ]
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from sceneprint.geometry.registration.icp import error_of, place_covariance, transported
 from sceneprint.geometry.registration.overlap import OverlapParameters
-from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import PoseAverage, average_poses, inverse
 from sceneprint.geometry.validation.acceptance import Strength
 from sceneprint.geometry.validation.map_verification import (

@@ -13,22 +13,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sceneprint.errors import ModelMismatch
-from sceneprint.geometry.execution import both
-from sceneprint.geometry.registration.alignment import NO_UPS, Ups, are_scans
+from sceneprint.geometry.kernel import both
+from sceneprint.geometry.registration.alignment import are_scans
 from sceneprint.geometry.registration.overlap import thinned
 from sceneprint.geometry.registration.patch_descriptors import compress, patch_descriptors
 from sceneprint.geometry.registration.sequence_alignment import Matching
-from sceneprint.geometry.retrieval.distance import (
+from sceneprint.geometry.retrieval.ranking import (
+    DiversityParameters,
     Metric,
     Ranking,
+    Selection,
     distances,
     pairwise_distances,
     rank,
     ranking_size,
 )
-from sceneprint.geometry.retrieval.dpp import DiversityParameters, Selection
-from sceneprint.geometry.retrieval.dpp import diversify as select
-from sceneprint.geometry.rigid import average_poses, inverse
+from sceneprint.geometry.retrieval.ranking import diversify as select
+from sceneprint.geometry.rigid import NO_UPS, Ups, average_poses, inverse
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.range_image import SPREAD_POINTS, range_image, spread_points
 from sceneprint.geometry.surface.voxels import Voxels

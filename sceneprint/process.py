@@ -1,27 +1,44 @@
-"""What a process sets up when it starts: log lines, limits, stop signals, and secrets out of files.
+"""What a process sets up when it starts, and what it says of its work.
 
-A log line is one JSON object on standard error. Each mapped segment of an index takes a descriptor.
-Container engines hand secrets over in files, in place of the environment.
+Log lines, limits, stop signals, and secrets out of files: a log line is one JSON object on standard
+error, and container engines hand secrets over in files, in place of the environment.
+
+What is known of the request in hand goes with it into threads: its id, its tenant, and its span of
+OpenTelemetry, where SCENEPRINT_TRACES_URL names a collector. A job carries the `traceparent` of the
+request that queued it, so that an upload and its signing are one trace over processes and hosts.
+
+    request --(traceparent in the job)--> job --> decode, sign, artifact, commit
+    query   --> prepare, retrieve, diversify, validate, locate
+
+Times are counted in histograms, which add up over processes.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import re
 import resource
 import select
 import signal
 import sys
-from collections.abc import Iterator, MutableMapping
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 
 from sceneprint.errors import InvalidRequest
+
+if TYPE_CHECKING:
+    from opentelemetry.trace import Tracer
+
 
 #: What every record has; the rest was given with `extra` and is written as it is.
 _OWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message"}
@@ -187,3 +204,200 @@ def read_secret_files(environment: MutableMapping[str, str]) -> None:
             )
         environment[name] = text
         del environment[f"{name}_FILE"]  # processes that are started from here have it already
+
+
+# Spans of OpenTelemetry.
+
+#: Attributes of a span, by OpenTelemetry's names, such as `http.route`.
+Attributes = Mapping[str, str | int]
+#: Milliseconds between two messages to the collector, and for one of them at most.
+EVERY_MS, TIMEOUT_MS = 2000, 5000
+
+_tracer: Tracer | None = None
+
+
+@contextmanager
+def tracing(url: str | None, process: str, version: str) -> Iterator[None]:
+    """Send the spans that end meanwhile to a collector; what is left is sent at the end.
+
+    A collector that is away costs the spans, a line of the log, and nothing else.
+
+    Parameters
+    ----------
+    url : of a collector that speaks OTLP over HTTP, such as http://127.0.0.1:4318; None for none
+    process, version : what spans say of this process
+    """
+    global _tracer  # one for each process, as that of OpenTelemetry is
+    if url is None:
+        yield
+        return
+    from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+    from opentelemetry.sdk.resources import Resource
+    from opentelemetry.sdk.trace import TracerProvider
+    from opentelemetry.sdk.trace.export import BatchSpanProcessor
+
+    exporter = OTLPSpanExporter(f"{url.rstrip('/')}/v1/traces", timeout=TIMEOUT_MS / 1e3)
+    about = {"service.name": process, "service.version": version}
+    provider = TracerProvider(resource=Resource.create(about), shutdown_on_exit=False)
+    provider.add_span_processor(
+        BatchSpanProcessor(
+            exporter, schedule_delay_millis=EVERY_MS, export_timeout_millis=TIMEOUT_MS
+        )
+    )
+    _tracer = provider.get_tracer("sceneprint", version)
+    try:
+        yield
+    finally:
+        _tracer = None
+        provider.shutdown()
+
+
+@contextmanager
+def span(
+    name: str,
+    parent: str | None = None,
+    kind: str = "INTERNAL",
+    attributes: Attributes | None = None,
+) -> Iterator[None]:
+    """A span of what is done meanwhile, below the current one; nothing where nothing is traced.
+
+    Parameters
+    ----------
+    name : short, of few kinds
+    parent : `traceparent` of another process; an invalid one is ignored
+    kind : of OpenTelemetry: SERVER, CONSUMER or INTERNAL
+    attributes : of the span
+    """
+    if _tracer is None:
+        yield
+        return
+    from opentelemetry.trace import SpanKind
+    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+    given = None if parent is None else {"traceparent": parent}
+    context = None if given is None else TraceContextTextMapPropagator().extract(given)
+    with _tracer.start_as_current_span(name, context, SpanKind[kind], attributes):
+        yield
+
+
+def name_span(name: str, attributes: Attributes) -> None:
+    """Rename and describe the current span: a request's route is known only at its end."""
+    if _tracer is not None:
+        from opentelemetry.trace import get_current_span
+
+        current = get_current_span()
+        current.update_name(name)
+        current.set_attributes(attributes)
+
+
+def record_span(name: str, seconds: float) -> None:
+    """A span below the current one, of what ends now and took so long."""
+    if _tracer is not None:
+        end = time.time_ns()
+        _tracer.start_span(name, start_time=end - int(1e9 * seconds)).end(end)
+
+
+def traceparent() -> str | None:
+    """The current span for another process, as W3C's Trace Context writes it."""
+    if _tracer is None:
+        return None
+    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+    carrier: dict[str, str] = {}
+    TraceContextTextMapPropagator().inject(carrier)
+    return carrier.get("traceparent")
+
+
+# Times of many answers in a few numbers that can be added up: a histogram of fixed bounds.
+#
+# Bin i holds what took from FIRST_S * STEP^i up to STEP times that. The bounds are the same in
+# every
+# process, so that the histograms of several add to that of all, and a quantile of the sum is that
+# of all answers, but for the width of a bin: it is wrong by 9 % at most.
+
+#: Lower bound of bin 0, seconds, and how much wider each bin reaches than the one before.
+FIRST_S, STEP = 1e-4, 2.0**0.25
+#: Bins: what takes longer than FIRST_S STEP^91, 12 minutes, is in the last one.
+BINS = 92
+
+
+def bin_of(seconds: float) -> int:
+    """The bin of a time."""
+    if seconds <= FIRST_S:
+        return 0
+    return min(int(math.log(seconds / FIRST_S, STEP)), BINS - 1)
+
+
+def quantile(histogram: Mapping[int, int], share: float) -> float | None:
+    """The time that this share of all answers did not take longer than.
+
+    Parameters
+    ----------
+    histogram : number of answers in each bin that has any
+    share : from 0 to 1
+
+    Returns
+    -------
+    seconds, the geometric middle of the bin; None where there were no answers
+    """
+    total = sum(histogram.values())
+    if total == 0:
+        return None
+    rank, seen = max(math.ceil(share * total), 1), 0
+    for place in sorted(histogram):
+        seen += histogram[place]
+        if seen >= rank:
+            return float(FIRST_S * STEP ** (place + 0.5))
+    raise AssertionError("the ranks of all bins are their sum")
+
+
+class Latencies:
+    """A histogram that grows."""
+
+    def __init__(self) -> None:
+        self._bins: Counter[int] = Counter()
+
+    def add(self, seconds: float) -> None:
+        """Count an answer."""
+        self._bins[bin_of(seconds)] += 1
+
+    def as_json(self) -> dict[str, int]:
+        """As it is stored."""
+        return {str(place): number for place, number in sorted(self._bins.items())}
+
+
+def merged(parts: list[Mapping[str, int]]) -> dict[int, int]:
+    """Several stored histograms as one."""
+    total: Counter[int] = Counter()
+    for part in parts:
+        for place, number in part.items():
+            total[int(place)] += int(number)
+    return dict(total)
+
+
+# Whose work this is: set once for a request or a job, known wherever it is charged.
+
+#: The tenant of work that no key asked for: commands, upkeep, a service that asks for no keys.
+NOBODY = ""
+
+_current: ContextVar[str] = ContextVar("tenant", default=NOBODY)
+
+
+def set_tenant(name: str) -> None:
+    """Charge what this task, and the threads it begins, does from now on to a tenant."""
+    _current.set(name)
+
+
+@contextmanager
+def work_of(name: str) -> Iterator[None]:
+    """Charge what is done meanwhile, here and in threads begun here, to a tenant."""
+    before = _current.set(name)
+    try:
+        yield
+    finally:
+        _current.reset(before)
+
+
+def current_tenant() -> str:
+    """Name of the tenant whose work is being done; NOBODY where no key asked for it."""
+    return _current.get()

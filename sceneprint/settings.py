@@ -15,7 +15,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from sceneprint.errors import UnusableStore
 from sceneprint.models import default_cache_dir
-from sceneprint_client.requests import is_loopback
+from sceneprint_client.api.base import is_loopback
 
 
 def default_data_dir() -> Path:

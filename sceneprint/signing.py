@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sceneprint.errors import UselessFrame
-from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.geometry.signature.fisher_vector import (
     LevelStatistics,
     fisher_vector,
@@ -210,7 +210,7 @@ def table_statistics(level: Patches, signer: Signer) -> LevelStatistics:
     p = signer.model.parameters
     weights = patch_weights(level, p.weights)
     counts = count_pairs(level.means, level.normals, weights, p.table, p.properties)
-    return statistics_of_counts(counts, signer.table, len(signer.model.mixture))
+    return statistics_of_counts(counts, signer.table, len(signer.model.mixture.weights))
 
 
 def exact_statistics(level: Patches, model: Model) -> LevelStatistics:

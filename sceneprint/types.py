@@ -13,9 +13,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidIntrinsics
-from sceneprint_client.files import MAXIMUM_SAMPLES
-from sceneprint_client.sidecars import MAXIMUM_PIXELS, Intrinsics
+from sceneprint_client.api.base import MAXIMUM_PIXELS, MAXIMUM_SAMPLES, Intrinsics
 
+__all__ = [
+    "MAXIMUM_PIXELS",
+    "MAXIMUM_SAMPLES",
+    "AnyFrame",
+    "Bytes",
+    "Camera",
+    "Cloud",
+    "DepthFrame",
+    "Floats",
+    "Floats32",
+    "Geometry",
+    "Hierarchy",
+    "Intrinsics",
+    "Ints32",
+    "Patches",
+    "Sphere",
+    "Surface",
+]
 # How a sensor looks: pixels to directions.
 #
 # Camera frames are optical: x right, y down, z forward. Clouds keep their sensor's axes.
@@ -84,25 +101,6 @@ Floats32 = NDArray[np.float32]
 Ints32 = NDArray[np.int32]
 Ints64 = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
-
-__all__ = [
-    "MAXIMUM_PIXELS",
-    "MAXIMUM_SAMPLES",
-    "AnyFrame",
-    "Bytes",
-    "Camera",
-    "Cloud",
-    "DepthFrame",
-    "Floats",
-    "Floats32",
-    "Geometry",
-    "Hierarchy",
-    "Intrinsics",
-    "Ints32",
-    "Patches",
-    "Sphere",
-    "Surface",
-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,3 +229,30 @@ class Geometry:
     patches: Patches
     descriptors: Bytes
     model_id: str
+
+
+#: Kinds of camera; of what saw points that are in no order nothing is known.
+PINHOLE, SPHERE, NOWHERE = 0, 1, 2
+
+
+def camera_of(camera: Camera | None, nearest: float) -> Floats:
+    """A camera as kernels take it: (7,), its kind, `nearest`, and five numbers of that kind.
+
+    Parameters
+    ----------
+    camera : None for points in no order
+    nearest : points this near are not looked up, metres of depth
+    """
+    if isinstance(camera, Intrinsics):
+        return np.array([PINHOLE, nearest, camera.fx, camera.fy, camera.cx, camera.cy, 0.0])
+    if isinstance(camera, Sphere):
+        closed = camera.width if camera.is_closed else 0
+        return np.array(
+            [SPHERE, nearest, camera.step, camera.left, camera.top, camera.pole, closed], float
+        )
+    return np.array([NOWHERE, nearest, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def kind_of(camera: Camera | None) -> int:
+    """The kind of a camera, as the first of `camera_of`."""
+    return int(camera_of(camera, 0.0)[0])

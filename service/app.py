@@ -18,8 +18,8 @@ from sceneprint import __version__
 from sceneprint.engine import Engine
 from sceneprint.engine.compilation import compile_kernels
 from sceneprint.errors import SceneprintError
+from sceneprint.process import tracing
 from sceneprint.settings import Settings
-from sceneprint.tracing import tracing
 from sceneprint_client.api import (
     Diversity,
     Filter,
@@ -44,9 +44,8 @@ from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.sessions import NewAssociation, NewDifference
 from sceneprint_client.api.surface import NewReconstruction
 from service import dashboard, problems, static_files
-from service.audit import RefusalFilter
+from service.auth import Context, RefusalFilter
 from service.browser_security import origins_of
-from service.context import Context
 from service.event_stream import Feed
 from service.limits import Gate, RateLimits
 from service.metrics import Metrics, housekeeping

@@ -1,4 +1,7 @@
-"""Who asks, and what they may: one path for all routes.
+"""Who asks, what they may, and what is noted of it: one path for all routes.
+
+    request  --caller-->  Caller, with the Context of the service  --may_read | may_write-->  a map
+    answer  --note-->  a line of the audit log, where it tells of a change or a refusal
 
 What depends on nothing slow is asked in the event loop: a thread's turn comes late where many
 are at work.
@@ -8,28 +11,40 @@ What a caller may not read is not there: the same answer, word for word, as wher
 
 from __future__ import annotations
 
+import logging
 import math
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
 from inspect import iscoroutinefunction
-from typing import Annotated
+from typing import Annotated, Any, TypeVar, cast
+from urllib.parse import unquote
 
-from anyio import to_thread
+from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.types import Scope as AsgiScope
 
-from sceneprint.errors import Forbidden, KeyRequired
+from sceneprint.engine import Engine
+from sceneprint.errors import Forbidden, KeyRequired, SceneprintError
+from sceneprint.process import NOBODY, current_tenant, set_tenant
+from sceneprint.store.audit_chain import KeyChange
 from sceneprint.store.maps import unknown_map
 from sceneprint.store.queue import unknown_job
-from sceneprint.store.tenants import NOBODY, set_tenant
 from sceneprint_client.api import Job
-from sceneprint_client.api.admin import EVERY, Scope, allows
-from service.context import Context, Here
+from sceneprint_client.api.admin import EVERY, SCOPES, Scope
+from service.event_stream import Feed
 from service.limits import (
     ROWS_PER_COST,
+    Gate,
+    Holdings,
+    RateLimits,
+    Spool,
+    TokenBucket,
+    Turns,
     enforce_rate_limit,
     is_import,
     network_of,
@@ -39,6 +54,100 @@ from service.limits import (
     take_turn,
     too_many_requests,
 )
+from service.metrics import Metrics
+
+log = logging.getLogger(__name__)
+
+
+def allows(grants: Mapping[str, Scope], scope: Scope, map_name: str = EVERY) -> bool:
+    """Whether grants, by the names of maps, are enough.
+
+    Parameters
+    ----------
+    grants : of a key; those for `*` hold for every map
+    scope : that is needed
+    map_name : for which it is; default: for all maps
+    """
+    least = SCOPES.index(scope)
+    held = [grants[name] for name in (EVERY, map_name) if name in grants]
+    return any(SCOPES.index(one) >= least for one in held)
+
+
+# What the routes share: the engine, the gates, the figures.
+
+T = TypeVar("T")
+
+#: Threads that look keys up, beside those that all other work shares.
+LOOKUPS = 4
+#: Turns of requests that work in shared threads, such as lists: they compete for one interpreter,
+#: so that one beside another tenant has one.
+READS, READS_BESIDE = 8, 1
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """Of one running service.
+
+    Parameters
+    ----------
+    engine, gate, metrics : see there
+    uploads : the gate of uploads, which wait for the disk and for other writers: of their own, so
+        that no query waits behind them
+    keys : whether callers must show one
+    feed : of events
+    limits : how often callers may ask
+    places : of requests that a tenant may have in progress three quarters of
+    wait_s : seconds to wait for a turn
+    requests : that tenants have in progress
+    reads : turns of requests that work in shared threads
+    spool : bodies that are kept on disk until they are read
+    lookups : threads that look keys up
+    """
+
+    engine: Engine
+    gate: Gate
+    uploads: Gate
+    metrics: Metrics
+    keys: bool
+    feed: Feed
+    limits: RateLimits
+    places: int
+    wait_s: float
+    requests: Holdings = field(default_factory=Holdings)
+    reads: Turns = field(default_factory=lambda: Turns(READS, READS_BESIDE))
+    spool: Spool = field(default_factory=Spool)
+    lookups: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(LOOKUPS))
+
+    async def run(self, do: Callable[..., T], *given: object, patient: bool = False) -> T:
+        """Do it in a shared thread, when it is the tenant's turn; not while a turn is held.
+
+        Parameters
+        ----------
+        do, given : the work, and its arguments
+        patient : wait for as long as it takes
+
+        Raises
+        ------
+        Busy : its turn did not come in time; nothing was begun.
+        """
+        tenant = current_tenant()
+        if tenant == NOBODY:  # nobody to share with
+            return await to_thread.run_sync(do, *given)
+        held = await take_turn(self.reads, tenant, None if patient else self.wait_s)
+        try:
+            return await to_thread.run_sync(do, *given)
+        finally:
+            self.reads.release(tenant, held)
+
+
+async def _context(request: Request) -> Context:
+    return cast(Context, request.app.state.context)
+
+
+Here = Annotated[Context, Depends(_context)]
+
+
+# Who asks, and what they may.
 
 _bearer = HTTPBearer(auto_error=False, description="A key made by `sceneprint keys`.")
 
@@ -299,3 +408,129 @@ def _forbidden(asking: Caller, scope: Scope, what: str) -> Forbidden:
         f"The key {asking.name!r:.80} does not have the scope {scope!r} for {what}. Ask the "
         "operator for a key that has it."
     )
+
+
+# The audit log: which requests are noted, and what is noted of them.
+
+_READING = frozenset(("GET", "HEAD", "OPTIONS"))
+#: What is asked much and changes no map, and uploads, which are many: frames and events tell of
+#: them.
+UNNOTED = frozenset(
+    ("add_frame", "put_frame", "add_batch", "ask", "ask_several", "ask_again", "localize",
+     "localize_sequence", "compare")
+)  # fmt: skip
+
+
+#: Statuses of what was refused for who asked.
+REFUSED = (401, 403)
+#: Refusals of one caller from one address that are noted at once, and how long one more takes.
+AT_ONCE, AGAIN_S = 10, 600.0
+#: Refusals of all callers together that are noted at once, and each second: each is a commit.
+ALL_AT_ONCE, ALL_PER_S = 20, 1.0
+
+
+class RefusalFilter:
+    """Which refusals are noted: however many there are, they do not fill the log or the disk.
+
+    Parameters
+    ----------
+    clock : seconds, never going back
+    most : callers and addresses that are remembered
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic, most: int = 10_000) -> None:
+        self._each = TokenBucket("refusals", 1 / AGAIN_S, AT_ONCE, most, clock)
+        self._all = TokenBucket("refusals", ALL_PER_S, ALL_AT_ONCE, most, clock)
+        self._passed_over: OrderedDict[str, int] = OrderedDict()
+        self._most = most
+
+    def count(self, caller: str, address: str) -> int | None:
+        """How many refusals alike were passed over before this one; None: it is passed over."""
+        whose = f"{network_of(address)} {caller}"
+        for bucket, of in ((self._each, whose), (self._all, "")):
+            state = bucket.take(of)
+            if state is not None and not state.allowed:
+                self._passed_over[whose] = self._passed_over.pop(whose, 0) + 1
+                if len(self._passed_over) > self._most:
+                    self._passed_over.popitem(last=False)
+                return None
+        return self._passed_over.pop(whose, 0)
+
+
+async def note(scope: AsgiScope, status: int, headers: list[tuple[bytes, bytes]]) -> None:
+    """Note an answer that tells of a change or a refusal, before it is sent: who has it finds the
+    line.
+
+    An answer is not held back by a log that cannot be written.
+    """
+    if status in REFUSED:
+        change = _refusal(scope, status)
+    elif scope["method"] not in _READING and 200 <= status < 300:
+        change = _change(scope, status, headers)
+    else:
+        return
+    if change is None:
+        return
+    context: Context = scope["app"].state.context
+    try:
+        # however long its turn takes: who asks much must not get rid of what is noted
+        await context.run(context.engine.audit.note, change, patient=True)
+    except SceneprintError as error:
+        log.error("audit entry not written", extra={"action": change.action, "error": str(error)})
+
+
+def _change(scope: AsgiScope, status: int, headers: list[tuple[bytes, bytes]]) -> KeyChange | None:
+    action = getattr(scope.get("route"), "name", None)
+    if action is None or action in UNNOTED:
+        return None
+    state: dict[str, Any] = scope["state"]
+    given: dict[str, str] = scope.get("path_params", {})
+    map_name, target = given.get("map_name"), None
+    for name, value in given.items():
+        target = value if name != "map_name" else target
+    made = [unquote(one) for one in _location(headers).split("/")[2:]]
+    if len(made) >= 2 and made[0] == "maps" and map_name is None:
+        map_name = made[1]
+    elif len(made) >= 2 and target is None:
+        target = made[-1]
+    changed = state.get("changed", ())
+    if map_name is None and len(changed) == 1:
+        (map_name,) = changed
+    client = scope.get("client")
+    return KeyChange(
+        action,
+        state.get("caller", ""),
+        None if client is None else client[0],
+        map_name,
+        target,
+        state["request_id"],
+        {"status": status, **state.get("audited", {})},
+        tenant=state.get("tenant"),
+    )
+
+
+def _refusal(scope: AsgiScope, status: int) -> KeyChange | None:
+    """What is noted of a refusal; None where there were too many."""
+    state: dict[str, Any] = scope["state"]
+    client, caller = scope.get("client"), state.get("caller", "")
+    address = None if client is None else client[0]
+    before = scope["app"].state.refusals.count(caller, address or "")
+    if before is None:
+        return None
+    given: dict[str, str] = scope.get("path_params", {})
+    target = [value for name, value in given.items() if name != "map_name"]
+    return KeyChange(
+        getattr(scope.get("route"), "name", None) or "request",
+        caller,
+        address,
+        given.get("map_name"),
+        target[-1] if target else None,
+        state["request_id"],
+        {"status": status} | ({"not_noted_before": before} if before else {}),
+        tenant=state.get("tenant"),
+        refused=True,
+    )
+
+
+def _location(headers: list[tuple[bytes, bytes]]) -> str:
+    return next((value.decode() for name, value in headers if name == b"location"), "")

@@ -31,13 +31,8 @@ from sceneprint.errors import (
 from sceneprint.formats.depth_file import size_of
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint_client.api import FrameMeta
-from sceneprint_client.api.frames import (
-    MOST_OF_BATCH,
-    MOST_PRIORITY,
-    Batch,
-    CloudFormat,
-    novelty_of,
-)
+from sceneprint_client.api.base import CloudFormat, novelty_of
+from sceneprint_client.api.frames import MOST_OF_BATCH, MOST_PRIORITY, Batch
 from sceneprint_client.files import HEAD, format_of
 from service.auth import Caller
 from service.limits import IN_MEMORY

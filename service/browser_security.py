@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 from sceneprint.errors import ForeignOrigin, InvalidRequest, Misdirected, SceneprintError
 from sceneprint.settings import Settings
-from sceneprint_client.requests import is_loopback
+from sceneprint_client.api.base import is_loopback
 
 Headers = list[tuple[bytes, bytes]]
 

@@ -23,9 +23,9 @@ from starlette.types import Receive, Scope, Send
 
 from sceneprint.engine.admin.operations import begin, missed, next_events
 from sceneprint.errors import Busy, RateLimited, SceneprintError
+from sceneprint.process import NOBODY
 from sceneprint.store import Database
 from sceneprint.store.events import EventRow, Wanted, list_events, newest_number
-from sceneprint.store.tenants import NOBODY
 from sceneprint_client.api.admin import Event
 from service.limits import Broken, Holdings, share
 

@@ -30,7 +30,7 @@ from starlette.requests import Request
 from starlette.types import Message, Receive, Scope
 
 from sceneprint.errors import Busy, RateLimited, SceneprintError, SlowBody, TooLarge
-from sceneprint.store.tenants import NOBODY, current_tenant
+from sceneprint.process import NOBODY, current_tenant
 from sceneprint.turns import TurnOrder
 from sceneprint_client.api import Page
 

@@ -23,11 +23,11 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, gene
 
 from sceneprint import __version__
 from sceneprint.engine import Engine
-from sceneprint.engine.admin.statistics import SERVICE, Figures, Latencies
+from sceneprint.engine.admin.statistics import SERVICE, Figures
 from sceneprint.errors import SceneprintError
+from sceneprint.process import NOBODY, Latencies
 from sceneprint.store import Database
 from sceneprint.store.store_counts import add_sample
-from sceneprint.store.tenants import NOBODY
 from sceneprint_client.api import Answer, FrameState, JobState
 from sceneprint_client.api.admin import ReplicaSeen
 

@@ -13,12 +13,9 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from sceneprint.errors import AmbiguousKey, Busy, SceneprintError
-from sceneprint.process import name_request
+from sceneprint.process import NOBODY, name_request, name_span, set_tenant, span
 from sceneprint.settings import Settings
-from sceneprint.store.tenants import NOBODY, set_tenant
-from sceneprint.tracing import name_span, span
-from service.audit import note
-from service.auth import address_of
+from service.auth import address_of, note
 from service.browser_security import (
     Headers,
     Origins,

@@ -12,7 +12,7 @@ from starlette.background import BackgroundTask
 
 from sceneprint.engine.maps.map_frames import Output
 from sceneprint.errors import InvalidRequest
-from service.context import Context
+from service.auth import Context
 from service.problems import declared, problem
 
 # What a request asks of a representation: its type, and whether it is still the one it knows.

@@ -25,8 +25,7 @@ from sceneprint.errors import MissingDependency
 from sceneprint.formats.artifact import write_geometry
 from sceneprint.formats.dataset import Camera, find_sequences, write_depth_png, write_intrinsics
 from sceneprint.fusion import open3d
-from sceneprint.geometry.retrieval.distance import distances, pairwise_distances, rank
-from sceneprint.geometry.retrieval.dpp import diversify
+from sceneprint.geometry.retrieval.ranking import distances, diversify, pairwise_distances, rank
 from sceneprint.lab.evaluation.pair_run import register
 from sceneprint.models import Model
 from sceneprint.pipeline import open_signer, prepare

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from sceneprint.errors import UselessFrame
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.geometry.retrieval.distance import Metric, distances
+from sceneprint.geometry.retrieval.ranking import Metric, distances
 from sceneprint.geometry.rigid import rotation_angle
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters

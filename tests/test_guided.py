@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.geometry.validation.validation import ValidationParameters, validate_guided
 from sceneprint.lab.synth import synthesise_room

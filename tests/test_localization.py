@@ -13,7 +13,7 @@ import pytest
 
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.registration.overlap import OverlapParameters
-from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sceneprint.formats.dataset import FrameReference, find_sequences
-from sceneprint.geometry.retrieval.distance import cross_distances
+from sceneprint.geometry.retrieval.ranking import cross_distances
 from sceneprint.geometry.signature.fisher_vector import quantise
 from sceneprint.lab.evaluation.protocol import overlaps, view_of
 from sceneprint.lab.synth import KINECT, Room, render, synthesise_room

@@ -10,8 +10,8 @@ import pytest
 
 from sceneprint.errors import ModelMismatch, UselessFrame
 from sceneprint.geometry.registration.patch_descriptors import compress, patch_descriptors
-from sceneprint.geometry.retrieval.distance import Ranking
-from sceneprint.geometry.retrieval.dpp import diversify as select
+from sceneprint.geometry.retrieval.ranking import Ranking
+from sceneprint.geometry.retrieval.ranking import diversify as select
 from sceneprint.geometry.signature.segmentation import patches_of, segment
 from sceneprint.geometry.validation.validation import PairValidation, expected_error, preferred
 from sceneprint.lab.evaluation.judgement import voters

@@ -23,10 +23,17 @@ from sceneprint.errors import NewerSchema, SceneprintError, StoreAway
 from sceneprint.maintenance.scrub import Scrub
 from sceneprint.maintenance.snapshot.creation import LONGEST_S as SNAPSHOT_S
 from sceneprint.maintenance.snapshot.creation import SNAPSHOT, snapshot_handler
-from sceneprint.process import StopSignal, limit_memory, log_as_json, of_request, raise_descriptors
+from sceneprint.process import (
+    StopSignal,
+    limit_memory,
+    log_as_json,
+    of_request,
+    raise_descriptors,
+    span,
+    tracing,
+)
 from sceneprint.settings import Settings
 from sceneprint.store.wakeup import Listening, process_name
-from sceneprint.tracing import span, tracing
 
 log = logging.getLogger(__name__)
 

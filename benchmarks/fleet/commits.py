@@ -26,8 +26,7 @@ from typing import TypeVar
 from benchmarks.fleet.postgres import Server
 from sceneprint.store import Database, open_database, queue
 from sceneprint.store.events import record_event
-from sceneprint.store.frames import frame_of, receive_frame
-from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.maps import add_map, frame_of, keep_model, receive_frame
 from sceneprint.store.signatures import StoredSignature, index_frame
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
 from sceneprint_client.api import JobState

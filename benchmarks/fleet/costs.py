@@ -130,12 +130,12 @@ def _sign(engine: Engine, pair: Pair, n: int) -> Work:
 
 def _query(engine: Engine, pair: Pair, frames: Sequence[FrameReference]) -> Work:
     seconds = []
-    engine.query_upload(MAP, frames[0].path.read_bytes(), meta_of(frames[0]), Query())
+    engine.queries.upload([MAP], frames[0].path.read_bytes(), meta_of(frames[0]), Query())
     with Meter(pair).running() as told:
         for frame in frames:
             data, meta = frame.path.read_bytes(), meta_of(frame, with_pose=False)
             begun = time.perf_counter()
-            engine.query_upload(MAP, data, meta, Query())
+            engine.queries.upload([MAP], data, meta, Query())
             seconds.append(time.perf_counter() - begun)
         return told(seconds)
 

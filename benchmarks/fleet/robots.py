@@ -18,8 +18,7 @@ import httpx
 from benchmarks.fleet.doors import PAUSE_S, Diary, Doors, Shut
 from benchmarks.fleet.recordings import Shot
 from sceneprint_client.api import Added, Answer
-from sceneprint_client.http import StreamPosition, read_events
-from sceneprint_client.requests import frame_form
+from sceneprint_client.http import StreamPosition, frame_form, read_events
 
 #: Of so many uploads one is followed by a query.
 ASK_EVERY = 5

@@ -29,9 +29,8 @@ from sceneprint_client.api.admin import (
 )
 from sceneprint_client.api.base import checked
 from sceneprint_client.errors import DamagedSnapshot, InvalidRequest, SnapshotError, Unreachable
-from sceneprint_client.http import PAGE, error_of, follow_stream
+from sceneprint_client.http import PAGE, error_of, follow_stream, given, snapshot_path
 from sceneprint_client.jobs import JobMethods
-from sceneprint_client.requests import given, snapshot_path
 
 _EVENTS = "/v1/events"
 #: Times that a download goes on where it broke off.

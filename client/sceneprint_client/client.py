@@ -14,10 +14,9 @@ from pydantic import Field
 from sceneprint_client.administration import AdminMethods
 from sceneprint_client.api.base import ApiRecord
 from sceneprint_client.errors import MissingDependency
-from sceneprint_client.http import ServiceConnection
+from sceneprint_client.http import DEFAULT_URL, ServiceConnection
 from sceneprint_client.map_contents import MapMethods, SurfaceMethods
 from sceneprint_client.queries import QueryMethods
-from sceneprint_client.requests import DEFAULT_URL
 from sceneprint_client.uploads import UploadMethods
 
 if TYPE_CHECKING:

@@ -60,8 +60,6 @@ a mistake of the programmer who calls.
 """
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 
 def kebab_case(name: str) -> str:
@@ -71,17 +69,6 @@ def kebab_case(name: str) -> str:
 
 class SceneprintError(Exception):
     """Base of every error raised on purpose."""
-
-
-@contextmanager
-def naming(subject: str) -> Iterator[None]:
-    """Let errors raised inside begin with what they are about."""
-    try:
-        yield
-    except SceneprintError as error:
-        if not subject:
-            raise
-        raise type(error)(f"{subject}: {error}") from error
 
 
 def printable(text: str) -> str:

@@ -14,19 +14,18 @@ import re
 import stat
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
-from sceneprint_client.api.frames import CloudFormat
-from sceneprint_client.errors import FrameError, SceneprintError, UnreadableCloud, naming
+from sceneprint_client.api.base import MAXIMUM_SAMPLES, CloudFormat
+from sceneprint_client.errors import FrameError, SceneprintError, UnreadableCloud
 
 #: Bytes that are read at once.
 _PIECE = 1 << 20
-#: Most samples a depth image may have (an 8-megapixel sensor); more is refused unread.
-MAXIMUM_SAMPLES = 8_388_608
 
 
 def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
@@ -434,3 +433,14 @@ class _Reader:
                 "read. Serialise it again."
             )
         return bytes(self.bytes(length)).rstrip(b"\0").decode("utf-8", "replace")
+
+
+@contextmanager
+def naming(subject: str) -> Iterator[None]:
+    """Let errors raised inside begin with what they are about."""
+    try:
+        yield
+    except SceneprintError as error:
+        if not subject:
+            raise
+        raise type(error)(f"{subject}: {error}") from error

@@ -19,8 +19,15 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint_client.api.base import MOST_OF_NAME, GivenDirection, checked
-from sceneprint_client.api.frames import CameraIntrinsics, FrameMeta, GivenBase, GivenPose
+from sceneprint_client.api.base import (
+    MOST_OF_NAME,
+    CameraIntrinsics,
+    FrameMeta,
+    GivenBase,
+    GivenDirection,
+    GivenPose,
+    checked,
+)
 from sceneprint_client.errors import (
     DatasetError,
     InvalidIntrinsics,
@@ -48,7 +55,7 @@ from sceneprint_client.sidecars import (
 )
 
 if TYPE_CHECKING:
-    from sceneprint_client.requests import FrameInput, MetaInput
+    from sceneprint_client.http import FrameInput, MetaInput
 
 #: A depth image of the 7-Scenes layout, whose pose lies beside it.
 SEVEN_SCENES = re.compile(r"frame-\d+\.depth\.png", re.ASCII)

@@ -40,37 +40,31 @@ from sceneprint_client.api.sessions import (
 )
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
 from sceneprint_client.errors import InvalidRequest, UnreadableArchive
-from sceneprint_client.http import ServiceConnection, error_of, read_record
-from sceneprint_client.requests import (
+from sceneprint_client.http import (
+    ServiceConnection,
     association_path,
     coverage_path,
     difference_path,
+    error_of,
     given,
+    growing_pauses,
     job_path,
     map_path,
     query_path,
+    read_record,
     reconstruction_path,
 )
 
 if TYPE_CHECKING:
     from sceneprint_client.surface_encoding import SurfacePoints
 
+
 #: A record of what a job does, with its `state`.
 _Begun = TypeVar("_Begun", Association, MapCoverage, Difference, Reconstruction)
-#: Pauses between two looks at a job, seconds: the first, and the longest.
-_PAUSES_S = (0.02, 0.5)
 #: Jobs that are looked at in one round; workers take them in about this order.
 _WINDOW = 8
 #: Bytes of an archive that are sent at once.
 _CHUNK = 1 << 20
-
-
-def growing_pauses(until: float) -> Iterator[float]:
-    """Growing pauses that end at a time of `time.monotonic`; none if it has come."""
-    pause, longest = _PAUSES_S
-    while (left := until - time.monotonic()) > 0:
-        yield min(pause, left)
-        pause = min(1.4 * pause, longest)
 
 
 class JobMethods(ServiceConnection):

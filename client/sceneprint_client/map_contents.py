@@ -45,8 +45,14 @@ from sceneprint_client.api.surface import (
     SurfaceTile,
 )
 from sceneprint_client.errors import InvalidRequest
-from sceneprint_client.http import ServiceConnection
-from sceneprint_client.requests import frame_path, given, map_path, surface_path, surface_tile_path
+from sceneprint_client.http import (
+    ServiceConnection,
+    frame_path,
+    given,
+    map_path,
+    surface_path,
+    surface_tile_path,
+)
 
 if TYPE_CHECKING:
     from sceneprint_client.surface_encoding import SurfacePoints

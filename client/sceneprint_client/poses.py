@@ -1,4 +1,5 @@
-"""Poses over time: rotations as quaternions, trajectories, frames of a robot, and which way is up.
+"""Poses, and poses over time: rigid transforms, rotations as quaternions, trajectories, frames of a
+robot, and which way is up.
 
 q (4,)  --rotation_of-->  R (3, 3)  --quaternion_of-->  q with w >= 0
 q, q' (M, 4), shares (M,)  --slerp-->  (M, 4)
@@ -16,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint_client.errors import DatasetError, printable
+from sceneprint_client.errors import DatasetError, InvalidPose, printable
 
 Floats = NDArray[np.float64]
 
@@ -475,3 +476,51 @@ def _up(rows: Floats) -> Floats | None:
         return None
     up: Floats = mean / length
     return up
+
+
+TOLERANCE = 1e-2  #: how far a written rotation may be from a true one, or a length from 1
+
+
+def rigid_transform(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the pose with its rotation made orthonormal to machine precision.
+
+    Parameters
+    ----------
+    matrix : (4, 4) T_parent_sensor, its rotation good to 1e-2
+
+    Returns
+    -------
+    T_parent_sensor : (4, 4) float64, the rotation nearest to the one given
+
+    Raises
+    ------
+    InvalidPose : the matrix is not 4 x 4 numbers, not finite, or not rigid.
+    """
+    try:
+        pose = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as cause:
+        raise InvalidPose("The pose is not made of numbers. Give 4 x 4 of them.") from cause
+    if pose.shape != (4, 4):
+        raise InvalidPose(f"The pose has shape {pose.shape}. Give 4 x 4 numbers.")
+    if not np.isfinite(pose).all():
+        raise InvalidPose(
+            "The pose is not finite, as where tracking was lost. Leave the frame or its pose out."
+        )
+    if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
+        raise InvalidPose(
+            "The last row of the pose is not 0 0 0 1. Give sensor-to-parent, row by row."
+        )
+    rotation = pose[:3, :3]
+    # entries first: the product of large ones overflows
+    rigid = np.abs(rotation).max() < 2.0
+    if not rigid or np.abs(rotation.T @ rotation - np.eye(3)).max() > TOLERANCE:
+        raise InvalidPose(
+            f"The rotation of the pose is not orthonormal to {TOLERANCE}. "
+            "Give a rigid transform without scale."
+        )
+    if np.linalg.det(rotation) < 0.0:
+        raise InvalidPose("The rotation of the pose mirrors. Give right-handed axes.")
+    left, _, right = np.linalg.svd(rotation)
+    pose[:3, :3] = left @ right
+    pose[3] = (0.0, 0.0, 0.0, 1.0)
+    return pose

@@ -34,10 +34,10 @@ from sceneprint_client.api.results import (
     Similarities,
 )
 from sceneprint_client.errors import InvalidRequest
-from sceneprint_client.http import ServiceConnection
-from sceneprint_client.requests import (
+from sceneprint_client.http import (
     QueryFrame,
     QueryOptions,
+    ServiceConnection,
     compared_frame,
     form_text,
     frames_form,
@@ -55,7 +55,7 @@ from sceneprint_client.requests import (
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from sceneprint_client.requests import FrameInput, MetaInput
+    from sceneprint_client.http import FrameInput, MetaInput
     from sceneprint_client.surface_encoding import SurfacePoints
 
 #: Most frames of a ranking that are compared with each other.

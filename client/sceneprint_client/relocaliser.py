@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sceneprint_client.api.frames import CameraIntrinsics
+from sceneprint_client.api.base import CameraIntrinsics
 from sceneprint_client.errors import SceneprintError
 from sceneprint_client.poses import (
     WINDOW_S,
@@ -42,7 +42,7 @@ from sceneprint_client.tracker import AsyncTracker, State, Tracker
 from sceneprint_client.tracker_core import inverse, shifted_covariance
 
 if TYPE_CHECKING:
-    from sceneprint_client.requests import FrameInput
+    from sceneprint_client.http import FrameInput
 
 #: Seconds of transforms and accelerations that are remembered.
 _MEMORY_S = 10.0

@@ -19,15 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneprint_client.api.base import MAXIMUM_SAMPLES, Intrinsics
 from sceneprint_client.errors import (
     InvalidIntrinsics,
     UnreadableCloud,
     UnreadableFrame,
     printable,
 )
-from sceneprint_client.files import MAXIMUM_SAMPLES, PNG_SIGNATURE
+from sceneprint_client.files import PNG_SIGNATURE
 from sceneprint_client.poses import Floats
-from sceneprint_client.sidecars import Intrinsics
 
 # Depth images.
 

@@ -8,7 +8,7 @@ text  --read_pose-->  T_parent_sensor (4, 4)
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import get_args
@@ -16,100 +16,19 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint_client.api.frames import CloudFormat
-from sceneprint_client.errors import DatasetError, InvalidIntrinsics, InvalidPose, naming
-from sceneprint_client.files import MAXIMUM_SAMPLES, read_object, read_text
+from sceneprint_client.api.base import CloudFormat, Intrinsics
+from sceneprint_client.errors import DatasetError, InvalidIntrinsics, InvalidPose
+from sceneprint_client.files import naming, read_object, read_text
+from sceneprint_client.poses import TOLERANCE, rigid_transform
 
 #: A place, metres, or a direction.
 Position = tuple[float, float, float]
-
-_TOLERANCE = 1e-2  #: how far a written rotation may be from a true one, or a length from 1
 _NO_UP = (
     "up is {}, no direction. Write a list of three numbers of length 1 in the sensor's axes, such "
     "as [0, -1, 0] of a camera that is held level."
 )
 _PARENTS = 4  #: folders above the frames that are looked into
 _MAXIMUM_BYTES = 65_536
-
-# The camera.
-
-
-#: Longest focal length and farthest principal point that are believed, pixels.
-MAXIMUM_PIXELS = 1e7
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """A pinhole camera: pixel = (fx x/z + cx, fy y/z + cy), pixel centres at integers.
-
-    Parameters
-    ----------
-    width, height : size of the image, pixels
-    fx, fy : focal lengths, pixels
-    cx, cy : principal point, pixels
-    distortion : Brown-Conrady coefficients k1, k2, p1, p2[, k3] in OpenCV's order and
-        meaning; empty for an image without distortion
-
-    Raises
-    ------
-    InvalidIntrinsics : a size below 1, a focal length that is not positive and finite, a
-        principal point that is not finite, or a number of coefficients other than 0, 4, 5.
-    """
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise InvalidIntrinsics(
-                f"The image size {self.width} x {self.height} is empty. "
-                "Give the width and height of the depth image in pixels."
-            )
-        if self.width * self.height > MAXIMUM_SAMPLES:
-            raise InvalidIntrinsics(
-                f"The image size {self.width} x {self.height} exceeds the limit of "
-                f"{MAXIMUM_SAMPLES} samples. Send the image at a lower resolution."
-            )
-        for name, value in (("fx", self.fx), ("fy", self.fy)):
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidIntrinsics(
-                    f"The focal length {name} = {value} is not a positive number, so pixels "
-                    "have no direction. Give it in pixels, as the sensor's calibration states."
-                )
-            if not 1e-3 <= value <= MAXIMUM_PIXELS:
-                raise InvalidIntrinsics(
-                    f"The focal length {name} = {value:g} is that of no camera. "
-                    "Give it in pixels, as the sensor's calibration states."
-                )
-        if not (math.isfinite(self.cx) and math.isfinite(self.cy)):
-            raise InvalidIntrinsics(
-                f"The principal point ({self.cx}, {self.cy}) is not finite. "
-                "Give cx and cy in pixels, as the sensor's calibration states."
-            )
-        if max(abs(self.cx), abs(self.cy)) > MAXIMUM_PIXELS:
-            raise InvalidIntrinsics(
-                f"The principal point ({self.cx:g}, {self.cy:g}) is that of no camera. "
-                "Give cx and cy in pixels, as the sensor's calibration states."
-            )
-        if len(self.distortion) not in (0, 4, 5):
-            raise InvalidIntrinsics(
-                f"{len(self.distortion)} distortion coefficients were given. "
-                "Give k1, k2, p1, p2 and optionally k3, or none."
-            )
-        if not all(math.isfinite(k) for k in self.distortion):
-            raise InvalidIntrinsics(
-                f"The distortion coefficients {self.distortion} are not all finite. "
-                "Give k1, k2, p1, p2 and optionally k3 as the calibration states."
-            )
-
-    def without_distortion(self) -> Intrinsics:
-        """The same camera after its images have been undistorted."""
-        return replace(self, distortion=())
 
 
 INTRINSICS_FILE = "intrinsics.json"
@@ -154,7 +73,7 @@ class Camera:
 
 def is_unit(vector: Position) -> bool:
     """Whether three numbers are of length 1, to a hundredth."""
-    return abs(math.hypot(*vector) - 1.0) <= _TOLERANCE
+    return abs(math.hypot(*vector) - 1.0) <= TOLERANCE
 
 
 def find_camera(folder: Path) -> Camera:
@@ -388,51 +307,6 @@ def read_pose(path: Path) -> NDArray[np.float64]:
                 "Write 4 rows of 4, sensor to parent."
             )
         return rigid_transform(np.array(_numbers(words)).reshape(4, 4))
-
-
-def rigid_transform(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the pose with its rotation made orthonormal to machine precision.
-
-    Parameters
-    ----------
-    matrix : (4, 4) T_parent_sensor, its rotation good to 1e-2
-
-    Returns
-    -------
-    T_parent_sensor : (4, 4) float64, the rotation nearest to the one given
-
-    Raises
-    ------
-    InvalidPose : the matrix is not 4 x 4 numbers, not finite, or not rigid.
-    """
-    try:
-        pose = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError) as cause:
-        raise InvalidPose("The pose is not made of numbers. Give 4 x 4 of them.") from cause
-    if pose.shape != (4, 4):
-        raise InvalidPose(f"The pose has shape {pose.shape}. Give 4 x 4 numbers.")
-    if not np.isfinite(pose).all():
-        raise InvalidPose(
-            "The pose is not finite, as where tracking was lost. Leave the frame or its pose out."
-        )
-    if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
-        raise InvalidPose(
-            "The last row of the pose is not 0 0 0 1. Give sensor-to-parent, row by row."
-        )
-    rotation = pose[:3, :3]
-    # entries first: the product of large ones overflows
-    rigid = np.abs(rotation).max() < 2.0
-    if not rigid or np.abs(rotation.T @ rotation - np.eye(3)).max() > _TOLERANCE:
-        raise InvalidPose(
-            f"The rotation of the pose is not orthonormal to {_TOLERANCE}. "
-            "Give a rigid transform without scale."
-        )
-    if np.linalg.det(rotation) < 0.0:
-        raise InvalidPose("The rotation of the pose mirrors. Give right-handed axes.")
-    left, _, right = np.linalg.svd(rotation)
-    pose[:3, :3] = left @ right
-    pose[3] = (0.0, 0.0, 0.0, 1.0)
-    return pose
 
 
 def _numbers(words: list[str]) -> list[float]:

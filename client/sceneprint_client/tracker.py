@@ -37,8 +37,8 @@ from sceneprint_client.tracker_core import (
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from sceneprint_client.http import FrameInput, MetaInput
     from sceneprint_client.queries import QueryMethods
-    from sceneprint_client.requests import FrameInput, MetaInput
 
 __all__ = ["AsyncTracker", "Observation", "State", "Tracker", "TrackerParameters", "replay"]
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sceneprint_client.api import Localization
 from sceneprint_client.errors import InvalidRequest
-from sceneprint_client.sidecars import rigid_transform
+from sceneprint_client.poses import rigid_transform
 
 Array = NDArray[np.float64]
 TrackerStatus = Literal["lost", "ambiguous", "tracking"]

@@ -7,21 +7,28 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from sceneprint_client.api import Added, Frame, FrameMeta, FrameState
+from sceneprint_client.api.base import novelty_of
 from sceneprint_client.api.frames import (
     MOST_OF_BATCH,
     MOST_PRIORITY,
     Batch,
     BatchItem,
     check_frame_id,
-    novelty_of,
 )
 from sceneprint_client.errors import InvalidRequest
-from sceneprint_client.http import ServiceConnection, read_record
-from sceneprint_client.jobs import growing_pauses
-from sceneprint_client.requests import frame_bytes, frame_form, frame_path, frames_form, map_path
+from sceneprint_client.http import (
+    ServiceConnection,
+    frame_bytes,
+    frame_form,
+    frame_path,
+    frames_form,
+    growing_pauses,
+    map_path,
+    read_record,
+)
 
 if TYPE_CHECKING:
-    from sceneprint_client.requests import FrameInput, MetaInput
+    from sceneprint_client.http import FrameInput, MetaInput
 
 #: Longest time the service is asked to wait for a worker, seconds.
 _LONGEST_WAIT_S = 60

@@ -32,7 +32,7 @@ from sceneprint.cli.checks import (
 from sceneprint.cli.options import add_service_options, one_line
 from sceneprint.cli.serve import add_data_option, settings_of
 from sceneprint.errors import SceneprintError
-from sceneprint_client.requests import DEFAULT_URL
+from sceneprint_client.http import DEFAULT_URL
 
 if TYPE_CHECKING:
     from sqlalchemy import URL, Engine

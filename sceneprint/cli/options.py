@@ -26,11 +26,11 @@ from sceneprint.models import PRESETS, Model, read_model
 from sceneprint.pipeline import Signer, open_signer, sign
 from sceneprint.settings import Settings
 from sceneprint.types import DepthFrame, Intrinsics
-from sceneprint_client.api.base import checked
-from sceneprint_client.api.frames import MOST_PRIORITY, GivenBase, novelty_of
+from sceneprint_client.api.base import GivenBase, checked, novelty_of
+from sceneprint_client.api.frames import MOST_PRIORITY
 from sceneprint_client.api.query import Prior
 from sceneprint_client.frame_files import FrameFile
-from sceneprint_client.requests import DEFAULT_URL
+from sceneprint_client.http import DEFAULT_URL
 
 if TYPE_CHECKING:
     from sceneprint.scenes.scene import SceneStream, SceneWriter

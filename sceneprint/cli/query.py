@@ -34,7 +34,7 @@ from sceneprint.cli.options import (
 )
 from sceneprint.errors import DatasetError, FrameError, MissingDependency, TooLarge, UnknownFrame
 from sceneprint.formats.dataset import FrameReference
-from sceneprint_client.api.frames import CameraIntrinsics
+from sceneprint_client.api.base import CameraIntrinsics
 from sceneprint_client.api.query import MOST_OF_SEQUENCE
 from sceneprint_client.api.results import COLOURS, TRANSFORMS
 

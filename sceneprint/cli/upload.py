@@ -38,8 +38,8 @@ from sceneprint.errors import (
 from sceneprint.formats.archive import is_archive
 from sceneprint.formats.dataset import FrameReference, FrameSequence, find_sequences
 from sceneprint.models import PRESETS
-from sceneprint_client.api.base import checked
-from sceneprint_client.api.frames import NOVEL, ImportOptions
+from sceneprint_client.api.base import NOVEL, checked
+from sceneprint_client.api.frames import ImportOptions
 
 if TYPE_CHECKING:
     from sceneprint_client import Client

@@ -38,7 +38,7 @@ from sceneprint.formats.points.cloud import FARTHEST_M, ReadPoints
 from sceneprint.formats.points.rows import MAXIMUM_POINTS
 from sceneprint.turns import ThreadTurns
 from sceneprint.types import MAXIMUM_SAMPLES, Floats32
-from sceneprint_client.api.frames import CloudFormat
+from sceneprint_client.api.base import CloudFormat
 from sceneprint_client.files import MAXIMUM_IMAGE_BYTES
 from sceneprint_client.sidecars import Position, Unsaid
 

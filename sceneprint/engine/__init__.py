@@ -1,6 +1,6 @@
 """The one place that joins computation and storage: frames in, answers out.
 
-frame  --Engine.add_frame-->  store  --Engine.run-->  signature  --Engine.query_upload-->  Answer
+frame  --Engine.add_frame-->  store  --Engine.run-->  signature  --Queries.upload-->  Answer
 """
 
 from sceneprint.engine.engine import Engine

@@ -31,9 +31,9 @@ from sceneprint.engine.results.kept_answers import KeptAnswers
 from sceneprint.engine.results.query_history import QueryHistory
 from sceneprint.engine.results.result_views import Inspection, PointClouds, Rerun
 from sceneprint.engine.results.stored_results import ResultValidity, open_results
-from sceneprint.engine.search.local_index import Readers
-from sceneprint.engine.search.map_view import IndexView
+from sceneprint.engine.search.local_index import IndexView
 from sceneprint.engine.search.query import Queries
+from sceneprint.engine.search.retrieval import Readers
 from sceneprint.engine.serializers import frame_records, map_record
 from sceneprint.engine.sessions.association_job import Associating
 from sceneprint.engine.sessions.associations import ASSOCIATE, AssociationJobs
@@ -47,8 +47,9 @@ from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
 from sceneprint.engine.upkeep.purge import Purging, Retention
 from sceneprint.errors import ModelError
-from sceneprint.geometry.execution import Cores
+from sceneprint.geometry.kernel import Cores
 from sceneprint.models import Model
+from sceneprint.process import current_tenant, work_of
 from sceneprint.settings import Settings
 from sceneprint.store import frames as stored_frames
 from sceneprint.store import keys as stored_keys
@@ -58,7 +59,6 @@ from sceneprint.store.database_errors import PATIENCE_S, open_patiently
 from sceneprint.store.deletion import remove_map
 from sceneprint.store.reencoding_rows import models_of
 from sceneprint.store.tables import MapRow
-from sceneprint.store.tenants import current_tenant, work_of
 from sceneprint.store.undo_rows import UndoLimits
 from sceneprint.store.wakeup import Notices, Wakeup
 from sceneprint_client.api import (
@@ -307,7 +307,7 @@ class Engine:
         """A frame; UnknownMap or UnknownFrame where there is none."""
         with self.store.database.read() as connection:
             row = stored_maps.find_map(connection, map_name)
-            frame = stored_frames.find_frame(connection, row, frame_id)
+            frame = stored_maps.find_frame(connection, row, frame_id)
             return frame_records(connection, row, [frame])[0]
 
     def delete_frame(self, map_name: str, frame_id: str) -> None:
@@ -319,18 +319,12 @@ class Engine:
         """
         with self.store.database.write() as connection:
             row = stored_maps.find_map(connection, map_name)
-            frame = stored_frames.find_frame(connection, row, frame_id)
+            frame = stored_maps.find_frame(connection, row, frame_id)
             deletion = self.undo_limits.begin(connection, row.number)
             blobs = stored_frames.delete_frame(connection, row, frame, deletion)
         collect_deleted_blobs(self.store, blobs)
 
     # queries
-
-    def query_upload(
-        self, map_name: str, data: bytes, meta: FrameMeta, query: Query, since: float | None = None
-    ) -> Answer:
-        """Look a frame up that is not kept; see `Queries.upload`."""
-        return self.queries.upload([map_name], data, meta, query, since)
 
     def query_frame(
         self, map_name: str, frame_id: str, query: Query, since: float | None = None

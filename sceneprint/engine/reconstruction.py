@@ -46,9 +46,7 @@ from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.surface.coverage import added_areas, observed_volume, of_views, share_seen
 from sceneprint.geometry.surface.depth_image import doubled
 from sceneprint.store import Store, queue
-from sceneprint.store.frames import find_frame
-from sceneprint.store.maps import find_map
-from sceneprint.store.signatures import geometry_blobs
+from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.store.tables import JobRow
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics
 from sceneprint_client.api import JobState, Match

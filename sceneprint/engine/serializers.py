@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.errors import InvalidPose, naming
-from sceneprint.formats.dataset import rigid_transform
 from sceneprint.store.deletion import DAY_S, count_old
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import model_names
@@ -35,8 +33,8 @@ from sceneprint_client.api import (
     Vector,
 )
 from sceneprint_client.api.base import Direction
-from sceneprint_client.api.frames import GivenTransform, Kind
-from sceneprint_client.poses import quaternion_of, rotation_of
+from sceneprint_client.api.frames import Kind
+from sceneprint_client.poses import quaternion_of
 
 # Entity tags: short texts that change when what they stand for does.
 
@@ -73,12 +71,6 @@ def map_tag(row: MapRow) -> str:
     return tag_of("map", row.name, row.title, *known, *([] if row.up is None else [row.up]))
 
 
-# Transforms and poses between matrices and JSON.
-
-#: How far from 1 the length of a given quaternion may be.
-_TOLERANCE = 1e-2
-
-
 def transform(T: Floats, parent_frame: str, child_frame: str) -> Transform:
     """T_parent_child (4, 4) as JSON tells it."""
     x, y, z, w = quaternion_of(T[:3, :3]).tolist()
@@ -89,41 +81,6 @@ def transform(T: Floats, parent_frame: str, child_frame: str) -> Transform:
         rotation=Quaternion(x=x, y=y, z=z, w=w),
         matrix=T.tolist(),
     )
-
-
-def pose_matrix(pose: GivenTransform, what: str = "") -> Floats:
-    """T_parent_sensor (4, 4) of a pose or another transform given either way.
-
-    Parameters
-    ----------
-    pose : see GivenTransform
-    what : to begin an error with, where it is no pose
-
-    Raises
-    ------
-    InvalidPose : not a rigid transform, or a quaternion that is not of unit length.
-    """
-    with naming(what):
-        return _matrix(pose)
-
-
-def _matrix(pose: GivenTransform) -> Floats:
-    if pose.matrix is not None:
-        return rigid_transform(np.array(pose.matrix))
-    t, r = pose.translation, pose.rotation
-    if t is None or r is None:  # the schema asks for both where there is no matrix
-        raise InvalidPose("The pose is incomplete. Give translation and rotation, or matrix.")
-    q = np.array([r.x, r.y, r.z, r.w])
-    length = float(np.linalg.norm(q))
-    if not abs(length - 1.0) <= _TOLERANCE:
-        raise InvalidPose(
-            f"The quaternion of the pose has length {length:.3g}, not 1. Give a unit quaternion "
-            "x, y, z, w."
-        )
-    T = np.eye(4)
-    T[:3, :3] = rotation_of(q / length)
-    T[:3, 3] = (t.x, t.y, t.z)
-    return rigid_transform(T)
 
 
 def when(seconds: float | None) -> Any:

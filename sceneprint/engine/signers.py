@@ -11,7 +11,7 @@ import numpy as np
 from sceneprint.errors import Busy, FrameError
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.registration.overlap import sampled
-from sceneprint.geometry.retrieval.distance import distances, pairwise_distances
+from sceneprint.geometry.retrieval.ranking import distances, pairwise_distances
 from sceneprint.geometry.validation.inspection import patches_at, residuals
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.index import Tail, search

@@ -23,9 +23,18 @@ from numpy.typing import NDArray
 from sceneprint.errors import InvalidIntrinsics, UnreadableGeometry
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.registration.overlap import thinned
-from sceneprint.geometry.surface.camera import camera_of
 from sceneprint.geometry.surface.range_image import SPREAD_POINTS, directions
-from sceneprint.types import Bytes, Floats, Floats32, Geometry, Intrinsics, Patches, Sphere, Surface
+from sceneprint.types import (
+    Bytes,
+    Floats,
+    Floats32,
+    Geometry,
+    Intrinsics,
+    Patches,
+    Sphere,
+    Surface,
+    camera_of,
+)
 
 Packed = NDArray[np.uint16]
 MOST = 65535

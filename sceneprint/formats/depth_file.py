@@ -19,7 +19,7 @@ from isal import isal_zlib
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
-from sceneprint.errors import InvalidIntrinsics, UnreadableFrame, UselessFrame, naming
+from sceneprint.errors import InvalidIntrinsics, UnreadableFrame, UselessFrame
 from sceneprint.geometry.surface.camera import ray_to_axis, undistort
 from sceneprint.types import MAXIMUM_SAMPLES, DepthFrame, Floats, Floats32, Intrinsics
 from sceneprint_client.files import (
@@ -27,11 +27,12 @@ from sceneprint_client.files import (
     NPY_SIGNATURE,
     PNG_SIGNATURE,
     NpyHeader,
+    naming,
     npy_header,
     read_bytes,
 )
+from sceneprint_client.poses import rigid_transform
 from sceneprint_client.ros_messages import TRANSPORT_BYTES
-from sceneprint_client.sidecars import rigid_transform
 
 #: What a depth image is stored as: whole numbers of some unit, or metres.
 Samples = NDArray[np.uint16] | Floats32

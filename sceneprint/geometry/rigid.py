@@ -348,3 +348,58 @@ def levelling(normals: Floats) -> Floats:
     right = np.cross(down, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     return np.stack([right, down, np.cross(right, down)])
+
+
+# Gravity: the transforms that are left where both frames know which way is up.
+
+#: Unit vectors (3,), up in the coordinates of source and target; None where it is not known.
+Ups = tuple[Floats | None, Floats | None]
+NO_UPS: Ups = (None, None)
+
+
+@dataclass(frozen=True)
+class GravityParameters:
+    """How far transforms may tilt against `up`; the room is for its noise."""
+
+    gate: float = math.radians(15.0)  #: of two patches that correspond, their angles to up
+    proposed_tilt: float = math.radians(20.0)  #: most of a hypothesis that is yet to be refined
+    refined_tilt: float = math.radians(10.0)  #: most of one that is refined: beyond, `up` is wrong
+    rival_tilt: float = math.radians(20.0)  #: from which on a rival is impossible
+    floor_tilt: float = math.radians(30.0)  #: within which of `up` a frame's floor is looked for
+    floor_stride: int = 7  #: of the pixels that it is looked for among
+
+
+def tilts(transforms: Floats, ups: Ups) -> Floats:
+    """Angles between up carried over by each transform and up as the target has it: (n,) radians.
+
+    Parameters
+    ----------
+    transforms : (n, 4, 4) T_target_source
+    ups : of source and target; 0 for all where one is not known
+    """
+    source, target = ups
+    if source is None or target is None:
+        return np.zeros(len(transforms))
+    carried = transforms[:, :3, :3] @ source
+    across = np.linalg.norm(np.cross(carried, target), axis=1)
+    angles: Floats = np.arctan2(across, carried @ target)  # exact near 0, as acos is not
+    return angles
+
+
+def tilt_of(T: Floats | None, ups: Ups) -> float | None:
+    """By how much one transform tilts, radians; None where that cannot be said."""
+    if T is None or ups[0] is None or ups[1] is None:
+        return None
+    return float(tilts(T[None], ups)[0])
+
+
+def are_level(transforms: Floats, ups: Ups, most: float) -> NDArray[np.bool_]:
+    """Which transforms tilt by no more than that: all of them where an up is not known."""
+    level: NDArray[np.bool_] = tilts(transforms, ups) <= most
+    return level
+
+
+def slopes(normals: Floats, up: Floats) -> Floats:
+    """Angles of normals (n, 3) to up: (n,) radians, 0 for floors and pi/2 for walls."""
+    angles: Floats = np.arccos(np.clip(normals @ up, -1.0, 1.0))
+    return angles

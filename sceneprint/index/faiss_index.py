@@ -24,7 +24,7 @@ import struct
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from sceneprint.geometry.retrieval.distance import distances
+from sceneprint.geometry.retrieval.ranking import distances
 from sceneprint.index.generation_files import BLOCK_BYTES, Recall, draw, mapped
 from sceneprint.types import Floats32, Ints32
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from sceneprint.atomic_files import create_private
 from sceneprint.errors import DamagedIndex
-from sceneprint.geometry.retrieval.distance import Metric, distances
+from sceneprint.geometry.retrieval.ranking import Metric, distances
 from sceneprint.index import faiss_index, generation_files
 from sceneprint.index.faiss_index import Lists, codes_of, map_index, map_lists, nearest
 from sceneprint.index.generation_files import (
@@ -29,7 +29,6 @@ from sceneprint.index.generation_files import (
     Block,
     GenerationManifest,
     Keys,
-    Places,
     Recall,
     building,
     check_block,
@@ -44,6 +43,7 @@ from sceneprint.types import Bytes
 
 if TYPE_CHECKING:
     from faiss import IndexScalarQuantizer
+
 
 log = logging.getLogger(__name__)
 
@@ -93,9 +93,9 @@ class Generation:
         return codes_of(self.index)
 
     @cached_property
-    def places(self) -> generation_files.Places:
+    def places(self) -> Places:
         """Rows of the frames by their keys."""
-        return generation_files.Places(self.keys)
+        return Places(self.keys)
 
     def vectors_of(self, keys: generation_files.Keys) -> Bytes:
         """Signatures (r, D) of some frames, a copy.
@@ -230,9 +230,9 @@ class Tail:
         return cls(np.empty(0, np.int64), np.empty((0, dimension), np.uint8))
 
     @cached_property
-    def places(self) -> generation_files.Places:
+    def places(self) -> Places:
         """Rows of the frames by their keys."""
-        return generation_files.Places(self.keys)
+        return Places(self.keys)
 
 
 def signatures_of(keys: generation_files.Keys, generation: Generation | None, tail: Tail) -> Bytes:
@@ -369,7 +369,7 @@ def _free(
     return free
 
 
-def _known(places: generation_files.Places, keys: generation_files.Keys) -> NDArray[np.int64]:
+def _known(places: Places, keys: generation_files.Keys) -> NDArray[np.int64]:
     at = places.of(keys)
     return at[at >= 0]
 
@@ -612,3 +612,34 @@ def _files(path: Path) -> tuple[tuple[str, int], ...]:
         return read_manifest(path).files
     except DamagedIndex:  # it was not sound, and nothing will be read by it
         return ()
+
+
+class Places:
+    """The places of keys in a list, found by bisection.
+
+    Parameters
+    ----------
+    keys : (n,) in their order; a rising list is not copied
+
+    Raises
+    ------
+    ValueError : a key is there twice.
+    """
+
+    def __init__(self, keys: Keys) -> None:
+        self._order: NDArray[np.intp] | None = None
+        self._rising = keys
+        if (keys[1:] <= keys[:-1]).any():
+            self._order = np.argsort(keys)
+            self._rising = keys[self._order]
+            again = self._rising[1:] == self._rising[:-1]
+            if again.any():
+                raise ValueError(f"the keys {self._rising[1:][again][:5].tolist()} are there twice")
+
+    def of(self, keys: Keys) -> NDArray[np.int64]:
+        """Places (m,) of keys (m,); -1 for a key that is not there."""
+        if len(self._rising) == 0:
+            return np.full(len(keys), -1, np.int64)
+        at = np.minimum(np.searchsorted(self._rising, keys), len(self._rising) - 1)
+        places = at if self._order is None else self._order[at]
+        return np.where(self._rising[at] == keys, places, -1)

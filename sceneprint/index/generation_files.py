@@ -171,37 +171,6 @@ Keys = NDArray[np.int64]
 Block = tuple[Keys, Bytes]
 
 
-class Places:
-    """The places of keys in a list, found by bisection.
-
-    Parameters
-    ----------
-    keys : (n,) in their order; a rising list is not copied
-
-    Raises
-    ------
-    ValueError : a key is there twice.
-    """
-
-    def __init__(self, keys: Keys) -> None:
-        self._order: NDArray[np.intp] | None = None
-        self._rising = keys
-        if (keys[1:] <= keys[:-1]).any():
-            self._order = np.argsort(keys)
-            self._rising = keys[self._order]
-            again = self._rising[1:] == self._rising[:-1]
-            if again.any():
-                raise ValueError(f"the keys {self._rising[1:][again][:5].tolist()} are there twice")
-
-    def of(self, keys: Keys) -> NDArray[np.int64]:
-        """Places (m,) of keys (m,); -1 for a key that is not there."""
-        if len(self._rising) == 0:
-            return np.full(len(keys), -1, np.int64)
-        at = np.minimum(np.searchsorted(self._rising, keys), len(self._rising) - 1)
-        places = at if self._order is None else self._order[at]
-        return np.where(self._rising[at] == keys, places, -1)
-
-
 def check_block(keys: Keys, signatures: Bytes, length: int) -> None:
     """See that these are keys and signatures of that many bytes.
 

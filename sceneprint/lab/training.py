@@ -21,7 +21,7 @@ import numpy as np
 from sceneprint.errors import FrameError, TrainingError
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.geometry.registration.patch_descriptors import fit_compression, patch_descriptors
-from sceneprint.geometry.retrieval.distance import Metric, pairwise_distances
+from sceneprint.geometry.retrieval.ranking import Metric, pairwise_distances
 from sceneprint.geometry.signature.fisher_vector import (
     UNITS,
     Ints16,

@@ -23,8 +23,7 @@ from sceneprint.maintenance.fsck.findings import Finding, Folder
 from sceneprint.settings import Settings
 from sceneprint.store import Store
 from sceneprint.store.events import record_event
-from sceneprint.store.frames import find_frame
-from sceneprint.store.maps import find_map
+from sceneprint.store.maps import find_frame, find_map
 from sceneprint.store.queue import read_clock
 from sceneprint.store.scrub_rows import (
     SLICE_S,

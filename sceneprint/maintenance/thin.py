@@ -16,14 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidRequest, NotFound
-from sceneprint.geometry.retrieval.distance import (
+from sceneprint.geometry.retrieval.ranking import (
     cross_distances,
     distance_share,
     distances,
+    novel,
     pairwise_distances,
     share_distance,
+    summarise,
 )
-from sceneprint.geometry.retrieval.dpp import novel, summarise
 from sceneprint.index import signatures_of
 from sceneprint.index.generation_files import Keys
 from sceneprint.store.frame_queries import Weight, weights_of
@@ -32,7 +33,7 @@ from sceneprint_client.api import FrameState
 
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
-    from sceneprint.engine.search.map_view import IndexView
+    from sceneprint.engine.search.local_index import IndexView
 
 #: Memory that the choice of a number of frames may take: 8 bytes for each kept one and each frame.
 CHOICE_BYTES = 2 << 30

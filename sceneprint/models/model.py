@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableModel
-from sceneprint.geometry.registration.alignment import AlignmentParameters
-from sceneprint.geometry.registration.consensus import ConsensusParameters
+from sceneprint.geometry.registration.alignment import AlignmentParameters, ConsensusParameters
 from sceneprint.geometry.registration.icp import CovarianceParameters, RefinementParameters
 from sceneprint.geometry.registration.overlap import OverlapParameters, PlaneParameters
 from sceneprint.geometry.registration.patch_descriptors import (
@@ -29,7 +28,7 @@ from sceneprint.geometry.registration.patch_descriptors import (
 )
 from sceneprint.geometry.registration.plan_search import PlanParameters
 from sceneprint.geometry.registration.sequence_alignment import SequenceParameters
-from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.geometry.signature.fisher_vector import Ints8, Whitening
 from sceneprint.geometry.signature.mixture import Mixture
 from sceneprint.geometry.signature.pair_features import Projection, PropertyParameters, TableLayout

@@ -62,7 +62,7 @@ from sceneprint.scenes.scene import (
 from sceneprint.types import Floats
 from sceneprint_client import Client
 from sceneprint_client.api import Answer, Frame, Match, Transform
-from sceneprint_client.api.frames import CameraIntrinsics
+from sceneprint_client.api.base import CameraIntrinsics
 from sceneprint_client.api.sessions import Association, Edge, Graph, Vertex
 
 #: An id that the service made, and how many of its digits stand for it in a scene.

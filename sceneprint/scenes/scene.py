@@ -18,7 +18,7 @@ import numpy as np
 
 from sceneprint.pictures import viridis
 from sceneprint.types import Bytes, Floats
-from sceneprint_client.api.frames import CameraIntrinsics
+from sceneprint_client.api.base import CameraIntrinsics
 
 #: Red, green, blue, 0 to 255.
 Colour = tuple[int, int, int]

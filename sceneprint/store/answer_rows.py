@@ -12,13 +12,13 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, delete, func, insert, or_, select, tuple_, update
 
 from sceneprint.store.query_records import WantedRecords
-from sceneprint.store.queue import now
 from sceneprint.store.tables import (
     deleted_frames,
     frames,
     kept_answer_frames,
     kept_answer_maps,
     kept_answers,
+    now,
 )
 from sceneprint_client.api import FrameState
 

@@ -15,8 +15,7 @@ import shutil
 import sqlite3
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
@@ -59,31 +58,20 @@ def database_label(url: URL) -> str:
     return f"postgresql://{of}{','.join(hosts)}/{url.database or ''}"
 
 
-@contextmanager
-def explained(engine: Engine) -> Iterator[None]:
-    """Say which database a fault is about, of what kind it is, and what to do."""
-    try:
-        yield
-    except DBAPIError as error:
+def fault_of(engine: Engine, error: Exception) -> UnusableStore | None:
+    """What an error of a database means for the store; None: it is no fault of the machine."""
+    if isinstance(error, DBAPIError):
         known = _of_sqlite if engine.dialect.name == "sqlite" else _of_server
-        found = known(engine.url, error)
-        if found is None:
-            raise
-        raise found from error
-    except AllInUse as error:
-        raise StoreLocked(
+        return known(engine.url, error)
+    if isinstance(error, AllInUse):
+        return StoreLocked(
             f"{database_label(engine.url)}: all connections that a process may have are in use. "
-            "Come back "
-            "later."
-        ) from error
-    except Exception as error:
-        driver = sys.modules.get("psycopg")  # over a connection that is not SQLAlchemy's
-        if driver is None or not isinstance(error, driver.Error):  # on SQLite it is never loaded
-            raise
-        found = explain_error(engine.url, error, isinstance(error, driver.OperationalError))
-        if found is None:
-            raise
-        raise found from error
+            "Come back later."
+        )
+    driver = sys.modules.get("psycopg")  # over a connection that is not SQLAlchemy's
+    if driver is None or not isinstance(error, driver.Error):  # on SQLite it is never loaded
+        return None
+    return explain_error(engine.url, error, isinstance(error, driver.OperationalError))
 
 
 def _of_server(url: URL, error: DBAPIError) -> UnusableStore | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +18,7 @@ from sqlalchemy import (
     select,
 )
 
-from sceneprint.store.tables import MapRow, among, blocks, events, former_maps, maps
+from sceneprint.store.tables import MapRow, among, blocks, event_values, events, former_maps, maps
 
 
 def record_event(
@@ -32,16 +31,6 @@ def record_event(
 ) -> None:
     """Note an event; `kind` is one of `KINDS` of the API."""
     connection.execute(insert(events).values(event_values(kind, map_name, frame_id, job_id, data)))
-
-
-def event_values(
-    kind: str, map_name: str | None, frame_id: str | None, job_id: str | None, data: dict[str, Any]
-) -> dict[str, Any]:
-    """Columns of an event that happens now."""
-    return {
-        "at": time.time(), "kind": kind, "map": map_name, "frame_id": frame_id, "job_id": job_id,
-        "data": data,
-    }  # fmt: skip
 
 
 def anchor_of(connection: Connection, map_name: str) -> str:

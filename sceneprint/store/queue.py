@@ -32,7 +32,6 @@ waits in a circle. Times are the database's (`now`): hosts may differ by hours.
 from __future__ import annotations
 
 import time
-import uuid
 from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
@@ -40,23 +39,19 @@ from typing import Any, NamedTuple
 from sqlalchemy import (
     ColumnElement,
     Connection,
-    Float,
     Label,
     Row,
     and_,
-    cast,
     delete,
-    extract,
     func,
     insert,
-    literal,
     or_,
     select,
     update,
 )
 
 from sceneprint.errors import JobOver, LostLease, UnknownJob
-from sceneprint.process import request_id
+from sceneprint.process import NOBODY
 from sceneprint.store.tables import (
     JOB_COLUMNS,
     JobRow,
@@ -66,13 +61,14 @@ from sceneprint.store.tables import (
     job_items,
     job_of_columns,
     job_row,
+    job_values,
     jobs,
     maps,
+    now,
     rows_among,
     tenants,
 )
-from sceneprint.store.tenants import NOBODY, current_tenant, keep_turns
-from sceneprint.tracing import traceparent
+from sceneprint.store.tenants import keep_turns
 from sceneprint_client.api import JobState
 
 # Jobs, one by one and as a list.
@@ -201,20 +197,6 @@ def waiting_by_tenant(connection: Connection) -> dict[str, int]:
     return {row[0]: row[1] for row in connection.execute(asked.group_by(jobs.c.tenant))}
 
 
-# The clock by which leases end and jobs are due: of the database, as those of its hosts differ.
-#
-# A SQLite file has one host, and so one clock.
-
-
-def now(connection: Connection) -> ColumnElement[float]:
-    """The time of the statement it is part of, seconds since 1970."""
-    if connection.dialect.name == "sqlite":
-        return literal(time.time())
-    # of the statement: the transaction may have waited for its turn since it began. Not
-    # clock_timestamp(), which is another time for each row, so that no index would be used
-    return cast(extract("epoch", func.statement_timestamp()), Float(53))
-
-
 def read_clock(connection: Connection) -> float:
     """The time now, seconds since 1970."""
     if connection.dialect.name == "sqlite":
@@ -259,23 +241,6 @@ def enqueue(
     values = job_values(connection, kind, priority, model_id, data)
     made = insert(jobs).values(map_number=of_map, frame_number=frame_number, **values)
     return job_row(connection.execute(made.returning(jobs)).mappings().one())
-
-
-def job_values(
-    connection: Connection, kind: str, priority: int, model_id: str | None = None,
-    data: dict[str, Any] | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """Columns of a job that is queued now, but for what it is about: see `enqueue`."""
-    made = now(connection)
-    if data is None and request_id() is not None:
-        data = {"request_id": request_id()}  # whose log its worker's lines belong to
-        if (parent := traceparent()) is not None:
-            data["traceparent"] = parent
-    return {
-        "id": uuid.uuid4().hex, "kind": kind, "model_id": model_id, "data": data,
-        "state": JobState.QUEUED, "priority": priority, "attempts": 0, "failures": 0, "token": 0,
-        "run_after": made, "created_at": made, "tenant": current_tenant(),
-    }  # fmt: skip
 
 
 def due_in_s(connection: Connection) -> float | None:

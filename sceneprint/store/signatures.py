@@ -186,14 +186,6 @@ def _gone(map_number: int, revision: int) -> tuple[ColumnElement[bool], ...]:
     )
 
 
-def geometry_blobs(connection: Connection, numbers: Iterable[int], model_id: str) -> dict[int, str]:
-    """Blobs of the geometry artifacts of frames."""
-    own = signatures.c.model_id == model_id
-    asked = select(signatures.c.frame_number, signatures.c.geometry).where(own)
-    found = rows_among(connection, asked, signatures.c.frame_number, numbers)
-    return {row.frame_number: row.geometry for row in found}
-
-
 def stored_vector(connection: Connection, number: int, model_id: str) -> bytes | None:
     """The signature of a frame, or None where it has none.
 

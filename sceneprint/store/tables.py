@@ -1,4 +1,5 @@
-"""The tables. `migrations/` makes them; a test holds the two together.
+"""The tables, and what their rows are in Python. `migrations/` makes them; a test holds the two
+together.
 
 Times are seconds since 1970. `number` orders rows as they came and is never given out twice;
 `id` is what the outside knows.
@@ -6,6 +7,8 @@ Times are seconds since 1970. `number` orders rows as they came and is never giv
 
 from __future__ import annotations
 
+import time
+import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import islice
@@ -33,12 +36,15 @@ from sqlalchemy import (
     Text,
     UniqueConstraint,
     any_,
+    cast,
+    extract,
     func,
     literal,
     select,
 )
 from sqlalchemy.types import TypeEngine
 
+from sceneprint.process import current_tenant, request_id, traceparent
 from sceneprint_client.api import FrameState, JobState
 from sceneprint_client.api.frames import Kind
 
@@ -741,3 +747,44 @@ FRAME_COLUMNS = tuple(frames.c[one.name] for one in fields(FrameRow))
 JOB_COLUMNS = tuple(jobs.c[one.name] for one in fields(JobRow))
 _FRAME_STATE = [column.name for column in FRAME_COLUMNS].index("state")
 _JOB_STATE = [column.name for column in JOB_COLUMNS].index("state")
+
+
+# The clock by which leases end and jobs are due: of the database, as those of its hosts differ.
+#
+# A SQLite file has one host, and so one clock.
+
+
+def now(connection: Connection) -> ColumnElement[float]:
+    """The time of the statement it is part of, seconds since 1970."""
+    if connection.dialect.name == "sqlite":
+        return literal(time.time())
+    # of the statement: the transaction may have waited for its turn since it began. Not
+    # clock_timestamp(), which is another time for each row, so that no index would be used
+    return cast(extract("epoch", func.statement_timestamp()), Float(53))
+
+
+def job_values(
+    connection: Connection, kind: str, priority: int, model_id: str | None = None,
+    data: dict[str, Any] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Columns of a job that is queued now, but for what it is about: see `enqueue`."""
+    made = now(connection)
+    if data is None and request_id() is not None:
+        data = {"request_id": request_id()}  # whose log its worker's lines belong to
+        if (parent := traceparent()) is not None:
+            data["traceparent"] = parent
+    return {
+        "id": uuid.uuid4().hex, "kind": kind, "model_id": model_id, "data": data,
+        "state": JobState.QUEUED, "priority": priority, "attempts": 0, "failures": 0, "token": 0,
+        "run_after": made, "created_at": made, "tenant": current_tenant(),
+    }  # fmt: skip
+
+
+def event_values(
+    kind: str, map_name: str | None, frame_id: str | None, job_id: str | None, data: dict[str, Any]
+) -> dict[str, Any]:
+    """Columns of an event that happens now."""
+    return {
+        "at": time.time(), "kind": kind, "map": map_name, "frame_id": frame_id, "job_id": job_id,
+        "data": data,
+    }  # fmt: skip

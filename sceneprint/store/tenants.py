@@ -3,43 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, func, insert, select, update
 
 from sceneprint.errors import Conflict, UnknownTenant
 from sceneprint.store.tables import jobs, keys, tenants
-
-# Whose work this is: set once for a request or a job, known wherever it is charged.
-
-#: The tenant of work that no key asked for: commands, upkeep, a service that asks for no keys.
-NOBODY = ""
-
-_current: ContextVar[str] = ContextVar("tenant", default=NOBODY)
-
-
-def set_tenant(name: str) -> None:
-    """Charge what this task, and the threads it begins, does from now on to a tenant."""
-    _current.set(name)
-
-
-@contextmanager
-def work_of(name: str) -> Iterator[None]:
-    """Charge what is done meanwhile, here and in threads begun here, to a tenant."""
-    before = _current.set(name)
-    try:
-        yield
-    finally:
-        _current.reset(before)
-
-
-def current_tenant() -> str:
-    """Name of the tenant whose work is being done; NOBODY where no key asked for it."""
-    return _current.get()
-
 
 # The table.
 

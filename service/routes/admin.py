@@ -31,9 +31,8 @@ from sceneprint_client.api.admin import (
     SnapshotFile,
     Stats,
 )
-from service.auth import Asking, Guest, administers, may_admin, reads_every, v1_router
+from service.auth import Asking, Guest, Here, administers, may_admin, reads_every, v1_router
 from service.bodies import media_type, read_json
-from service.context import Here
 from service.problems import declared, invalid
 from service.responses import files, send_file
 

@@ -15,9 +15,8 @@ from sceneprint_client.api.coverage import (
     MapCoverage,
     NewMapCoverage,
 )
-from service.auth import may_read, may_write, v1_router
+from service.auth import Here, may_read, may_write, v1_router
 from service.bodies import read_record
-from service.context import Here
 from service.problems import declared
 from service.responses import file_responses, look, sent
 

@@ -11,9 +11,8 @@ from sceneprint.errors import DamagedBlob
 from sceneprint.formats.export import MEDIA_TYPE
 from sceneprint_client.api import Page
 from sceneprint_client.api.sessions import Difference, NewDifference
-from service.auth import may_read, may_write, v1_router
+from service.auth import Here, may_read, may_write, v1_router
 from service.bodies import read_record
-from service.context import Here
 from service.problems import declared
 from service.responses import file_responses, is_known, send_file
 

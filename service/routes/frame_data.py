@@ -30,8 +30,7 @@ from sceneprint_client.api.results import (
     View,
 )
 from sceneprint_client.files import HEAD
-from service.auth import Asking, may_read, v1_router
-from service.context import Context, Here
+from service.auth import Asking, Context, Here, may_read, v1_router
 from service.responses import (
     file_responses,
     files,

@@ -16,19 +16,18 @@ from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.errors import InvalidRequest, MalformedBody, UnsupportedType
 from sceneprint.store.queue import JobFile
 from sceneprint_client.api import Added, Frame, FrameState, Job, Page
+from sceneprint_client.api.base import NOVEL, novelty_of
 from sceneprint_client.api.frames import (
     MOST_OF_BATCH,
     MOST_PRIORITY,
-    NOVEL,
     Batch,
     ImportItem,
     ImportOptions,
     check_frame_id,
-    novelty_of,
 )
 from sceneprint_client.api.listing import FramePage
 from service import bodies
-from service.auth import Asking, Caller, may_read, may_write, v1_router
+from service.auth import Asking, Caller, Context, Here, may_read, may_write, v1_router
 from service.bodies import (
     FORM,
     FRAME_BODY,
@@ -41,9 +40,8 @@ from service.bodies import (
     upload_responses,
     uploaded,
 )
-from service.context import Context, Here
 from service.problems import declared
-from service.query_bodies import checked
+from service.routes.queries import checked
 
 router = v1_router("/maps/{map_name}/frames", "frames")
 

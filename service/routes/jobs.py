@@ -18,8 +18,7 @@ from sceneprint.store.events import Wanted
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint_client.api import Job, JobState, Page
 from sceneprint_client.api.admin import EventPage, RetriedJobs
-from service.auth import Asking, Caller, hold_read, release_place, v1_router
-from service.context import Context, Here
+from service.auth import Asking, Caller, Context, Here, hold_read, release_place, v1_router
 from service.event_stream import BEGIN, MEDIA_TYPE, EventStream, Feed, alive, message
 from service.problems import declared
 

@@ -13,9 +13,8 @@ from sceneprint.engine.maps.map_lifecycle import LIMITS, edit_frame, edit_map
 from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint_client.api import Frame, Map, NewMap, Page
 from sceneprint_client.api.listing import OPERATORS
-from service.auth import Asking, may_admin, may_read, may_write, v1_router
+from service.auth import Asking, Here, may_admin, may_read, may_write, v1_router
 from service.bodies import media_type, read_json
-from service.context import Here
 from service.problems import declared, invalid
 from service.responses import expected
 

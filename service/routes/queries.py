@@ -1,16 +1,26 @@
-"""Queries."""
+"""Queries as they come, and each answered in its turn, with its count and its record.
+
+A query names a stored frame in JSON, or comes as a frame with its options.
+
+    AskedQuery, what answers it  --run_query-->  Answer
+"""
 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, BinaryIO, Generic, TypeVar
 
 from fastapi import Depends, Request
+from pydantic import BaseModel, ValidationError
+from starlette.datastructures import FormData, UploadFile
 
-from sceneprint.engine.results.query_history import AskedQuery
+from sceneprint.engine.results.query_history import AskedQuery, record_of
 from sceneprint.engine.search.query import check_localizes, localization_of
+from sceneprint.errors import InvalidRequest, MalformedBody, NotFound
 from sceneprint_client.api import (
     Answer,
     Comparison,
@@ -22,24 +32,318 @@ from sceneprint_client.api import (
     SeveralQuery,
     Similarity,
 )
+from sceneprint_client.api.base import Given, Label
 from sceneprint_client.api.query import MOST_OF_SEQUENCE
-from service.auth import Asking, Caller, may_read, v1_router
-from service.bodies import FORM, frames_of
-from service.context import Context, Here
-from service.problems import declared
-from service.query_bodies import (
-    JSON,
-    TEMPLATE,
-    Sent,
-    as_text,
-    checked,
-    described,
-    pair,
-    question,
-    run_query,
-    sequence_body,
-    unnamed,
+from service import bodies
+from service.auth import Asking, Caller, Context, Here, may_read, v1_router
+from service.bodies import (
+    FORM,
+    FRAME_BODY,
+    FormUpload,
+    form_of,
+    frames_of,
+    media_type,
+    read_json,
+    uploaded,
 )
+from service.problems import declared, invalid
+
+Asked = TypeVar("Asked", bound=Query)
+Record = TypeVar("Record", bound=BaseModel)
+
+JSON = "application/json"
+TEMPLATE = "#/components/schemas/{model}"
+
+
+@dataclass(frozen=True, eq=False)
+class QueryBody(Generic[Asked]):
+    """A query as it came.
+
+    Parameters
+    ----------
+    query : how to ask
+    upload : the frame that was sent; None where a stored one is named
+    named : what JSON had beside the query, by name
+    robot : who asks, as far as it is told
+    """
+
+    query: Asked
+    upload: FormUpload | None
+    named: Mapping[str, Any]
+    robot: str | None = None
+
+    @property
+    def session(self) -> str | None:
+        """In which run an upload was taken."""
+        return None if self.upload is None else self.upload.meta.session
+
+
+class _Asker(Given):
+    """What JSON says of who asks."""
+
+    robot: Label | None = None
+
+
+@asynccontextmanager
+async def question(
+    request: Request, kind: type[Asked], named: str
+) -> AsyncIterator[QueryBody[Asked]]:
+    """Read a query, however it came.
+
+    Parameters
+    ----------
+    request : with JSON, or with a frame as `uploaded` reads it
+    kind : of the query
+    named : field of JSON that names a stored frame; others have none
+
+    Raises
+    ------
+    UnsupportedType, MalformedBody, InvalidRequest, StoreFull, UnusableStore : see `uploaded`.
+    """
+    if media_type(request) == JSON:
+        given = await read_object(request)
+        asker = checked(_Asker, {"robot": given.pop("robot", None)})
+        own = {} if named in kind.model_fields else {named: given.pop(named, None)}
+        yield QueryBody(checked(kind, given), None, own, asker.robot)
+        return
+    options = [name for name in kind.model_fields if name != named]
+    async with uploaded(request, *options) as upload:
+        yield QueryBody(checked(kind, upload.fields), upload, {}, upload.meta.robot)
+
+
+async def read_object(request: Request) -> dict[str, Any]:
+    """The body as a JSON object; MalformedBody where it is none."""
+    given = await read_json(request)
+    if not isinstance(given, dict):
+        raise MalformedBody("The body is not a JSON object. Send an object.")
+    return given
+
+
+def checked(kind: type[Record], fields: Mapping[str, Any], what: str = "The query") -> Record:
+    """A record of the API, or what is wrong with its fields."""
+    try:
+        return kind.model_validate(fields)
+    except ValidationError as error:
+        raise invalid(error, what) from error
+
+
+def unnamed(name: str) -> InvalidRequest:
+    """That a query has no frame: neither a file nor the name of a stored one."""
+    return InvalidRequest(
+        f"The query has no frame. Give `{name}`, or send a frame as a form.",
+        ((name, "missing"),),
+    )
+
+
+def described(kind: type[BaseModel], named: Mapping[str, Any], required: list[str]) -> Any:
+    """The ways to ask, for the OpenAPI document: `requestBody` and `parameters`.
+
+    Parameters
+    ----------
+    kind : of the query
+    named : schemas of what JSON has beside it, by name
+    required : fields that JSON must have
+    """
+    form = FRAME_BODY["content"][FORM]["schema"]
+    own = kind.model_json_schema(ref_template=TEMPLATE)["properties"]
+    texts = {n: as_text(one) for n, one in own.items() if n not in form["properties"]}
+    needed = sorted({*form["required"], *(name for name in required if name in texts)})
+    parts = {**form["properties"], **texts}
+    body = {"type": "object", "required": required, "properties": {**named, **own}}
+    return {
+        "requestBody": {
+            "required": True,
+            "content": {
+                FORM: {"schema": {**form, "required": needed, "properties": parts}},
+                JSON: {"schema": body},
+                **bodies.content(),
+            },
+        },
+        "parameters": bodies.parameters() + [_parameter(name, one) for name, one in texts.items()],
+    }
+
+
+def sequence_body(kind: type[BaseModel], most: int) -> dict[str, Any]:
+    """A form with the frames of a sequence and how to ask, for the OpenAPI document."""
+    own = kind.model_json_schema(ref_template=TEMPLATE)["properties"]
+    meta = {"type": "array", "items": {"$ref": "#/components/schemas/FrameMeta"}}
+    file = {"type": "string", "format": "binary"}
+    properties = {
+        "frame": {
+            "type": "array", "minItems": 2, "maxItems": most, "items": file,
+            "description": "A part `frame` for each, in the order they were taken.",
+        },
+        "metas": {**meta, "description": "One for each, with `pose`: the odometry."},
+        **{name: as_text(one) for name, one in own.items()},
+    }  # fmt: skip
+    schema = {"type": "object", "required": ["frame", "metas"], "properties": properties}
+    encoding = {"metas": {"contentType": JSON}}
+    return {
+        "requestBody": {
+            "required": True, "content": {FORM: {"schema": schema, "encoding": encoding}}
+        }
+    }  # fmt: skip
+
+
+def _parameter(name: str, option: Mapping[str, Any]) -> dict[str, Any]:
+    """An option as the query string has it, where the frame is the body."""
+    schema = {key: one for key, one in option.items() if key not in ("description", "title")}
+    told = f"Where the frame is the body: {option.get('description', 'as in JSON')}"
+    return {"name": name, "in": "query", "required": False, "schema": schema, "description": told}
+
+
+def as_text(option: Mapping[str, Any]) -> dict[str, Any]:
+    """An option as a form has it: an object as JSON text, a list with commas between."""
+    kinds = option.get("anyOf", [])
+    reference = next((one for one in kinds if "$ref" in one), None)
+    told = {name: option[name] for name in ("description", "title") if name in option}
+    if reference is not None:
+        content = {"contentMediaType": JSON, "contentSchema": reference}
+        return {"type": "string", **content, **told}
+    if any(one.get("type") == "array" for one in kinds):
+        given = option.get("default")
+        default = {} if given is None else {"default": ",".join(given)}
+        return {"type": "string", **default, **told}
+    one = next((one for one in kinds if one.get("type") != "null"), None)
+    return dict(option) if one is None else {**one, **told}
+
+
+# Two frames to compare: each named, or sent as a part of a form.
+
+_SIDES = ("a", "b")
+
+
+@dataclass(frozen=True, eq=False)
+class Sent:
+    """A frame that came in a form; its bytes are on disk until they are read."""
+
+    file: BinaryIO
+    meta: FrameMeta
+
+    def read(self) -> tuple[bytes, FrameMeta]:
+        """Its bytes, and what is known of it."""
+        return self.file.read(), self.meta
+
+
+@dataclass(frozen=True, eq=False)
+class PairBody:
+    """Two frames, and how to compare them."""
+
+    a: NamedFrame | Sent
+    b: NamedFrame | Sent
+    how: Comparison
+
+
+@asynccontextmanager
+async def pair(request: Request) -> AsyncIterator[PairBody]:
+    """Read two frames: from JSON, or from a form with parts `a` and `b`.
+
+    Raises
+    ------
+    UnsupportedType : neither JSON nor a form.
+    MalformedBody : it cannot be parsed.
+    InvalidRequest : a frame is missing or there twice, or a field is not as it should be.
+    StoreFull, UnusableStore : the machine cannot keep a file until it is read.
+    """
+    if media_type(request) == JSON:
+        how = checked(Comparison, await read_object(request), "The comparison")
+        a, b = (_pair_frame(name, how, {}, {}) for name in _SIDES)
+        yield PairBody(a, b, how)
+        return
+    async with form_of(request, most_files=2) as form:
+        files, texts = _parts(form)
+        own = {name: value for name, value in texts.items() if not name.startswith("meta_")}
+        how = checked(Comparison, own, "The comparison")
+        a, b = (_pair_frame(name, how, files, texts) for name in _SIDES)
+        yield PairBody(a, b, how)
+
+
+def _parts(form: FormData) -> tuple[dict[str, BinaryIO], dict[str, str]]:
+    """Files and texts of a form by their names."""
+    files: dict[str, BinaryIO] = {}
+    texts: dict[str, str] = {}
+    for name, value in form.multi_items():
+        if name in files or name in texts:
+            raise _wrong(name, "given more than once")
+        if isinstance(value, UploadFile) != (name in _SIDES):
+            raise _wrong(name, "a file instead of text, or text instead of a file")
+        if isinstance(value, UploadFile):
+            files[name] = value.file
+        else:
+            texts[name] = value
+    for name in texts:
+        if name.startswith("meta_") and name.removeprefix("meta_") not in files:
+            raise _wrong(name, "without a file")
+    return files, texts
+
+
+def _pair_frame(
+    name: str, how: Comparison, files: Mapping[str, BinaryIO], texts: Mapping[str, str]
+) -> NamedFrame | Sent:
+    """One of the two, as it came."""
+    named: NamedFrame | None = getattr(how, f"frame_{name}")
+    if (named is None) == (name not in files):
+        raise _wrong(
+            f"frame_{name}",
+            f"missing, and so is a file part `{name}`" if named is None
+            else f"given together with a file part `{name}`",
+        )  # fmt: skip
+    if named is not None:
+        return named
+    field = f"meta_{name}"
+    if field not in texts:
+        raise _wrong(field, "missing")
+    try:
+        return Sent(files[name], FrameMeta.model_validate_json(texts[field]))
+    except ValidationError as error:
+        if error.errors(include_url=False)[0]["type"] == "json_invalid":
+            raise MalformedBody(f"The field `{field}` is not JSON. Send a JSON object.") from error
+        raise invalid(error, f"The field `{field}`") from error
+
+
+def _wrong(name: str, how: str) -> InvalidRequest:
+    return InvalidRequest(
+        f"The frames to compare are not valid: {name[:80]!r} is {how}. Give each frame once: as "
+        "a file part `a` or `b` with `meta_a` or `meta_b`, or named in `frame_a` or `frame_b`.",
+        ((name[:80], how),),
+    )
+
+
+async def run_query(
+    here: Context, asked: AskedQuery, since: float, do: Callable[[], Answer]
+) -> Answer:
+    """Answer a query when it is its turn, and leave a record of it, unless it wants none.
+
+    Parameters
+    ----------
+    here : of the service; the query has a place at its gate
+    asked : the query, and who asks
+    since : when the request came, by `time.perf_counter`
+    do : answers it, in a thread
+
+    Raises
+    ------
+    Busy : see `Gate.run`; and what `do` raises.
+    """
+    try:
+        answer = await here.gate.run(do)
+    except NotFound:  # what was asked for is not there: no query was begun
+        raise
+    except Exception as error:
+        _note(here, asked, error, since)
+        raise
+    if asked.query.record:
+        here.metrics.answer(answer)
+    _note(here, asked, answer, since)
+    return answer
+
+
+def _note(here: Context, asked: AskedQuery, came_of_it: Answer | Exception, since: float) -> None:
+    if asked.query.record:
+        here.engine.history.note(record_of(asked, came_of_it, time.perf_counter() - since))
+
+
+# The routes.
 
 router = v1_router(tag="queries")
 
@@ -155,8 +459,8 @@ async def _asked(
         if upload is not None:
             return await run_query(
                 here, asked, since,
-                lambda: engine.query_upload(
-                    map_name, upload.file.read(), upload.meta, query, since
+                lambda: engine.queries.upload(
+                    [map_name], upload.file.read(), upload.meta, query, since
                 ),
             )  # fmt: skip
         frame_id = body.named["frame_id"]

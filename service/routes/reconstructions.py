@@ -12,9 +12,8 @@ from sceneprint.engine.results.stored_results import StoredResult, unknown_query
 from sceneprint.errors import DamagedBlob
 from sceneprint.store.queue import unknown_job
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
-from service.auth import Asking, Caller, v1_router
+from service.auth import Asking, Caller, Context, Here, v1_router
 from service.bodies import read_record
-from service.context import Context, Here
 from service.problems import declared
 from service.responses import files, is_known, send_file
 

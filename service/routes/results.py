@@ -32,11 +32,10 @@ from sceneprint_client.api.results import (
     Similarities,
     View,
 )
-from service.auth import Asking, Caller, v1_router
+from service.auth import Asking, Caller, Context, Here, v1_router
 from service.bodies import media_type, read_record
-from service.context import Context, Here
 from service.problems import declared
-from service.query_bodies import JSON, TEMPLATE, checked, read_object, run_query
+from service.routes.queries import JSON, TEMPLATE, checked, read_object, run_query
 
 router = v1_router("/queries/{query_id}", "queries")
 

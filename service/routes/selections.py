@@ -18,9 +18,8 @@ from sceneprint_client.api.listing import (
     FramesRestored,
     RestoreOptions,
 )
-from service.auth import may_read, may_write, v1_router
+from service.auth import Here, may_read, may_write, v1_router
 from service.bodies import read_record
-from service.context import Here
 from service.problems import declared
 
 router = v1_router("/maps/{map_name}", "frames")

@@ -15,9 +15,8 @@ from sceneprint_client.api.base import Label
 from sceneprint_client.api.listing import Run, Session, SessionChange, SessionEdit, Trajectory
 from sceneprint_client.api.maps import Growth, GrowthOf
 from sceneprint_client.api.sessions import Association, Edge, Graph, GraphFormat, NewAssociation
-from service.auth import may_read, may_write, v1_router
+from service.auth import Here, may_read, may_write, v1_router
 from service.bodies import read_record
-from service.context import Here
 from service.problems import declared
 from service.responses import preferred_media_type
 

@@ -18,8 +18,7 @@ from sceneprint_client.api.surface import (
     SurfaceSighting,
     SurfaceTile,
 )
-from service.auth import may_read, may_write, v1_router
-from service.context import Here
+from service.auth import Here, may_read, may_write, v1_router
 from service.problems import declared
 from service.responses import file_responses, is_known, look, sent
 

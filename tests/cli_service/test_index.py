@@ -16,8 +16,7 @@ from sceneprint.index import Generation, Tail, faiss_index, newest, publish, sea
 from sceneprint.index.generation_files import draw
 from sceneprint.maintenance.fsck import indexes
 from sceneprint.settings import Settings
-from sceneprint.store.frames import add_frame, frame_of
-from sceneprint.store.maps import find_map
+from sceneprint.store.maps import add_frame, find_map, frame_of
 from sceneprint.store.signatures import StoredSignature, index_frame
 from sceneprint.store.tables import signatures
 from sceneprint_client.api import NewMap

@@ -12,7 +12,7 @@ from sceneprint.errors import InvalidRequest, UnreadableCloud
 from sceneprint.formats.dataset import find_sequences, write_pose
 from sceneprint.formats.export import write_ply
 from sceneprint.formats.points import decode_cloud
-from sceneprint.geometry.retrieval.distance import distances
+from sceneprint.geometry.retrieval.ranking import distances
 from sceneprint.pipeline import open_signer, sign
 from sceneprint.types import DepthFrame, Floats
 from sceneprint_client import Client

@@ -20,7 +20,8 @@ from sceneprint.errors import (
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, meta_of
 from sceneprint_client.api import JobState
-from sceneprint_client.api.frames import GivenBase, ImportOptions
+from sceneprint_client.api.base import GivenBase
+from sceneprint_client.api.frames import ImportOptions
 
 BASE = GivenBase.model_validate(
     {

@@ -18,8 +18,7 @@ import sceneprint
 import sceneprint_client
 from sceneprint import errors as our_errors
 from sceneprint.formats.dataset import FrameReference
-from sceneprint.geometry.retrieval.distance import Metric
-from sceneprint.geometry.retrieval.dpp import DiversityParameters
+from sceneprint.geometry.retrieval.ranking import DiversityParameters, Metric
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
 from sceneprint.models import PRESETS
 from sceneprint_client import errors

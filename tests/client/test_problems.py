@@ -6,7 +6,7 @@ import pytest
 
 from sceneprint import errors as our_errors
 from sceneprint_client import Client, errors, http
-from sceneprint_client.requests import is_loopback
+from sceneprint_client.api.base import is_loopback
 from service.problems import type_of
 
 KINDS = [

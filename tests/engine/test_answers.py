@@ -32,7 +32,7 @@ def test_an_upload_is_found_where_it_was_taken(full: Engine, uploads: Any, ids: 
     numbers = {frame_id: i for i, frame_id in enumerate(ids(full))}
     full.delete_frame("hall", ids(full)[8])
     asked = uploads[8]  # of the second room
-    answer = full.query_upload("hall", asked.data, asked.meta, Query())
+    answer = full.queries.upload(["hall"], asked.data, asked.meta, Query())
     assert answer.status == "found"
     accepted = [m for m in answer.matches if m.validation.status == "accepted"]
     assert len(accepted) == 5 == answer.counts.accepted
@@ -118,7 +118,9 @@ def test_an_answer_has_the_numbers_of_the_library(
 def test_stages_are_done_as_asked(
     full: Engine, uploads: Any, stages: Any, k: int, matches: int, selected: int, validated: int
 ) -> None:
-    answer = full.query_upload("hall", uploads[0].data, uploads[0].meta, Query(k=k, stages=stages))
+    answer = full.queries.upload(
+        ["hall"], uploads[0].data, uploads[0].meta, Query(k=k, stages=stages)
+    )
     assert len(answer.matches) == matches
     counts = answer.counts
     assert (counts.map, counts.compared, counts.ranked) == (12, 12, 12)
@@ -147,7 +149,7 @@ def test_stages_are_done_as_asked(
 def test_the_same_question_has_the_same_answer(full: Engine, uploads: Any, ids: Ids) -> None:
     frame_id = ids(full)[4]
     for ask in (
-        lambda: full.query_upload("hall", uploads[4].data, uploads[4].meta, Query(seed=9)),
+        lambda: full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, Query(seed=9)),
         lambda: full.query_frame("hall", frame_id, Query(seed=9)),
     ):
         first, second = ask(), ask()
@@ -166,7 +168,7 @@ def test_a_frame_of_the_map_finds_what_its_upload_finds_but_not_itself(
     assert frame_id not in [m.frame_id for m in asked.matches]
     assert asked.matches[0].transform.child_frame == f"{frame_id}.optical"
     full.delete_frame("hall", frame_id)
-    sent = full.query_upload("hall", uploads[2].data, uploads[2].meta, Query(k=50))
+    sent = full.queries.upload(["hall"], uploads[2].data, uploads[2].meta, Query(k=50))
     assert [m.frame_id for m in sent.matches] == [m.frame_id for m in asked.matches]
     assert [m.transform and m.transform.matrix for m in sent.matches] == [
         m.transform and m.transform.matrix for m in asked.matches
@@ -176,7 +178,7 @@ def test_a_frame_of_the_map_finds_what_its_upload_finds_but_not_itself(
 
 @pytest.mark.parametrize("stages", [("retrieve",), ("retrieve", "diversify", "validate")])
 def test_an_empty_map_finds_nothing(empty: Engine, uploads: Any, stages: Any) -> None:
-    answer = empty.query_upload("hall", uploads[0].data, uploads[0].meta, Query(stages=stages))
+    answer = empty.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query(stages=stages))
     assert answer.status == ("unvalidated" if len(stages) == 1 else "not_found")
     assert (answer.matches, answer.location) == ([], None)
     assert set(answer.counts.model_dump().values()) == {0}
@@ -186,7 +188,7 @@ def test_what_is_not_there_cannot_be_asked(full: Engine, uploads: Any) -> None:
     full.create_map(NewMap(name="other", model="depth"))
     added, _ = full.add_frame("other", uploads[0].data, uploads[0].meta)
     with pytest.raises(UnknownMap, match="'attic'"):
-        full.query_upload("attic", uploads[0].data, uploads[0].meta, Query())
+        full.queries.upload(["attic"], uploads[0].data, uploads[0].meta, Query())
     with pytest.raises(UnknownFrame, match="in map 'hall'"):
         full.query_frame("hall", added.frame_id, Query())
     with pytest.raises(InvalidRequest, match="is received: Stored durably") as caught:
@@ -203,7 +205,7 @@ def test_answers_are_the_same_on_one_core_and_on_two(
         shutil.copytree(signed_folder, folder)
         engine = make_engine(folder, query_cores=cores)
         meta = uploads[8].meta.model_copy(update={"pose": None})
-        answer = engine.query_upload("hall", uploads[8].data, meta, Query(k=5, seed=3))
+        answer = engine.queries.upload(["hall"], uploads[8].data, meta, Query(k=5, seed=3))
         assert answer.status == "found"
         told.append(answer)
     assert same(*told)

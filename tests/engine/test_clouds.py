@@ -125,7 +125,7 @@ def test_what_is_behind_a_match_without_a_viewpoint_can_be_looked_at(
     assert work_off(empty) == [JobState.SUCCEEDED] * 2
     for view in ("depth", "normals", "patches"):
         assert empty.outputs.preview("hall", frame_id, view).make().startswith(b"\x89PNG")
-    answer = empty.query_upload("hall", points, said(viewpoint=None), Query(k=2, explain=True))
+    answer = empty.queries.upload(["hall"], points, said(viewpoint=None), Query(k=2, explain=True))
     tried = {one.frame_id: one.validation for one in answer.matches}
     assert tried[frame_id].free_space_violations is None
     assert tried[image_id].free_space_violations is not None  # the image knows of free space

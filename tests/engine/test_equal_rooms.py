@@ -35,7 +35,7 @@ class Twins:
         """Where the asked frame was taken, of which the map holds the twin alone."""
         query = Query.model_validate({"keep": False, **how})
         meta = self.asked.meta.model_copy(update={"pose": None})
-        return self.engine.query_upload("hall", self.asked.data, meta, query)
+        return self.engine.queries.upload(["hall"], self.asked.data, meta, query)
 
 
 def equal(frame: DepthFrame, rng: np.random.Generator) -> DepthFrame:

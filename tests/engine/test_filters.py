@@ -13,8 +13,8 @@ import pytest
 from sceneprint.engine import Engine
 from sceneprint.engine.engine import stored_maps
 from sceneprint.errors import InvalidRequest
-from sceneprint.geometry.retrieval.distance import ranking_size
-from sceneprint.store.frames import add_frame
+from sceneprint.geometry.retrieval.ranking import ranking_size
+from sceneprint.store.maps import add_frame
 from sceneprint.store.signatures import StoredSignature, index_frame
 from sceneprint_client.api import Answer, Filter, NewMap, Query
 
@@ -240,7 +240,7 @@ def test_what_does_not_pass_is_neither_matched_nor_located_by(
                         "max": {"x": 99, "y": 99, "z": 99}}}
         ),
     ):  # fmt: skip
-        answer = full.query_upload("hall", asked.data, asked.meta, Query(k=50, filter=wanted))
+        answer = full.queries.upload(["hall"], asked.data, asked.meta, Query(k=50, filter=wanted))
         told = {match.frame_id for match in answer.matches}
         if wanted.region is not None:
             assert told == set(names[6:])
@@ -250,7 +250,7 @@ def test_what_does_not_pass_is_neither_matched_nor_located_by(
         assert answer.status == "found"
     for stages in (("retrieve",), ("retrieve", "diversify", "validate")):
         query = Query(stages=stages, filter=Filter(tags=["nowhere"]))
-        answer = full.query_upload("hall", asked.data, asked.meta, query)
+        answer = full.queries.upload(["hall"], asked.data, asked.meta, query)
         assert answer.status == ("unvalidated" if len(stages) == 1 else "not_found")
         assert (answer.matches, answer.location) == ([], None)
         assert answer.counts.model_dump() == {
@@ -265,16 +265,16 @@ def test_who_asks_to_keep_away_from_itself_says_where_it_is(
     query = Query(stages=("retrieve",), filter=Filter(not_within_s=5))
     needed = "needed by filter.not_within_s"
     with pytest.raises(InvalidRequest, match="no session and no captured_at") as caught:
-        full.query_upload("hall", uploads[0].data, uploads[0].meta, query)
+        full.queries.upload(["hall"], uploads[0].data, uploads[0].meta, query)
     assert caught.value.fields == (("session", needed), ("captured_at", needed))
     with pytest.raises(InvalidRequest, match="has no session and no captured_at"):
         full.query_frame("hall", ids(full)[0], query)
     named = uploads[0].meta.model_copy(update={"session": "s1"})
     with pytest.raises(InvalidRequest, match="has no captured_at") as caught:
-        full.query_upload("hall", uploads[0].data, named, query)
+        full.queries.upload(["hall"], uploads[0].data, named, query)
     assert caught.value.fields == (("captured_at", needed),)
     whole = named.model_copy(update={"captured_at": START})
-    assert full.query_upload("hall", uploads[0].data, whole, query).counts.passed == 12
+    assert full.queries.upload(["hall"], uploads[0].data, whole, query).counts.passed == 12
 
 
 def test_frames_between_view_and_filter_do_no_harm(

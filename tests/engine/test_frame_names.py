@@ -110,7 +110,7 @@ def test_edges_and_odometry_follow_the_order_taken(
 def test_answers_do_not_depend_on_the_order(two_orders: Engine, uploads: Sequence[Any]) -> None:
     asked = uploads[2]
     answers = [
-        two_orders.query_upload(name, asked.data, asked.meta, Query(k=3))
+        two_orders.queries.upload([name], asked.data, asked.meta, Query(k=3))
         for name in ("sorted", "shuffled")
     ]
     told = [

@@ -34,7 +34,7 @@ def data(signed_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def ask(engine: Engine, uploads: Any) -> tuple[list[tuple[str, int]], int]:
-    answer = engine.query_upload("hall", uploads[2].data, uploads[2].meta, ALL)
+    answer = engine.queries.upload(["hall"], uploads[2].data, uploads[2].meta, ALL)
     return [(match.frame_id, match.distance) for match in answer.matches], answer.index_generation
 
 

@@ -17,9 +17,7 @@ from sceneprint.geometry.registration.icp import adjoint
 from sceneprint.geometry.rigid import difference
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.pipeline import Signature, distance, validate
-from sceneprint.store.frames import find_frame
-from sceneprint.store.maps import find_map
-from sceneprint.store.signatures import geometry_blobs
+from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.types import Geometry
 from sceneprint_client.api import Answer, Query, ValidationOptions
 
@@ -49,7 +47,7 @@ def test_the_answer_is_had_again(full: Engine, uploads: Any, asked: Answer) -> N
     again = full.inspection.answer(asked.query_id)
     assert again.model_dump_json() == asked.model_dump_json()
     one = uploads[2]
-    silent = full.query_upload("hall", one.data, one.meta, Query(k=1, keep=False))
+    silent = full.queries.upload(["hall"], one.data, one.meta, Query(k=1, keep=False))
     with pytest.raises(UnknownQuery, match="no answer"):
         full.inspection.answer(silent.query_id)
 
@@ -210,7 +208,7 @@ def test_answers_speak_of_the_robots_base(
     base[:3, 3] = (0.2, 0.0, 0.5)
     sent = {"T_base_sensor": {"base_frame": "base", "matrix": base.tolist()}}
     one = make_upload(replace(uploads[8].frame, pose=uploads[8].pose), "room-001", **sent)
-    answer = full.query_upload("hall", one.data, one.meta, Query(k=2))
+    answer = full.queries.upload(["hall"], one.data, one.meta, Query(k=2))
     best, there = answer.matches[0], answer.location
     assert there is not None
     for camera, robot in ((best.pose_in_map, best.base_in_map), (there.pose, there.base)):
@@ -225,7 +223,7 @@ def test_answers_speak_of_the_robots_base(
         np.testing.assert_allclose(back[:3, 3], (0.2, 0.0, 0.5), atol=1e-12)
     told = full.inspection.answer(answer.query_id)
     assert told.location == there
-    plain = full.query_upload("hall", uploads[8].data, uploads[8].meta, Query(k=1))
+    plain = full.queries.upload(["hall"], uploads[8].data, uploads[8].meta, Query(k=1))
     assert plain.matches[0].base_in_map is None
     assert plain.location is not None
     assert plain.location.base is None
@@ -233,7 +231,7 @@ def test_answers_speak_of_the_robots_base(
 
 def test_the_uncertainty_of_a_place_is_told_in_its_axes(full: Engine, uploads: Any) -> None:
     one = uploads[8]
-    answer = full.query_upload("hall", one.data, one.meta, Query(k=1))
+    answer = full.queries.upload(["hall"], one.data, one.meta, Query(k=1))
     (match,) = [m for m in answer.matches if m.validation.status == "accepted"]
     assert answer.location is not None
     assert answer.location.uncertainty is not None
@@ -264,7 +262,7 @@ def test_a_guided_match_is_labelled_and_had_again(
     work_off(empty)
     asking = make_upload(frames[2], "room")
     meta = asking.meta.model_copy(update={"pose": None})
-    answer = empty.query_upload("hall", asking.data, meta, Query())
+    answer = empty.queries.upload(["hall"], asking.data, meta, Query())
     assert answer.location is not None
     assert (answer.status, answer.location.support, answer.location.guided) == ("found", 5, 3)
     assert difference(np.array(answer.location.pose.matrix), asking.pose)[0] < 0.02
@@ -298,7 +296,7 @@ def test_guided_matches_are_searched_for_where_the_answer_is_undecided(
     work_off(empty)
     asking = make_upload(path[4], "room")
     meta = asking.meta.model_copy(update={"pose": None})
-    answer = empty.query_upload("hall", asking.data, meta, Query(k=8, candidates=8))
+    answer = empty.queries.upload(["hall"], asking.data, meta, Query(k=8, candidates=8))
     assert answer.status == "ambiguous"
     assert {one.validation.search for one in answer.matches} == {"correspondences"}
     first, second = answer.alternatives[:2]

@@ -24,7 +24,7 @@ ALL = WantedRecords()
 @pytest.fixture
 def asked(full: Engine, uploads: Any) -> str:
     """Id of an answer to an upload."""
-    return full.query_upload("hall", uploads[0].data, uploads[0].meta, Query(seed=3)).query_id
+    return full.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query(seed=3)).query_id
 
 
 def expire(engine: Engine) -> None:
@@ -88,7 +88,9 @@ def test_release_removes_the_blob(full: Engine, asked: str) -> None:
 def test_the_list_has_what_the_query_came_to(full: Engine, asked: str, uploads: Any) -> None:
     answer = full.inspection.answer(asked)
     robot = uploads[1].meta.model_copy(update={"robot": "r7"})
-    other = full.query_upload("hall", uploads[1].data, robot, Query(stages=("retrieve",))).query_id
+    other = full.queries.upload(
+        ["hall"], uploads[1].data, robot, Query(stages=("retrieve",))
+    ).query_id
     keep(full, asked, title="one")
     keep(full, other)
     page = full.kept_answers.page(ALL, None, "hall", None, 1)
@@ -182,7 +184,7 @@ def test_a_map_has_so_many_kept_answers(
 ) -> None:
     engine = make_engine(**bound)
     ids = [
-        engine.query_upload("hall", one.data, one.meta, Query(seed=3)).query_id
+        engine.queries.upload(["hall"], one.data, one.meta, Query(seed=3)).query_id
         for one in uploads[:2]
     ]
     if "kept_bytes" in bound:

@@ -85,5 +85,5 @@ def test_what_a_killed_worker_had_in_hand_is_done_once_by_another(
     assert empty.get_map("hall").revision == 1
     assert told(empty) == ["map.created", "frame.received", "frame.indexed"]
     assert empty.get_frame("hall", added.frame_id).state == FrameState.INDEXED
-    answer = empty.query_upload("hall", uploads[0].data, uploads[0].meta, Query(k=1))
+    answer = empty.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query(k=1))
     assert [(m.frame_id, m.distance) for m in answer.matches] == [(added.frame_id, 0)]

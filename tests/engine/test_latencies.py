@@ -5,15 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.engine.admin.statistics import (
-    BINS,
-    FIRST_S,
-    STEP,
-    Latencies,
-    bin_of,
-    merged,
-    quantile,
-)
+from sceneprint.process import BINS, FIRST_S, STEP, Latencies, bin_of, merged, quantile
 
 
 @pytest.mark.parametrize("spread", [0.3, 1.0, 2.0])

@@ -46,7 +46,7 @@ def test_what_is_found_without_a_pose_has_the_transform_to_its_match(
     bare = uploads[0].meta.model_copy(update={"pose": None})
     empty.add_frame("hall", uploads[0].data, bare)
     work_off(empty)
-    there = localization_of(empty.query_upload("hall", uploads[1].data, bare, Query()))
+    there = localization_of(empty.queries.upload(["hall"], uploads[1].data, bare, Query()))
     assert (there.status, there.pose, there.spread_m, there.votes) == ("found", None, None, 0)
     assert "none has a pose" in there.reason
     T = np.linalg.inv(uploads[0].pose) @ uploads[1].pose

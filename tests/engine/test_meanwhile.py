@@ -14,7 +14,7 @@ import pytest
 from sqlalchemy import select
 
 from sceneprint.engine import Engine
-from sceneprint.engine.search import local_index, map_view, verification
+from sceneprint.engine.search import local_index, verification
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import UnknownMap
@@ -84,7 +84,7 @@ def test_a_damaged_artifact_costs_its_match_and_no_other(
 def test_what_is_deleted_while_a_query_runs_is_not_told(
     full: Engine, uploads: Any, ids: Ids, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names, search = ids(full), map_view.search
+    names, search = ids(full), local_index.search
     gone = [names[6], names[1]]
 
     def then_delete(*given: Any, **more: Any) -> Any:
@@ -93,9 +93,9 @@ def test_what_is_deleted_while_a_query_runs_is_not_told(
             full.delete_frame("hall", gone.pop())
         return hits
 
-    monkeypatch.setattr(map_view, "search", then_delete)
+    monkeypatch.setattr(local_index, "search", then_delete)
     for query, missing in ((Query(), names[1]), (R, names[6])):
-        answer = full.query_upload("hall", uploads[1].data, uploads[1].meta, query)
+        answer = full.queries.upload(["hall"], uploads[1].data, uploads[1].meta, query)
         assert missing not in [m.frame_id for m in answer.matches]
         assert len(answer.matches) == (9 if query != R else 10)
     assert gone == []
@@ -141,7 +141,7 @@ def test_matches_that_are_deleted_while_they_are_validated_are_not_found(
         return found
 
     monkeypatch.setattr(verification, "associate", then_delete)
-    answer = empty.query_upload("hall", uploads[0].data, uploads[0].meta, Query())
+    answer = empty.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query())
     assert (answer.status, answer.matches, answer.location) == ("not_found", [], None)
     assert (answer.counts.validated, answer.counts.accepted) == (0, 0)
 
@@ -151,7 +151,7 @@ def test_maps_are_never_mixed(full: Engine, uploads: Any, work_off: Any) -> None
     added, _ = full.add_frame("other", uploads[5].data, uploads[5].meta)
     work_off(full)
     for name, count in (("other", 1), ("hall", 12)):
-        answer = full.query_upload(name, uploads[5].data, uploads[5].meta, R)
+        answer = full.queries.upload([name], uploads[5].data, uploads[5].meta, R)
         assert (answer.counts.map, {m.map for m in answer.matches}) == (count, {name})
         assert answer.matches[0].distance == 0
         assert (added.frame_id in [m.frame_id for m in answer.matches]) == (name == "other")

@@ -22,7 +22,7 @@ from sceneprint.store.tables import events, signatures
 from sceneprint.store.undo_rows import NO_UNDO
 from sceneprint.types import Geometry
 from sceneprint_client.api import FrameState, JobState, NewMap, Query
-from sceneprint_client.api.frames import NOVEL, novelty_of
+from sceneprint_client.api.base import NOVEL, novelty_of
 
 Make = Callable[..., Engine]
 WorkOff = Callable[[Engine], list[JobState | None]]
@@ -58,7 +58,7 @@ def send(uploads: Any, work_off: WorkOff) -> Callable[..., Any]:
 
 def found(engine: Engine, uploads: Any) -> set[str]:
     query = Query(stages=("retrieve",), k=50)
-    answer = engine.query_upload("hall", uploads[0].data, uploads[0].meta, query)
+    answer = engine.queries.upload(["hall"], uploads[0].data, uploads[0].meta, query)
     return {match.frame_id for match in answer.matches}
 
 

@@ -44,7 +44,7 @@ def test_what_one_node_takes_another_works_on(
     assert len(keys(objects, "blobs/")) == 2
     assert work_off(other) == ["succeeded"] * 2
     assert len(keys(objects, "blobs/")) == 4  # with the artifacts
-    told = one.query_upload("hall", uploads[0].data, uploads[0].meta, Query(k=1))
+    told = one.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query(k=1))
     assert told.status == "found"
     assert told.matches[0].frame_id == added[0].frame_id
     assert other.kept.find(told.query_id).answer == told

@@ -16,10 +16,11 @@ from sqlalchemy import func, select, update
 from sceneprint.engine import Engine
 from sceneprint.engine.admin import statistics
 from sceneprint.engine.admin import statistics as measuring
-from sceneprint.engine.admin.statistics import Latencies, anchors, bin_of
-from sceneprint.engine.search import local_index
+from sceneprint.engine.admin.statistics import anchors
+from sceneprint.engine.search import retrieval
 from sceneprint.errors import Conflict, IdempotencyConflict, InvalidRequest, UnknownMap
 from sceneprint.models import PRESETS, read_model
+from sceneprint.process import Latencies, bin_of
 from sceneprint.store.events import Wanted, record_event
 from sceneprint.store.keys import IdempotentRequest, remove_old_requests
 from sceneprint.store.store_counts import add_sample, samples_since
@@ -232,7 +233,7 @@ def test_events_that_are_not_kept_go_and_no_index_is_doubted(data, make_engine):
 
 
 def test_a_map_that_another_process_deleted_is_let_go(data, make_engine, monkeypatch):
-    monkeypatch.setattr(local_index, "_TIDY_S", 1e9)  # by `forget_gone` alone
+    monkeypatch.setattr(retrieval, "_TIDY_S", 1e9)  # by `forget_gone` alone
     engine, other = make_engine(data), make_engine(data)
     engine.rebuild_index("hall")
     frame = engine.list_frames("hall").items[0].frame_id

@@ -29,8 +29,7 @@ from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.pictures import depth_view, normals_view, picture
 from sceneprint.pipeline import Signature, Signer
 from sceneprint.signing import describe
-from sceneprint.store.frames import find_frame
-from sceneprint.store.maps import find_map
+from sceneprint.store.maps import find_frame, find_map
 from sceneprint.types import Geometry
 from sceneprint_client.api import FrameMeta, NewMap
 from sceneprint_client.api.listing import Run

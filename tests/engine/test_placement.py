@@ -27,7 +27,7 @@ from sceneprint.localization import (
     views_of_rows,
 )
 from sceneprint.pipeline import PairMatch, Signature, Signer, associate, diversify, retrieve
-from sceneprint.store.frame_queries import placed_frames
+from sceneprint.store.maps import placed_frames
 from sceneprint.types import Geometry, Patches
 from sceneprint_client.api import Counts, Localization, Prior, Query
 
@@ -38,7 +38,7 @@ Ids = Callable[[Engine], list[str]]
 def localized(engine: Engine, upload: Any, **how: Any) -> Localization:
     query = Query.model_validate({"keep": False, **how})
     meta = upload.meta.model_copy(update={"pose": None})
-    return localization_of(engine.query_upload("hall", upload.data, meta, query))
+    return localization_of(engine.queries.upload(["hall"], upload.data, meta, query))
 
 
 def prior_at(upload: Any, shift: float = 0.0, **more: Any) -> dict[str, Any]:
@@ -160,7 +160,7 @@ def test_candidates_near_a_prior_are_tried_first(full: Engine, uploads: Any, ids
     def tried(prior: dict[str, Any] | None) -> list[str]:
         query = Query.model_validate({"keep": False, "k": 1, "prior": prior})
         meta = uploads[8].meta.model_copy(update={"pose": None})
-        answer = full.query_upload("hall", uploads[8].data, meta, query)
+        answer = full.queries.upload(["hall"], uploads[8].data, meta, query)
         assert len(answer.matches) == 10
         elsewhere = [one for one in answer.matches if rooms[one.frame_id] == uploads[0].room]
         assert len(elsewhere) > 1
@@ -235,8 +235,8 @@ def test_a_prior_that_cannot_be_used_says_why(full: Engine, uploads: Any) -> Non
     with pytest.raises(InvalidPose, match="The prior"):
         localized(full, uploads[8], prior=skew)
     with pytest.raises(InvalidRequest, match="A prior needs validated matches"):
-        full.query_upload(
-            "hall", uploads[8].data, uploads[8].meta,
+        full.queries.upload(
+            ["hall"], uploads[8].data, uploads[8].meta,
             Query.model_validate({"stages": "retrieve", "prior": prior_at(uploads[8])}),
         )  # fmt: skip
     elsewhere = prior_at(uploads[8])
@@ -294,13 +294,13 @@ def test_what_is_not_found_names_its_likeliest_cause(
     if change == "scale":
         upload = uploads[0]
         meta = upload.meta.model_copy(update={"depth_scale": 5000.0, "pose": None})
-        answer = full.query_upload("hall", upload.data, meta, Query(keep=False))
+        answer = full.queries.upload(["hall"], upload.data, meta, Query(keep=False))
     else:
         # a slanted wall, which fills the view
         slant = 1.5 + np.linspace(0.0, 1.0, frame.depth.shape[1])[None, :]
         depth = np.broadcast_to(slant, frame.depth.shape).astype(np.float32)
         wall = make_upload(replace(frame, depth=depth, pose=np.eye(4)), "wall")
-        answer = full.query_upload("hall", wall.data, wall.meta, Query(keep=False))
+        answer = full.queries.upload(["hall"], wall.data, wall.meta, Query(keep=False))
     assert (answer.status, answer.cause, answer.location) == ("not_found", cause, None)
     assert told in answer.reason
     assert [m.pose_in_map for m in answer.matches if m.validation.status == "rejected"] == [

@@ -24,11 +24,11 @@ from sceneprint.errors import BusyIndex, UnknownJob, UnknownQuery
 from sceneprint.index import newest, newest_number
 from sceneprint.index.generation_files import building
 from sceneprint.models import read_model
-from sceneprint.store.frames import delete_frame, find_frame, write_frame
-from sceneprint.store.maps import find_map
+from sceneprint.store.frames import delete_frame, write_frame
+from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.postgres.vectors import table_of
-from sceneprint.store.signatures import geometry_blobs, stored_vector
+from sceneprint.store.signatures import stored_vector
 from sceneprint_client.api import NewMap, Query
 from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.surface import NewReconstruction
@@ -122,7 +122,7 @@ def asked(engine: Engine, frame_id: str, uploads) -> tuple[str, str, str]:
     """Ids of an answer that was made from a frame, of one that shows it, and of a surface."""
     options = Query(stages="retrieve,diversify,validate", seed=1)
     own = engine.query_frame("hall", frame_id, options)
-    other = engine.query_upload("hall", uploads[1].data, uploads[1].meta, options)
+    other = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, options)
     assert frame_id in {match.frame_id for match in other.matches}
     fused = engine.reconstructions.begin(engine.kept.find(own.query_id), NewReconstruction())
     return own.query_id, other.query_id, fused.job_id
@@ -158,7 +158,7 @@ def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
     with pytest.raises(UnknownJob):
         engine.reconstructions.find(fused)
     # the others are found as before
-    told = engine.query_upload("hall", uploads[4].data, uploads[4].meta, Query(seed=1))
+    told = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, Query(seed=1))
     assert told.matches[0].frame_id == ids(engine)[3]
     assert engine.purging.now().indexes == 0
 

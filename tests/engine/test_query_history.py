@@ -62,7 +62,7 @@ def count(engine) -> int:
 
 def test_an_answer_and_a_failure_are_recorded_as_they_were(full, uploads):
     one, query = uploads[3], Query(k=3)
-    answer = full.query_upload("hall", one.data, one.meta, query)
+    answer = full.queries.upload(["hall"], one.data, one.meta, query)
     assert answer.status == "found"
     found = record_of(AskedQuery(["hall"], query, "spot", "monday", at=7.0), answer, 0.25)
     t, r = answer.location.pose.translation, answer.location.pose.rotation

@@ -14,15 +14,18 @@ import pytest
 from sqlalchemy import update
 
 from sceneprint.engine import Engine
-from sceneprint.engine.search import map_view, retrieval
+from sceneprint.engine.search import local_index, retrieval
 from sceneprint.engine.search.retrieval import FIRST_S, Deadline
 from sceneprint.errors import UnknownFrame
-from sceneprint.geometry.retrieval.distance import distances, pairwise_distances
-from sceneprint.geometry.retrieval.dpp import DiversityParameters, diversify
+from sceneprint.geometry.retrieval.ranking import (
+    DiversityParameters,
+    distances,
+    diversify,
+    pairwise_distances,
+)
 from sceneprint.index import SearchHits
 from sceneprint.pipeline import Signature, Signer, retrieve, validate
-from sceneprint.store.frames import find_frame
-from sceneprint.store.maps import find_map
+from sceneprint.store.maps import find_frame, find_map
 from sceneprint.store.tables import frames
 from sceneprint.types import Geometry
 from sceneprint_client.api import Answer, Query
@@ -294,7 +297,7 @@ def test_what_an_approximate_index_missed_is_said(
 ) -> None:
     names = ids(full)
     near = [one.frame_id for one in ask(full, names[0], stages=["retrieve"], k=11).matches]
-    real, lost = map_view.search, near[1]
+    real, lost = local_index.search, near[1]
     with full.store.database.read() as connection:
         number = find_frame(connection, find_map(connection, "hall"), lost).number
 
@@ -303,7 +306,7 @@ def test_what_an_approximate_index_missed_is_said(
             return real(*given, dead=dead, exact=True, **more)
         return replace(real(*given, dead=dead | {number}, exact=False, **more), exact=False)
 
-    monkeypatch.setattr(map_view, "search", search)
+    monkeypatch.setattr(local_index, "search", search)
     monkeypatch.setattr(retrieval, "ranking_size", lambda n: min(n, 3))
     for rank, name in enumerate(near, 1):
         answer = ask(full, names[0], explain_frame=name, stages=["retrieve"], k=3)

@@ -14,6 +14,7 @@ from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.maps.map_lifecycle import edit_map
 from sceneprint.errors import InvalidRequest, MapExists, QuotaExceeded
 from sceneprint.store import frames as stored
+from sceneprint.store import maps
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import MapUsage, counted_usage, find_map, use_of
 from sceneprint.store.tables import frames
@@ -107,10 +108,10 @@ def test_every_change_of_a_frame_is_counted(empty, uploads):
             size, kind = int(rng.integers(1, 1000)), rng.integers(6)
             ordered = select(frames.c.number).order_by(frames.c.number)  # ids are random
             numbers = connection.execute(ordered).scalars().all()
-            one = stored.frame_of(connection, int(rng.choice(numbers)))
+            one = maps.frame_of(connection, int(rng.choice(numbers)))
             if kind <= 1:
                 content = {"content_id": f"{step:064d}", "bytes": size}
-                stored.add_frame(connection, row.number, values | content)
+                maps.add_frame(connection, row.number, values | content)
             elif kind == 2:
                 stored.set_state(connection, one.number, FrameState.REDUNDANT)
             elif kind == 3 and one.state == FrameState.REDUNDANT:
@@ -175,7 +176,7 @@ def test_a_failed_frame_that_comes_larger_needs_room_too(empty, uploads):
     added, _ = empty.add_frame("hall", one.data, one.meta)
     with empty.store.database.write() as connection:
         row = find_map(connection, "hall")
-        number = stored.find_frame(connection, row, added.frame_id).number
+        number = maps.find_frame(connection, row, added.frame_id).number
         stored.set_state(connection, number, FrameState.FAILED, "it broke down")
     picture = Image.open(io.BytesIO(one.data))
     loose = io.BytesIO()

@@ -60,7 +60,7 @@ def found(answer: Answer) -> list[tuple[str, int]]:
 
 
 def ask(engine: Engine, uploads: Any, which: int = 2, query: Query = ALL) -> Answer:
-    return engine.query_upload("hall", uploads[which].data, uploads[which].meta, query)
+    return engine.queries.upload(["hall"], uploads[which].data, uploads[which].meta, query)
 
 
 def truth(make: Make, uploads: Any, folder: Path, tmp_path: Path) -> list[tuple[str, int]]:

@@ -16,7 +16,7 @@ from sqlalchemy import select
 from sceneprint.engine import Engine
 from sceneprint.engine.maps import map_lifecycle
 from sceneprint.errors import Conflict, InvalidRequest, UnknownMap, UnreadableModel
-from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.models import Model, save_model
 from sceneprint.settings import Settings
@@ -113,7 +113,7 @@ def test_a_map_of_version_0_1_is_compared_whole_by_l1_until_it_is_moved(
         return sorted(((name, d) for name, d in found.items()), key=lambda one: one[1])
 
     def answered() -> tuple[Answer, list[tuple[str, int]]]:
-        answer = engine.query_upload("hall", uploads[4].data, uploads[4].meta, R)
+        answer = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
         return answer, [(match.frame_id, match.distance) for match in answer.matches]
 
     assert engine.publish_due() == 0
@@ -142,7 +142,7 @@ def test_after_the_switch_the_map_is_as_if_made_with_that_model(
     shutil.copytree(paper_folder, tmp_path / "paper")
     fresh = make_engine(tmp_path / "paper")
     before, paper = full.get_map("hall"), fresh.get_map("hall")
-    seen = said(full, full.query_upload("hall", uploads[4].data, uploads[4].meta, R))
+    seen = said(full, full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R))
     now = full.reencode("hall", "paper").reencoding
     assert now is not None
     assert (now.model, now.model_id) == (paper.model, paper.model_id)
@@ -159,7 +159,7 @@ def test_after_the_switch_the_map_is_as_if_made_with_that_model(
         assert during.reencoding is not None
         assert (during.reencoding.done, during.reencoding.left) == (done, 12 - done)
         if done % 4 == 0:
-            again = full.query_upload("hall", uploads[4].data, uploads[4].meta, R)
+            again = full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
             assert said(full, again) == seen
         assert full.get_frame("hall", claimed.frame.id).state == FrameState.INDEXED
         assert full.run(claimed) == JobState.SUCCEEDED
@@ -178,8 +178,8 @@ def test_after_the_switch_the_map_is_as_if_made_with_that_model(
     for query, which in ((R, (0, 4, 9)), (Query(seed=3), (4,))):
         for i in which:
             for asked in (full, other):
-                answer = asked.query_upload("hall", uploads[i].data, uploads[i].meta, query)
-                wanted = fresh.query_upload("hall", uploads[i].data, uploads[i].meta, query)
+                answer = asked.queries.upload(["hall"], uploads[i].data, uploads[i].meta, query)
+                wanted = fresh.queries.upload(["hall"], uploads[i].data, uploads[i].meta, query)
                 assert said(full, answer) == said(fresh, wanted)
             answer = full.query_frame("hall", names[i], query)
             assert said(full, answer) == said(fresh, fresh.query_frame("hall", others[i], query))
@@ -222,7 +222,7 @@ def test_what_comes_and_goes_meanwhile(
     assert frame.state == FrameState.REJECTED
     assert frame.reason is not None
     assert "range" in frame.reason
-    answer = full.query_upload("hall", uploads[4].data, uploads[4].meta, R)
+    answer = full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
     assert {match.frame_id for match in answer.matches} == set(ids(full, FrameState.INDEXED))
     assert (answer.counts.map, answer.matches[0].distance) == (10, 0)
     assert models_of(full) == {now.model_id: 10}

@@ -23,7 +23,7 @@ from sceneprint.engine.search import local_index, query
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.search.retrieval import Deadline
 from sceneprint.errors import Busy, ModelMismatch, UselessFrame
-from sceneprint.geometry.retrieval.distance import distances
+from sceneprint.geometry.retrieval.ranking import distances
 from sceneprint.models import Model, save_model
 from sceneprint.pipeline import Signer, open_signer, prepare
 from sceneprint.store.signatures import StoredSignature, replace_signature
@@ -106,7 +106,7 @@ def test_no_answer_mixes_models_while_a_map_goes_to_and_fro(
                     ]
                 else:
                     one = uploads[i % 12]
-                    answer = asking.query_upload("hall", one.data, one.meta, R)
+                    answer = asking.queries.upload(["hall"], one.data, one.meta, R)
                     expected = wanted[answer.model][i % 12]
                 assert found(answer) == expected
                 mine.append(answer.model)
@@ -153,9 +153,9 @@ def test_a_query_signed_before_the_switch_is_signed_again(
     for name in ("prepare_upload", "prepare_stored", "answer"):
         monkeypatch.setattr(query, name, then_switch(getattr(query, name)))
     del models[1:]
-    answer = full.query_upload("hall", uploads[4].data, uploads[4].meta, Query())
+    answer = full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, Query())
     assert answer.model.startswith("small-")
-    assert found(full.query_upload("hall", uploads[4].data, uploads[4].meta, R)) == right(
+    assert found(full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)) == right(
         names, by_model, answer.model, 4
     )
     models[:] = [DEPTH]
@@ -165,11 +165,11 @@ def test_a_query_signed_before_the_switch_is_signed_again(
     monkeypatch.undo()
     monkeypatch.setattr(query, "answer", then_switch(query.answer))
     models[:] = [small_file]
-    answer = full.query_upload("hall", uploads[4].data, uploads[4].meta, R)
+    answer = full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
     assert answer.model.startswith("small-")
     models[:] = [DEPTH, small_file] * 5
     with pytest.raises(Busy, match="kept changing its model"):
-        full.query_upload("hall", uploads[4].data, uploads[4].meta, R)
+        full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
 
 
 def test_signatures_of_two_models_are_not_compared_whatever_their_length(
@@ -199,7 +199,7 @@ def test_what_was_being_signed_at_the_switch_is_signed_with_the_new_model(
     assert empty.get_frame("hall", added.frame_id).state == FrameState.RECEIVED
     assert len(list(empty.store.blobs.digests())) == 3 + 2
     assert work_off(empty) == [JobState.SUCCEEDED]
-    answer = empty.query_upload("hall", uploads[2].data, uploads[2].meta, R)
+    answer = empty.queries.upload(["hall"], uploads[2].data, uploads[2].meta, R)
     assert (answer.counts.map, found(answer)[0]) == (3, (added.frame_id, 0))
     # and one in which the former model finds nothing is not rejected for it
     added, _ = empty.add_frame("hall", uploads[3].data, uploads[3].meta)
@@ -241,7 +241,7 @@ def test_the_index_of_the_next_model_is_there_at_the_switch(
         answer = asked.query_frame("hall", names[1], R)
         assert (answer.index_generation, answer.model[:6]) == (1, "depth-")
     engine.publish_due()
-    answer = engine.query_upload("hall", uploads[4].data, uploads[4].meta, R)
+    answer = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
     assert (answer.index_generation, answer.counts.map) == (1, 12)
     assert found(answer) == right(names, by_model, answer.model, 4)
     assert not before.exists()
@@ -259,7 +259,7 @@ def test_an_index_that_cannot_be_written_does_not_hold_the_switch_up(
     nowhere = tmp_path / "file" / "index"
     engine = make_engine(full.settings.data_dir, tail_frames=5, index_dir=nowhere)
     switch(engine, small_file, work_off)
-    answer = engine.query_upload("hall", uploads[4].data, uploads[4].meta, R)
+    answer = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
     assert (answer.index_generation, answer.counts.map) == (0, 12)
 
 
@@ -293,7 +293,7 @@ def test_what_an_index_of_the_next_model_lacks_is_found_after_the_switch(
         replace_signature(connection, blind.frame, made)
     engine.publish_due()
     assert engine.get_map("hall").frames == {"indexed": 12}
-    answer = engine.query_upload("hall", uploads[at].data, uploads[at].meta, R)
+    answer = engine.queries.upload(["hall"], uploads[at].data, uploads[at].meta, R)
     assert answer.index_generation == 1
     assert found(answer) == right(names, by_model, answer.model, at)
 
@@ -319,12 +319,12 @@ def test_a_rejected_frame_is_gone_for_readers_that_knew_it(
     at = names.index(blind.frame.id)
     asked = (at + 1) % 12
     wanted = right(names, by_model, full.get_map("hall").model, asked)
-    answer = sleeper.query_upload("hall", uploads[asked].data, uploads[asked].meta, R)
+    answer = sleeper.queries.upload(["hall"], uploads[asked].data, uploads[asked].meta, R)
     assert found(answer) == [one for one in wanted if one[0] != blind.frame.id]
     # what one model rejects another has to look at: it is found again
     assert full.get_frame("hall", blind.frame.id).state == FrameState.RECEIVED
     assert work_off(full) == [JobState.SUCCEEDED]
-    answer = sleeper.query_upload("hall", uploads[asked].data, uploads[asked].meta, R)
+    answer = sleeper.queries.upload(["hall"], uploads[asked].data, uploads[asked].meta, R)
     assert found(answer) == wanted
 
 
@@ -411,7 +411,7 @@ def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
             worker.kill()
     label = full.get_map("hall").model
     assert label.startswith("small-") == switched
-    answer = full.query_upload("hall", uploads[7].data, uploads[7].meta, R)
+    answer = full.queries.upload(["hall"], uploads[7].data, uploads[7].meta, R)
     assert found(answer) == right(names, by_model, label, 7)
     due_now(full)
     other = make_engine(full.settings.data_dir, tail_frames=5)
@@ -421,7 +421,7 @@ def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
     assert other.get_map("hall").frames == {"indexed": 12}
     for i in (2, 7):
         for asked in (full, other):
-            answer = asked.query_upload("hall", uploads[i].data, uploads[i].meta, R)
+            answer = asked.queries.upload(["hall"], uploads[i].data, uploads[i].meta, R)
             assert answer.model.startswith("small-")
             assert found(answer) == right(names, by_model, answer.model, i)
     with other.store.database.read() as connection:

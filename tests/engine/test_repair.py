@@ -78,14 +78,14 @@ def test_a_damaged_artifact_is_skipped_and_soon_made_again(
     full: Engine, uploads: Any, ids: Ids, work_off: WorkOff, how: str
 ) -> None:
     asked = uploads[1]
-    before = full.query_upload("hall", asked.data, asked.meta, Query())
+    before = full.queries.upload(["hall"], asked.data, asked.meta, Query())
     hurt = before.matches[0].frame_id
     path = artifact(full, hurt)
     sound, revision = path.read_bytes(), row_of(full).revision
     path.unlink() if how == "missing" else damage(path)
     full.store.geometries.forget_older(0)  # as after a while
     for _ in range(3):  # a crowd of queries is one job
-        answer = full.query_upload("hall", asked.data, asked.meta, Query())
+        answer = full.queries.upload(["hall"], asked.data, asked.meta, Query())
         status, reason = statuses(answer)[hurt]
         assert status == "skipped"
         assert "blob" in str(reason)
@@ -105,7 +105,9 @@ def test_a_damaged_artifact_is_skipped_and_soon_made_again(
     assert full.get_frame("hall", hurt).state == "indexed"
     assert work_off(full) == [JobState.SUCCEEDED]
     assert path.read_bytes() == sound
-    assert statuses(full.query_upload("hall", asked.data, asked.meta, Query())) == statuses(before)
+    assert statuses(full.queries.upload(["hall"], asked.data, asked.meta, Query())) == statuses(
+        before
+    )
     # the signature is the same, and nobody has anything to learn
     assert row_of(full).revision == revision
     assert waiting(full) == []
@@ -140,14 +142,14 @@ def test_a_damaged_signature_is_never_compared_and_soon_made_again(
     ]
     assert [job.frame_number for job in waiting(full)] == [number_of(full, hurt)]
     fresh = make_engine()  # `full` holds it from before
-    answer = fresh.query_upload("hall", uploads[3].data, uploads[3].meta, ask)
+    answer = fresh.queries.upload(["hall"], uploads[3].data, uploads[3].meta, ask)
     assert [(m.frame_id, m.distance) for m in answer.matches] == [
         (m.frame_id, m.distance) for m in others.matches
     ]
     assert work_off(full) == [JobState.SUCCEEDED]
     assert column(full, hurt, "vector") == sound
     for engine in (fresh, full):  # one that passed it over, and one that held it
-        answer = engine.query_upload("hall", uploads[3].data, uploads[3].meta, ask)
+        answer = engine.queries.upload(["hall"], uploads[3].data, uploads[3].meta, ask)
         assert (answer.matches[0].frame_id, answer.matches[0].distance) == (hurt, 0)
         assert len(answer.matches) == answer.counts.map == 12
         assert len({m.frame_id for m in answer.matches}) == 12
@@ -158,11 +160,11 @@ def test_who_passes_a_damaged_signature_over_has_it_made_again(
 ) -> None:
     hurt, ask = ids(full)[3], Query(stages=("retrieve",), k=50)
     damage_signature(full, hurt)
-    answer = full.query_upload("hall", uploads[3].data, uploads[3].meta, ask)
+    answer = full.queries.upload(["hall"], uploads[3].data, uploads[3].meta, ask)
     assert hurt not in [m.frame_id for m in answer.matches]
     assert [job.frame_number for job in waiting(full)] == [number_of(full, hurt)]
     assert work_off(full) == [JobState.SUCCEEDED]
-    answer = full.query_upload("hall", uploads[3].data, uploads[3].meta, ask)
+    answer = full.queries.upload(["hall"], uploads[3].data, uploads[3].meta, ask)
     assert answer.matches[0].frame_id == hurt
     assert full.view("hall")[2].damaged == frozenset()
     # now by whoever publishes an index
@@ -171,7 +173,7 @@ def test_who_passes_a_damaged_signature_over_has_it_made_again(
     assert make_engine(tail_frames=1).publish_due() == 1
     assert [job.frame_number for job in waiting(full)] == [number_of(full, other)]
     assert work_off(full) == [JobState.SUCCEEDED]
-    answer = make_engine().query_upload("hall", uploads[4].data, uploads[4].meta, ask)
+    answer = make_engine().queries.upload(["hall"], uploads[4].data, uploads[4].meta, ask)
     assert (answer.index_generation, answer.matches[0].frame_id) == (1, other)
     assert len(answer.matches) == answer.counts.map == 12
 
@@ -196,7 +198,7 @@ def test_what_cannot_be_healed_is_not_tried_for_ever(
     full.store.blobs.path(blob).unlink()
 
     def ask() -> Any:
-        return full.query_upload("hall", uploads[1].data, uploads[1].meta, Query())
+        return full.queries.upload(["hall"], uploads[1].data, uploads[1].meta, Query())
 
     assert statuses(ask())[hurt][0] == "skipped"
     for _ in range(3):
@@ -274,7 +276,7 @@ def test_a_store_that_cannot_be_written_costs_no_answer(
     damage(artifact(full, frame))
     with full.store.database.write() as connection:
         connection.exec_driver_sql("ALTER TABLE jobs RENAME TO away")
-    answer = full.query_upload("hall", uploads[0].data, uploads[0].meta, Query())
+    answer = full.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query())
     assert statuses(answer)[frame][0] == "skipped"
     assert answer.status == "found"
     assert "repair failed" in caplog.text

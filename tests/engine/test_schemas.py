@@ -13,7 +13,8 @@ from pydantic import BaseModel, ValidationError
 from scipy.spatial.transform import Rotation
 
 from sceneprint.engine import Engine
-from sceneprint.engine.serializers import pose_matrix, transform
+from sceneprint.engine.ingest.frame_decoder import pose_matrix
+from sceneprint.engine.serializers import transform
 from sceneprint.errors import InvalidPose, InvalidRequest, MapExists
 from sceneprint_client.api import FrameMeta, FrameState, GivenPose, JobState, NewMap, Query
 

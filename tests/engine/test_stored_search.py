@@ -16,16 +16,15 @@ from sqlalchemy import event, select, text
 
 from benchmarks.fleet.bulk import fill, walk
 from sceneprint.engine import Engine
-from sceneprint.engine.search import local_index, map_view
+from sceneprint.engine.search import local_index, retrieval, stored_maps
 from sceneprint.engine.search import query as querying
 from sceneprint.errors import InvalidRequest
-from sceneprint.geometry.retrieval.distance import distances
+from sceneprint.geometry.retrieval.ranking import distances
 from sceneprint.maintenance.snapshot.postgres_restore import copy_into
 from sceneprint.models import Model
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
-from sceneprint.store.frames import find_frame
-from sceneprint.store.maps import find_map
+from sceneprint.store.maps import find_frame, find_map
 from sceneprint.store.postgres import vectors
 from sceneprint.store.signatures import StoredSignature, remove_signature, replace_signature
 from sceneprint.store.tables import frames, signatures
@@ -43,7 +42,7 @@ BOTH = ["hall", "yard"]
 @pytest.fixture
 def make(postgres_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     """Engines on one database, each a node of its own folder, that counts frames each time."""
-    monkeypatch.setattr(map_view, "_COUNTED", 0)
+    monkeypatch.setattr(stored_maps, "_COUNTED", 0)
     opened: list[Engine] = []
 
     def engine(node: str = "a", search: str = "database", **more: object) -> Engine:
@@ -322,6 +321,7 @@ def test_a_node_asks_the_database_only_for_what_it_has_not(
     wanted = nearest(places, "hall-321", ["hall"], 10)
     node = make("b", "auto", tail_frames=1)
     monkeypatch.setattr(local_index, "READ_MOST", 600)
+    monkeypatch.setattr(retrieval, "READ_MOST", 600)
     far = ask(node, "hall-321", k=10)
     assert (found(far), far.index_generation, far.exact) == (wanted, 0, True)
     assert [kind_of(node, name) for name in BOTH] == ["database"] * 2
@@ -363,7 +363,7 @@ def test_a_damaged_signature_costs_its_frame_alone(filled: Engine) -> None:
         count = connection.execute(
             select(frames.c.number).where(frames.c.map_number == hall.number)
         ).all()
-    assert isinstance(view, map_view.Stored)
+    assert isinstance(view, stored_maps.Stored)
     hits = view.search(walk(1, LENGTH, seed=0)[0], 950, dead=frozenset(), exact=True)
     assert (view.damaged, len(hits)) == ({number}, len(count) - 1)
     with filled.store.database.write() as connection:  # of all but the last thirty

@@ -22,9 +22,8 @@ from sceneprint.errors import DamagedBlob, InvalidRequest, NotFound
 from sceneprint.geometry.rigid import moved
 from sceneprint.settings import Settings
 from sceneprint.store.frame_queries import numbers_of_runs, stops_of
-from sceneprint.store.frames import find_frame, refers_to, write_frame
-from sceneprint.store.maps import find_map
-from sceneprint.store.signatures import geometry_blobs
+from sceneprint.store.frames import refers_to, write_frame
+from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.store.tables import (
     events,
     jobs,

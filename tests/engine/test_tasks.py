@@ -14,9 +14,9 @@ from sceneprint.engine.jobs.lifecycle import list_jobs
 from sceneprint.engine.jobs.tasks import SLICE_S, Handler, IsOver, LongJob, SliceResult
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
+from sceneprint.process import work_of
 from sceneprint.store.queue import JobFile, files_of, find_job, items_of, remove_job
 from sceneprint.store.tables import events, jobs
-from sceneprint.store.tenants import work_of
 from sceneprint_client.api import Job, JobState, NewMap
 
 

@@ -20,8 +20,8 @@ from sceneprint.errors import (
     UnknownFrame,
     UnknownMap,
 )
-from sceneprint.store.frames import find_frame, set_state, write_map
-from sceneprint.store.maps import find_map
+from sceneprint.store.frames import set_state, write_map
+from sceneprint.store.maps import find_frame, find_map
 from sceneprint.store.tables import deletions
 from sceneprint_client.api import Frame, FrameMeta, FrameState, Query
 from sceneprint_client.api.listing import FrameListing, FrameSelection, RestoreOptions
@@ -60,7 +60,7 @@ def test_a_restored_frame_is_as_it_was_and_found_again(
     options = Query(seed=5)
 
     def nearest() -> tuple[str, float]:
-        answer = full.query_upload("hall", uploads[0].data, uploads[0].meta, options)
+        answer = full.queries.upload(["hall"], uploads[0].data, uploads[0].meta, options)
         return answer.matches[0].frame_id, answer.matches[0].distance
 
     found = nearest()

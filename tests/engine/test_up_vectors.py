@@ -17,12 +17,10 @@ from sceneprint.engine.search.query import localization_of
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.serializers import EDITABLE, frame_tag, map_tag, tag_of
 from sceneprint.errors import FrameConflict, InvalidRequest, MapExists
-from sceneprint.store.frames import find_frame
-from sceneprint.store.maps import find_map
+from sceneprint.store.maps import find_frame, find_map
 from sceneprint.types import Floats
 from sceneprint_client.api import Comparison, NamedFrame, NewMap, Query
-from sceneprint_client.api.base import checked
-from sceneprint_client.api.frames import FrameMeta
+from sceneprint_client.api.base import FrameMeta, checked
 
 Ids = Callable[[Engine], list[str]]
 Z = [0.0, 0.0, 1.0]  #: up in the world of synthetic rooms
@@ -169,8 +167,8 @@ def level(full: Engine) -> Engine:
 def test_a_query_with_up_is_found_as_without(level: Engine, uploads: Any) -> None:
     one = uploads[2]
     query = Query(keep=False, k=3)
-    before = level.query_upload("hall", one.data, one.meta, query)
-    told = level.query_upload("hall", one.data, with_up(one.meta, up_of(one)), query)
+    before = level.queries.upload(["hall"], one.data, one.meta, query)
+    told = level.queries.upload(["hall"], one.data, with_up(one.meta, up_of(one)), query)
     assert (before.status, told.status) == ("found", "found")
     assert before.counts.accepted <= told.counts.accepted
     assert all(match.validation.tilt_deg is None for match in before.matches)
@@ -185,7 +183,7 @@ def test_a_query_with_up_is_found_as_without(level: Engine, uploads: Any) -> Non
 def test_a_wrong_up_is_told_and_gives_no_pose(level: Engine, uploads: Any) -> None:
     one = uploads[2]
     meta = with_up(one.meta, up_of(one, 20))
-    told = level.query_upload("hall", one.data, meta, Query(k=3, explain=True))
+    told = level.queries.upload(["hall"], one.data, meta, Query(k=3, explain=True))
     assert (told.status, told.location, told.counts.accepted) == ("not_found", None, 0)
     first = told.matches[0].validation
     assert first.status == "rejected"
@@ -203,7 +201,7 @@ def test_a_wrong_up_is_told_and_gives_no_pose(level: Engine, uploads: Any) -> No
 
 def test_what_was_found_with_up_is_looked_at_again_with_it(level: Engine, uploads: Any) -> None:
     one = uploads[2]
-    told = level.query_upload("hall", one.data, with_up(one.meta, up_of(one)), Query(k=3))
+    told = level.queries.upload(["hall"], one.data, with_up(one.meta, up_of(one)), Query(k=3))
     best = told.matches[0]
     again = level.inspection.match(told.query_id, best.frame_id)
     assert again.validation == best.validation

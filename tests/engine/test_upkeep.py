@@ -13,7 +13,7 @@ from sqlalchemy import update
 
 from sceneprint.engine import Engine
 from sceneprint.engine import engine as administration
-from sceneprint.engine.search import local_index
+from sceneprint.engine.search import local_index, retrieval
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import InvalidRequest, UnreadableModel
 from sceneprint.store.maps import find_map
@@ -49,12 +49,12 @@ def test_an_index_of_a_history_that_was_undone_is_not_believed(
     engine = make_engine(data, tail_frames=2)
     names = fill(engine, uploads, work_off, range(5, 8))
     for name, i in zip(names, range(5, 8), strict=True):
-        answer = engine.query_upload("hall", uploads[i].data, uploads[i].meta, ALL)
+        answer = engine.queries.upload(["hall"], uploads[i].data, uploads[i].meta, ALL)
         assert (answer.index_generation, answer.counts.map) == (0, 5)
         assert (answer.matches[0].frame_id, answer.matches[0].distance) == (name, 0)
     assert engine.publish_due() == 1  # anew, from nothing
     for fresh in (engine, make_engine(data, tail_frames=2)):
-        answer = fresh.query_upload("hall", uploads[5].data, uploads[5].meta, ALL)
+        answer = fresh.queries.upload(["hall"], uploads[5].data, uploads[5].meta, ALL)
         assert (answer.matches[0].frame_id, answer.matches[0].distance) == (names[0], 0)
         assert answer.counts.map == 5
     assert answer.index_generation == 2
@@ -71,7 +71,7 @@ def test_an_index_that_cannot_be_written_costs_no_frame(
     assert [r.message for r in caplog.records if r.levelname == "ERROR"] == [
         "index publication failed"
     ]
-    answer = engine.query_upload("hall", uploads[1].data, uploads[1].meta, ALL)
+    answer = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, ALL)
     assert (answer.matches[0].frame_id, answer.index_generation) == (names[1], 0)
 
 
@@ -104,14 +104,12 @@ def test_what_was_not_asked_for_long_is_not_held(
 
     def held() -> list[str]:
         for name in ("hall", "other", "hall"):
-            answer = engine.query_upload(name, uploads[0].data, uploads[0].meta, ALL)
+            answer = engine.queries.upload([name], uploads[0].data, uploads[0].meta, ALL)
             assert answer.matches[0].distance == 0
         return list(engine._readers._open)
 
     assert held() == ["other", "hall"]
-    monkeypatch.setattr(
-        local_index, "HELD_BYTES", 2 * 64 * 448 - 1
-    )  # 64 rows are set aside at once
+    monkeypatch.setattr(retrieval, "HELD_BYTES", 2 * 64 * 448 - 1)  # 64 rows are set aside at once
     assert held() == ["hall"]
 
 
@@ -129,9 +127,9 @@ def test_a_model_that_cannot_be_read_costs_its_maps_alone(
     (error,) = [r for r in caplog.records if r.levelname == "ERROR"]
     assert (error.name, error.__dict__["model"]) == (administration.__name__, old)
     fill(fresh, uploads, work_off, range(1))
-    assert fresh.query_upload("hall", uploads[0].data, uploads[0].meta, ALL).counts.map == 1
+    assert fresh.queries.upload(["hall"], uploads[0].data, uploads[0].meta, ALL).counts.map == 1
     with pytest.raises(UnreadableModel):
-        fresh.query_upload("old", uploads[0].data, uploads[0].meta, ALL)
+        fresh.queries.upload(["old"], uploads[0].data, uploads[0].meta, ALL)
 
 
 def test_a_large_map_is_published_by_its_share(
@@ -150,7 +148,7 @@ def test_a_large_map_is_published_by_its_share(
         other = make_engine(tmp_path / "data", tail_frames=1)  # who knows nothing of the index
         due.append((engine.publish_due(), other.publish_due()))
     assert due == [(0, 0), (0, 0), (0, 0), (1, 0)]
-    answer = engine.query_upload("hall", uploads[11].data, uploads[11].meta, ALL)
+    answer = engine.queries.upload(["hall"], uploads[11].data, uploads[11].meta, ALL)
     assert (answer.counts.map, answer.index_generation) == (8, 2)
 
 
@@ -179,7 +177,7 @@ def test_maps_of_whole_fisher_vectors_have_no_index(
     left()
     assert engine.purging.now().indexes == 1
     assert not folder.exists()
-    answer = engine.query_upload("hall", uploads[1].data, uploads[1].meta, ALL)
+    answer = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, ALL)
     assert (answer.matches[0].frame_id, answer.index_generation) == (names[1], 0)
 
 
@@ -216,6 +214,6 @@ def test_purging_leaves_no_byte_of_what_was_deleted(
     assert engine.purging.now().indexes == 1
     assert all(row not in one.read_bytes() for one in folder.iterdir())
     assert engine.purging.now().indexes == 0
-    answer = engine.query_upload("hall", uploads[1].data, uploads[1].meta, ALL)
+    answer = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, ALL)
     assert names[1] not in [one.frame_id for one in answer.matches]
     assert answer.counts.map == 4

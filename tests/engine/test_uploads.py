@@ -166,12 +166,12 @@ def test_a_deleted_frame_is_found_no_more_and_may_come_again(
     full: Engine, uploads: Any, ids: Callable[[Engine], list[str]], work_off: WorkOff, told: Told
 ) -> None:
     data, meta, gone = uploads[3].data, uploads[3].meta, ids(full)[3]
-    assert full.query_upload("hall", data, meta, ASK).matches[0].frame_id == gone
+    assert full.queries.upload(["hall"], data, meta, ASK).matches[0].frame_id == gone
     before = set(blobs(full))
     full.undo_limits = NO_UNDO
     full.delete_frame("hall", gone)
     assert len(before - set(blobs(full))) == 2  # upload and artifact
-    answer = full.query_upload("hall", data, meta, ASK)
+    answer = full.queries.upload(["hall"], data, meta, ASK)
     assert len(answer.matches) == answer.counts.map == answer.counts.compared == 11
     assert gone not in [m.frame_id for m in answer.matches]
     assert full.get_frame("hall", gone).state == FrameState.DELETED
@@ -184,7 +184,7 @@ def test_a_deleted_frame_is_found_no_more_and_may_come_again(
     assert again.frame_id != gone
     assert work_off(full) == [JobState.SUCCEEDED]
     assert set(blobs(full)) == before
-    answer = full.query_upload("hall", data, meta, ASK)
+    answer = full.queries.upload(["hall"], data, meta, ASK)
     assert (answer.matches[0].frame_id, answer.matches[0].distance) == (again.frame_id, 0)
     assert answer.counts.map == 12
     assert told(full)[-3:] == ["frame.deleted", "frame.received", "frame.indexed"]

@@ -207,7 +207,7 @@ def test_an_artifact_swept_before_its_commit_is_not_referred_to(
     due_now(empty)
     work_off(empty)
     assert empty.get_frame("hall", added.frame_id).state == FrameState.INDEXED
-    answer = empty.query_upload("hall", uploads[1].data, uploads[1].meta, Query())
+    answer = empty.queries.upload(["hall"], uploads[1].data, uploads[1].meta, Query())
     assert [m.validation.status for m in answer.matches] == ["accepted"]
 
 

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.registration import consensus as module
-from sceneprint.geometry.registration.consensus import ConsensusParameters, consensus
+from sceneprint.geometry.registration import alignment as module
+from sceneprint.geometry.registration.alignment import ConsensusParameters, consensus
 from sceneprint.geometry.rigid import difference, inverse, moved
 from sceneprint.types import Floats, Ints32, Patches
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from sceneprint.geometry.execution import Cores, both
+from sceneprint.geometry.kernel import Cores, both
 
 
 @pytest.fixture

@@ -9,11 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.geometry.retrieval.distance import Metric, distances, pairwise_distances, rank
-from sceneprint.geometry.retrieval.dpp import (
+from sceneprint.geometry.retrieval.ranking import (
     DiversityParameters,
+    Metric,
+    distances,
     diversify,
     kernel_matrix,
+    pairwise_distances,
+    rank,
     remaining,
 )
 from sceneprint.types import Floats

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sceneprint.geometry.execution import cached_per_frame
+from sceneprint.geometry.kernel import cached_per_frame
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
     PlaneParameters,

@@ -10,22 +10,25 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.registration.alignment import (
-    NO_UPS,
-    GravityParameters,
-    are_level,
-    floor_error,
-    slopes,
-    tilt_of,
-    tilts,
-)
+from sceneprint.geometry.registration.alignment import floor_error
 from sceneprint.geometry.registration.overlap import OverlapParameters, plane_view
 from sceneprint.geometry.registration.patch_descriptors import (
     MatchingParameters,
     SlopeGate,
     correspondences,
 )
-from sceneprint.geometry.rigid import difference, inverse, inverses, mean_direction
+from sceneprint.geometry.rigid import (
+    NO_UPS,
+    GravityParameters,
+    are_level,
+    difference,
+    inverse,
+    inverses,
+    mean_direction,
+    slopes,
+    tilt_of,
+    tilts,
+)
 from sceneprint.geometry.validation.acceptance import AmbiguityParameters, best_alternative
 from sceneprint.geometry.validation.validation import validate, validate_without_up
 from sceneprint.lab.synth import KINECT, symmetric_box, take, trajectory

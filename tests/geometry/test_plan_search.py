@@ -17,7 +17,7 @@ from sceneprint.geometry.registration.plan_search import (
     plan_of,
     up_of,
 )
-from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import difference, distinct, inverse, moved
 from sceneprint.lab.synth import synthesise_survey
 from sceneprint.models import Model, read_model

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.geometry.retrieval.distance import (
+from sceneprint.geometry.retrieval.ranking import (
     Ints64,
     Metric,
     cross_distances,

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.geometry.retrieval.distance import Ints64, frozen, scan
+from sceneprint.geometry.retrieval.ranking import Ints64, frozen, scan
 from sceneprint.geometry.retrieval.scanners import QUERIES, SCANNERS, widths, widths_of
 from sceneprint.types import Bytes
 
@@ -138,7 +138,7 @@ def test_what_a_processor_can_do() -> None:
 FOREIGN = """
 import numpy as np
 from sceneprint.geometry.retrieval.scanners import widths
-from sceneprint.geometry.retrieval.distance import scan
+from sceneprint.geometry.retrieval.ranking import scan
 x = np.arange(7000, dtype=np.uint64).reshape(7, 1000).astype(np.uint8)
 right = np.abs(x.astype(int)[:, None] - x.astype(int)).sum(axis=2)
 assert all((scan(x, x, np.arange(7), width=w) == right).all() for w in widths())

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sceneprint.geometry.retrieval.dpp import diversify, novel, summarise
+from sceneprint.geometry.retrieval.ranking import diversify, novel, summarise
 from sceneprint.types import Floats
 
 

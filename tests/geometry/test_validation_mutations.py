@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry import rigid
-from sceneprint.geometry.registration import consensus, icp, overlap
+from sceneprint.geometry.registration import alignment, icp, overlap
 from sceneprint.geometry.surface import camera
 
 RIGID = [
@@ -183,7 +183,7 @@ CHECKS = {
     camera: ("check_projecting",),
     overlap: ("check_targets", "check_agreement", "check_sampling", "check_agreement_of_clouds"),
     icp: ("check_registration", "check_registration_of_clouds"),
-    consensus: ("check_consensus",),
+    alignment: ("check_consensus",),
 }
 CASES = [
     (module, line, wrong)
@@ -192,7 +192,7 @@ CASES = [
         (camera, PROJECTING),
         (overlap, TARGETS + AGREEMENT),
         (icp, REGISTRATION),
-        (consensus, CONSENSUS),
+        (alignment, CONSENSUS),
     )
     for line, wrong in mutations
 ]

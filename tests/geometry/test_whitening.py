@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.geometry.retrieval.distance import distances
+from sceneprint.geometry.retrieval.ranking import distances
 from sceneprint.geometry.signature.fisher_vector import (
     UNITS,
     Whitening,

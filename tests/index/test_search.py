@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.geometry.retrieval import distance
+from sceneprint.geometry.retrieval import ranking
 from sceneprint.index import Generation, SearchHits, Tail, publish, search, signatures_of
 from sceneprint.types import Bytes
 
@@ -140,7 +140,7 @@ def test_rows_that_may_not_be_found_are_not_read(
 
     def counted(query: Bytes, stored: Bytes, metric: Any, rows: np.ndarray) -> np.ndarray:
         read.append(len(rows))
-        return distance.distances(query, stored, metric, rows=rows)
+        return ranking.distances(query, stored, metric, rows=rows)
 
     names = search.__globals__
     monkeypatch.setitem(names, "distances", counted)
@@ -192,7 +192,7 @@ def test_distances_that_floats_cannot_hold_are_exact(published: Publish, nearest
         assert hits.distances[0] > 1 << 24
         assert answer(hits) == nearest(query, frames_of(keys, signatures), size)
     np.testing.assert_array_equal(
-        distance.distances(query, generation.vectors, "l2"),
+        ranking.distances(query, generation.vectors, "l2"),
         (signatures.astype(np.int64) ** 2).sum(axis=1),
     )
 

@@ -12,14 +12,12 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest, UnknownMap
-from sceneprint.geometry.retrieval.distance import pairwise_distances
-from sceneprint.geometry.retrieval.dpp import diversify
+from sceneprint.geometry.retrieval.ranking import diversify, pairwise_distances
 from sceneprint.maintenance import thin
 from sceneprint.maintenance.thin import carry_out, propose
 from sceneprint.settings import Settings
 from sceneprint.store import queue
-from sceneprint.store.frames import add_frame
-from sceneprint.store.maps import find_map
+from sceneprint.store.maps import add_frame, find_map
 from sceneprint.store.signatures import StoredSignature, index_frame
 from sceneprint.types import Bytes
 from sceneprint_client.api import NewMap

@@ -51,7 +51,7 @@ def index(engine: Engine, frame: Any) -> str:
 
 
 def found(engine: Engine, frame: Any) -> list[str]:
-    answer = engine.query_upload("hall", *frame, ASKED)
+    answer = engine.queries.upload(["hall"], *frame, ASKED)
     return sorted(match.frame_id for match in answer.matches)
 
 

@@ -11,19 +11,21 @@ import pytest
 from sqlalchemy import text
 
 from benchmarks.fleet.postgres import Server
+from sceneprint import store as sceneprint_store
 from sceneprint.errors import UnknownMap, UnusableStore, UselessFrame
-from sceneprint.store import Database, Store, open_store
-from sceneprint.store.database import open_database
-from sceneprint.store.events import record_event
-from sceneprint.store.maps import add_map, find_map, keep_model
-from sceneprint.store.postgres import replica
-from sceneprint.store.postgres.replica import (
+from sceneprint.store import (
     Behind,
+    Database,
     Replica,
+    Store,
     behind_s,
+    open_store,
     read_through,
     require_primary,
 )
+from sceneprint.store.database import open_database
+from sceneprint.store.events import record_event
+from sceneprint.store.maps import add_map, find_map, keep_model
 
 MODEL = "ab" * 32
 NAMES = text("SELECT name FROM maps ORDER BY name")
@@ -45,8 +47,8 @@ def store(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Store]:  # fmt: skip
     """A store whose replica has caught up."""
-    monkeypatch.setattr(replica, "AGAIN_S", 0.05)
-    monkeypatch.setattr(replica, "EVERY_S", 0.05)
+    monkeypatch.setattr(sceneprint_store, "AGAIN_S", 0.05)
+    monkeypatch.setattr(sceneprint_store, "EVERY_S", 0.05)
     name = postgres_url.rpartition("/")[2]
     opened = open_store(postgres_url, tmp_path / "blobs", pair[1].url(name), 30.0)
     assert opened.replica is not None
@@ -154,7 +156,7 @@ def test_it_is_asked_only_while_it_is_near_by_the_log_and_not_by_a_clock(
     pair: tuple[Server, Server], postgres_url: str, until: Callable[..., Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(replica, "AGAIN_S", 0.05)  # its database is not there at first
+    monkeypatch.setattr(sceneprint_store, "AGAIN_S", 0.05)  # its database is not there at first
     name = postgres_url.rpartition("/")[2]
     primary = open_database(postgres_url)
     ours = Replica(primary, pair[1].url(name), 0.2)
@@ -188,7 +190,7 @@ def test_what_is_no_replica_or_is_away_costs_no_query(
     postgres: Server, postgres_url: str, url: str, reason: str, until: Callable[..., Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(replica, "AGAIN_S", 0.05)
+    monkeypatch.setattr(sceneprint_store, "AGAIN_S", 0.05)
     given = url.format(primary=postgres_url, other=postgres.url("postgres"))
     primary = open_database(postgres_url)
     ours = Replica(primary, given, 30.0)
@@ -204,7 +206,7 @@ def test_what_is_no_replica_or_is_away_costs_no_query(
 
 def test_one_of_an_older_schema_is_not_used(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     assert store.replica is not None
-    monkeypatch.setattr(replica, "known_revisions", lambda: ("9999", frozenset()))
+    monkeypatch.setattr(sceneprint_store, "known_revisions", lambda: ("9999", frozenset()))
     with pytest.raises(UnusableStore, match=r"has schema 0.*, not yet ours"):
         store.replica.measure()
 

@@ -14,7 +14,7 @@ from benchmarks.fleet.postgres import Server
 from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest
 from sceneprint.settings import Settings
-from sceneprint.store.postgres.replica import Replica
+from sceneprint.store import Replica
 from sceneprint_client.api import Answer, JobState, NewMap, Query
 from sceneprint_client.api.admin import ReplicaSeen
 from service.metrics import Metrics
@@ -73,13 +73,13 @@ def test_queries_are_answered_from_the_replica_as_from_the_database(
     asked = Query(k=5, candidates=5, keep=False)
 
     def ask(number: int) -> Answer:
-        return engine.query_upload("hall", *small[number], asked)
+        return engine.queries.upload(["hall"], *small[number], asked)
 
     first = ask(0)
     assert of_replica(first)
     assert first.matches[0].frame_id == kept[0]
     with Engine(engine.settings.model_copy(update={"replica_url": None})) as other:
-        same = other.query_upload("hall", *small[0], asked)
+        same = other.queries.upload(["hall"], *small[0], asked)
     apart = {"query_id", "milliseconds", "replica_behind_s"}
     assert not of_replica(same)
     assert first.model_dump(exclude=apart) == same.model_dump(exclude=apart)

@@ -17,7 +17,7 @@ from sceneprint.scenes.scene import (
     small_outline,
     up_of_sensors,
 )
-from sceneprint_client.api.frames import CameraIntrinsics
+from sceneprint_client.api.base import CameraIntrinsics
 
 #: 4 x 2 pixels, 90 degrees wide, its axis in the middle.
 CAMERA = CameraIntrinsics(width=4, height=2, fx=2, fy=2, cx=1.5, cy=0.5)

@@ -7,7 +7,7 @@ import socket
 import httpx
 import pytest
 
-from sceneprint_client.requests import is_loopback
+from sceneprint_client.api.base import is_loopback
 
 HERE = ["localhost", "LocalHost", "127.0.0.1", "127.8.9.10", "[::1]", "[0:0:0:0:0:0:0:1]"]
 ELSEWHERE = [

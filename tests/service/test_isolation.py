@@ -511,7 +511,7 @@ def test_without_a_key_no_body_is_waited_for(walled, there, operations):
 
 def test_what_is_not_noted_is_said(operations):
     """Every change is in the audit log but those that are named."""
-    from service.audit import UNNOTED
+    from service.auth import UNNOTED
 
     names = {
         operation["operationId"].partition("_v1_")[0]

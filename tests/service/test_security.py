@@ -13,7 +13,7 @@ import pytest
 
 from sceneprint.errors import InvalidRequest
 from sceneprint.settings import Settings
-from service.audit import AGAIN_S, ALL_AT_ONCE, AT_ONCE, RefusalFilter
+from service.auth import AGAIN_S, ALL_AT_ONCE, AT_ONCE, RefusalFilter
 from service.browser_security import origins_of
 
 FLEET = "https://fleet.example"

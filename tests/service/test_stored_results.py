@@ -11,8 +11,7 @@ import pytest
 from sceneprint.engine import Engine
 from sceneprint.engine.results.stored_results import StoredResult
 from sceneprint.settings import Settings
-from sceneprint.store.frames import add_frame
-from sceneprint.store.maps import find_map
+from sceneprint.store.maps import add_frame, find_map
 from sceneprint_client.api import Answer, Counts, NewMap, Query
 from sceneprint_client.api.query import FrameName
 

@@ -17,10 +17,10 @@ import service
 from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import create_tenant
 from sceneprint.errors import RateLimited
+from sceneprint.process import NOBODY, work_of
 from sceneprint.settings import Settings
 from sceneprint.store.queue import enqueue, waiting_by_tenant
 from sceneprint.store.tables import jobs
-from sceneprint.store.tenants import NOBODY, work_of
 from service.browser_security import origins_of
 from service.limits import (
     IN_MEMORY,

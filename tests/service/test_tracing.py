@@ -162,7 +162,7 @@ def test_without_opentelemetry_nothing_starts_and_it_says_what_to_install(packag
 
 def test_nothing_of_it_is_loaded_unless_asked():
     code = (
-        "import sys, sceneprint.tracing as t\n"
+        "import sys, sceneprint.process as t\n"
         "with t.span('x', 'y'): t.record_span('z', 1.0); t.name_span('n', {'a': 1})\n"
         "assert t.traceparent() is None\n"
         "assert not [name for name in sys.modules if name.startswith('opentelemetry')]"

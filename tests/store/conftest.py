@@ -15,8 +15,7 @@ import pytest
 from sqlalchemy import Connection, event, update
 
 from sceneprint.store import Store, open_database, open_store, queue
-from sceneprint.store.frames import add_frame
-from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.maps import add_frame, add_map, keep_model
 from sceneprint.store.tables import FrameRow, JobRow, MapRow, jobs
 from sceneprint_client.api import JobState
 

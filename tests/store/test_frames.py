@@ -40,7 +40,7 @@ def indexed(store: Store, hall: MapRow) -> Indexed:
 
 def delete(store: Store, row: MapRow, frame: FrameRow) -> list[str]:
     with store.database.write() as connection:
-        now = stored.find_frame(connection, row, frame.id)
+        now = stored_maps.find_frame(connection, row, frame.id)
         return stored.delete_frame(connection, row, now)
 
 
@@ -59,12 +59,12 @@ def test_a_row_comes_back_as_it_was_given(store: Store, hall: MapRow, received: 
         pose_parent="p", pose=pose,
     )  # fmt: skip
     with store.database.read() as connection:
-        assert stored.find_frame(connection, hall, frame.id) == frame
-        assert stored.frames_of_content(connection, hall.number, "a")[:1] == [frame]
-        assert stored.frames_of_content(connection, hall.number, "b") == []
-        assert stored.frames_of_content(connection, hall.number + 1, "a") == []
+        assert stored_maps.find_frame(connection, hall, frame.id) == frame
+        assert stored_maps.frames_of_content(connection, hall.number, "a")[:1] == [frame]
+        assert stored_maps.frames_of_content(connection, hall.number, "b") == []
+        assert stored_maps.frames_of_content(connection, hall.number + 1, "a") == []
         with pytest.raises(UnknownFrame, match="no frame 'x' in map 'hall'"):
-            stored.find_frame(connection, hall, "x")
+            stored_maps.find_frame(connection, hall, "x")
         with pytest.raises(UnknownMap, match="no map 'x'"):
             stored_maps.find_map(connection, "x")
     assert frame.pose == pose
@@ -83,13 +83,13 @@ def test_an_id_is_in_a_map_once_and_given_up_by_what_is_deleted(
     assert received("a", other, frame_id="gate.1").map_number == other.number
     second = received("a")  # the same content under an id of its own
     with store.database.read() as connection:
-        assert stored.frames_of_content(connection, hall.number, "a")[:1] == [first]
+        assert stored_maps.frames_of_content(connection, hall.number, "a")[:1] == [first]
     delete(store, hall, first)
     again = received("b", frame_id="gate.1")
     with store.database.read() as connection:
-        assert stored.frames_of_content(connection, hall.number, "a")[:1] == [second]
-        assert stored.find_frame(connection, hall, "gate.1") == again
-        gone = stored.frame_of(connection, first.number)
+        assert stored_maps.frames_of_content(connection, hall.number, "a")[:1] == [second]
+        assert stored_maps.find_frame(connection, hall, "gate.1") == again
+        gone = stored_maps.frame_of(connection, first.number)
     assert (gone.state, gone.id != "gate.1") == (FrameState.DELETED, True)
     assert again.number > second.number > first.number
 
@@ -155,18 +155,20 @@ def test_a_deleted_frame_leaves_a_row_and_nothing_else(
     assert delete(store, hall, frame) == ["11" * 32, artifact]
     with store.database.read() as connection:
         now, gone = (
-            stored.find_frame(connection, hall, frame.id),
+            stored_maps.find_frame(connection, hall, frame.id),
             FrameListing(state=FrameState.DELETED),
         )
         assert (now.state, now.content_id, now.revision) == (FrameState.DELETED, None, 2)
-        assert stored.frames_of_content(connection, hall.number, "a") == []
+        assert stored_maps.frames_of_content(connection, hall.number, "a") == []
         assert frame_queries.list_frames(connection, hall.number, None, 9, FrameListing()) == [
             other
         ]
         assert frame_queries.list_frames(connection, hall.number, None, 9, gone) == [now]
-        assert stored.frames_of(connection, [frame.number, other.number]) == {other.number: other}
+        assert stored_maps.frames_of(connection, [frame.number, other.number]) == {
+            other.number: other
+        }
         assert signed.stored_vector(connection, frame.number, hall.model_id) is None
-        assert signed.geometry_blobs(connection, [frame.number], hall.model_id) == {}
+        assert stored_maps.geometry_blobs(connection, [frame.number], hall.model_id) == {}
         assert stored.refers_to(connection, "11" * 32)  # the other frame does
         assert not stored.refers_to(connection, artifact)
         told = connection.execute(select(events).where(events.c.kind == "frame.deleted")).all()
@@ -175,7 +177,7 @@ def test_a_deleted_frame_leaves_a_row_and_nothing_else(
         delete(store, hall, frame)
     with store.database.write() as connection:
         stored.set_state(connection, frame.number, FrameState.FAILED, "late")
-        assert stored.find_frame(connection, hall, frame.id) == now
+        assert stored_maps.find_frame(connection, hall, frame.id) == now
     assert received("a").number > other.number
 
 
@@ -216,7 +218,9 @@ def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(
     assert sorted(blobs) == sorted(["11" * 32, f"{mine.number:064d}"])
     with store.database.read() as connection:
         assert [row.name for row in stored_maps.list_maps(connection)] == ["other"]
-        assert stored.frames_of(connection, [mine.number, theirs.number]).keys() == {theirs.number}
+        assert stored_maps.frames_of(connection, [mine.number, theirs.number]).keys() == {
+            theirs.number
+        }
         assert queue.job_ids_of(connection, [mine.number, theirs.number]) == {
             theirs.number: kept.id
         }

@@ -12,8 +12,8 @@ from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.pipeline import Signer, prepare
+from sceneprint.store import GeometryCache
 from sceneprint.store.blobs.folder import FolderBlobs
-from sceneprint.store.geometry_cache import GeometryCache
 
 
 @pytest.fixture(scope="module")

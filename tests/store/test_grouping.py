@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, event, func, select
 
+from sceneprint.engine.ingest.uploads import MOST_TOGETHER, Grouping, _Waiting
 from sceneprint.errors import FrameConflict, LostLease, StoreFull
 from sceneprint.process import of_request, request_id
 from sceneprint.store import Database, Store
-from sceneprint.store.database import MOST_TOGETHER, Grouping, _Waiting
 from sceneprint.store.events import record_event
 from sceneprint.store.tables import events
 

@@ -16,9 +16,9 @@ from sceneprint.store import open_database
 from sceneprint.store.deletion import doomed_blobs
 from sceneprint.store.events import last_event
 from sceneprint.store.frame_queries import frame_ups
-from sceneprint.store.frames import add_frame, frame_of, write_frame, write_map
+from sceneprint.store.frames import write_frame, write_map
 from sceneprint.store.keys import list_keys
-from sceneprint.store.maps import MapUsage, counted_usage, find_map, use_of
+from sceneprint.store.maps import MapUsage, add_frame, counted_usage, find_map, frame_of, use_of
 from sceneprint.store.queue import enqueue, find_job
 from sceneprint.store.tables import frame_tags
 from sceneprint_client.api import FrameState

@@ -11,11 +11,12 @@ from sqlalchemy import event, select, update
 
 from sceneprint.engine.jobs.lifecycle import LEFT_S
 from sceneprint.errors import LostLease, UnknownJob
+from sceneprint.process import work_of
 from sceneprint.settings import Settings
 from sceneprint.store import Store, queue
 from sceneprint.store.signatures import StoredSignature, index_frame
 from sceneprint.store.tables import FrameRow, JobRow, MapRow, jobs, signatures
-from sceneprint.store.tenants import create_tenant, work_of
+from sceneprint.store.tenants import create_tenant
 from sceneprint_client.api import JobState
 
 Queued = Callable[..., JobRow]

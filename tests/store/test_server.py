@@ -23,9 +23,16 @@ from sceneprint.store import Database, Store, database, open_database, open_stor
 from sceneprint.store.audit_chain import KeyChange, list_changes, note
 from sceneprint.store.database import is_there, known_revisions, migration_config, reach_database
 from sceneprint.store.events import record_event
-from sceneprint.store.frames import add_frame, frames_of
 from sceneprint.store.keys import create_key, list_keys
-from sceneprint.store.maps import add_map, find_map, keep_model, list_maps, map_of
+from sceneprint.store.maps import (
+    add_frame,
+    add_map,
+    find_map,
+    frames_of,
+    keep_model,
+    list_maps,
+    map_of,
+)
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.tables import MapRow, events, maps, metadata
 

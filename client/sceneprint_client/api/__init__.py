@@ -5,7 +5,10 @@ Field names, units and words are those of the JSON; docs/api.md has examples.
 
 from sceneprint_client.api.admin import Job, Progress
 from sceneprint_client.api.base import (
+    CameraIntrinsics,
+    FrameMeta,
     FrameState,
+    GivenPose,
     JobState,
     Page,
     Problem,
@@ -13,7 +16,7 @@ from sceneprint_client.api.base import (
     Transform,
     Vector,
 )
-from sceneprint_client.api.frames import Added, CameraIntrinsics, Frame, FrameMeta, GivenPose
+from sceneprint_client.api.frames import Added, Frame
 from sceneprint_client.api.listing import Filter, Region
 from sceneprint_client.api.maps import Map, NewMap, Reencoding
 from sceneprint_client.api.query import (

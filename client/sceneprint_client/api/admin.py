@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
@@ -17,20 +16,6 @@ SCOPES: tuple[Scope, ...] = ("read", "write", "admin")
 EVERY = "*"
 #: A map's name, or EVERY.
 GRANTED = r"^(\*|[a-z0-9][a-z0-9_-]{0,62})$"
-
-
-def allows(grants: Mapping[str, Scope], scope: Scope, map_name: str = EVERY) -> bool:
-    """Whether grants, by the names of maps, are enough.
-
-    Parameters
-    ----------
-    grants : of a key; those for `*` hold for every map
-    scope : that is needed
-    map_name : for which it is; default: for all maps
-    """
-    least = SCOPES.index(scope)
-    held = [grants[name] for name in (EVERY, map_name) if name in grants]
-    return any(SCOPES.index(one) >= least for one in held)
 
 
 class NewKey(Given):

@@ -1,23 +1,29 @@
-"""What all records of the API share."""
+"""What records of the API share: names, cameras, poses, and what is said of a frame beside its
+samples."""
 
 from __future__ import annotations
 
+import ipaddress
 import math
 import sys
-from typing import Annotated, Any, Generic, TypeVar
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
+    AwareDatetime,
     BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
     StringConstraints,
     ValidationError,
+    field_validator,
     model_validator,
 )
 
-from sceneprint_client.errors import InvalidRequest
+from sceneprint_client.errors import InvalidIntrinsics, InvalidRequest
 
 if sys.version_info >= (3, 11):
     from enum import StrEnum
@@ -265,3 +271,305 @@ def checked(kind: type[Record], what: str, **fields: Any) -> Record:
         )
         told = "; ".join(f"{place or 'it'}: {reason}" for place, reason in found[:3])
         raise InvalidRequest(f"{what} is not as it should be: {told}.", found) from error
+
+
+#: Most samples a depth image may have (an 8-megapixel sensor); more is refused unread.
+MAXIMUM_SAMPLES = 8_388_608
+
+
+# The camera.
+
+
+#: Longest focal length and farthest principal point that are believed, pixels.
+MAXIMUM_PIXELS = 1e7
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera: pixel = (fx x/z + cx, fy y/z + cy), pixel centres at integers.
+
+    Parameters
+    ----------
+    width, height : size of the image, pixels
+    fx, fy : focal lengths, pixels
+    cx, cy : principal point, pixels
+    distortion : Brown-Conrady coefficients k1, k2, p1, p2[, k3] in OpenCV's order and
+        meaning; empty for an image without distortion
+
+    Raises
+    ------
+    InvalidIntrinsics : a size below 1, a focal length that is not positive and finite, a
+        principal point that is not finite, or a number of coefficients other than 0, 4, 5.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise InvalidIntrinsics(
+                f"The image size {self.width} x {self.height} is empty. "
+                "Give the width and height of the depth image in pixels."
+            )
+        if self.width * self.height > MAXIMUM_SAMPLES:
+            raise InvalidIntrinsics(
+                f"The image size {self.width} x {self.height} exceeds the limit of "
+                f"{MAXIMUM_SAMPLES} samples. Send the image at a lower resolution."
+            )
+        for name, value in (("fx", self.fx), ("fy", self.fy)):
+            if not (math.isfinite(value) and value > 0):
+                raise InvalidIntrinsics(
+                    f"The focal length {name} = {value} is not a positive number, so pixels "
+                    "have no direction. Give it in pixels, as the sensor's calibration states."
+                )
+            if not 1e-3 <= value <= MAXIMUM_PIXELS:
+                raise InvalidIntrinsics(
+                    f"The focal length {name} = {value:g} is that of no camera. "
+                    "Give it in pixels, as the sensor's calibration states."
+                )
+        if not (math.isfinite(self.cx) and math.isfinite(self.cy)):
+            raise InvalidIntrinsics(
+                f"The principal point ({self.cx}, {self.cy}) is not finite. "
+                "Give cx and cy in pixels, as the sensor's calibration states."
+            )
+        if max(abs(self.cx), abs(self.cy)) > MAXIMUM_PIXELS:
+            raise InvalidIntrinsics(
+                f"The principal point ({self.cx:g}, {self.cy:g}) is that of no camera. "
+                "Give cx and cy in pixels, as the sensor's calibration states."
+            )
+        if len(self.distortion) not in (0, 4, 5):
+            raise InvalidIntrinsics(
+                f"{len(self.distortion)} distortion coefficients were given. "
+                "Give k1, k2, p1, p2 and optionally k3, or none."
+            )
+        if not all(math.isfinite(k) for k in self.distortion):
+            raise InvalidIntrinsics(
+                f"The distortion coefficients {self.distortion} are not all finite. "
+                "Give k1, k2, p1, p2 and optionally k3 as the calibration states."
+            )
+
+    def without_distortion(self) -> Intrinsics:
+        """The same camera after its images have been undistorted."""
+        return replace(self, distortion=())
+
+
+#: Tags of a frame.
+MOST_TAGS = 32
+
+#: A frame's place in its session is at most this, which every reader of JSON reads exactly.
+MOST_SEQUENCE = 2**53 - 1
+#: Place of a frame within its session.
+Place = Annotated[int, Field(ge=0, le=MOST_SEQUENCE)]
+#: How files of clouds are packed; all but KITTI's say so themselves.
+CloudFormat = Literal["ply", "pcd", "kitti", "npy", "las", "pointcloud2"]
+
+Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
+
+
+class CameraIntrinsics(Given):
+    """The camera: pixel = (fx x/z + cx, fy y/z + cy), pixel centres at integers."""
+
+    width: int = Field(ge=1, le=65535)
+    height: int = Field(ge=1, le=65535)
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: list[float] = Field(
+        default=[], max_length=5, description="k1, k2, p1, p2[, k3] of OpenCV; none by default."
+    )
+
+
+class GivenVector(Given):
+    """Metres."""
+
+    x: float
+    y: float
+    z: float
+
+
+class GivenQuaternion(GivenVector):
+    """Unit quaternion."""
+
+    w: float
+
+
+#: What ROS calls the parts of a pose, and what we do.
+ROS_NAMES = {"position": "translation", "orientation": "rotation"}
+
+
+class GivenTransform(Given):
+    """A rigid transform, as `translation` and `rotation` or as `matrix`."""
+
+    translation: GivenVector | None = Field(
+        default=None, description="`position`, as ROS calls it, is taken too."
+    )
+    rotation: GivenQuaternion | None = Field(
+        default=None, description="`orientation`, as ROS calls it, is taken too."
+    )
+    matrix: Annotated[list[Row4], Field(min_length=4, max_length=4)] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_ros_calls_it(cls, given: object) -> object:
+        if not isinstance(given, dict):
+            return given
+        ours = {name: own for name, own in ROS_NAMES.items() if name in given and own not in given}
+        return {ours.get(name, name): value for name, value in given.items()}
+
+    @model_validator(mode="after")
+    def _one_way(self) -> GivenTransform:
+        parts = (self.translation is not None, self.rotation is not None)
+        if parts not in ((True, True), (False, False)) or parts[0] == (self.matrix is not None):
+            raise ValueError("give translation and rotation, or matrix")
+        return self
+
+
+class GivenPose(GivenTransform):
+    """T_parent_sensor, as `translation` and `rotation` or as `matrix`."""
+
+    parent_frame: Label | None = Field(
+        default=None,
+        description="Poses are combined within one parent frame; default: ROBOT/SESSION.",
+    )
+    of: Literal["sensor", "base"] = Field(
+        default="sensor",
+        description="`base`, of an upload with `T_base_sensor`: the pose is T_parent_base, and is "
+        "stored as that of the sensor.",
+    )
+
+
+class GivenBase(GivenTransform):
+    """T_base_sensor: where the sensor sits on the robot; x_base = T_base_sensor @ x_sensor."""
+
+    base_frame: Label = Field(
+        default="base_link", description="What the robot calls the frame of its base."
+    )
+
+
+class FrameMeta(Given):
+    """What is known of a frame beside its samples."""
+
+    intrinsics: CameraIntrinsics | None = Field(
+        default=None, description="Of a depth image, which needs them; a point cloud has none."
+    )
+    depth_scale: float = Field(
+        default=1000.0,
+        gt=0,
+        description="Stored units per metre; floating NPY files are metres whatever it is.",
+    )
+    depth_along_ray: bool = Field(
+        default=False, description="Samples are ranges along the pixel's ray."
+    )
+    viewpoint: GivenVector | Literal["file"] | None = Field(
+        default="file",
+        description="Of a point cloud: where it was seen from, along its own axes, metres; null "
+        "where there is no such place, as of a cloud that is fused of many views. `file`: as the "
+        "file says (a PCD's VIEWPOINT), else the origin of its coordinates.",
+    )
+    units_per_metre: float = Field(
+        default=1.0, gt=0, description="Of a point cloud: 1000 where it is in millimetres."
+    )
+    format: CloudFormat | None = Field(
+        default=None,
+        description="Of a point cloud: how it is packed. KITTI's files alone do not say so "
+        "themselves; `kitti` has to be given.",
+    )
+    robot: Label | None = Field(default=None, description="Who took the frame.")
+    session: Label | None = Field(default=None, description="In which run.")
+    captured_at: AwareDatetime | None = Field(
+        default=None,
+        description="When, with its time zone.",
+    )
+    name: FileName | None = Field(
+        default=None,
+        description="Of the original file or message, such as `frame-000123.depth.png`: to find "
+        "the frame again by. A label: nothing opens it as a path.",
+    )
+    sequence: Place | None = Field(
+        default=None,
+        description="Place within the session, such as the number of the file or message: orders "
+        "the frames that have no `captured_at`, whatever the order of upload.",
+    )
+    pose: GivenPose | None = None
+    T_base_sensor: GivenBase | None = Field(
+        default=None,
+        description="Where the sensor sits on the robot: answers then also say where its base is. "
+        "A cloud with a `viewpoint` that is not its origin has the base frame `cloud` without it: "
+        "the coordinates as they were sent.",
+    )
+    up: Up | None = Field(
+        default=None,
+        description="Up as an IMU has it: a unit vector in the sensor's axes, of a camera x right, "
+        "y down, z forward. A camera held level has (0, -1, 0). Transforms that tilt a query "
+        "against a frame are impossible then.",
+    )
+    tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
+
+    @field_validator("captured_at")
+    @classmethod
+    def _in_utc(cls, captured_at: datetime | None) -> datetime | None:
+        if captured_at is not None:
+            try:  # as it will be told
+                datetime.fromtimestamp(captured_at.timestamp(), timezone.utc)
+            except (ValueError, OverflowError) as error:
+                raise ValueError("not within the years 1 to 9999 of UTC") from error
+        return captured_at
+
+    @model_validator(mode="after")
+    def _named_parent(self) -> FrameMeta:
+        if self.pose is not None and self.pose.parent_frame is None and self.session is None:
+            raise ValueError("pose: name its parent_frame, or the session it belongs to")
+        if self.pose is not None and self.pose.of == "base" and self.T_base_sensor is None:
+            raise ValueError("pose: of the base; give T_base_sensor, where the sensor sits on it")
+        return self
+
+
+# What `if_novel` of an upload means, however it is given.
+
+#: Where `if_novel` is just true: consecutive frames of a slow Kinect lie nearer than this, mostly
+#: by the noise of their depth, and what is left of a recording answers as well (docs/).
+NOVEL = 0.25
+
+
+def novelty_of(given: bool | float | str | None) -> float | None:
+    """The distance beyond which a frame is kept, as a share of that of unrelated frames.
+
+    Parameters
+    ----------
+    given : the share, as number or text; true for the default; false or None for every frame
+
+    Raises
+    ------
+    InvalidRequest : none of these.
+    """
+    if given is None or given is False or given == "false":
+        return None
+    if given is True or given == "true":
+        return NOVEL
+    try:
+        share = float(given)
+    except (TypeError, ValueError):
+        share = -1.0
+    if not 0 < share <= 1:  # nor for NaN
+        raise InvalidRequest(
+            f"`if_novel` is {given!r:.40}. Give true, or a share of the distance of unrelated "
+            "frames: above 0, up to 1.",
+            (("if_novel", "neither true nor false nor a number above 0, up to 1"),),
+        )
+    return share
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a name or address, without port or brackets, is only ever this machine."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

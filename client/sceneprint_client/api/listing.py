@@ -17,15 +17,19 @@ from pydantic_core import from_json
 
 from sceneprint_client.api.base import (
     MOST_OF_NAME,
+    MOST_TAGS,
     ApiRecord,
     FileName,
     FrameState,
     Given,
+    GivenBase,
+    GivenPose,
+    GivenVector,
     Label,
     Note,
+    Place,
     Up,
 )
-from sceneprint_client.api.frames import MOST_TAGS, GivenBase, GivenPose, GivenVector, Place
 from sceneprint_client.api.maps import Days, Quota
 
 

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, StringConstraints, field_validator, model_validator
 
-from sceneprint_client.api.base import ApiRecord, Given, Transform, Vector
-from sceneprint_client.api.frames import GivenPose, Kind
+from sceneprint_client.api.base import ApiRecord, Given, GivenPose, Transform, Vector
+from sceneprint_client.api.frames import Kind
 from sceneprint_client.api.listing import Filter, parsed
 
 Stage = Literal["retrieve", "diversify", "validate"]

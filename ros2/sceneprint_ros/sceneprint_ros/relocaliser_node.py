@@ -25,6 +25,7 @@ from tf2_msgs.msg import TFMessage
 
 from sceneprint_client import Client, Tracker
 from sceneprint_client.errors import InvalidRequest, SceneprintError
+from sceneprint_client.http import DEFAULT_URL
 from sceneprint_client.relocaliser import (
     Relocaliser,
     RelocaliserParameters,
@@ -33,7 +34,6 @@ from sceneprint_client.relocaliser import (
     write_stamp,
     write_transform,
 )
-from sceneprint_client.requests import DEFAULT_URL
 from sceneprint_client.ros_messages import is_rectified, topic_without_transport
 from sceneprint_client.tracker import TrackerParameters
 

@@ -15,14 +15,17 @@ import numpy as np
 
 from sceneprint import errors
 from sceneprint.decoders import Decoder, Decoders
-from sceneprint.engine.serializers import pose_matrix
-from sceneprint.formats.dataset import decode_frame
+from sceneprint.errors import InvalidPose
+from sceneprint.formats.dataset import decode_frame, rigid_transform
 from sceneprint.formats.depth_file import has_transport_header
 from sceneprint.formats.points import UNSAID, decode_cloud, decode_scan, format_of
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import AnyFrame, Cloud, Floats, Intrinsics
 from sceneprint_client.api import CameraIntrinsics, FrameMeta
-from sceneprint_client.api.frames import CloudFormat, GivenBase, Kind
+from sceneprint_client.api.base import CloudFormat, GivenBase, GivenTransform
+from sceneprint_client.api.frames import Kind
+from sceneprint_client.files import naming
+from sceneprint_client.poses import rotation_of
 
 #: What the coordinates of a cloud as they were sent are called, where its viewpoint is elsewhere.
 GIVEN_FRAME = "cloud"
@@ -299,3 +302,44 @@ def _without_camera(data: bytes) -> errors.SceneprintError:
 
 def _camera(k: CameraIntrinsics) -> Intrinsics:
     return Intrinsics(k.width, k.height, k.fx, k.fy, k.cx, k.cy, tuple(k.distortion))
+
+
+# Transforms and poses between matrices and JSON.
+
+#: How far from 1 the length of a given quaternion may be.
+_TOLERANCE = 1e-2
+
+
+def pose_matrix(pose: GivenTransform, what: str = "") -> Floats:
+    """T_parent_sensor (4, 4) of a pose or another transform given either way.
+
+    Parameters
+    ----------
+    pose : see GivenTransform
+    what : to begin an error with, where it is no pose
+
+    Raises
+    ------
+    InvalidPose : not a rigid transform, or a quaternion that is not of unit length.
+    """
+    with naming(what):
+        return _matrix(pose)
+
+
+def _matrix(pose: GivenTransform) -> Floats:
+    if pose.matrix is not None:
+        return rigid_transform(np.array(pose.matrix))
+    t, r = pose.translation, pose.rotation
+    if t is None or r is None:  # the schema asks for both where there is no matrix
+        raise InvalidPose("The pose is incomplete. Give translation and rotation, or matrix.")
+    q = np.array([r.x, r.y, r.z, r.w])
+    length = float(np.linalg.norm(q))
+    if not abs(length - 1.0) <= _TOLERANCE:
+        raise InvalidPose(
+            f"The quaternion of the pose has length {length:.3g}, not 1. Give a unit quaternion "
+            "x, y, z, w."
+        )
+    T = np.eye(4)
+    T[:3, :3] = rotation_of(q / length)
+    T[:3, 3] = (t.x, t.y, t.z)
+    return rigid_transform(T)

@@ -16,8 +16,8 @@ from sceneprint.engine.serializers import job_record
 from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError, UnknownJob
 from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
-from sceneprint.store.frames import frame_of, set_state
-from sceneprint.store.maps import map_of
+from sceneprint.store.frames import set_state
+from sceneprint.store.maps import frame_of, map_of
 from sceneprint.store.queue import fail_of_dead
 from sceneprint.store.queue import list_jobs as list_stored
 from sceneprint.store.reencoding_rows import REENCODE

@@ -15,26 +15,25 @@ from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_stored
 from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.jobs.tasks import LongJob
-from sceneprint.engine.search.local_index import Readers
+from sceneprint.engine.search.retrieval import Readers
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.formats.artifact import write_geometry
-from sceneprint.geometry.retrieval.distance import Metric, distance_share, distances
+from sceneprint.geometry.retrieval.ranking import Metric, distance_share, distances
 from sceneprint.models import Model
 from sceneprint.pipeline import prepare
+from sceneprint.process import span
 from sceneprint.store import Database, Store, queue
-from sceneprint.store.frames import frame_of, set_state
-from sceneprint.store.maps import find_map, map_of
+from sceneprint.store.frames import set_state
+from sceneprint.store.maps import find_map, frame_of, geometry_blobs, map_of
 from sceneprint.store.reencoding_rows import REENCODE, enqueue_all, models_of
 from sceneprint.store.signatures import (
     StoredSignature,
     changes_since,
-    geometry_blobs,
     index_frame,
     replace_signature,
 )
 from sceneprint.store.tables import FrameRow, MapRow
-from sceneprint.tracing import span
 from sceneprint.types import Bytes
 from sceneprint_client.api import FrameState, JobState
 

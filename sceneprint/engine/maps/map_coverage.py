@@ -49,12 +49,11 @@ from sceneprint.store.frame_queries import (
     positions_of_map,
     stops_of,
 )
-from sceneprint.store.frames import count_states, living_frame
-from sceneprint.store.maps import find_map, living_map, model_names
+from sceneprint.store.frames import count_states
+from sceneprint.store.maps import find_map, geometry_blobs, living_frame, living_map, model_names
 from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.queue import items_of
 from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
-from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats
 from sceneprint_client.api import Answer, Filter, JobState, Page, Progress, Query, Transform, Vector

@@ -37,14 +37,14 @@ from sceneprint.store.frame_queries import (
     poses_of_run,
     stamps_of_run,
 )
-from sceneprint.store.frames import count_states, find_frame
-from sceneprint.store.maps import find_map, model_names
+from sceneprint.store.frames import count_states
+from sceneprint.store.maps import find_frame, find_map, geometry_blobs, model_names
 from sceneprint.store.opaque_ids import invalid_cursor
-from sceneprint.store.signatures import geometry_blobs, patch_counts, stored_vector
+from sceneprint.store.signatures import patch_counts, stored_vector
 from sceneprint.store.tables import FrameRow, MapRow
 from sceneprint.types import Geometry, Hierarchy, Intrinsics, Ints32, Patches, Surface
 from sceneprint_client.api import Frame, FrameState, Page
-from sceneprint_client.api.frames import MOST_SEQUENCE
+from sceneprint_client.api.base import MOST_SEQUENCE
 from sceneprint_client.api.listing import FrameListing, Run, Session, Trajectory
 from sceneprint_client.api.maps import By, Grown, Growth
 from sceneprint_client.api.results import CloudFrame, FramePatches, FrameSignature, PatchLevel, View

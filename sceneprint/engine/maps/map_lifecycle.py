@@ -24,6 +24,7 @@ from sqlalchemy import Connection, select
 
 from sceneprint import errors
 from sceneprint.engine import serializers
+from sceneprint.engine.ingest import frame_decoder
 from sceneprint.engine.ingest.frame_decoder import base_of, columns, viewpoint_of
 from sceneprint.engine.search.local_index import trusted
 from sceneprint.engine.serializers import map_record, model_label
@@ -33,9 +34,10 @@ from sceneprint.index import Generation
 from sceneprint.models import PRESETS, Model, parse_model, read_model, write_model
 from sceneprint.store import Database, Store, signatures
 from sceneprint.store import reencoding_rows as stored
-from sceneprint.store.frames import find_frame, write_frame, write_map
+from sceneprint.store.frames import write_frame, write_map
 from sceneprint.store.maps import (
     add_map,
+    find_frame,
     find_map,
     keep_model,
     list_maps,
@@ -46,7 +48,7 @@ from sceneprint.store.queue import cancel_jobs
 from sceneprint.store.tables import FrameRow, MapRow, jobs, models
 from sceneprint_client.api import Frame, FrameMeta, FrameState, Map, NewMap
 from sceneprint_client.api.admin import ModelInfo
-from sceneprint_client.api.frames import ROS_NAMES
+from sceneprint_client.api.base import ROS_NAMES
 from sceneprint_client.api.listing import FrameEdit, MapEdit
 
 #: Fields of a new map that say what it may hold, and for how long.
@@ -175,7 +177,7 @@ def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
             "The edited pose is that of the base. Give that of the sensor, and leave `of` out.",
             (("pose.of", "an edited pose is that of the sensor"),),
         )
-    pose = None if meta.pose is None else serializers.pose_matrix(meta.pose)
+    pose = None if meta.pose is None else frame_decoder.pose_matrix(meta.pose)
     known = columns(meta, pose, base_of(meta.T_base_sensor, viewpoint_of(frame)))
     found = {name: known[name] for field in patch for name in _COLUMNS[field]}
     for field, column in (("pose", "pose"), ("T_base_sensor", "base")):

@@ -38,8 +38,8 @@ from sceneprint.store.frame_queries import (
     list_frames,
     session_frames,
 )
-from sceneprint.store.frames import find_frame, frame_of, write_frame
-from sceneprint.store.maps import find_map, use_of
+from sceneprint.store.frames import write_frame
+from sceneprint.store.maps import find_frame, find_map, frame_of, use_of
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
 from sceneprint.store.undo_rows import (
     NO_UNDO,
@@ -60,7 +60,7 @@ from sceneprint.store.undo_rows import (
     spent_frames,
 )
 from sceneprint_client.api import FrameState, Page
-from sceneprint_client.api.frames import MOST_TAGS
+from sceneprint_client.api.base import MOST_TAGS
 from sceneprint_client.api.listing import (
     MOST_REFUSED,
     MOST_SELECTED,

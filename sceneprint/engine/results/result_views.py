@@ -33,11 +33,10 @@ from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
 from sceneprint.errors import DamagedSignature, InvalidRequest, NotIndexed, UnknownFrame
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.export import LIMIT, encode_points, points_of, thinned, write_ply
-from sceneprint.geometry.registration.alignment import NO_UPS, Ups
 from sceneprint.geometry.registration.icp import PAIR_METHOD
 from sceneprint.geometry.registration.overlap import sampled
-from sceneprint.geometry.retrieval.distance import pairwise_distances, similarity
-from sceneprint.geometry.rigid import inverse, moved
+from sceneprint.geometry.retrieval.ranking import pairwise_distances, similarity
+from sceneprint.geometry.rigid import NO_UPS, Ups, inverse, moved
 from sceneprint.geometry.validation.inspection import (
     AGREES,
     VIOLATES,
@@ -51,11 +50,17 @@ from sceneprint.geometry.validation.inspection import (
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.pictures import depth_view, normals_view, picture
 from sceneprint.pipeline import validate, validate_guided, validate_without_up
-from sceneprint.store import Store
-from sceneprint.store.frames import find_frame, frame_of, frames_of, refers_to
-from sceneprint.store.maps import find_map, list_maps
-from sceneprint.store.postgres.replica import read_through
-from sceneprint.store.signatures import geometry_blobs, stored_signatures, stored_vector
+from sceneprint.store import Store, read_through
+from sceneprint.store.frames import refers_to
+from sceneprint.store.maps import (
+    find_frame,
+    find_map,
+    frame_of,
+    frames_of,
+    geometry_blobs,
+    list_maps,
+)
+from sceneprint.store.signatures import stored_signatures, stored_vector
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Bytes, Floats, Floats32, Geometry
 from sceneprint_client.api import Answer, FrameState, NamedFrame, Query

@@ -41,17 +41,21 @@ from sceneprint.engine.search.verification import (
 from sceneprint.engine.serializers import query_sensor
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.geometry.registration.overlap import PlaneParameters, plane_weights
-from sceneprint.geometry.retrieval.distance import Ints64, pairwise_distances
-from sceneprint.geometry.retrieval.dpp import DiversityParameters, Selection, diversify
+from sceneprint.geometry.retrieval.ranking import (
+    DiversityParameters,
+    Ints64,
+    Selection,
+    diversify,
+    pairwise_distances,
+)
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.localization import PoseEstimate, PosePrior, QueryFrame, unconfirmed
 from sceneprint.models import Model
 from sceneprint.pipeline import PairMatch, searched
-from sceneprint.store import Store
-from sceneprint.store.frames import frames_of
-from sceneprint.store.postgres.replica import behind_s
+from sceneprint.process import record_span
+from sceneprint.store import Store, behind_s
+from sceneprint.store.maps import frames_of
 from sceneprint.store.tables import FrameRow
-from sceneprint.tracing import record_span
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Answer, AnswerStatus, Counts, FrameName, OfMap, Query
 from sceneprint_client.api.query import Cause
@@ -242,7 +246,8 @@ def _attempt(
     clock = clock or _Clock({})
     searched = search_maps(store, places, asked, query, model)
     for place in places:
-        resign_frames(store, place.row, sorted(place.view.damaged), place.row.model_id)
+        if place.view.damaged:
+            resign_frames(store, place.row, sorted(place.view.damaged), place.row.model_id)
     ranking, wanted = searched.ranking, wanted_of(query)
     clock.stage("retrieve")
     among, selection, scales = _selection(searched, query, model, wanted)

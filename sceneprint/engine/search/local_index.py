@@ -15,29 +15,146 @@ import re
 import tempfile
 import threading
 import time
-from collections import OrderedDict
-from collections.abc import Collection, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Set
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection
 
 from sceneprint.atomic_files import make_folder
-from sceneprint.engine.search.map_view import IndexView, MapView, StoredMaps
-from sceneprint.engine.signers import Signers
 from sceneprint.errors import UnusableStore
-from sceneprint.index import Generation, Tail, newest, newest_number
+from sceneprint.geometry.retrieval.ranking import Metric
+from sceneprint.index import (
+    Generation,
+    SearchHits,
+    Tail,
+    newest,
+    newest_number,
+    search,
+    signatures_of,
+)
+from sceneprint.index.generation_files import Keys
 from sceneprint.models import Model
-from sceneprint.store import Database
+from sceneprint.store import require_primary
 from sceneprint.store.events import holds_anchor
-from sceneprint.store.maps import list_maps
-from sceneprint.store.postgres import vectors
-from sceneprint.store.postgres.replica import require_primary
 from sceneprint.store.signatures import SignatureChange, changes_since, count_indexed
-from sceneprint.store.tables import MapRow, maps
+from sceneprint.store.tables import MapRow
 from sceneprint.types import Bytes
+
+log = logging.getLogger(__name__)
+
+
+#: Where a map is searched: by this node, or by the database.
+Kind = Literal["local", "database"]
+
+
+@dataclass(frozen=True, eq=False)
+class MapView(ABC):
+    """A map that can be searched, as of one revision or later.
+
+    Parameters
+    ----------
+    model_id : of the model that made all signatures
+    metric : how they are compared
+    revision : of the map
+    size : frames that can be found
+    dead : frames that it holds and that are deleted
+    damaged : frames that were passed over, as their signature is damaged
+    """
+
+    #: Who searches it.
+    kind: ClassVar[Kind]
+
+    model_id: str
+    metric: Metric
+    revision: int
+    size: int
+    dead: frozenset[int]
+    damaged: Set[int]
+
+    @property
+    def number(self) -> int:
+        """Of the generation of the index; 0 where none is used."""
+        return 0
+
+    @abstractmethod
+    def search(
+        self, query: Bytes, size: int, *, dead: frozenset[int], among: Keys | None = None,
+        exact: bool = False,
+    ) -> SearchHits:  # fmt: skip
+        """The nearest frames by exact distance; see `index.search`."""
+
+    @abstractmethod
+    def nearer(
+        self, query: Bytes, key: int, distance: int, *, dead: frozenset[int],
+        among: Keys | None = None,
+    ) -> int:  # fmt: skip
+        """How many frames come before one in the order of exact distance, equal ones by key."""
+
+    @abstractmethod
+    def signatures(self, keys: Keys) -> Bytes:
+        """Signatures (r, D) of frames that it has."""
+
+    @abstractmethod
+    def has(self, keys: Keys) -> NDArray[np.bool_]:
+        """Which frames (n,) can be found."""
+
+
+@dataclass(frozen=True, eq=False)
+class IndexView(MapView):
+    """A map as of one revision, held by this node: an index, and the frames that are newer.
+
+    Parameters
+    ----------
+    generation : of its index, or None
+    tail : frames newer than it
+    """
+
+    kind: ClassVar[Kind] = "local"
+
+    generation: Generation | None
+    tail: Tail
+
+    @property
+    def number(self) -> int:
+        """See MapView."""
+        return 0 if self.generation is None else self.generation.number
+
+    def search(
+        self, query: Bytes, size: int, *, dead: frozenset[int], among: Keys | None = None,
+        exact: bool = False,
+    ) -> SearchHits:  # fmt: skip
+        """See `index.search`."""
+        return search(
+            query, self.generation, self.tail, size, metric=self.metric, dead=dead, among=among,
+            exact=exact,
+        )  # fmt: skip
+
+    def nearer(
+        self, query: Bytes, key: int, distance: int, *, dead: frozenset[int],
+        among: Keys | None = None,
+    ) -> int:  # fmt: skip
+        """See MapView."""
+        hits = self.search(query, max(self.size, 1), dead=dead, among=among, exact=True)
+        same = (hits.distances == distance) & (hits.keys < key)
+        return int(((hits.distances < distance) | same).sum())
+
+    def signatures(self, keys: Keys) -> Bytes:
+        """See `index.signatures_of`."""
+        return signatures_of(keys, self.generation, self.tail)
+
+    def has(self, keys: Keys) -> NDArray[np.bool_]:
+        """See MapView."""
+        known = self.tail.places.of(keys) >= 0
+        if self.generation is not None:
+            known |= self.generation.places.of(keys) >= 0
+        alive: NDArray[np.bool_] = known & ~np.isin(keys, list(self.dead))
+        return alive
+
 
 # The tail of a reader while it grows: appended to behind what has been handed out of it.
 
@@ -156,19 +273,11 @@ def _nameless(folder: Path, size: int) -> mmap.mmap:
     ) from failed
 
 
-log = logging.getLogger(__name__)
-
-Setting = Literal["auto", "local", "database"]
-
 #: Frames that a node reads of maps before it would ask the database instead, if it can.
 READ_MOST = 20_000
-#: Memory of all tails above which maps that were not asked for long are forgotten.
-HELD_BYTES = 1 << 30
 #: Seconds between two looks for a newer generation, and until one that is damaged, or out of reach
 #: for a moment, is read again.
 _LOOK_S, _AGAIN_S = 1.0, 60.0
-#: Seconds between two looks for maps that are held and no longer there.
-_TIDY_S = 10.0
 
 
 def index_folder(indexes: Path, row: MapRow) -> Path:
@@ -326,120 +435,3 @@ class Reader:
         self._view = IndexView(
             model.id, model.metric, revision, size, dead, damaged, generation, tail
         )
-
-
-class Readers:
-    """The readers of all maps that were asked.
-
-    Parameters
-    ----------
-    signers : see Signers
-    indexes : folder of all indexes
-    setting : `local` never asks the database; `database` wherever it can; `auto` where much is
-        missing here
-    """
-
-    def __init__(self, signers: Signers, indexes: Path, setting: Setting = "local") -> None:
-        self._signers, self._indexes, self._setting = signers, indexes, setting
-        self._stored = StoredMaps()
-        self._database, self._history = signers.database, signers.database.history
-        self._lock = threading.Lock()
-        self._open: OrderedDict[str, tuple[tuple[int, str], Reader]] = OrderedDict()
-        self._tidied = time.monotonic()
-
-    def views(
-        self, connection: Connection, database: Database, rows: Sequence[MapRow]
-    ) -> list[MapView]:
-        """Maps of one model as of their rows' revisions, or later, each where it is searched best.
-
-        Parameters
-        ----------
-        connection : a reading transaction of `database`
-        rows : of the maps, one or more
-        """
-        model = self._signers(rows[0].model_id).model
-        found: dict[int, MapView] = {}
-        if model.metric == "l2" and model.signature_bytes in self._searched_there(connection):
-            others = self._others(connection, rows)
-            found.update(self._stored.views(connection, database, others, model))
-        return [found.get(row.number) or self.view(connection, row) for row in rows]
-
-    def asks_database(self, connection: Connection) -> bool:
-        """Whether the database searches, so that a query may name very many maps."""
-        return bool(self._searched_there(connection))
-
-    def _searched_there(self, connection: Connection) -> frozenset[int]:
-        if self._setting == "local":
-            return frozenset()
-        return vectors.complete_dimensions(connection)
-
-    def _others(self, connection: Connection, rows: Sequence[MapRow]) -> list[MapRow]:
-        """Maps of which this node would have to read much before it could search them."""
-        if self._setting == "database":
-            return list(rows)
-        others, left = [], READ_MOST
-        for row in rows:
-            reader = self._reader(connection, row)
-            lacking = reader.lacks(connection, row)
-            if lacking is None and reader.is_outdated():
-                self.forget(row.name)  # it was asked long ago: another begins with the newest index
-                lacking = self._reader(connection, row).lacks(connection, row)
-            if lacking is None or lacking > left:
-                others.append(row)
-            else:
-                left -= lacking
-        return others
-
-    def view(self, connection: Connection, row: MapRow) -> IndexView:
-        """A map as of the row's revision, or later, on this node."""
-        reader = self._reader(connection, row)
-        if time.monotonic() - self._tidied >= _TIDY_S:
-            self.tidy(connection)
-        return reader.view(connection, row)
-
-    def _reader(self, connection: Connection, row: MapRow) -> Reader:
-        with self._lock:
-            if self._history != self._database.history:  # revisions may be of other frames now
-                self._history = self._database.history
-                self._open.clear()
-            held, reader = self._open.get(row.name, (None, None))
-            wanted = (row.number, row.model_id)
-            if reader is None or held != wanted:  # made anew, or signed with another model
-                model = self._signers(row.model_id).model
-                reader = Reader(connection, row, index_folder(self._indexes, row), model)
-                self._open[row.name] = (wanted, reader)
-            self._open.move_to_end(row.name)
-            # the one that was asked longest ago first, and never the one that is asked now
-            held_bytes = sum(one.bytes_held for _, one in self._open.values())
-            while len(self._open) > 1 and held_bytes > HELD_BYTES:
-                _, (_, oldest) = self._open.popitem(last=False)
-                held_bytes -= oldest.bytes_held
-            return reader
-
-    def forget(self, name: str) -> None:
-        """Give up what is held of a map that was deleted."""
-        with self._lock:
-            self._open.pop(name, None)
-
-    def purge(self, connection: Connection) -> None:
-        """Hold nothing of deleted frames any more, beyond what the newest indexes have of them."""
-        self.tidy(connection)
-        with self._lock:
-            held = list(self._open.items())
-        rows = {row.name: row for row in list_maps(connection)}
-        for name, (wanted, reader) in held:
-            row = rows.get(name)
-            if row is not None and (row.number, row.model_id) == wanted:
-                reader.purge(connection, row)
-
-    def tidy(self, connection: Connection) -> None:
-        """Give up what is held of maps that another process deleted, or gave another model.
-
-        Their files are gone, but take room on the disk and a descriptor each while mapped.
-        """
-        asked = select(maps.c.name, maps.c.number, maps.c.model_id)
-        there = {row.name: (row.number, row.model_id) for row in connection.execute(asked)}
-        with self._lock:
-            self._tidied = time.monotonic()
-            for name in [name for name, (held, _) in self._open.items() if there.get(name) != held]:
-                del self._open[name]

@@ -11,11 +11,11 @@ from typing import TypeVar
 
 from sceneprint.engine.results.stored_results import StoredResult, StoredResults
 from sceneprint.engine.search.answer import SequenceFrame, answer
-from sceneprint.engine.search.local_index import Readers
 from sceneprint.engine.search.response import uncertainty_record, validation_record
 from sceneprint.engine.search.retrieval import (
     Deadline,
     PreparedQuery,
+    Readers,
     SearchedMap,
     prepare_stored,
     prepare_upload,
@@ -24,15 +24,14 @@ from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import model_label, sensor_frame, transform
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import Busy, InvalidRequest, ModelMismatch, SceneprintError, UnknownMap
-from sceneprint.geometry.execution import Cores
+from sceneprint.geometry.kernel import Cores
 from sceneprint.geometry.registration.icp import PAIR_METHOD
-from sceneprint.geometry.retrieval.distance import distances, similarity
+from sceneprint.geometry.retrieval.ranking import distances, similarity
 from sceneprint.geometry.rigid import inverse
 from sceneprint.models import PRESETS, read_model
 from sceneprint.pipeline import Signer, validate
-from sceneprint.store import Store
+from sceneprint.store import Store, read_through
 from sceneprint.store.maps import find_maps, list_maps, model_names, unknown_map
-from sceneprint.store.postgres.replica import read_through
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats
 from sceneprint_client.api import (

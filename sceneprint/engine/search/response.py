@@ -24,16 +24,23 @@ from sceneprint.geometry.registration.icp import (
     Method,
     free_directions,
 )
-from sceneprint.geometry.retrieval.distance import Ints64, Ranking, distances, similarity
-from sceneprint.geometry.retrieval.dpp import DUPLICATE, DiversityParameters, Selection, remaining
+from sceneprint.geometry.retrieval.ranking import (
+    DUPLICATE,
+    DiversityParameters,
+    Ints64,
+    Ranking,
+    Selection,
+    distances,
+    remaining,
+    similarity,
+)
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.localization import PoseEstimate
 from sceneprint.models import Model
 from sceneprint.pipeline import PairMatch, validate
 from sceneprint.store import Store
-from sceneprint.store.frames import find_frame
-from sceneprint.store.signatures import geometry_blobs
+from sceneprint.store.maps import find_frame, geometry_blobs
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats
 from sceneprint_client.api import Alternative as ToldAlternative

@@ -1,40 +1,173 @@
 """A query to R, one ranking over all maps that are asked: Sec. III-C.
 
-signature, Places  --search_maps-->  Searched
+maps as of now  --Readers.views-->  MapViews  --search_maps-->  Searched
 """
 
 from __future__ import annotations
 
+import threading
 import time
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from sqlalchemy import Connection, select
 
 from sceneprint import errors
 from sceneprint.decoders import Decoders
 from sceneprint.engine.ingest.frame_decoder import read_upload
-from sceneprint.engine.search.map_view import MapView, Stored, search_stored
+from sceneprint.engine.search.local_index import READ_MOST, IndexView, MapView, Reader, index_folder
+from sceneprint.engine.search.stored_maps import Stored, StoredMaps, search_stored
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.retrieval.distance import Ranking, ranking_size, similarity
+from sceneprint.geometry.retrieval.ranking import Ranking, ranking_size, similarity
 from sceneprint.index import SearchHits
 from sceneprint.index.generation_files import Keys
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, prepare, sign
-from sceneprint.store import Store
+from sceneprint.store import Database, Store
 from sceneprint.store.frame_queries import QueryOrigin, passing
-from sceneprint.store.frames import find_frame, refers_to
-from sceneprint.store.maps import find_map
-from sceneprint.store.signatures import geometry_blobs, stored_vector
-from sceneprint.store.tables import MapRow
+from sceneprint.store.frames import refers_to
+from sceneprint.store.maps import find_frame, find_map, geometry_blobs, list_maps
+from sceneprint.store.postgres import vectors
+from sceneprint.store.signatures import stored_vector
+from sceneprint.store.tables import MapRow, maps
 from sceneprint.types import Bytes, Floats, Geometry
 from sceneprint_client.api import Filter, FrameMeta, Query
 from sceneprint_client.api.frames import Kind
+
+# The readers of all maps, and where each is searched.
+
+Setting = Literal["auto", "local", "database"]
+#: Memory of all tails above which maps that were not asked for long are forgotten.
+HELD_BYTES = 1 << 30
+#: Seconds between two looks for maps that are held and no longer there.
+_TIDY_S = 10.0
+
+
+class Readers:
+    """The readers of all maps that were asked.
+
+    Parameters
+    ----------
+    signers : see Signers
+    indexes : folder of all indexes
+    setting : `local` never asks the database; `database` wherever it can; `auto` where much is
+        missing here
+    """
+
+    def __init__(self, signers: Signers, indexes: Path, setting: Setting = "local") -> None:
+        self._signers, self._indexes, self._setting = signers, indexes, setting
+        self._stored = StoredMaps()
+        self._database, self._history = signers.database, signers.database.history
+        self._lock = threading.Lock()
+        self._open: OrderedDict[str, tuple[tuple[int, str], Reader]] = OrderedDict()
+        self._tidied = time.monotonic()
+
+    def views(
+        self, connection: Connection, database: Database, rows: Sequence[MapRow]
+    ) -> list[MapView]:
+        """Maps of one model as of their rows' revisions, or later, each where it is searched best.
+
+        Parameters
+        ----------
+        connection : a reading transaction of `database`
+        rows : of the maps, one or more
+        """
+        model = self._signers(rows[0].model_id).model
+        found: dict[int, MapView] = {}
+        if model.metric == "l2" and model.signature_bytes in self._searched_there(connection):
+            others = self._others(connection, rows)
+            found.update(self._stored.views(connection, database, others, model))
+        return [found.get(row.number) or self.view(connection, row) for row in rows]
+
+    def asks_database(self, connection: Connection) -> bool:
+        """Whether the database searches, so that a query may name very many maps."""
+        return bool(self._searched_there(connection))
+
+    def _searched_there(self, connection: Connection) -> frozenset[int]:
+        if self._setting == "local" or self._database.is_sqlite:
+            return frozenset()
+        return vectors.complete_dimensions(connection)
+
+    def _others(self, connection: Connection, rows: Sequence[MapRow]) -> list[MapRow]:
+        """Maps of which this node would have to read much before it could search them."""
+        if self._setting == "database":
+            return list(rows)
+        others, left = [], READ_MOST
+        for row in rows:
+            reader = self._reader(connection, row)
+            lacking = reader.lacks(connection, row)
+            if lacking is None and reader.is_outdated():
+                self.forget(row.name)  # it was asked long ago: another begins with the newest index
+                lacking = self._reader(connection, row).lacks(connection, row)
+            if lacking is None or lacking > left:
+                others.append(row)
+            else:
+                left -= lacking
+        return others
+
+    def view(self, connection: Connection, row: MapRow) -> IndexView:
+        """A map as of the row's revision, or later, on this node."""
+        reader = self._reader(connection, row)
+        if time.monotonic() - self._tidied >= _TIDY_S:
+            self.tidy(connection)
+        return reader.view(connection, row)
+
+    def _reader(self, connection: Connection, row: MapRow) -> Reader:
+        with self._lock:
+            if self._history != self._database.history:  # revisions may be of other frames now
+                self._history = self._database.history
+                self._open.clear()
+            held, reader = self._open.get(row.name, (None, None))
+            wanted = (row.number, row.model_id)
+            if reader is None or held != wanted:  # made anew, or signed with another model
+                model = self._signers(row.model_id).model
+                reader = Reader(connection, row, index_folder(self._indexes, row), model)
+                self._open[row.name] = (wanted, reader)
+            self._open.move_to_end(row.name)
+            # the one that was asked longest ago first, and never the one that is asked now
+            held_bytes = sum(one.bytes_held for _, one in self._open.values())
+            while len(self._open) > 1 and held_bytes > HELD_BYTES:
+                _, (_, oldest) = self._open.popitem(last=False)
+                held_bytes -= oldest.bytes_held
+            return reader
+
+    def forget(self, name: str) -> None:
+        """Give up what is held of a map that was deleted."""
+        with self._lock:
+            self._open.pop(name, None)
+
+    def purge(self, connection: Connection) -> None:
+        """Hold nothing of deleted frames any more, beyond what the newest indexes have of them."""
+        self.tidy(connection)
+        with self._lock:
+            held = list(self._open.items())
+        rows = {row.name: row for row in list_maps(connection)}
+        for name, (wanted, reader) in held:
+            row = rows.get(name)
+            if row is not None and (row.number, row.model_id) == wanted:
+                reader.purge(connection, row)
+
+    def tidy(self, connection: Connection) -> None:
+        """Give up what is held of maps that another process deleted, or gave another model.
+
+        Their files are gone, but take room on the disk and a descriptor each while mapped.
+        """
+        asked = select(maps.c.name, maps.c.number, maps.c.model_id)
+        there = {row.name: (row.number, row.model_id) for row in connection.execute(asked)}
+        with self._lock:
+            self._tidied = time.monotonic()
+            for name in [name for name, (held, _) in self._open.items() if there.get(name) != held]:
+                del self._open[name]
+
 
 # A query made ready: its signature and, for validation, its geometry.
 #

@@ -14,12 +14,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sceneprint.engine.ingest.frame_decoder import pose_matrix
 from sceneprint.engine.search.retrieval import Deadline, Searched, SearchedMap
 from sceneprint.engine.search.up_vectors import known_ups
-from sceneprint.engine.serializers import pose_matrix
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, InvalidRequest, UnreadableGeometry
-from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.map_verification import MapViews, looks_ahead
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
@@ -35,15 +35,15 @@ from sceneprint.localization import (
 )
 from sceneprint.pipeline import PairMatch, associate
 from sceneprint.store import Store
-from sceneprint.store.frame_queries import (
+from sceneprint.store.frame_queries import has_parent_frame
+from sceneprint.store.maps import (
     FrameViewpoint,
     PlacedFrame,
-    has_parent_frame,
+    frames_of,
+    geometry_blobs,
     placed_frames,
     viewpoints_among,
 )
-from sceneprint.store.frames import frames_of
-from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Prior, Query, ValidationOptions
@@ -158,8 +158,8 @@ def validated(
     )  # fmt: skip
     owner = dict(zip(ranking.indices.tolist(), searched.owners.tolist(), strict=True))
     for i, part in enumerate(searched.parts):
-        bad = sorted(number for number in unreadable if owner[number] == i)
-        resign_frames(store, part.place.row, bad, model_id)
+        if bad := sorted(number for number in unreadable if owner[number] == i):
+            resign_frames(store, part.place.row, bad, model_id)
     late = deadline.reached
     untried = (
         "the deadline passed before it was validated"

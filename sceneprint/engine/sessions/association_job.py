@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult
-from sceneprint.engine.search.local_index import Readers
-from sceneprint.engine.search.map_view import MapView
+from sceneprint.engine.search.local_index import MapView
+from sceneprint.engine.search.retrieval import Readers
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import transform
@@ -22,13 +22,13 @@ from sceneprint.engine.sessions.associations import Plan, eligible, runs_of
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
-from sceneprint.geometry.retrieval.distance import (
+from sceneprint.geometry.retrieval.ranking import (
     Ranking,
+    diversify,
     pairwise_distances,
     ranking_size,
     similarity,
 )
-from sceneprint.geometry.retrieval.dpp import diversify
 from sceneprint.geometry.session_join import (
     LoopEdges,
     RobotPath,
@@ -42,10 +42,9 @@ from sceneprint.models import Model
 from sceneprint.pipeline import PairMatch, associate
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import PathFrame, stops_of
-from sceneprint.store.frames import frames_of
-from sceneprint.store.maps import find_map, unknown_map
+from sceneprint.store.maps import find_map, frames_of, geometry_blobs, unknown_map
 from sceneprint.store.queue import items_of
-from sceneprint.store.signatures import geometry_blobs, stored_signatures
+from sceneprint.store.signatures import stored_signatures
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api.sessions import Join, NewAssociation

@@ -57,9 +57,8 @@ from sceneprint.store.frame_queries import (
     posed_in_session,
     stops_of,
 )
-from sceneprint.store.maps import find_map, living_map, map_of
+from sceneprint.store.maps import find_map, geometry_blobs, living_map, map_of
 from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
-from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Page

@@ -19,17 +19,12 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from sceneprint.atomic_files import PRIVATE_FILE, make_folder
-from sceneprint.engine.search.local_index import (
-    READ_MOST,
-    Setting,
-    index_folder,
-    is_index_folder,
-    trusted,
-)
+from sceneprint.engine.search.local_index import READ_MOST, index_folder, is_index_folder, trusted
+from sceneprint.engine.search.retrieval import Setting
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import BusyIndex, InvalidRequest, ModelError, SceneprintError, UnknownMap
-from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.index import Generation, clear, manifests, newest, newest_number, publish, scrub
 from sceneprint.store import Store
 from sceneprint.store.events import anchor_of

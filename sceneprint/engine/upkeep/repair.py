@@ -20,11 +20,10 @@ from sceneprint.pipeline import Signer, prepare
 from sceneprint.store import Store
 from sceneprint.store.blobs.folder import Condition
 from sceneprint.store.events import record_event
-from sceneprint.store.frames import find_frame, frames_of, renew_upload
-from sceneprint.store.maps import find_map
+from sceneprint.store.frames import renew_upload
+from sceneprint.store.maps import find_frame, find_map, frames_of, geometry_blobs
 from sceneprint.store.queue import enqueue, last_of
 from sceneprint.store.reencoding_rows import REENCODE
-from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import FrameRow, MapRow
 from sceneprint.types import Bytes
 from sceneprint_client.api import FrameState

@@ -28,7 +28,7 @@ from sceneprint.formats.depth_file import (
     make_frame,
     read_frame,
 )
-from sceneprint_client.poses import SensorTrajectory, interpolate
+from sceneprint_client.poses import SensorTrajectory, interpolate, rigid_transform
 from sceneprint_client.sidecars import (
     Camera,
     CloudSource,
@@ -36,7 +36,6 @@ from sceneprint_client.sidecars import (
     find_cloud_source,
     read_camera,
     read_pose,
-    rigid_transform,
 )
 
 __all__ = [

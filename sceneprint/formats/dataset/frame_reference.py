@@ -10,11 +10,11 @@ from typing import Literal
 
 import numpy as np
 
-from sceneprint.errors import DatasetError, InvalidPose, UnreadableCloud, naming
+from sceneprint.errors import DatasetError, InvalidPose, UnreadableCloud
 from sceneprint.formats.depth_file import decode_frame
 from sceneprint.formats.points import SUFFIXES, Scan, decode_scan
 from sceneprint.types import AnyFrame, DepthFrame, Floats
-from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, data_lines, read_bytes, read_text
+from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, data_lines, naming, read_bytes, read_text
 from sceneprint_client.frame_files import FrameFile
 from sceneprint_client.poses import SensorTrajectory
 from sceneprint_client.sidecars import CloudSource

@@ -31,14 +31,13 @@ from sceneprint.formats.dataset.frame_reference import (
 from sceneprint.types import Floats, Floats32
 from sceneprint_client.files import RECORDING_SUFFIXES, data_lines, is_cloud, read_text
 from sceneprint_client.frame_files import SEVEN_SCENES, find_frame_file, seven_scenes_number
-from sceneprint_client.poses import interpolate, quaternion_of
+from sceneprint_client.poses import interpolate, quaternion_of, rigid_transform
 from sceneprint_client.sidecars import (
     CLOUDS_FILE,
     INTRINSICS_FILE,
     Camera,
     find_camera,
     find_cloud_source,
-    rigid_transform,
 )
 
 if TYPE_CHECKING:

@@ -16,23 +16,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.errors import UnreadableCloud, UselessFrame, naming
+from sceneprint.errors import UnreadableCloud, UselessFrame
 from sceneprint.formats.points.las import read_las
 from sceneprint.formats.points.pcd import read_pcd
 from sceneprint.formats.points.ply import read_ply
 from sceneprint.formats.points.rows import FilePoints, check_count, steps
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Cloud, Floats, Floats32
-from sceneprint_client.api.frames import CloudFormat
+from sceneprint_client.api.base import CloudFormat
 from sceneprint_client.files import (
     MAXIMUM_CLOUD_BYTES,
     NPY_SIGNATURE,
     format_of,
+    naming,
     npy_header,
     read_point_cloud,
 )
+from sceneprint_client.poses import rigid_transform
 from sceneprint_client.ros_messages import cloud_blocks, cloud_table
-from sceneprint_client.sidecars import UNSAID, Position, Unsaid, rigid_transform
+from sceneprint_client.sidecars import UNSAID, Position, Unsaid
 
 # Plain arrays: KITTI's .bin, and NPY.
 

@@ -20,9 +20,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sceneprint.errors import DatasetError, MissingDependency, SceneprintError, naming
+from sceneprint.errors import DatasetError, MissingDependency, SceneprintError
 from sceneprint_client.errors import printable
-from sceneprint_client.files import RECORDING_SUFFIXES
+from sceneprint_client.files import RECORDING_SUFFIXES, naming
 from sceneprint_client.poses import MOST_SAMPLES, Accelerations, TransformTree, frame_name
 from sceneprint_client.ros_messages import (
     is_calibrated,

@@ -25,7 +25,6 @@ from sceneprint.errors import (
     InvalidIntrinsics,
     UnreadableCloud,
     UnreadableFrame,
-    naming,
 )
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
 from sceneprint.formats.depth_file import decode_png, encode_png, inverse_depth
@@ -42,9 +41,9 @@ from sceneprint.formats.recording.bag import (
     shared_bag,
 )
 from sceneprint.types import Floats
-from sceneprint_client.api.base import checked
-from sceneprint_client.api.frames import GivenBase
+from sceneprint_client.api.base import GivenBase, checked
 from sceneprint_client.errors import printable
+from sceneprint_client.files import naming
 from sceneprint_client.poses import frame_name
 from sceneprint_client.ros_messages import (
     DEPTH_SCALE,

@@ -31,18 +31,16 @@ from sceneprint.geometry.registration.overlap import LookupTarget, nearest_alike
 from sceneprint.geometry.rigid import PoseAverage, rotation_angle, solve_positive, turned
 from sceneprint.geometry.surface.camera import (
     BLOCK,
-    PINHOLE,
     depth_of,
     gather,
     gather_pixels,
     grown,
-    kind_of,
     move_all,
     project_all,
     transposed,
     within,
 )
-from sceneprint.types import Floats, Floats32, Ints32, Surface
+from sceneprint.types import PINHOLE, Floats, Floats32, Ints32, Surface, kind_of
 
 
 @dataclass(frozen=True)

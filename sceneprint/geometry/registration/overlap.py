@@ -16,12 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sceneprint.geometry.execution import cached_per_frame
-from sceneprint.geometry.kernel import disjoint_kernel, kernel
+from sceneprint.geometry.kernel import cached_per_frame, disjoint_kernel, kernel
 from sceneprint.geometry.rigid import inverses
 from sceneprint.geometry.surface.camera import (
     BLOCK,
-    camera_of,
     depth_at,
     depth_of,
     gather,
@@ -33,7 +31,17 @@ from sceneprint.geometry.surface.camera import (
     within,
 )
 from sceneprint.geometry.surface.cloud import Ints64, mixed
-from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches, Sphere, Surface
+from sceneprint.types import (
+    Bytes,
+    Floats,
+    Floats32,
+    Geometry,
+    Ints32,
+    Patches,
+    Sphere,
+    Surface,
+    camera_of,
+)
 
 # Sec. III-E, a surface made ready to be looked up: by its camera, or by place where it has none.
 #

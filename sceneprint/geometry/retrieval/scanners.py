@@ -21,7 +21,7 @@ from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.retrieval.distance import GROUP, Ints64
+from sceneprint.geometry.retrieval.ranking import GROUP, Ints64
 from sceneprint.types import Bytes
 
 Scanner = Callable[[Bytes, Bytes, Ints64, bool, int, Ints64], None]

@@ -22,36 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import disjoint_kernel, kernel
-from sceneprint.types import Camera, Floats, Floats32, Intrinsics, Ints32, Sphere
+from sceneprint.types import Floats, Floats32, Intrinsics, Ints32
 
-#: Kinds of camera; of what saw points that are in no order nothing is known.
-PINHOLE, SPHERE, NOWHERE = 0, 1, 2
 TURN = 2.0 * math.pi
 #: Points that kernels work on at once: their numbers stay in the first level of the cache.
 BLOCK = 256
-
-
-def camera_of(camera: Camera | None, nearest: float) -> Floats:
-    """A camera as kernels take it: (7,), its kind, `nearest`, and five numbers of that kind.
-
-    Parameters
-    ----------
-    camera : None for points in no order
-    nearest : points this near are not looked up, metres of depth
-    """
-    if isinstance(camera, Intrinsics):
-        return np.array([PINHOLE, nearest, camera.fx, camera.fy, camera.cx, camera.cy, 0.0])
-    if isinstance(camera, Sphere):
-        closed = camera.width if camera.is_closed else 0
-        return np.array(
-            [SPHERE, nearest, camera.step, camera.left, camera.top, camera.pole, closed], float
-        )
-    return np.array([NOWHERE, nearest, 0.0, 0.0, 0.0, 0.0, 0.0])
-
-
-def kind_of(camera: Camera | None) -> int:
-    """The kind of a camera, as the first of `camera_of`."""
-    return int(camera_of(camera, 0.0)[0])
 
 
 @kernel

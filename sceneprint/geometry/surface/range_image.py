@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import UselessFrame
-from sceneprint.geometry.execution import cached_per_frame
-from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.kernel import cached_per_frame, kernel
 from sceneprint.geometry.surface.cloud import CloudParameters, within_range
 from sceneprint.geometry.surface.voxels import solve
 from sceneprint.types import Cloud, Floats, Floats32, Sphere, Surface

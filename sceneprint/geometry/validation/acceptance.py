@@ -22,9 +22,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sceneprint.geometry.execution import cached_per_frame
-from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.registration.alignment import NO_UPS, Ups, are_level
+from sceneprint.geometry.kernel import cached_per_frame, kernel
 from sceneprint.geometry.registration.icp import COARSE, QUICK, RefinementParameters, refined_all
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
@@ -32,7 +30,7 @@ from sceneprint.geometry.registration.overlap import (
     PlaneView,
     explained,
 )
-from sceneprint.geometry.rigid import are_near, distinct
+from sceneprint.geometry.rigid import NO_UPS, Ups, are_level, are_near, distinct
 from sceneprint.types import Floats, Patches
 
 Status = Literal["accepted", "ambiguous", "rejected"]

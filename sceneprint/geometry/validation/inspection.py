@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.registration.consensus import ConsensusParameters
+from sceneprint.geometry.registration.alignment import ConsensusParameters
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
     looked_up,

@@ -83,6 +83,11 @@ class MapFrame:
         """Its patches with their weights, when they are first needed."""
         return plane_view(self.geometry, self.weighing)
 
+    @cached_property
+    def inverse_pose(self) -> Floats:
+        """(4, 4), the inverse of T: many poses are scored on one frame."""
+        return inverse(self.T)
+
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose:
@@ -233,7 +238,7 @@ def score_pose(
             view = views[i]
             if view is None:
                 continue
-            T_view_sensor = inverse(view.T) @ T_parent_sensor
+            T_view_sensor = view.inverse_pose @ T_parent_sensor
             said = look_up(points, view.target, T_view_sensor, limits)
             count = int((said == AGREES).sum())
             agree += said == AGREES
@@ -369,7 +374,7 @@ def best_of_places(scored: list[ScoredPose], p: MapParameters) -> list[ScoredPos
     """The best pose of each place, best first; equals in the order they came."""
     places: list[ScoredPose] = []
     for one in sorted(scored, key=lambda pose: -pose.score):
-        if not any(same_place(one.T, other.T, p) for other in places):
+        if not places or not at_place(np.stack([other.T for other in places]), one.T, p).any():
             places.append(one)
     return places
 

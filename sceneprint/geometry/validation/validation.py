@@ -18,21 +18,18 @@ from typing import Literal
 
 import numpy as np
 
-from sceneprint.geometry.execution import both
+from sceneprint.geometry.kernel import both
 from sceneprint.geometry.registration.alignment import (
-    NO_UPS,
     Alignment,
     AlignmentParameters,
     FrameSamples,
     Search,
-    Ups,
     align,
     align_guided,
     align_scans,
     are_scans,
     contradiction,
     samples_of,
-    tilt_of,
 )
 from sceneprint.geometry.registration.icp import (
     FINE,
@@ -50,13 +47,15 @@ from sceneprint.geometry.registration.overlap import (
 )
 from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.rigid import (
+    NO_UPS,
+    Ups,
     difference,
     inverse,
     inverses,
     nearest_rotation,
     rotation_angle,
+    tilt_of,
 )
-from sceneprint.geometry.surface.camera import kind_of
 from sceneprint.geometry.validation.acceptance import (
     AcceptanceParameters,
     AmbiguityParameters,
@@ -69,7 +68,7 @@ from sceneprint.geometry.validation.acceptance import (
     best_alternative,
     objection,
 )
-from sceneprint.types import Floats, Geometry, Sphere
+from sceneprint.types import Floats, Geometry, Sphere, kind_of
 
 #: From which frame to which a transform was searched for.
 Direction = Literal["query_to_match", "match_to_query"]

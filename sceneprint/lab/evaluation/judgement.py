@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.registration.sequence_alignment import Matching
-from sceneprint.geometry.retrieval.distance import (
+from sceneprint.geometry.retrieval.ranking import (
     Ints64,
     Metric,
     Ranking,
     cross_distances,
+    diversify,
     pairwise_distances,
     ranking_size,
 )
-from sceneprint.geometry.retrieval.dpp import diversify
 from sceneprint.geometry.rigid import average_poses, inverse
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.map_verification import looks_ahead

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sceneprint.atomic_files import write_whole
 from sceneprint.formats.export import write_ply
-from sceneprint.geometry.retrieval.distance import similarity
+from sceneprint.geometry.retrieval.ranking import similarity
 from sceneprint.geometry.rigid import inverse, levelling, moved
 from sceneprint.lab.evaluation.measures import (
     FARTHEST,

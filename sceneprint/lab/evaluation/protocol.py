@@ -25,7 +25,7 @@ from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.formats.dataset import FrameSequence as Run
 from sceneprint.formats.dataset.sequences import natural
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.geometry.rigid import difference, moved
 from sceneprint.geometry.validation.acceptance import Strength
 from sceneprint.geometry.validation.validation import (

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sceneprint.errors import DatasetError
 from sceneprint.geometry.registration.sequence_alignment import Matching
-from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.lab.evaluation.baselines import Compared, compare, open_baselines, registered
 from sceneprint.lab.evaluation.judgement import (

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from sqlalchemy import Connection
 
     from sceneprint.engine import Engine
-    from sceneprint.engine.search.map_view import IndexView
+    from sceneprint.engine.search.local_index import IndexView
 
 #: Neighbours by which recall is told, and farther ones whose distance tells how hard it is.
 NEAR, FAR = 10, 100

@@ -90,7 +90,7 @@ class House:
         with Engine(self.settings) as engine:
             for each in uploads:
                 query = Query(exact=True, k=50, stages=("retrieve",))
-                answer = engine.query_upload("hall", each.data, each.meta, query)
+                answer = engine.queries.upload(["hall"], each.data, each.meta, query)
                 found.append(
                     [(m.frame_id, m.distance) for m in answer.matches if m.frame_id != without]
                 )

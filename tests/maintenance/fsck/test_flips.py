@@ -90,7 +90,7 @@ def test_a_damaged_index_is_removed_and_made_again(
     assert house.answers(uploads[:HALL]) == truth
     with Engine(house.settings) as engine:
         engine.publish_due()
-        answer = engine.query_upload("hall", uploads[0].data, uploads[0].meta, ask())
+        answer = engine.queries.upload(["hall"], uploads[0].data, uploads[0].meta, ask())
     assert answer.index_generation > 0
     assert house.look() == []
     assert house.answers(uploads[:HALL]) == truth

@@ -196,7 +196,7 @@ def test_an_index_that_differs_from_the_database_is_made_again(
     with Engine(house.settings) as engine:
         assert engine.publish_due() == 1
         query = Query(stages=("retrieve",), k=2)
-        answer = engine.query_upload("hall", uploads[1].data, uploads[1].meta, query)
+        answer = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, query)
     assert [match.distance for match in answer.matches] == [0, 0]
     assert answer.index_generation == 1
     assert house.look() == []

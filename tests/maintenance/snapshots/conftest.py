@@ -143,7 +143,7 @@ def answers() -> Callable[[Path, list[Upload]], list[Answer]]:
         free = {"query_id": "", "milliseconds": {}}
         with Engine(settings_of(folder)) as engine:
             return [
-                engine.query_upload("hall", one.data, one.meta, Query(exact=True)).model_copy(
+                engine.queries.upload(["hall"], one.data, one.meta, Query(exact=True)).model_copy(
                     update=free
                 )
                 for one in asked

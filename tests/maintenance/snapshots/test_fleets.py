@@ -47,7 +47,7 @@ def answers_of(settings: Settings, asked: list) -> list:
     """What the map `hall` answers, but for what no two answers share."""
     free = {"query_id": "", "milliseconds": {}}
     with Engine(settings) as engine:
-        found = [engine.query_upload("hall", x.data, x.meta, Query(exact=True)) for x in asked]
+        found = [engine.queries.upload(["hall"], x.data, x.meta, Query(exact=True)) for x in asked]
         return [one.model_copy(update=free) for one in found]
 
 

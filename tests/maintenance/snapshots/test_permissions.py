@@ -39,7 +39,7 @@ def test_all_that_is_made_is_its_owners_alone(no_umask, tmp_path, uploads, setti
         while (work := engine.claim("w")) is not None:
             engine.run(work)
         engine.rebuild_index("hall")
-        engine.query_upload("hall", uploads[0].data, uploads[0].meta, Query())
+        engine.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query())
         assert {path.name for path in data.iterdir()} >= {
             "sceneprint.db", "sceneprint.db-wal", "sceneprint.db-shm", "blobs", "index", "queries",
         }  # fmt: skip

@@ -1,142 +1,31 @@
-"""Maps as queries see them: as of one revision, held by this node or in the database.
+"""Maps that PostgreSQL searches, where this node would have to read much of them first.
 
-    a map as of now  --Readers.views-->  MapView  --search-->  Hits
-
-`IndexView` is a map that this node holds, `Stored` one that PostgreSQL searches. Exact
-distances of signatures decide in both, so that where both compare the same frames their answers
-are the same.
+Exact distances of signatures decide there and on this node (`local_index.py`), so that where both
+compare the same frames their answers are the same.
 """
 
 from __future__ import annotations
 
 import time
 import zlib
-from abc import ABC, abstractmethod
-from collections.abc import Sequence, Set
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection
 
+from sceneprint.engine.search.local_index import Kind, MapView
 from sceneprint.errors import UnknownFrame
-from sceneprint.geometry.retrieval.distance import Metric, distances
-from sceneprint.index import Generation, SearchHits, Tail, search, signatures_of
+from sceneprint.geometry.retrieval.ranking import distances
+from sceneprint.index import SearchHits
 from sceneprint.index.generation_files import Keys
 from sceneprint.models import Model
 from sceneprint.store import Database
 from sceneprint.store.postgres import vectors
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Bytes
-
-#: Where a map is searched: by this node, or by the database.
-Kind = Literal["local", "database"]
-
-
-@dataclass(frozen=True, eq=False)
-class MapView(ABC):
-    """A map that can be searched, as of one revision or later.
-
-    Parameters
-    ----------
-    model_id : of the model that made all signatures
-    metric : how they are compared
-    revision : of the map
-    size : frames that can be found
-    dead : frames that it holds and that are deleted
-    damaged : frames that were passed over, as their signature is damaged
-    """
-
-    #: Who searches it.
-    kind: ClassVar[Kind]
-
-    model_id: str
-    metric: Metric
-    revision: int
-    size: int
-    dead: frozenset[int]
-    damaged: Set[int]
-
-    @property
-    def number(self) -> int:
-        """Of the generation of the index; 0 where none is used."""
-        return 0
-
-    @abstractmethod
-    def search(
-        self, query: Bytes, size: int, *, dead: frozenset[int], among: Keys | None = None,
-        exact: bool = False,
-    ) -> SearchHits:  # fmt: skip
-        """The nearest frames by exact distance; see `index.search`."""
-
-    @abstractmethod
-    def nearer(
-        self, query: Bytes, key: int, distance: int, *, dead: frozenset[int],
-        among: Keys | None = None,
-    ) -> int:  # fmt: skip
-        """How many frames come before one in the order of exact distance, equal ones by key."""
-
-    @abstractmethod
-    def signatures(self, keys: Keys) -> Bytes:
-        """Signatures (r, D) of frames that it has."""
-
-    @abstractmethod
-    def has(self, keys: Keys) -> NDArray[np.bool_]:
-        """Which frames (n,) can be found."""
-
-
-@dataclass(frozen=True, eq=False)
-class IndexView(MapView):
-    """A map as of one revision, held by this node: an index, and the frames that are newer.
-
-    Parameters
-    ----------
-    generation : of its index, or None
-    tail : frames newer than it
-    """
-
-    kind: ClassVar[Kind] = "local"
-
-    generation: Generation | None
-    tail: Tail
-
-    @property
-    def number(self) -> int:
-        """See MapView."""
-        return 0 if self.generation is None else self.generation.number
-
-    def search(
-        self, query: Bytes, size: int, *, dead: frozenset[int], among: Keys | None = None,
-        exact: bool = False,
-    ) -> SearchHits:  # fmt: skip
-        """See `index.search`."""
-        return search(
-            query, self.generation, self.tail, size, metric=self.metric, dead=dead, among=among,
-            exact=exact,
-        )  # fmt: skip
-
-    def nearer(
-        self, query: Bytes, key: int, distance: int, *, dead: frozenset[int],
-        among: Keys | None = None,
-    ) -> int:  # fmt: skip
-        """See MapView."""
-        hits = self.search(query, max(self.size, 1), dead=dead, among=among, exact=True)
-        same = (hits.distances == distance) & (hits.keys < key)
-        return int(((hits.distances < distance) | same).sum())
-
-    def signatures(self, keys: Keys) -> Bytes:
-        """See `index.signatures_of`."""
-        return signatures_of(keys, self.generation, self.tail)
-
-    def has(self, keys: Keys) -> NDArray[np.bool_]:
-        """See MapView."""
-        known = self.tail.places.of(keys) >= 0
-        if self.generation is not None:
-            known |= self.generation.places.of(keys) >= 0
-        alive: NDArray[np.bool_] = known & ~np.isin(keys, list(self.dead))
-        return alive
-
 
 # Maps searched in PostgreSQL, by a node that does not hold their signatures.
 #
