@@ -183,7 +183,10 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
         try:
             gate = Gate(settings.concurrency, settings.waiting, settings.wait_s)
             # they mostly wait for the disk: the engine sees to how many are decoded at once
-            uploads = Gate(max(UPLOADS, settings.concurrency), settings.waiting, settings.wait_s)
+            uploads = Gate(
+                max(UPLOADS, settings.concurrency), settings.waiting, settings.wait_s,
+                max(settings.concurrency // 2, 1),
+            )  # fmt: skip
             places = settings.concurrency + settings.waiting
             # more than the requests of one tenant hold, so that others find a thread
             to_thread.current_default_thread_limiter().total_tokens += places

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from typing import Any
 from urllib.parse import unquote
 
-from anyio import to_thread
 from starlette.types import Scope as AsgiScope
 
 from sceneprint.errors import SceneprintError
 from sceneprint.store.audit_chain import KeyChange
+from service.context import Context
 from service.limits import TokenBucket, network_of
 
 log = logging.getLogger(__name__)
@@ -77,8 +77,10 @@ async def note(scope: AsgiScope, status: int, headers: list[tuple[bytes, bytes]]
         return
     if change is None:
         return
+    context: Context = scope["app"].state.context
     try:
-        await to_thread.run_sync(scope["app"].state.context.engine.audit.note, change)
+        # however long its turn takes: who asks much must not get rid of what is noted
+        await context.run(context.engine.audit.note, change, patient=True)
     except SceneprintError as error:
         log.error("audit entry not written", extra={"action": change.action, "error": str(error)})
 

@@ -18,7 +18,7 @@ import re
 import tempfile
 import threading
 import time
-from collections import Counter, OrderedDict, deque
+from collections import Counter, OrderedDict
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -31,12 +31,10 @@ from starlette.types import Message, Receive, Scope
 
 from sceneprint.errors import Busy, RateLimited, SceneprintError, SlowBody, TooLarge
 from sceneprint.store.tenants import NOBODY, current_tenant
+from sceneprint.turns import TurnOrder
 from sceneprint_client.api import Page
 
 T = TypeVar("T")
-
-#: Seconds after its last request in which a tenant counts as one to share turns with.
-PRESENT_S = 60.0
 
 
 class Holdings:
@@ -76,85 +74,42 @@ def share(room: int) -> int:
 
 
 class Turns:
-    """Turns at work: who holds fewest is next, and of equals who was served the longest ago.
-
-    Beside another tenant one has half of them at most, so that the other need not wait for the
-    work of the first to end; alone it has all.
+    """Turns of requests: see TurnOrder.
 
     Parameters
     ----------
-    count : of turns that are held at once
-    clock : seconds, never going back
+    count, beside, clock : see TurnOrder
     """
 
-    def __init__(self, count: int, clock: Callable[[], float] = time.monotonic) -> None:
-        self._count, self._clock = count, clock
-        self._held: Counter[str] = Counter()
-        self._waiting: dict[str, deque[tuple[int, asyncio.Future[None]]]] = {}
-        # when each tenant came last, and the number of its latest turn; the oldest first
-        self._seen: OrderedDict[str, tuple[float, int]] = OrderedDict()
-        self._given = 0
+    def __init__(
+        self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._order: TurnOrder[asyncio.Future[None]] = TurnOrder(count, beside, clock)
 
     async def acquire(self, tenant: str, weight: int = 1) -> int:
         """Wait for a turn, or for several at once; returns how many: give them back."""
-        weight = min(weight, max(self._count // 2, 1))
         turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._see(tenant)
-        self._waiting.setdefault(tenant, deque()).append((weight, turn))
+        weight = self._order.enter(tenant, turn, weight)
         self._admit()
         try:
             await turn
         except asyncio.CancelledError:
-            if turn.done() and not turn.cancelled():
-                self.release(tenant, weight)
-            else:
+            if self._order.leave(tenant, turn):
                 self._admit()  # who gave up may have been in the way of others
+            else:
+                self.release(tenant, weight)
             raise
         return weight
 
     def release(self, tenant: str, weight: int = 1) -> None:
         """Give turns back."""
-        self._held[tenant] -= weight
-        if not self._held[tenant]:
-            del self._held[tenant]
+        self._order.release(tenant, weight)
         self._admit()
 
-    def _see(self, tenant: str) -> None:
-        now = self._clock()
-        _, turn = self._seen.pop(tenant, (now, 0))
-        self._seen[tenant] = now, turn
-        while True:
-            first, (seen, _) = next(iter(self._seen.items()))
-            if seen > now - PRESENT_S:
-                return
-            if first in self._held or first in self._waiting:
-                self._seen[first] = now, self._seen.pop(first)[1]
-            else:
-                del self._seen[first]
-
     def _admit(self) -> None:
-        most = self._count if len(self._seen) < 2 else max(self._count // 2, 1)
-        while True:
-            for tenant in list(self._waiting):
-                queue = self._waiting[tenant]
-                while queue and queue[0][1].cancelled():
-                    queue.popleft()
-                if not queue:
-                    del self._waiting[tenant]
-            may = [
-                (self._held[tenant], self._seen[tenant][1], tenant, queue[0][0])
-                for tenant, queue in self._waiting.items()
-                if self._held[tenant] + queue[0][0] <= most
-            ]
-            if not may:
-                return
-            _, _, tenant, weight = min(may)
-            if sum(self._held.values()) + weight > self._count:
-                return  # nobody overtakes who waits for several
-            self._given += 1
-            self._held[tenant] += weight
-            self._seen[tenant] = self._seen[tenant][0], self._given
-            self._waiting[tenant].popleft()[1].set_result(None)
+        for turn in self._order.admit():
+            if not turn.cancelled():
+                turn.set_result(None)
 
 
 class Gate:
@@ -165,10 +120,13 @@ class Gate:
     running : at once
     waiting : at most, be it for their bodies or for their turn
     longest_s : seconds to wait for a turn: an answer that comes later helps no robot
+    beside : of a tenant that run at once beside another; default: half
     """
 
-    def __init__(self, running: int, waiting: int, longest_s: float) -> None:
-        self._turns, self._threads = Turns(running), anyio.CapacityLimiter(running)
+    def __init__(
+        self, running: int, waiting: int, longest_s: float, beside: int | None = None
+    ) -> None:
+        self._turns, self._threads = Turns(running, beside), anyio.CapacityLimiter(running)
         self._longest_s = longest_s
         self._places = running + waiting
         self._taken = Holdings()
@@ -333,6 +291,33 @@ class RateLimits:
     def __init__(self, requests_per_s: float, failed_per_minute: float) -> None:
         self.requests = TokenBucket("requests", requests_per_s, requests_per_s * 5)
         self.failed_keys = TokenBucket("wrong-keys", failed_per_minute / 60, failed_per_minute)
+
+
+#: Refusals that a caller gets at once, then a second, and how late the others come.
+REFUSALS, REFUSALS_PER_S, REFUSAL_S = 20, 10.0, 1.0
+#: Refusals that are held back at once, of all callers: each holds a connection.
+_MOST_HELD_BACK = 100
+
+
+class RefusalDelays:
+    """Holds refusals back from callers who go on asking without a pause: each costs the same to
+    answer, and hundreds a second would cost others their time.
+    """
+
+    def __init__(self) -> None:
+        self._bucket = TokenBucket("refusals", REFUSALS_PER_S, REFUSALS)
+        self._held_back = 0
+
+    async def wait(self, whose: str) -> None:
+        """Wait before a refusal is sent to a tenant, or an address."""
+        state = self._bucket.take(whose)
+        if state is None or state.allowed or self._held_back >= _MOST_HELD_BACK:
+            return
+        self._held_back += 1
+        try:
+            await asyncio.sleep(REFUSAL_S)
+        finally:
+            self._held_back -= 1
 
 
 def page_rows(request: Request) -> int:

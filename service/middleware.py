@@ -8,7 +8,7 @@ import time
 import uuid
 from collections.abc import Callable
 
-from starlette.requests import ClientDisconnect
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -18,6 +18,7 @@ from sceneprint.settings import Settings
 from sceneprint.store.tenants import NOBODY, set_tenant
 from sceneprint.tracing import name_span, span
 from service.audit import note
+from service.auth import address_of
 from service.browser_security import (
     Headers,
     Origins,
@@ -27,7 +28,15 @@ from service.browser_security import (
     security_headers,
     stranger,
 )
-from service.limits import Broken, RateState, RequestBody, is_import, too_large
+from service.limits import (
+    Broken,
+    RateState,
+    RefusalDelays,
+    RequestBody,
+    is_import,
+    network_of,
+    too_large,
+)  # fmt: skip
 from service.metrics import Metrics
 from service.problems import problem, status_of
 
@@ -38,6 +47,8 @@ _ID = re.compile(rb"[\w.-]{1,64}")
 _METHODS = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"))
 #: As noted where the caller hung up before there was an answer.
 _HUNG_UP = 499
+#: Refusals that come late to who does not stop.
+_HELD_BACK = (401, 429)
 #: What machines ask every few seconds: not traced, and in the log at DEBUG alone.
 _PROBES = ("/healthz", "/readyz", "/metrics")
 #: Requests that are answered at once, those that wait or stream among them.
@@ -62,6 +73,7 @@ class RequestMiddleware:
         self._most, self._body_s = settings.upload_bytes, settings.body_s
         self._most_of_import = settings.import_bytes
         self._alone = not settings.asks_for_keys
+        self._delays = RefusalDelays()
         self._at_once = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -105,8 +117,11 @@ class RequestMiddleware:
                     *([] if standing is None else standing.headers()),
                 ]
                 message["headers"] = said + security_headers(said)
+                _call(at_answer)  # the note has a turn of its own
+                if status in _HELD_BACK and not self._alone:
+                    whose = state.get("tenant") or network_of(address_of(Request(scope)))
+                    await self._delays.wait(whose)
                 await note(scope, status, said)
-                _call(at_answer)
             await send(message)
 
         self._at_once += 1

@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, BinaryIO, TypeVar
 
-from anyio import to_thread
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 from starlette.background import BackgroundTask
@@ -94,9 +93,9 @@ def file_responses(
     return {200: done, 304: known, **declared(*statuses)}
 
 
-async def look(find: Callable[[], Output[T]]) -> Output[T]:
+async def look(here: Context, find: Callable[[], Output[T]]) -> Output[T]:
     """Look for it in a thread."""
-    return await to_thread.run_sync(find)
+    return await here.run(find)
 
 
 def tagged(output: Output[Any]) -> dict[str, str]:

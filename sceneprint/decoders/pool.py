@@ -21,7 +21,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -37,6 +36,7 @@ from sceneprint.errors import DecoderFailure
 from sceneprint.formats.depth_file import Samples, decode_samples
 from sceneprint.formats.points.cloud import FARTHEST_M, ReadPoints
 from sceneprint.formats.points.rows import MAXIMUM_POINTS
+from sceneprint.turns import ThreadTurns
 from sceneprint.types import MAXIMUM_SAMPLES, Floats32
 from sceneprint_client.api.frames import CloudFormat
 from sceneprint_client.files import MAXIMUM_IMAGE_BYTES
@@ -68,8 +68,6 @@ _ENVIRONMENT = (
     "PYTHONHOME", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "NUMBA_CPU_NAME",
     "NUMBA_CPU_FEATURES", "PYTHONDONTWRITEBYTECODE",
 )  # fmt: skip
-#: Seconds after its last upload in which a tenant counts as one to share decoders with.
-_PRESENT_S = 60.0
 
 
 class _Ended(Exception):
@@ -315,8 +313,7 @@ class _Slot:
 class DecoderPool:
     """Decoders in processes of their own; see Decoders.
 
-    A place goes to the tenant that holds fewest, and of equals to the one served the longest ago.
-    Beside another tenant one has half of the places at most.
+    Tenants take turns: see `sceneprint.turns`.
 
     Parameters
     ----------
@@ -332,15 +329,11 @@ class DecoderPool:
         program: str = PROGRAM,
     ) -> None:  # fmt: skip
         self.more_bytes, self.seconds = more_bytes, seconds
-        self._count, self._whose, self._program = count, whose, program
-        self._changed = threading.Condition()
+        self._whose, self._program = whose, program
+        self._turns = ThreadTurns(count)
         self._free = [_Slot(self) for _ in range(count)]
         self._slots = tuple(self._free)
-        self._held: Counter[str] = Counter()
-        self._waiting: dict[str, deque[object]] = {}
-        # when each tenant came last, and the number of its latest turn
-        self._seen: OrderedDict[str, tuple[float, int]] = OrderedDict()
-        self._given, self._closed = 0, False
+        self._closed = False
         # a process ends with the thread that started it, so one thread starts all of them
         self._starter = ThreadPoolExecutor(1, "decoder-starter")
         self._compiling = threading.Lock()
@@ -351,14 +344,16 @@ class DecoderPool:
     def place(self) -> Iterator[_Slot]:
         """See Decoders; Busy where no decoder gets free in time."""
         tenant = self._whose()
-        slot = self._take(tenant)
+        if not self._turns.acquire(tenant, _WAIT_S):
+            raise errors.Busy(
+                f"No decoder is free within {_WAIT_S:g} s. Nothing was stored. Retry in a minute."
+            )
+        slot = self._free.pop()  # the last is taken first: the others need not be started
         try:
             yield slot
         finally:
-            with self._changed:
-                self._held[tenant] -= 1
-                self._free.append(slot)  # the last is taken first: the others need not be started
-                self._changed.notify_all()
+            self._free.append(slot)
+            self._turns.release(tenant)
 
     def start(self) -> None:
         """Start one process."""
@@ -372,9 +367,8 @@ class DecoderPool:
 
     def close(self) -> None:
         """End all processes; uploads in hand fail."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
+        self._closed = True
+        self._turns.close()
         for slot in self._slots:
             slot.end()
         self._starter.shutdown()
@@ -416,43 +410,6 @@ class DecoderPool:
         about = {"pid": None if process is None else process.pid, "error": reason}
         log.warning("decoder replaced", extra={**about, "tenant": self._whose()})
         slot.end()
-
-    def _take(self, tenant: str) -> _Slot:
-        turn = object()
-        until = time.monotonic() + _WAIT_S
-        with self._changed:
-            now = time.monotonic()
-            self._seen[tenant] = now, self._seen.pop(tenant, (now, 0))[1]
-            while self._seen[next(iter(self._seen))][0] < now - _PRESENT_S:
-                self._seen.popitem(last=False)
-            queue = self._waiting.setdefault(tenant, deque())
-            queue.append(turn)
-            try:
-                while not (self._free and self._next() == tenant and queue[0] is turn):
-                    if self._closed or not self._changed.wait(until - time.monotonic()):
-                        raise errors.Busy(
-                            f"No decoder is free within {_WAIT_S:g} s. Nothing was stored. Retry "
-                            "in a minute."
-                        )
-            finally:
-                queue.remove(turn)
-                if not queue:
-                    del self._waiting[tenant]
-                self._changed.notify_all()
-            self._given += 1
-            self._held[tenant] += 1
-            self._seen[tenant] = now, self._given
-            return self._free.pop()
-
-    def _next(self) -> str | None:
-        """Tenant that is to have the next free place."""
-        most = self._count if len(self._seen) < 2 else max(self._count // 2, 1)
-        may = [
-            (self._held[one], self._seen.get(one, (0.0, 0))[1], one)
-            for one in self._waiting
-            if self._held[one] < most
-        ]
-        return min(may)[2] if may else None
 
 
 def _shape(reply: dict[str, Any], most: int) -> tuple[int, int]:

@@ -21,6 +21,7 @@ from sceneprint.store.sqlite import (
     BUSY_S,
     HELD_S,
     ReadOnlyFile,
+    WriterLine,
     open_sqlite,
     read_only_file,
     shrink_log,
@@ -41,6 +42,8 @@ from sqlalchemy.exc import ArgumentError
 import migrations
 from sceneprint.errors import SceneprintError
 from sceneprint.store.tables import metadata, schema_range, secrets
+from sceneprint.store.tenants import current_tenant
+from sceneprint.turns import ThreadTurns
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -305,7 +308,9 @@ class Database:
         )  # fmt: skip
         # of the writers of this process one asks for the turn, and the others wait here: each of
         # them would keep a connection from the readers
-        self._turn = threading.Lock()
+        self._turns = ThreadTurns(1)
+        file = None if sealed is not None else self.file
+        self._line = None if file is None else WriterLine(file.parent)
         self._held = False  # by another process, for longer than anybody should wait
         self._history: str | None = None
         self._guarded = False
@@ -417,14 +422,18 @@ class Database:
         wait_s = held_s if self._held else BUSY_S
         if unchecked and not self.is_sqlite:
             wait_s = postgres.MIGRATION_S
-        if not self._turn.acquire(timeout=wait_s):
+        tenant = current_tenant()
+        if not self._turns.acquire(tenant, wait_s):
             raise StoreLocked(
                 f"{self.shown}: other writers of this process have waited for long, and "
                 "nothing was stored. Come back later."
             )
         try:
             with self.explained(), self._engine.connect() as connection:
-                options: dict[str, Any] = {"sceneprint_write": wait_s}
+                options: dict[str, Any] = {
+                    "sceneprint_write": wait_s,
+                    "sceneprint_line": self._line,
+                }
                 if unchecked and self.is_sqlite:
                     options["sceneprint_unchecked"] = True
                     connection.detach()  # nobody else gets a connection that does not look
@@ -438,7 +447,7 @@ class Database:
             self._held = True
             raise
         finally:
-            self._turn.release()
+            self._turns.release(tenant)
 
     def _begin_writing(self, writing: Connection, wait_s: float, *, checked: bool) -> None:
         """Have the turn, which SQLite gave with the transaction, and see that it may be used."""
@@ -492,6 +501,8 @@ class Database:
     def close(self) -> None:
         """Give all connections back."""
         self._engine.dispose()
+        if self._line is not None:
+            self._line.close()
 
 
 def is_there(url: str) -> bool:

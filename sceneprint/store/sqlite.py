@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import sqlite3
 import stat
-from contextlib import suppress
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, event, make_url
-from sqlalchemy.exc import ArgumentError
+from sqlalchemy.exc import ArgumentError, OperationalError
 
 from sceneprint.atomic_files import PRIVATE_FILE
 from sceneprint.errors import ReadOnlyStore, UnusableStore
@@ -107,6 +110,8 @@ class ReadOnlyFile:
 
 #: Seconds a writer waits for another, and waits after somebody has waited so long in vain.
 BUSY_S, HELD_S = 10.0, 0.1
+#: Seconds between two looks for the lock, and for which a process waits until it is first in line.
+LOOK_S, LINE_S = 0.0005, 1.0
 #: Seconds for which emptying the log waits for readers: writers wait for it meanwhile.
 SHRINKING_S = 0.5
 
@@ -180,14 +185,85 @@ def begin_sqlite(connection: Connection) -> None:
     if connection.get_execution_options().get("sceneprint_unchecked"):
         connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # within a transaction it is late
     # a reader that turns writer half way would fail where another wrote in between
-    if wait_s == BUSY_S:
-        connection.exec_driver_sql("BEGIN IMMEDIATE")
-        return
-    connection.exec_driver_sql(f"PRAGMA busy_timeout = {_milliseconds(wait_s)}")
+    line: WriterLine | None = connection.get_execution_options().get("sceneprint_line")
+    with nullcontext() if line is None else line.first(min(wait_s, LINE_S)):
+        _begin_immediate(connection, wait_s)
+
+
+def _begin_immediate(connection: Connection, wait_s: float) -> None:
+    """Take the lock. SQLite itself would look for it less and less often, up to 0.1 s apart."""
+    until = time.monotonic() + wait_s
+    connection.exec_driver_sql("PRAGMA busy_timeout = 0")
     try:
-        connection.exec_driver_sql("BEGIN IMMEDIATE")
+        while True:
+            try:
+                connection.exec_driver_sql("BEGIN IMMEDIATE")
+            except OperationalError as error:
+                busy = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY
+                if not busy or time.monotonic() >= until:
+                    raise
+            else:
+                return
+            time.sleep(LOOK_S)
     finally:
         connection.exec_driver_sql(f"PRAGMA busy_timeout = {_milliseconds(BUSY_S)}")
+
+
+class WriterLine:
+    """Where processes that want to write stand in line: one at a time waits for SQLite's lock.
+
+    Else that would go to whoever looks at the right moment: to a service that writes without a
+    pause, and a worker would wait for seconds. What a process does that knows no line is right,
+    and not fair.
+
+    Parameters
+    ----------
+    folder : of the database; its lock is the place at the head of the line
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._descriptor: int | None = None
+
+    @contextmanager
+    def first(self, longest_s: float) -> Iterator[None]:
+        """Be the first in line, or have waited so long: the first may have been stopped."""
+        descriptor = self._open()
+        if descriptor is None or not _locked(descriptor, longest_s):
+            yield
+            return
+        try:
+            yield
+        finally:
+            fcntl.flock(descriptor, fcntl.LOCK_UN)
+
+    def close(self) -> None:
+        """Leave the folder."""
+        descriptor, self._descriptor = self._descriptor, None
+        if descriptor is not None:
+            os.close(descriptor)
+
+    def _open(self) -> int | None:
+        if self._descriptor is None:
+            with suppress(OSError):  # without a line it works too
+                how = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+                self._descriptor = os.open(self._folder, how)
+        return self._descriptor
+
+
+def _locked(descriptor: int, longest_s: float) -> bool:
+    until = time.monotonic() + longest_s
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= until:
+                return False
+            time.sleep(LOOK_S)
+        except OSError:  # the file system has no locks
+            return False
+        else:
+            return True
 
 
 def _milliseconds(seconds: float) -> int:

@@ -7,7 +7,6 @@ from functools import partial
 from typing import Annotated, Any
 from urllib.parse import quote
 
-from anyio import to_thread
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, Field, ValidationError
@@ -149,7 +148,7 @@ async def create_key(request: Request, here: Here, response: Response) -> MadeKe
         )
     new = _new(await read_json(request))
     make = partial(here.engine.create_key, new.name, new.grants, new.expires_at, new.tenant)
-    made = await to_thread.run_sync(make)
+    made = await here.run(make)
     response.headers["Location"] = f"/v1/keys/{quote(made.name, safe='')}"
     request.state.audited = made.model_dump(mode="json", include={"grants", "expires_at", "tenant"})
     return made
@@ -301,9 +300,7 @@ async def reencode(map_name: str, request: Request, here: Here, asking: Asking) 
     wanted = _wanted(await read_json(request))
     may_read = None if asking.reads_every else partial(asking.may, "read")
     find = here.engine.operations.catalogue.find
-    return await to_thread.run_sync(
-        lambda: here.engine.reencode(map_name, find(wanted.model, may_read))
-    )
+    return await here.run(lambda: here.engine.reencode(map_name, find(wanted.model, may_read)))
 
 
 @operations_router.delete(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from anyio import to_thread
 from fastapi import Depends, Query, Request, Response
 
 from sceneprint_client.api import Page
@@ -49,7 +48,7 @@ async def begin_coverage(
     `state` is `succeeded`. It takes the scope `write`.
     """
     asked = await read_record(request, NewMapCoverage, "The coverage", optional=True)
-    begun = await to_thread.run_sync(here.engine.coverage.begin, map_name, asked)
+    begun = await here.run(here.engine.coverage.begin, map_name, asked)
     response.headers["Location"] = f"/v1/maps/{map_name}/coverage/{begun.coverage_id}"
     return begun
 
@@ -132,5 +131,5 @@ async def get_coverage_plan(
     ] = None,
 ) -> Response:
     """A plan as a picture; 409 until the job has succeeded."""
-    output = await look(lambda: here.engine.coverage.picture(map_name, job_id, parent_frame))
+    output = await look(here, lambda: here.engine.coverage.picture(map_name, job_id, parent_frame))
     return await sent(request, here, output, _PNG, f"coverage-{job_id[:12]}.png")

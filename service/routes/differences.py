@@ -5,7 +5,6 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Annotated, Any
 
-from anyio import to_thread
 from fastapi import Depends, Query, Request, Response
 
 from sceneprint.errors import DamagedBlob
@@ -43,7 +42,7 @@ async def begin_difference(
     until `state` is `succeeded`. It takes the scope `write`.
     """
     asked = await read_record(request, NewDifference, "The difference")
-    begun = await to_thread.run_sync(here.engine.differences.begin, map_name, asked)
+    begun = await here.run(here.engine.differences.begin, map_name, asked)
     response.headers["Location"] = f"/v1/maps/{map_name}/differences/{begun.difference_id}"
     return begun
 

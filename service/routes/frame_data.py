@@ -5,7 +5,6 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Annotated
 
-from anyio import to_thread
 from fastapi import Depends, Query, Request, Response
 
 from sceneprint.engine.maps.map_frames import (
@@ -76,7 +75,7 @@ async def get_cloud(
     compares it; of a point cloud, a range image's about its viewpoint. The samples themselves are
     in the upload.
     """
-    found = await look(lambda: here.engine.outputs.cloud(map_name, frame_id, frame))
+    found = await look(here, lambda: here.engine.outputs.cloud(map_name, frame_id, frame))
     return await sent(request, here, found, PLY, name=f"{frame_id}-{frame}.ply")
 
 
@@ -107,7 +106,7 @@ async def get_preview(
     width: Annotated[int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Columns.")] = WIDTH,
 ) -> Response:
     """A picture of a frame, for people."""
-    found = await look(lambda: here.engine.outputs.preview(map_name, frame_id, view, width))
+    found = await look(here, lambda: here.engine.outputs.preview(map_name, frame_id, view, width))
     return await sent(request, here, found, PNG, name=f"{frame_id}-{view}.png")
 
 
@@ -118,7 +117,7 @@ async def get_preview(
 )
 async def get_patches(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """The surface patches of a frame, by level, and those that validation compares."""
-    found = await look(lambda: here.engine.outputs.patches(map_name, frame_id))
+    found = await look(here, lambda: here.engine.outputs.patches(map_name, frame_id))
     told = Output(found.tag, lambda: found.make().model_dump_json().encode())
     return await sent(request, here, told, JSON)
 
@@ -139,10 +138,10 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
     """
     outputs, kind = here.engine.outputs, preferred_media_type(request, (JSON, BYTES, NPY))
     if kind == JSON:
-        made = await look(lambda: outputs.signature(map_name, frame_id))
+        made = await look(here, lambda: outputs.signature(map_name, frame_id))
         told = Output(made.tag, lambda: made.make().model_dump_json().encode())
     else:
-        told = await look(lambda: outputs.vector(map_name, frame_id, kind))
+        told = await look(here, lambda: outputs.vector(map_name, frame_id, kind))
     return await sent(request, here, told, kind, Vary="Accept")
 
 
@@ -153,7 +152,7 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
 )
 async def get_upload(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """The frame's upload: what you sent in is yours to take out."""
-    found = await look(lambda: here.engine.outputs.upload(map_name, frame_id))
+    found = await look(here, lambda: here.engine.outputs.upload(map_name, frame_id))
     if is_known(request, found.tag):
         return Response(None, 304, tagged(found))
     async with here.gate.place():
@@ -205,7 +204,7 @@ async def get_frame_points(
 ) -> Response:
     """The points of `cloud.ply` in a third of its bytes, for a page to draw."""
     clouds = here.engine.points
-    found = await look(lambda: clouds.frame(map_name, frame_id, frame, limit))
+    found = await look(here, lambda: clouds.frame(map_name, frame_id, frame, limit))
     return await sent(request, here, found, MEDIA_TYPE)
 
 
@@ -223,8 +222,8 @@ async def get_query_points(
     query_id: str, request: Request, here: Here, asking: Asking, limit: Limit = LIMIT
 ) -> Response:
     """The surface that a query saw, for a page to draw, in the query's sensor's frame."""
-    await to_thread.run_sync(readable_answer, query_id, here, asking)
-    found = await look(lambda: here.engine.points.query(query_id, limit))
+    await here.run(readable_answer, query_id, here, asking)
+    found = await look(here, lambda: here.engine.points.query(query_id, limit))
     return await sent(request, here, found, MEDIA_TYPE)
 
 
@@ -259,7 +258,9 @@ async def get_match_points(
     """The query or a match of it, for a page to draw, each in its own sensor's frame; every point
     says how far it is from the surface that the other saw.
     """
-    await to_thread.run_sync(readable_answer, query_id, here, asking)
+    await here.run(readable_answer, query_id, here, asking)
     clouds = here.engine.points
-    found = await look(lambda: clouds.match(query_id, frame_id, map_name, side, transform, limit))
+    found = await look(
+        here, lambda: clouds.match(query_id, frame_id, map_name, side, transform, limit)
+    )
     return await sent(request, here, found, MEDIA_TYPE)

@@ -7,7 +7,6 @@ import time
 from typing import Annotated, Any
 
 import anyio
-from anyio import to_thread
 from fastapi import Depends, Header, Query, Request, Response
 from fastapi.concurrency import contextmanager_in_threadpool
 from pydantic_core import from_json
@@ -271,7 +270,7 @@ async def _settled(
             break
         await anyio.sleep(min(pause, left))  # holds no thread meanwhile
         pause = min(pause * GROWTH, LONGEST_PAUSE_S)
-        frame = await to_thread.run_sync(here.engine.get_frame, map_name, added.frame_id)
+        frame = await here.run(here.engine.get_frame, map_name, added.frame_id)
         added = added.model_copy(update={"state": frame.state, "reason": frame.reason})
     return added
 

@@ -172,7 +172,7 @@ async def events(
         wanted = _wanted(here, asking, map_name, kind)
         return wanted, None if last is None else seals.event(last, place)
 
-    wanted, number = await to_thread.run_sync(asked)
+    wanted, number = await here.run(asked)
     if MEDIA_TYPE in request.headers.get("accept", ""):
         here.feed.join(asking.tenant)
         release_place(request)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Annotated, Any
 
-from anyio import to_thread
 from fastapi import Depends, Query, Request, Response
 from pydantic import ValidationError
 
@@ -47,7 +46,7 @@ async def create_map(request: Request, here: Here, asking: Asking, response: Res
     asking.require_new(new.name)
     if OPERATORS & new.model_fields_set:
         asking.require_every("admin")
-    made, is_new = await to_thread.run_sync(here.engine.create_map, new)
+    made, is_new = await here.run(here.engine.create_map, new)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/maps/{made.name}"
     return made
@@ -132,7 +131,7 @@ async def patch_frame(
 ) -> Frame:
     """Change the metadata of a frame (JSON merge patch, RFC 7396); filters see it at once."""
     patch, tags = await _patch(request), expected(request)
-    frame = await to_thread.run_sync(edit_frame, here.engine.store, map_name, frame_id, patch, tags)
+    frame = await here.run(edit_frame, here.engine.store, map_name, frame_id, patch, tags)
     response.headers["ETag"] = f'"{frame.etag}"'
     return frame
 
@@ -156,7 +155,7 @@ async def patch_map(
     if OPERATORS & patch.keys():
         asking.require_every("admin")
     edit = partial(edit_map, here.engine.store, map_name, patch, tags, dry_run=dry_run)
-    edited = await to_thread.run_sync(edit)
+    edited = await here.run(edit)
     told = {name: getattr(edited, name) for name in sorted(LIMITS & patch.keys())}
     request.state.audited = {"dry_run": True} if dry_run else told
     response.headers["ETag"] = f'"{edited.etag}"'

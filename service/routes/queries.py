@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from anyio import to_thread
 from fastapi import Depends, Request
 
 from sceneprint.engine.results.query_history import AskedQuery
@@ -128,7 +127,7 @@ async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
     since, at, queries = time.perf_counter(), time.time(), here.engine.queries
     async with here.gate.place(), question(request, SeveralQuery, "frame") as body:
         query, upload, frame = body.query, body.upload, body.query.frame
-        maps = await to_thread.run_sync(queries.maps_of, query, partial(asking.may, "read"))
+        maps = await here.run(queries.maps_of, query, partial(asking.may, "read"))
         named = None if frame is None else FrameName(map=frame.map, frame_id=frame.frame_id)
         asked = AskedQuery(maps, query, body.robot, body.session, asking.key_id, named, at)
         if upload is not None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Any
 
-from anyio import to_thread
 from fastapi import Request, Response
 
 from sceneprint.engine.reconstruction import MEDIA_TYPES, MESH, PICTURE
@@ -45,9 +44,9 @@ async def reconstruct(
     A worker does it, with Open3D. The answer may expire meanwhile. Ask under `Location` until
     `state` is `succeeded`; then mesh.ply and picture.png are there. It takes the scope `write`.
     """
-    kept = await to_thread.run_sync(lambda: _stored_answer(here, asking, query_id))
+    kept = await here.run(lambda: _stored_answer(here, asking, query_id))
     wanted = await read_record(request, NewReconstruction, "The reconstruction", optional=True)
-    made = await to_thread.run_sync(lambda: here.engine.reconstructions.begin(kept, wanted))
+    made = await here.run(lambda: here.engine.reconstructions.begin(kept, wanted))
     response.headers["Location"] = f"/v1/reconstructions/{made.job_id}"
     return made
 
@@ -117,7 +116,7 @@ async def _sent(
     request: Request, here: Context, asking: Caller, job_id: str, name: str
 ) -> Response:
     """A file of a reconstruction, which is read whole before: when it is its turn."""
-    await to_thread.run_sync(_find_reconstruction, here, asking, job_id)
+    await here.run(_find_reconstruction, here, asking, job_id)
     async with here.gate.place():
         return await here.gate.run(lambda: _file(request, here, job_id, name))
 

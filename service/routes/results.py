@@ -6,7 +6,6 @@ import time
 from functools import partial
 from typing import Annotated, Any
 
-from anyio import to_thread
 from fastapi import Query, Request, Response
 from pydantic import AwareDatetime
 
@@ -87,7 +86,7 @@ def get_answer(query_id: str, here: Here, asking: Asking) -> Answer:
 async def get_query_cloud(query_id: str, here: Here, asking: Asking) -> Response:
     """The surface that the query saw, as validation compares it: binary PLY, metres."""
     inspection = here.engine.inspection
-    await to_thread.run_sync(readable_answer, query_id, here, asking)
+    await here.run(readable_answer, query_id, here, asking)
     async with here.gate.place():
         data = await here.gate.run(lambda: inspection.cloud(query_id))
     return Response(data, media_type=PLY)
@@ -104,7 +103,7 @@ async def get_similarities(
 ) -> Similarities:
     """How alike the query and its nearest frames are, each to each: what the selection sees."""
     inspection = here.engine.inspection
-    await to_thread.run_sync(readable_answer, query_id, here, asking)
+    await here.run(readable_answer, query_id, here, asking)
     async with here.gate.place():
         return await here.gate.run(lambda: inspection.similarities(query_id, limit))
 
@@ -119,7 +118,7 @@ async def get_match(
     passed over is validated now.
     """
     inspection = here.engine.inspection
-    await to_thread.run_sync(readable_answer, query_id, here, asking)
+    await here.run(readable_answer, query_id, here, asking)
     async with here.gate.place():
         return await here.gate.run(lambda: inspection.match(query_id, frame_id, map_name))
 
@@ -155,7 +154,7 @@ async def get_overlay(
 ) -> Response:
     """The query laid on a match, to see how well they fit: binary PLY, metres."""
     inspection = here.engine.inspection
-    await to_thread.run_sync(readable_answer, query_id, here, asking)
+    await here.run(readable_answer, query_id, here, asking)
     async with here.gate.place():
         data = await here.gate.run(
             lambda: inspection.overlay(query_id, frame_id, map_name, color, transform)
@@ -208,7 +207,7 @@ async def get_query_preview(
 ) -> Response:
     """A picture of what the query saw, for people."""
     again = here.engine.again
-    await to_thread.run_sync(readable_answer, query_id, here, asking)
+    await here.run(readable_answer, query_id, here, asking)
     async with here.gate.place():
         data = await here.gate.run(lambda: again.preview(query_id, view, width))
     return Response(data, 200, {"Cache-Control": "private, no-cache"}, PNG)
@@ -222,7 +221,7 @@ async def ask_again(query_id: str, request: Request, here: Here, asking: Asking)
     The answer has an id of its own.
     """
     since, at, engine = time.perf_counter(), time.time(), here.engine
-    answer = await to_thread.run_sync(readable_answer, query_id, here, asking)
+    answer = await here.run(readable_answer, query_id, here, asking)
     if media_type(request) != JSON:
         raise UnsupportedType(
             f"The body is {media_type(request) or 'of no type'!r:.80}. Send options as {JSON}; "
@@ -233,7 +232,7 @@ async def ask_again(query_id: str, request: Request, here: Here, asking: Asking)
     fields = engine.again.options(query_id, given)
     query = checked(SeveralQuery, {**fields, "maps": answer.maps if maps is None else maps})
     async with here.gate.place():
-        names = await to_thread.run_sync(engine.queries.maps_of, query, partial(asking.may, "read"))
+        names = await here.run(engine.queries.maps_of, query, partial(asking.may, "read"))
         # which also refuses `frame`, that SeveralQuery has: it is the kept one
         options = checked(Options, fields)
         asked = AskedQuery(names, options, key_id=asking.key_id, frame=answer.frame, at=at)
@@ -270,9 +269,9 @@ async def keep_answer(
     asked.
     """
     engine = here.engine
-    await to_thread.run_sync(_writable_answer, query_id, here, asking)
+    await here.run(_writable_answer, query_id, here, asking)
     options = await read_record(request, KeepOptions, "The request to keep it", optional=True)
-    return await to_thread.run_sync(engine.kept_answers.keep, engine.kept, query_id, options)
+    return await here.run(engine.kept_answers.keep, engine.kept, query_id, options)
 
 
 @router.delete("/keep", status_code=204, responses=declared(404, 422))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Annotated, Any
 
-from anyio import to_thread
 from fastapi import Depends, Query, Request, Response
 
 from sceneprint.engine.maps.map_frames import growth, list_sessions, trajectory, trajectory_file
@@ -179,7 +178,7 @@ async def begin_association(
     frames, and those that are left vote on how the sessions' parent frames lie to each other.
     """
     asked = await read_record(request, NewAssociation, "The association")
-    begun = await to_thread.run_sync(here.engine.associations.begin, map_name, asked)
+    begun = await here.run(here.engine.associations.begin, map_name, asked)
     response.headers["Location"] = f"/v1/maps/{map_name}/associations/{begun.association_id}"
     return begun
 

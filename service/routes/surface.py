@@ -160,7 +160,9 @@ async def get_surface_plan(
     ] = None,
 ) -> Response:
     """A surface as a picture. `plan` of GET /v1/maps/{map_name}/surface tells where it lies."""
-    output = await look(lambda: here.engine.surfaces.picture(map_name, parent, width, low, high))
+    output = await look(
+        here, lambda: here.engine.surfaces.picture(map_name, parent, width, low, high)
+    )
     return await sent(request, here, output, _PNG, "surface.png")
 
 

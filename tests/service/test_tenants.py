@@ -6,12 +6,14 @@ import asyncio
 import re
 import socket
 from contextlib import ExitStack
+from pathlib import Path
 
 import httpx
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 from sqlalchemy import select
 
+import service
 from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import create_tenant
 from sceneprint.errors import RateLimited
@@ -19,8 +21,19 @@ from sceneprint.settings import Settings
 from sceneprint.store.queue import enqueue, waiting_by_tenant
 from sceneprint.store.tables import jobs
 from sceneprint.store.tenants import NOBODY, work_of
-from service.limits import IN_MEMORY, Broken, Holdings, RequestBody, Spool, Turns, share
-from service.metrics import MOST_TENANTS, TenantMetrics
+from service.browser_security import origins_of
+from service.limits import (
+    IN_MEMORY,
+    REFUSALS,
+    Broken,
+    Holdings,
+    RequestBody,
+    Spool,
+    Turns,
+    share,
+)  # fmt: skip
+from service.metrics import MOST_TENANTS, Metrics, TenantMetrics
+from service.middleware import RequestMiddleware
 
 
 class Clock:
@@ -118,7 +131,7 @@ def test_a_tenant_holds_three_quarters_at_most_and_gives_it_back():
 def test_turns_alternate_between_tenants_and_leave_half_to_others():
     async def test() -> list[str]:
         clock = Clock()
-        turns, order = Turns(4, clock), []
+        turns, order = Turns(4, clock=clock), []
 
         async def ask(tenant: str, weight: int = 1) -> None:
             await turns.acquire(tenant, weight)
@@ -165,6 +178,57 @@ def test_who_gives_up_takes_no_turn():
         assert await asyncio.wait_for(turns.acquire("b", 9), 30) == 1  # no more than there are
 
     asyncio.run(test())
+
+
+def test_refusals_come_late_to_who_does_not_stop():
+    """Of one address; another is answered at once."""
+
+    async def refuse(scope, receive, send) -> None:
+        del scope, receive
+        await send({"type": "http.response.start", "status": 429, "headers": []})
+        await send({"type": "http.response.body", "body": b"no"})
+
+    settings = Settings(host="0.0.0.0")
+    assert settings.asks_for_keys
+    app = RequestMiddleware(refuse, settings, origins_of(settings), Metrics())
+    answered: list[str] = []
+
+    async def receive():
+        return {"type": "http.request"}
+
+    async def ask(address: str) -> None:
+        async def send(message) -> None:
+            if message["type"] == "http.response.start":
+                answered.append(address)
+
+        scope = {
+            "type": "http", "method": "GET", "path": "/v1/maps", "headers": [],
+            "query_string": b"", "client": (address, 1),
+        }  # fmt: skip
+        await app(scope, receive, send)
+
+    async def test() -> None:
+        asking = [asyncio.create_task(ask("192.0.2.1")) for _ in range(REFUSALS + 5)]
+        other = asyncio.create_task(ask("192.0.2.2"))
+        await other
+        assert sorted(answered) == ["192.0.2.1"] * REFUSALS + ["192.0.2.2"]
+        done, late = await asyncio.wait(asking, return_when=asyncio.FIRST_COMPLETED)
+        assert (len(done), len(late)) == (REFUSALS, 5)
+        for one in late:
+            one.cancel()
+        await asyncio.gather(*late, return_exceptions=True)
+
+    asyncio.run(test())
+
+
+def test_every_route_that_works_in_a_thread_takes_a_turn():
+    """Else one tenant could hold all threads, and the interpreter, with whatever takes none."""
+    free = []
+    for path in (Path(service.__file__).parent / "routes").glob("*.py"):
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            if "to_thread.run_sync" in line:
+                free.append(f"{path.name}:{number}")
+    assert [one.partition(":")[0] for one in free] == ["jobs.py"]  # which holds one by hand
 
 
 class SmallSpool(Spool):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -27,6 +28,39 @@ def work(i):
         with database.write() as connection:
             seen.append(next_revision(connection, int(ARGS[1])))
     return seen
+"""
+
+
+#: One process writes in four threads without a pause; the other counts the commits of the first
+#: that it has to wait for.
+LINE = """
+import threading
+from pathlib import Path
+from sceneprint.store import open_database
+from sceneprint.store.maps import next_revision
+
+def work(i):
+    database, number, over = open_database(ARGS[0]), int(ARGS[1]), Path(ARGS[2])
+    def revise():
+        with database.write() as connection:
+            return [next_revision(connection, number) for _ in range(10)][0]
+    def go_on():
+        while not over.exists():
+            revise()
+    if i == 0:
+        threads = [threading.Thread(target=go_on) for _ in range(4)]
+        [one.start() for one in threads]
+        [one.join() for one in threads]
+        return []
+    while revise() < 200:  # the other has begun
+        pass
+    last, waited = revise(), []
+    for _ in range(30):
+        found = revise()
+        waited.append((found - last) // 10 - 1)
+        last = found
+    over.touch()
+    return waited
 """
 
 
@@ -112,6 +146,15 @@ def test_a_writer_holds_what_it_has_read(store: Store, hall: MapRow) -> None:
         thread.join()
     with store.database.read() as connection:
         assert find_map(connection, "hall").revision == 120
+
+
+@pytest.mark.sqlite_only("a server has locks of its own")
+def test_a_process_that_writes_without_a_pause_keeps_no_other_waiting(
+    url: str, hall: MapRow, race: Callable[..., list[Any]], tmp_path: Path
+) -> None:
+    _, waited = race(LINE, 2, url, hall.number, tmp_path / "over")
+    assert len(waited) == 30
+    assert max(waited) <= 2, waited
 
 
 def test_no_revision_is_lost_or_given_twice(

@@ -1,0 +1,136 @@
+"""Turns of threads: fair among tenants, given up in time, and none after the end."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from sceneprint.turns import PRESENT_S, ThreadTurns, TurnOrder
+
+
+class Clock:
+    """Seconds that pass when told to."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def queue(turns: ThreadTurns, tenants: str, order: list[str]) -> list[threading.Thread]:
+    """Threads that wait for a turn in that order, and note when they have had it."""
+    found = []
+
+    def take(tenant: str) -> None:
+        assert turns.acquire(tenant, 60)
+        order.append(tenant)
+        turns.release(tenant)
+
+    for number, tenant in enumerate(tenants):
+        thread = threading.Thread(target=take, args=(tenant,))
+        thread.start()
+        found.append(thread)
+        await_waiting(turns, number + 1)
+    return found
+
+
+def await_waiting(turns: ThreadTurns, count: int) -> None:
+    until = time.monotonic() + 60
+    while len(turns._order.waiters()) != count:
+        assert time.monotonic() < until
+        time.sleep(0.001)
+
+
+def test_a_turn_goes_to_who_was_served_the_longest_ago() -> None:
+    turns, order = ThreadTurns(1), list[str]()
+    assert turns.acquire("a", 60)
+    threads = queue(turns, "aaaaabbc", order)
+    turns.release("a")
+    for thread in threads:
+        thread.join()
+    assert "".join(order) == "bcabaaaa"
+
+
+def test_who_waits_for_too_long_gets_none_and_holds_nobody_up() -> None:
+    turns, order = ThreadTurns(1), list[str]()
+    assert turns.acquire("a", 60)
+    assert not turns.acquire("b", 0.01)
+    threads = queue(turns, "c", order)
+    turns.release("a")
+    threads[0].join()
+    assert order == ["c"]
+    assert turns.acquire("b", 0)
+
+
+def test_after_the_end_there_are_no_turns() -> None:
+    turns, told = ThreadTurns(1), list[bool]()
+    assert turns.acquire("a", 60)
+    waiting = threading.Thread(target=lambda: told.append(turns.acquire("b", 600)))
+    waiting.start()
+    await_waiting(turns, 1)
+    turns.close()
+    waiting.join(60)
+    assert told == [False]
+    assert not turns.acquire("c", 600)
+
+
+def test_beside_another_a_tenant_holds_so_many_and_alone_all() -> None:
+    clock = Clock()
+    order: TurnOrder[str] = TurnOrder(4, 1, clock)
+
+    def ask(*waiters: str) -> list[str]:
+        for one in waiters:
+            order.enter(one[0], one)
+        return order.admit()
+
+    assert ask("a1", "a2") == ["a1", "a2"]
+    assert ask("b1", "b2", "a3") == ["b1"]
+    order.release("a")
+    order.release("b")
+    assert order.admit() == ["b2"]  # a has one still
+    order.release("a")
+    assert order.admit() == ["a3"]
+    order.release("b")
+    clock.now = PRESENT_S + 1  # b is gone
+    assert ask("a4", "a5", "a6", "a7") == ["a4", "a5", "a6"]
+
+
+def test_who_asks_for_several_gets_them_beside_another_too_where_it_holds_none() -> None:
+    order: TurnOrder[str] = TurnOrder(8, 1)
+    assert order.enter("b", "b1") == 1
+    assert order.enter("a", "heavy", 20) == 4  # half of all at most
+    assert order.admit() == ["heavy", "b1"]
+    order.enter("a", "light")
+    assert order.admit() == []
+    order.release("a", 4)
+    assert order.admit() == ["light"]
+
+
+def test_many_threads_never_hold_more_than_there_are() -> None:
+    turns, lock = ThreadTurns(3), threading.Lock()
+    held, most, done = 0, 0, 0
+
+    def work(tenant: str) -> Callable[[], None]:
+        def run() -> None:
+            nonlocal held, most, done
+            for _ in range(50):
+                assert turns.acquire(tenant, 60)
+                with lock:
+                    held += 1
+                    most = max(most, held)
+                with lock:
+                    held -= 1
+                    done += 1
+                turns.release(tenant)
+
+        return run
+
+    threads = [threading.Thread(target=work("abc"[number % 3])) for number in range(9)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (held, done) == (0, 450)
+    assert 1 <= most <= 3
