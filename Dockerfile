@@ -82,7 +82,7 @@ USER 10001:10001
 # an older one the first use compiles once more, into the same folder.
 RUN python -c "from sceneprint.cli.options import prepare_presets; \
     from sceneprint.settings import Settings; \
-    prepare_presets(Settings(), clouds=True, portable=True)"
+    prepare_presets(Settings(), clouds=True)"
 
 VOLUME ["/data"]
 EXPOSE 8008

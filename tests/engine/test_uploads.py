@@ -72,7 +72,7 @@ def test_while_others_wait_a_new_frame_takes_one_statement_or_one_for_each_table
     written = ["UPDATE maps", "INSERT INTO frames", "INSERT INTO frame_tags", "INSERT INTO jobs",
                "INSERT INTO events"]  # fmt: skip
     if database.is_sqlite:
-        begun, *said = said
+        begun, *said = [one for one in said if not one.startswith("PRAGMA busy_timeout")]
         assert begun == "BEGIN IMMEDIATE"
     # whether a later version migrated meanwhile: on PostgreSQL in the message that has the turn
     check, *said = said

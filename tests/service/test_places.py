@@ -219,7 +219,11 @@ def test_a_wait_looks_less_and_less_often_and_ends_with_its_caller(
     monkeypatch.setattr(frames, "time", clock)
     monkeypatch.setattr(frames.anyio, "sleep", sleep)
     frame = SimpleNamespace(state="received", reason=None)
-    here: Any = SimpleNamespace(engine=SimpleNamespace(get_frame=lambda *_: frame))
+
+    async def run(do: Callable[..., object], *given: object) -> object:
+        return do(*given)
+
+    here: Any = SimpleNamespace(engine=SimpleNamespace(get_frame=lambda *_: frame), run=run)
     request: Any = SimpleNamespace(is_disconnected=is_disconnected)
     added = Added(frame_id="f", job_id="j", state="received", reason=None)
     settled = asyncio.run(frames._settled(request, here, "m", added, 10.0))
