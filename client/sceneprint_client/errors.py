@@ -138,7 +138,7 @@ class UnreadableGeometry(SceneprintError):
 
 
 class NotFound(SceneprintError):
-    """Nothing with the name or id of the request exists."""
+    """What the request names does not exist."""
 
 
 class UnknownMap(NotFound):
@@ -248,7 +248,7 @@ class KeyRequired(SceneprintError):
 
 
 class Forbidden(SceneprintError):
-    """The key of the request may read this, but not change it."""
+    """The key of the request lacks the scope for it."""
 
 
 class QuotaExceeded(SceneprintError):

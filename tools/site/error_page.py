@@ -75,8 +75,10 @@ REMEDIES: dict[type[SceneprintError], str] = {
 OTHERS = (
     (400, "BadRequest", "The request is not HTTP.", "Use an HTTP client."),
     (404, "NotFound", "There is no such path.", "Check the path against the operations."),
-    (405, "MethodNotAllowed", "The path does not support this method.", "`Allow` lists the methods that it supports."),
-    (406, "NotAcceptable", "`Accept` names no type that the operation returns.", "Leave `Accept` out."),
+    (405, "MethodNotAllowed", "The path does not support this method.",
+     "`Allow` lists the methods that it supports."),
+    (406, "NotAcceptable", "`Accept` names no type that the operation returns.",
+     "Leave `Accept` out."),
     (416, "RangeNotSatisfiable", "The file is shorter than `Range` asks for.",
      "Ask for a range within the file."),
     (500, "InternalError", "The service failed; nothing was partially written.",
