@@ -37,7 +37,8 @@ class BuildWithKernels(build_py):
         """Build."""
         super().run()
         if COMPILE and not self.editable_mode:
-            compile_in(Path(self.build_lib).resolve())
+            metadata = Path(self.get_finalized_command("egg_info").egg_info)
+            compile_in(Path(self.build_lib).resolve(), metadata)
 
 
 class Package(Distribution):
@@ -48,17 +49,19 @@ class Package(Distribution):
         return COMPILE
 
 
-def compile_in(folder: Path) -> None:
-    """Compile the kernels of packages in a folder, for every processor of our kind."""
+def compile_in(folder: Path, metadata: Path) -> None:
+    """Compile the kernels of packages in a folder, for every processor of our kind.
+
+    The packages ask for their version, and need not be installed yet: they find it in `metadata`.
+    """
     for old in [*folder.rglob("__pycache__")]:
         shutil.rmtree(old)
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join((str(folder), str(HERE / "client"))),
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
     environment.pop("NUMBA_CACHE_DIR", None)
     with tempfile.TemporaryDirectory() as elsewhere:  # the tables, and no checkout beside it
+        shutil.copytree(metadata, Path(elsewhere) / metadata.name)
+        path = (str(folder), str(HERE / "client"), elsewhere)
+        environment["PYTHONPATH"] = os.pathsep.join(path)
         subprocess.run(
             [sys.executable, "-c", PROGRAM, elsewhere], cwd=elsewhere, env=environment, check=True
         )

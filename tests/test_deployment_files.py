@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -94,7 +95,7 @@ def settings_of(text: str) -> dict[str, str]:
         if line.startswith("Environment="):
             found += line.removeprefix("Environment=").split()
         elif re.match(r"(# )?[A-Z_]+=", line):
-            found.append(line.removeprefix("# "))
+            found += shlex.split(line.removeprefix("# "))
     return dict(one.split("=", 1) for one in found)
 
 
@@ -113,6 +114,20 @@ def test_units_and_environment_set_what_is_read() -> None:
     assert told.workers == 0
     assert told.asks_for_keys
     assert "change-me" not in told.database  # in no URL is a secret
+
+
+def test_a_shell_reads_the_environment_as_systemd_does() -> None:
+    """docs/deployment.md has operators source it; in an unquoted URL `&` ends a command."""
+    path = FOLDER / "sceneprint.env"
+    expected = {line for line in path.read_text().splitlines() if re.match("[A-Z_]+=", line)}
+    block = f"set -a && . {path} && set +a && env -0"
+    env = {"PATH": os.environ["PATH"]}
+    done = subprocess.run(["bash", "-euc", block], env=env, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    sourced = dict(one.split("=", 1) for one in done.stdout.split("\0") if one)
+    assert sourced.items() >= settings_of("\n".join(expected)).items()
+    url = "postgresql+psycopg://sceneprint@/sceneprint?host=db1.example:5432&host=db2.example:5432"
+    assert sourced["SCENEPRINT_DATABASE_URL"] == f"{url}&target_session_attrs=read-write"
 
 
 def test_units_are_alike_but_for_what_they_run() -> None:

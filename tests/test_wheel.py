@@ -79,10 +79,22 @@ print(hashlib.sha256(prepare(_corner(), signer)[0].vector.tobytes()).hexdigest()
 """
 
 
+def environment_without_us(folder: Path) -> Path:
+    """The Python of an environment with all libraries of this one, and no sceneprint yet."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
+    (there,) = folder.glob("lib/python*/site-packages")
+    for libraries in (Path(one) for one in sys.path if one.endswith("site-packages")):
+        for one in libraries.iterdir():
+            if "sceneprint" not in one.name and one.suffix != ".pth" and one.name != "__pycache__":
+                (there / one.name).symlink_to(one)
+    return folder / "bin" / "python"
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built from what git knows of this checkout."""
+    """Built from what git knows of this checkout, as on a node where nothing of it is installed."""
     folder = tmp_path_factory.mktemp("wheel")
+    python = environment_without_us(folder / "environment")
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT, capture_output=True, text=True, check=True,
@@ -94,7 +106,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
             to = folder / "source" / name
             to.parent.mkdir(parents=True, exist_ok=True)
             to.write_bytes((ROOT / name).read_bytes())
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps",
+    command = [str(python), "-m", "pip", "wheel", "--quiet", "--no-deps",
                "--no-build-isolation", "--wheel-dir", str(folder / "wheels"), "."]  # fmt: skip
     env = {**os.environ, "SCENEPRINT_COMPILE": "1"}
     done = subprocess.run(

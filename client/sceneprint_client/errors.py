@@ -101,11 +101,11 @@ class UselessFrame(FrameError):
 
 
 class UnreadableArchive(FrameError):
-    """The bytes are no archive of frames, or none that is safe to read."""
+    """The bytes are not an archive of frames, or are not safe to read."""
 
 
 class DatasetError(SceneprintError):
-    """The folder or file is no sequence of frames."""
+    """The folder or file is not a sequence of frames."""
 
 
 class ModelError(SceneprintError):
@@ -113,7 +113,7 @@ class ModelError(SceneprintError):
 
 
 class UnreadableModel(ModelError):
-    """The file is no model, is damaged, or has another schema."""
+    """The file is not a model, is damaged, or has another schema."""
 
 
 class ModelMismatch(ModelError):
@@ -121,19 +121,19 @@ class ModelMismatch(ModelError):
 
 
 class UnreadableGeometry(SceneprintError):
-    """The bytes are no geometry artifact, are damaged, or have another schema."""
+    """The bytes are not a geometry artifact, are damaged, or have another schema."""
 
 
 class NotFound(SceneprintError):
-    """What a request names is not there."""
+    """What the request names does not exist."""
 
 
 class UnknownMap(NotFound):
-    """There is no map of that name."""
+    """There is no map with that name."""
 
 
 class UnknownFrame(NotFound):
-    """There is no frame of that id in the map."""
+    """There is no frame with that id in the map."""
 
 
 class UnknownSession(NotFound):
@@ -141,39 +141,39 @@ class UnknownSession(NotFound):
 
 
 class UnknownJob(NotFound):
-    """There is no job of that id."""
+    """There is no job with that id."""
 
 
 class UnknownKey(NotFound):
-    """There is no key of that name."""
+    """There is no key with that name."""
 
 
 class UnknownTenant(NotFound):
-    """There is no tenant of that name."""
+    """There is no tenant with that name."""
 
 
 class UnknownQuery(NotFound):
-    """There is no answer of that id, or no longer."""
+    """There is no answer with that id, or it has expired."""
 
 
 class UnknownDeletion(NotFound):
-    """There is no deletion of that id that could be undone, or no longer."""
+    """There is no deletion with that id, or it can no longer be undone."""
 
 
 class UnknownSnapshot(NotFound):
-    """There is no snapshot of that id."""
+    """There is no snapshot with that id."""
 
 
 class Conflict(SceneprintError):
-    """The request contradicts what is there."""
+    """The request contradicts what is stored."""
 
 
 class MapExists(Conflict):
-    """There is a map of that name, with another title or model."""
+    """A map with that name exists, but has another title or model."""
 
 
 class FrameConflict(Conflict):
-    """The map has a frame of the same content with other metadata."""
+    """The map has a frame with the same content and other metadata."""
 
 
 class JobOver(Conflict):
@@ -181,15 +181,15 @@ class JobOver(Conflict):
 
 
 class CannotRetry(Conflict):
-    """The job is not over, its frame has a later one, or there is nothing to try again."""
+    """The job is not over, its frame has a later job, or there is nothing to retry."""
 
 
 class NotIndexed(Conflict):
-    """What is asked for is made when the frame is indexed, or the job done, and it is not."""
+    """The frame is not indexed, or the job has not succeeded, so the result does not exist yet."""
 
 
 class PreconditionFailed(SceneprintError):
-    """What is to be edited is not as it was when it was read."""
+    """The object was changed after you read it."""
 
 
 class InvalidRequest(SceneprintError):
@@ -211,7 +211,7 @@ class MalformedBody(InvalidRequest):
 
 
 class UnsupportedType(InvalidRequest):
-    """The body of a request is of a type that is not read."""
+    """The body of a request has a type that the operation does not read."""
 
 
 class TooLarge(InvalidRequest):
@@ -231,11 +231,11 @@ class IdempotencyConflict(InvalidRequest):
 
 
 class KeyRequired(SceneprintError):
-    """The service asks for a key, and none or an unknown one was given."""
+    """The service requires a key, and the request has none or an unknown one."""
 
 
 class Forbidden(SceneprintError):
-    """The key that was shown may see this, but not do that."""
+    """The key of the request lacks the scope for it."""
 
 
 class QuotaExceeded(SceneprintError):
@@ -243,7 +243,7 @@ class QuotaExceeded(SceneprintError):
 
 
 class RateLimited(SceneprintError):
-    """The caller asks more often than it may."""
+    """The caller sends more requests than it may."""
 
 
 class Misdirected(SceneprintError):
@@ -255,11 +255,11 @@ class ForeignOrigin(SceneprintError):
 
 
 class Busy(SceneprintError):
-    """As many requests wait as may."""
+    """The queue of waiting requests is full."""
 
 
 class StoreError(SceneprintError):
-    """The store cannot do what it should."""
+    """The store failed."""
 
 
 class UnusableStore(StoreError):
@@ -271,11 +271,11 @@ class StoreFull(UnusableStore):
 
 
 class ReadOnlyStore(UnusableStore):
-    """The folder or database may be read, and not written."""
+    """The folder or database can be read, but not written."""
 
 
 class StoreLocked(UnusableStore):
-    """Another process has kept the database from all other writers for long."""
+    """Another process has locked the database for too long."""
 
 
 class StoreAway(UnusableStore):
@@ -291,7 +291,7 @@ class DamagedBlob(StoreError):
 
 
 class DamagedSignature(StoreError):
-    """A stored signature has not the bytes that were stored."""
+    """A stored signature differs from the one that was stored."""
 
 
 class SnapshotError(StoreError):
@@ -303,7 +303,7 @@ class DamagedSnapshot(SnapshotError):
 
 
 class ServiceError(SceneprintError):
-    """What a client is told by, or of, a service."""
+    """A service refused a request, or could not be reached."""
 
 
 class Unreachable(ServiceError):

@@ -459,7 +459,9 @@ def open_store(
 def _open_store(url: str, blobs: Path | str) -> Store:
     new = not is_read_only(url) and not is_there(url)
     if isinstance(blobs, Path):
-        kept = FolderBlobs(blobs, make=new)  # the data folder is made with it
+        kept = FolderBlobs(blobs, make=new)
+        if new:  # its folder need not be that of the blobs: `file:///folder`
+            _make_folder_of(url)
         return Store(open_database(url), kept)
     if new:
         _make_folder_of(url)

@@ -204,7 +204,7 @@ def test_every_error_is_listed_with_its_status_and_what_to_do(
             assert row[3] == cell(remedy(kind))
     assert problems["/problems/rate-limited"] == [
         "429 Too Many Requests", "`/problems/rate-limited`",
-        "The caller asks more often than it may.", "Wait for the seconds in `Retry-After`.",
+        "The caller sends more requests than it may.", "Wait for the seconds in `Retry-After`.",
     ]  # fmt: skip
     # whatever the reference by hand lists is there, too
     table = (ROOT / "docs/reference.md").read_text().split("## Problems")[1]

@@ -29,6 +29,15 @@ def objects_of(store: Store) -> ObjectBlobs:
     return store.blobs
 
 
+def test_a_new_database_gets_its_folder_beside_blobs_elsewhere(tmp_path: Path) -> None:
+    data, blobs = tmp_path / "data" / "node", tmp_path / "mount" / "blobs"
+    store = open_store(f"sqlite:///{data / 'a.db'}", blobs)
+    digest = store.blobs.put(b"depth")
+    store.close()
+    assert data.stat().st_mode & 0o777 == 0o700
+    assert [*blobs.rglob(digest)] != []
+
+
 def test_a_prefix_belongs_to_one_database(store_url: str, bucket: str, tmp_path: Path) -> None:
     first = open_store(store_url, f"{bucket}/mine")
     digest = first.blobs.put(b"depth")

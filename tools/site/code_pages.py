@@ -148,7 +148,7 @@ class MetricFamily:
 
 
 def metric_families() -> list[MetricFamily]:
-    """All families that a service tells, also those without data, by name."""
+    """All families that a service serves, also those without data, by name."""
     metrics = Metrics()
     metrics._tell_replica(ReplicaSeen(used=True, behind_s=0.5))  # told only where there is one
     found = set()
@@ -170,7 +170,7 @@ def metrics_page() -> str:
     )
     return page(
         "# Metrics",
-        f"`GET /metrics` tells Prometheus {len(found)} families. "
+        f"`GET /metrics` serves {len(found)} families of metrics to Prometheus. "
         "[Operations](../operations.md#what-to-watch) says what to watch, and has a dashboard.",
         table(("metric", "kind", "labels", "meaning"), rows),
     )
