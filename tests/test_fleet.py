@@ -13,17 +13,17 @@ from typing import Any
 
 import pytest
 
-from benchmarks.fleet import checking, doors, saboteur
+from benchmarks.fleet import audit, failover_client, faults
 from benchmarks.fleet.__main__ import MARKS, table
-from benchmarks.fleet.checking import Found, check
-from benchmarks.fleet.doors import Diary, Doors, Shut, Wait
-from benchmarks.fleet.driving import FleetFigures, Plan, drive, outages
-from benchmarks.fleet.metering import Work
+from benchmarks.fleet.audit import Found, check
+from benchmarks.fleet.failover_client import FailoverClient, RequestLog, Unreachable, Wait
+from benchmarks.fleet.faults import PRIMARY, Kill, Promotion, schedule
 from benchmarks.fleet.paper import Costs, paper
 from benchmarks.fleet.postgres import NoServer, binaries
 from benchmarks.fleet.recordings import GRIDS, walks
+from benchmarks.fleet.resource_usage import Work
 from benchmarks.fleet.robots import Kept, Listener
-from benchmarks.fleet.saboteur import PRIMARY, Kill, Promotion, schedule
+from benchmarks.fleet.run import FleetFigures, Plan, drive, outages
 from benchmarks.pages import put_between
 from benchmarks.soak.load import free_port
 from sceneprint.errors import DatasetError
@@ -58,9 +58,9 @@ def test_a_fleet_loses_nothing(
         binaries()
     except NoServer as error:
         pytest.skip(str(error))
-    monkeypatch.setattr(saboteur, "AWAY_S", (0.0, 0.0))
-    monkeypatch.setattr(saboteur, "UNNOTICED_S", 0.2)
-    monkeypatch.setattr(checking, "COMPARED", 4)
+    monkeypatch.setattr(faults, "AWAY_S", (0.0, 0.0))
+    monkeypatch.setattr(faults, "UNNOTICED_S", 0.2)
+    monkeypatch.setattr(audit, "COMPARED", 4)
     plan = Plan(**vars(SMALL) | {"data": recording})
     found = drive(tmp_path, plan)
     assert (found.kills["service"], found.kills[PRIMARY], found.kills.total()) == (1, 1, 3)
@@ -139,30 +139,30 @@ def answering(*statuses: int) -> Iterator[str]:
 
 
 def test_a_robot_asks_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doors, "PAUSE_S", 0.01)
-    diary = Diary()
+    monkeypatch.setattr(failover_client, "PAUSE_S", 0.01)
+    log = RequestLog()
     with answering(503, 200, 500, 404) as url:
         dead = f"http://127.0.0.1:{free_port()}"
-        with Doors([dead, url], "secret", diary) as asked:
+        with FailoverClient([dead, url], "secret", log) as asked:
             assert asked.ask("upload", "GET", "/").status_code == 200
             assert asked.ask("query", "GET", "/").status_code == 404
-    assert diary.repeated == 3 + 2  # dead, 503, dead, 200; 500, dead, 404
-    assert [wait.kind for wait in diary.waits] == ["upload", "query"]
-    assert [line[:10] for line in diary.faults] == ["query: 500"]  # to be retried, and a fault
+    assert log.repeated == 3 + 2  # dead, 503, dead, 200; 500, dead, 404
+    assert [wait.kind for wait in log.waits] == ["upload", "query"]
+    assert [line[:10] for line in log.faults] == ["query: 500"]  # to be retried, and a fault
 
 
 def test_a_robot_gives_up_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doors, "PAUSE_S", 0.01)
-    monkeypatch.setattr(doors, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(failover_client, "PAUSE_S", 0.01)
+    monkeypatch.setattr(failover_client, "PATIENCE_S", 0.1)
     nobody = [f"http://127.0.0.1:{free_port()}"]
-    with Doors(nobody, "secret", Diary()) as asked, pytest.raises(Shut):
+    with FailoverClient(nobody, "secret", RequestLog()) as asked, pytest.raises(Unreachable):
         asked.ask("upload", "GET", "/")
 
 
 def test_what_is_not_there_is_seen(
     tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checking, "EVENTS_S", 0.0)
+    monkeypatch.setattr(audit, "EVENTS_S", 0.0)
     [walk] = walks(recording, 1, 5)
     with Client.embedded(tmp_path) as client:
         client.create_map("fleet", model="depth")
@@ -175,7 +175,7 @@ def test_what_is_not_there_is_seen(
         client.delete_frame("fleet", added[1].frame_id)
         # the second is gone, the third was told of as the fourth, and nobody of the fourth
         told = [kept[0], kept[1], Kept(kept[2].frame_id, "fleet", walk[3], 0.0), kept[4]]
-        listener = Listener("fleet", Doors(["http://127.0.0.1:1"], "secret", Diary()))
+        listener = Listener("fleet", FailoverClient(["http://127.0.0.1:1"], "secret", RequestLog()))
         listener.heard["frame.received", kept[0].frame_id] = 2
         found = check(told, [client, client], [listener])
     assert found == Found(

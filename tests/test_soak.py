@@ -14,9 +14,9 @@ from benchmarks.pages import put_between
 from benchmarks.soak import kills
 from benchmarks.soak.__main__ import BEGIN, END, clock_table, table
 from benchmarks.soak.answers import State
-from benchmarks.soak.checking import CrowdFigures, K, check, faults
 from benchmarks.soak.clocks import ClockFigures, find_library, jump_clocks
 from benchmarks.soak.crowd import STABLE, crowd
+from benchmarks.soak.crowd_audit import CrowdFigures, K, check, faults
 from benchmarks.soak.kills import KillFigures, figures, kill
 from benchmarks.soak.load import shots
 from benchmarks.soak.writers import Plan

@@ -12,7 +12,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from benchmarks.fleet.driving import FleetFigures, Plan, drive
+from benchmarks.fleet.run import FleetFigures, Plan, drive
 from benchmarks.machine import describe_machine
 from benchmarks.pages import put_between
 from sceneprint.cli.options import ended_by_signals

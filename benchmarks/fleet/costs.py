@@ -18,10 +18,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from benchmarks.fleet.metering import Meter, Work, memory_of
-from benchmarks.fleet.pair import DATABASE, Pair
 from benchmarks.fleet.paper import Costs, paper
+from benchmarks.fleet.postgres_pair import DATABASE, Pair
 from benchmarks.fleet.recordings import ROOM_FRAMES, recordings
+from benchmarks.fleet.resource_usage import Meter, Work, memory_of
 from benchmarks.machine import describe_machine
 from benchmarks.pages import put_between
 from sceneprint.engine import Engine

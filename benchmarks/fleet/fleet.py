@@ -11,8 +11,8 @@ from pathlib import Path
 
 import httpx
 
-from benchmarks.fleet.doors import PAUSE_S
-from benchmarks.fleet.pair import Pair
+from benchmarks.fleet.failover_client import PAUSE_S
+from benchmarks.fleet.postgres_pair import Pair
 from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.soak.load import Part, free_port
 from sceneprint.engine import Engine

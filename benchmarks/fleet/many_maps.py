@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.fleet.bulk import fill, walk
+from benchmarks.fleet.bulk_load import fill, walk
 from benchmarks.fleet.postgres import Server
 from sceneprint.engine import Engine
 from sceneprint.models import Model, read_model

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from benchmarks.fleet.metering import Work
+from benchmarks.fleet.resource_usage import Work
 
 #: The fleet, in sites that have a map each, and how often each robot sends a frame that is kept,
 #: and asks where it is, seconds.

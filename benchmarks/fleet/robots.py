@@ -15,7 +15,7 @@ from typing import Any
 
 import httpx
 
-from benchmarks.fleet.doors import PAUSE_S, Diary, Doors, Shut
+from benchmarks.fleet.failover_client import PAUSE_S, FailoverClient, RequestLog, Unreachable
 from benchmarks.fleet.recordings import Shot
 from sceneprint_client.api import Added, Answer
 from sceneprint_client.http import StreamPosition, frame_form, read_events
@@ -68,25 +68,25 @@ class Robot(threading.Thread):
     map_name : that it uploads to
     walk : its frames
     rate : frames a second
-    doors : the service
-    ledger, diary : shared with the others
+    client : the service
+    ledger, log : shared with the others
     stop : ends the walk
     """
 
     def __init__(
-        self, name: str, map_name: str, walk: list[Shot], rate: float, doors: Doors,
-        ledger: Ledger, diary: Diary, stop: threading.Event,
+        self, name: str, map_name: str, walk: list[Shot], rate: float, client: FailoverClient,
+        ledger: Ledger, log: RequestLog, stop: threading.Event,
     ) -> None:  # fmt: skip
         super().__init__(name=name, daemon=True)
         self._map, self._walk, self._rate = map_name, walk, rate
-        self._doors, self._ledger, self._diary = doors, ledger, diary
+        self._client, self._ledger, self._log = client, ledger, log
         self._ending = stop
 
     def run(self) -> None:
         """Walk to the end, or until told to stop; what was begun is sent until it is answered."""
         due = time.monotonic()
         try:
-            with self._doors:
+            with self._client:
                 for number, shot in enumerate(self._walk):
                     if self._ending.wait(max(due - time.monotonic(), 0.0)):
                         return
@@ -94,17 +94,17 @@ class Robot(threading.Thread):
                     if number % ASK_EVERY == ASK_EVERY - 1:
                         self._query(shot)
                     due = max(due + 1 / self._rate, time.monotonic())
-        except Shut as error:
-            self._diary.fault(str(error))
+        except Unreachable as error:
+            self._log.fault(str(error))
 
     def _upload(self, number: int, shot: Shot) -> None:
         meta = shot.meta.model_copy(update={"robot": self.name, "session": self.name})
-        response = self._doors.ask(
+        response = self._client.ask(
             "upload", "POST", f"/v1/maps/{self._map}/frames",
             headers={"Idempotency-Key": f"{self.name}-{number}"}, **frame_form(shot.png, meta),
         )  # fmt: skip
         if not response.is_success:
-            self._diary.fault(f"upload: {response.status_code} {response.text:.300}")
+            self._log.fault(f"upload: {response.status_code} {response.text:.300}")
             return
         added = Added.model_validate_json(response.content)
         kept = Kept(added.frame_id, self._map, shot, time.monotonic())
@@ -112,11 +112,11 @@ class Robot(threading.Thread):
             self._ledger.kept.append(kept)
 
     def _query(self, shot: Shot) -> None:
-        response = self._doors.ask(
+        response = self._client.ask(
             "query", "POST", f"/v1/maps/{self._map}/queries", **asked(shot, k="1")
         )
         if not response.is_success:
-            self._diary.fault(f"query: {response.status_code} {response.text:.300}")
+            self._log.fault(f"query: {response.status_code} {response.text:.300}")
             return
         with self._ledger.lock:
             self._ledger.answers[Answer.model_validate_json(response.content).status] += 1
@@ -135,13 +135,13 @@ class Listener(threading.Thread):
     Parameters
     ----------
     map_name : whose events
-    doors : the service
+    client : the service
     """
 
-    def __init__(self, map_name: str, doors: Doors) -> None:
+    def __init__(self, map_name: str, client: FailoverClient) -> None:
         super().__init__(name=f"listener of {map_name}", daemon=True)
         self.map_name = map_name
-        self._doors = doors
+        self._client = client
         self._ending = threading.Event()
         #: How often each was heard, by kind and frame.
         self.heard: Counter[tuple[str, str | None]] = Counter()
@@ -153,8 +153,8 @@ class Listener(threading.Thread):
     def run(self) -> None:
         """Listen until told to stop."""
         place = StreamPosition("0")  # all that is kept
-        with self._doors:
-            for client in cycle(self._doors.clients):
+        with self._client:
+            for client in cycle(self._client.clients):
                 with suppress(httpx.TransportError):  # it was killed, or is not there yet
                     self._listen(client, place)
                 if self._ending.wait(PAUSE_S):

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from benchmarks.machine import describe_machine
 from benchmarks.pages import put_between
-from benchmarks.soak.checking import CrowdFigures
 from benchmarks.soak.clocks import ClockFigures, find_library, jump_clocks
 from benchmarks.soak.crowd import STABLE, crowd
+from benchmarks.soak.crowd_audit import CrowdFigures
 from benchmarks.soak.kills import KillFigures, kill
 from benchmarks.soak.load import Shot, shots
 

@@ -15,7 +15,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
-from benchmarks.soak.checking import CrowdFigures, K, check
+from benchmarks.soak.crowd_audit import CrowdFigures, K, check
 from benchmarks.soak.load import MAP, MODEL, Shot, free_port, service, workers
 from benchmarks.soak.writers import read_shots, write_shots
 from sceneprint.errors import SceneprintError, UnknownFrame

@@ -497,10 +497,18 @@ class Database:
         return found
 
     def close(self) -> None:
-        """Give all connections back."""
-        self._engine.dispose()
+        """Close all connections; those in use, when they are given back."""
+        pool = self._engine.pool
+        self._engine.dispose()  # the old pool would leave the others to the collector
+        event.listen(pool, "checkin", _close_connection)
+        pool.dispose()  # those that were given back meanwhile
         if self._line is not None:
             self._line.close()
+
+
+def _close_connection(connection: Any, _record: object) -> None:
+    if connection is not None:
+        connection.close()
 
 
 def is_there(url: str) -> bool:

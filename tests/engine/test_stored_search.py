@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from sqlalchemy import event, select, text
 
-from benchmarks.fleet.bulk import fill, walk
+from benchmarks.fleet.bulk_load import fill, walk
 from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index, retrieval, stored_maps
 from sceneprint.engine.search import query as querying

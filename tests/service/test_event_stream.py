@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
@@ -18,8 +18,10 @@ Batch = tuple[list[EventRow], int]
 
 
 @pytest.fixture
-def database(tmp_path: Path) -> Database:
-    return open_store(f"sqlite:///{tmp_path / 'sceneprint.db'}", tmp_path / "blobs").database
+def database(tmp_path: Path) -> Iterator[Database]:
+    store = open_store(f"sqlite:///{tmp_path / 'sceneprint.db'}", tmp_path / "blobs")
+    yield store.database
+    store.close()
 
 
 @pytest.fixture(autouse=True)

@@ -240,3 +240,17 @@ def test_a_store_that_is_there_is_opened_without_alembic(url: str, store: Store)
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+def test_a_connection_that_is_in_use_is_closed_when_it_comes_back(tmp_path: Path) -> None:
+    database = open_database(f"sqlite:///{tmp_path / 'a.db'}")
+    with database.read() as connection:
+        used = connection.connection.driver_connection
+        assert isinstance(used, sqlite3.Connection)
+        database.close()
+        assert connection.exec_driver_sql("SELECT 1").scalar() == 1
+    with pytest.raises(sqlite3.ProgrammingError, match="closed"):
+        used.execute("SELECT 1")
+    with database.read() as connection:  # and it can be used again
+        assert connection.exec_driver_sql("SELECT 1").scalar() == 1
+    database.close()

@@ -1,6 +1,6 @@
 """The addresses of a fleet's service, of which one answers unless none does.
 
-Doors.ask  --each address in turn-->  the first answer that is not "come back"
+FailoverClient.ask  --each address in turn-->  the first answer that is not "come back"
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PATIENCE_S = 180.0
 _LATER = (429, 503)
 
 
-class Shut(Exception):
+class Unreachable(Exception):
     """No address answered, for very long."""
 
 
@@ -45,7 +45,7 @@ class Wait:
 
 
 @dataclass
-class Diary:
+class RequestLog:
     """What the robots met with; shared by all."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -69,19 +69,19 @@ class Diary:
             self.faults.append(text)
 
 
-class Doors:
+class FailoverClient:
     """A service at several addresses, asked with one key.
 
     Parameters
     ----------
     urls : of the service processes
     key : of the robot
-    diary : where waits are noted
+    log : where waits are noted
     first : number of the address that is asked first
     """
 
-    def __init__(self, urls: list[str], key: str, diary: Diary, first: int = 0) -> None:
-        self._diary = diary
+    def __init__(self, urls: list[str], key: str, log: RequestLog, first: int = 0) -> None:
+        self._log = log
         headers = {"Authorization": f"Bearer {key}"}
         self.clients = [
             httpx.Client(base_url=url, headers=headers, timeout=SILENCE_S, trust_env=False)
@@ -90,7 +90,7 @@ class Doors:
         self._order = cycle(self.clients)
         self._open = next(self._order)
 
-    def __enter__(self) -> Doors:
+    def __enter__(self) -> FailoverClient:
         return self
 
     def __exit__(
@@ -105,12 +105,12 @@ class Doors:
 
         Parameters
         ----------
-        kind : of the request, for the diary
+        kind : of the request, for the log
         method, path, request : as for httpx
 
         Raises
         ------
-        Shut : nobody did, for very long.
+        Unreachable : nobody did, for very long.
         """
         begun, tries = time.monotonic(), 0
         while time.monotonic() < begun + PATIENCE_S:
@@ -122,12 +122,12 @@ class Doors:
                 pass  # killed, or not begun yet
             else:
                 if response.status_code < 500 and response.status_code not in _LATER:
-                    self._diary.note(kind, begun, tries=tries)
+                    self._log.note(kind, begun, tries=tries)
                     return response
                 if response.status_code not in _LATER:
-                    self._diary.fault(f"{kind}: {response.status_code} {response.text:.300}")
+                    self._log.fault(f"{kind}: {response.status_code} {response.text:.300}")
                 pause = min(retry_after_s(response.headers.get("Retry-After", "")), 1.0)
             self._open = next(self._order)
             if tries % len(self.clients) == 0:
                 time.sleep(max(PAUSE_S, pause))
-        raise Shut(f"{kind}: nobody answered for {PATIENCE_S:g} s")
+        raise Unreachable(f"{kind}: nobody answered for {PATIENCE_S:g} s")

@@ -16,7 +16,7 @@ from typing import cast
 
 from sqlalchemy import Connection
 
-from benchmarks.fleet.pair import Pair
+from benchmarks.fleet.postgres_pair import Pair
 from benchmarks.machine import own_bytes
 from sceneprint.cli.demo import serving
 from sceneprint.formats.dataset import FrameReference

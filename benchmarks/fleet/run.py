@@ -1,4 +1,4 @@
-"""One run of the fleet: robots, a saboteur, and what came of it.
+"""One run of the fleet: robots, injected faults, and what came of it.
 
 drive(folder, Plan)  -->  FleetFigures
 """
@@ -17,12 +17,12 @@ from pathlib import Path
 import httpx
 from tqdm import tqdm
 
-from benchmarks.fleet.checking import Found, await_idle, check
-from benchmarks.fleet.doors import Diary, Doors, Wait
+from benchmarks.fleet.audit import Found, await_idle, check
+from benchmarks.fleet.failover_client import FailoverClient, RequestLog, Wait
+from benchmarks.fleet.faults import FaultInjector, Kill, Promotion, schedule
 from benchmarks.fleet.fleet import Fleet, await_service
 from benchmarks.fleet.recordings import Shot, recordings, walks
 from benchmarks.fleet.robots import Ledger, Listener, Robot, asked
-from benchmarks.fleet.saboteur import Kill, Promotion, Saboteur, schedule
 from sceneprint_client import Client
 
 #: The map that most robots share; every so many robots have one of their own.
@@ -131,13 +131,15 @@ def drive(folder: Path, plan: Plan) -> FleetFigures:
 
 def _driven(fleet: Fleet, plan: Plan, walked: list[list[Shot]], begun: float) -> FleetFigures:
     rng = random.Random(plan.seed)
-    ledger, diary, stop = Ledger(), Diary(), threading.Event()
+    ledger, log, stop = Ledger(), RequestLog(), threading.Event()
     key = fleet.begin()
     with ExitStack() as opened:
         clients = [opened.enter_context(Client(url, key)) for url in fleet.urls]
-        robots, listeners = _crowd(fleet, plan, walked, clients[0], ledger, diary, stop)
+        robots, listeners = _crowd(fleet, plan, walked, clients[0], ledger, log, stop)
         probe = walked[0][0]
-        saboteur = Saboteur(fleet, lambda url: _answers(url, key, probe), rng, plan.asynchronous)
+        injector = FaultInjector(
+            fleet, lambda url: _answers(url, key, probe), rng, plan.asynchronous
+        )
         bar = opened.enter_context(tqdm(total=plan.seconds, unit="s", disable=None, leave=False))
         telling = threading.Thread(target=_tell, args=(bar, ledger, stop), daemon=True)
         walking = time.monotonic()
@@ -145,14 +147,14 @@ def _driven(fleet: Fleet, plan: Plan, walked: list[list[Shot]], begun: float) ->
             one.start()
         try:
             due = schedule(plan.seconds, plan.kills, plan.promotions, rng)
-            saboteur.run(due, bar.set_postfix_str)
+            injector.run(due, bar.set_postfix_str)
             stop.wait(max(walking + plan.seconds - time.monotonic(), 0.0))
         finally:
             stop.set()
         for robot in robots:
             robot.join(PATIENCE_S)
             if robot.is_alive():
-                diary.fault(f"{robot.name} does not come to its end")
+                log.fault(f"{robot.name} does not come to its end")
         for url in fleet.urls:
             await_service(url)
         await_idle(clients[0])
@@ -161,17 +163,17 @@ def _driven(fleet: Fleet, plan: Plan, walked: list[list[Shot]], begun: float) ->
             listener.stop()
         fleet.stop()
         leftovers, damaged = fleet.fsck()
-    unreceived = {name for one in saboteur.promotions for name in one.unreceived}
+    unreceived = {name for one in injector.promotions for name in one.unreceived}
     window = {one.frame_id for one in ledger.kept} & unreceived
     return FleetFigures(
         plan=plan,
         found=found,
-        kills=Counter(one.victim for one in saboteur.kills),
-        outages=outages(saboteur.kills, diary.waits),
-        promotions=saboteur.promotions,
+        kills=Counter(one.victim for one in injector.kills),
+        outages=outages(injector.kills, log.waits),
+        promotions=injector.promotions,
         answers=ledger.answers,
-        repeated=diary.repeated,
-        faults=diary.faults,
+        repeated=log.repeated,
+        faults=log.faults,
         damaged=damaged,
         leftovers=leftovers,
         lost=len(found.missing - window),
@@ -182,7 +184,7 @@ def _driven(fleet: Fleet, plan: Plan, walked: list[list[Shot]], begun: float) ->
 
 def _crowd(
     fleet: Fleet, plan: Plan, walked: list[list[Shot]], client: Client, ledger: Ledger,
-    diary: Diary, stop: threading.Event,
+    log: RequestLog, stop: threading.Event,
 ) -> tuple[list[Robot], list[Listener]]:  # fmt: skip
     """Robots with keys and maps, and who hears the events of each map."""
     robots = []
@@ -192,12 +194,12 @@ def _crowd(
     for i, walk in enumerate(walked):
         name = f"{MAP}-{i}" if i % OWN == OWN - 1 else MAP
         secret = client.create_key(f"robot-{i}", {name: "write"}).secret
-        doors = Doors(fleet.urls, secret, diary, first=i)
-        robots.append(Robot(f"robot-{i}", name, walk, plan.rate, doors, ledger, diary, stop))
+        own = FailoverClient(fleet.urls, secret, log, first=i)
+        robots.append(Robot(f"robot-{i}", name, walk, plan.rate, own, ledger, log, stop))
     listeners = []
     for i, name in enumerate(maps):
         secret = client.create_key(f"listener-{i}", {name: "read"}).secret
-        listeners.append(Listener(name, Doors(fleet.urls, secret, diary, first=i)))
+        listeners.append(Listener(name, FailoverClient(fleet.urls, secret, log, first=i)))
     return robots, listeners
 
 

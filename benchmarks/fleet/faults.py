@@ -1,6 +1,6 @@
-"""Who kills parts of the fleet at random, begins them again, and notes when.
+"""Injected faults: parts of the fleet killed at random, started again, and when.
 
-schedule(seconds, kills, promotions, seed)  -->  Saboteur.run  -->  kills, promotions
+schedule(seconds, kills, promotions, seed)  -->  FaultInjector.run  -->  kills, promotions
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def schedule(
 
 
 @dataclass
-class Saboteur:
+class FaultInjector:
     """Works through a schedule.
 
     Parameters
