@@ -72,6 +72,9 @@ def kebab_case(name: str) -> str:
 class SceneprintError(Exception):
     """Base of every error raised on purpose."""
 
+    #: Seconds after which a service asked to come back (`Retry-After`); 0 if it did not ask.
+    retry_after_s: float = 0.0
+
 
 @contextmanager
 def naming(subject: str) -> Iterator[None]:
