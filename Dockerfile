@@ -49,7 +49,7 @@ FROM python:3.11-slim-bookworm
 
 LABEL org.opencontainers.image.title="sceneprint" \
       org.opencontainers.image.description="Place recognition from pure geometry: service and workers" \
-      org.opencontainers.image.version="0.2.0" \
+      org.opencontainers.image.version="1.0.0rc1" \
       org.opencontainers.image.licenses="Apache-2.0"
 
 # OMP, OPENBLAS: our kernels want one thread each (see Makefile).
@@ -82,7 +82,7 @@ USER 10001:10001
 # an older one the first use compiles once more, into the same folder.
 RUN python -c "from sceneprint.cli.options import prepare_presets; \
     from sceneprint.settings import Settings; \
-    prepare_presets(Settings(), clouds=True, portable=True)"
+    prepare_presets(Settings(), clouds=True)"
 
 VOLUME ["/data"]
 EXPOSE 8008

@@ -26,7 +26,7 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from sceneprint.engine.compilation import ALL, compile_kernels
-compile_kernels(Path(sys.argv[1]), ALL, print, portable=True)
+compile_kernels(Path(sys.argv[1]), ALL, print)
 """
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from sceneprint.cli import parser
+from sceneprint.decoders import sandbox
 from sceneprint.settings import Settings
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "deployment"
@@ -73,6 +74,17 @@ def test_units_confine_what_they_run(path: Path) -> None:
         "RestrictRealtime=yes", "NoNewPrivileges=yes", "CapabilityBoundingSet=", "UMask=0077",
     }  # fmt: skip
     assert {"MemoryMax", "TasksMax"} <= {line.partition("=")[0] for line in lines}
+
+
+@pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
+def test_units_let_decoders_lock_themselves_in(path: Path) -> None:
+    """What they call for it is in no group of systemd 252."""
+    filters = re.findall(r"(?m)^SystemCallFilter=([^~].*)$", path.read_text())
+    named = {name for line in filters for name in line.split()}
+    needed = {"seccomp": 317, "landlock_create_ruleset": 444, "landlock_restrict_self": 446}
+    assert named == {"@system-service", *needed}
+    used = {sandbox._SECCOMP["x86_64"], sandbox._CREATE_RULESET, sandbox._RESTRICT_SELF}
+    assert set(needed.values()) == used
 
 
 def settings_of(text: str) -> dict[str, str]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sceneprint_client.spool import Spool
     from sceneprint_client.tracker import AsyncTracker, State, Tracker
 
-__version__ = "0.2.0"
+__version__ = "1.0.0rc1"
 __all__ = [
     "AsyncTracker",
     "Client",

@@ -469,7 +469,7 @@ def open_for(options: argparse.Namespace, settings: Settings, *, psi: bool = Fal
 
 def prepare_presets(
     settings: Settings, say: Callable[[str], None] | None = None, *, clouds: bool = False,
-    portable: bool = False, stop: threading.Event | None = None,
+    stop: threading.Event | None = None,
 ) -> None:  # fmt: skip
     """See that code is compiled and the presets' tables are built, once an installation.
 
@@ -480,11 +480,10 @@ def prepare_presets(
     settings : see Settings
     say : what tells of each step, as it takes a while (default: lines on standard error)
     clouds : compile what clouds need as well; else the first cloud waits for that
-    portable : compile for other processors too; see `compile_kernels`
     stop : once it is set, nothing more is compiled or built
     """
     parts = ALL if clouds else DEPTH
-    compile_kernels(settings.cache_dir, parts, say or _print, stop, portable=portable)
+    compile_kernels(settings.cache_dir, parts, say or _print, stop)
     for preset in PRESETS:
         if stop is None or not stop.is_set():
             _open_signer(read_model(preset), preset, settings)

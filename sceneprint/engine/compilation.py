@@ -46,11 +46,14 @@ def missing(parts: Sequence[str] = DEPTH) -> tuple[str, ...]:
 
 def compile_kernels(
     cache_dir: Path, parts: Sequence[str] = DEPTH, say: Callable[[str], None] | None = None,
-    stop: threading.Event | None = None, *, portable: bool = False,
+    stop: threading.Event | None = None,
 ) -> None:  # fmt: skip
     """Compile parts that are missing, in a process each, and wait for them.
 
-    Where a process fails, kernels are compiled when they are first used.
+    Where a process fails, kernels are compiled when they are first used. Machine code is for every
+    processor from x86-64-v3 on: with the wider registers of its own, one that gathers scattered
+    numbers slowly is slower (docs/performance.md). It is for this one where this one is another,
+    as arm64 is, or where the environment names one (NUMBA_CPU_NAME).
 
     Parameters
     ----------
@@ -58,8 +61,6 @@ def compile_kernels(
     parts : of `ALL`
     say : what tells that it takes a while, and how long it took
     stop : once it is set, nothing more is compiled
-    portable : for every processor from x86-64-v3 on, as for an image or a wheel; elsewhere, as
-        for arm64, for processors like this one
     """
     with _compiling:
         wanted = missing(parts)
@@ -68,7 +69,7 @@ def compile_kernels(
         tell, begun = say or (lambda _: None), time.monotonic()
         tell(f"first use after installation: compiling kernels for {' and '.join(wanted)}, once")
         environment = dict(os.environ)
-        if portable and runs_here():
+        if not environment.get("NUMBA_CPU_NAME") and runs_here():
             environment |= {"NUMBA_CPU_NAME": TARGET, "NUMBA_CPU_FEATURES": TARGET_FEATURES}
         # clouds are validated with the kernels of the other parts: compiled twice, if beside them
         for group in ([one for one in wanted if one != "clouds"], ["clouds"]):

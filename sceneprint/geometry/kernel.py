@@ -121,6 +121,37 @@ def disjoint_kernel(function: Callable[P, R]) -> Callable[P, R]:
     return cast(Callable[P, R], Kernel(function, disjoint=True))
 
 
+class _Prefetch:
+    """Ask for a row of a table that will be read soon: `prefetch(table, row)` in a kernel.
+
+    Where rows are scattered over a table larger than the caches, each would be waited for. Only a
+    hint: it changes no result, and in Python, without a compiler, it does nothing. As a kernel
+    does, it imports numba when it is compiled.
+    """
+
+    def __call__(self, table: Any, row: Any) -> None:
+        """Nothing to do in Python."""
+
+    @property
+    def _defn(self) -> Any:
+        """What writes its code, for the stamp of kernels that use it."""
+        from sceneprint.geometry.kernel_cache import prefetch_row
+
+        return prefetch_row._defn
+
+    @property
+    def _numba_type_(self) -> Any:
+        """As numba sees it in a kernel."""
+        from numba.core.registry import cpu_target
+
+        from sceneprint.geometry.kernel_cache import prefetch_row
+
+        return cpu_target.typing_context.resolve_value_type(prefetch_row)
+
+
+prefetch = _Prefetch()
+
+
 def cached_at(function: Any) -> tuple[str, bool]:
     """Folder of a kernel's machine code, and whether it is there for this processor."""
     cache = getattr(function, "_cache", None)
@@ -189,7 +220,7 @@ def _constant_text(value: Any, module: str) -> str:
         return ""
     if isinstance(value, Kernel):
         return value.stamp
-    made = getattr(value, "_defn", None)  # an intrinsic
+    made = getattr(value, "_defn", None)  # an intrinsic, or `prefetch`
     return "" if made is None else _code(made.__code__)
 
 

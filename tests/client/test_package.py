@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
 import shutil
 import subprocess
 import sys
@@ -15,6 +17,7 @@ import pytest
 import sceneprint
 import sceneprint_client
 from sceneprint import errors as our_errors
+from sceneprint.formats.dataset import FrameReference
 from sceneprint.geometry.retrieval.distance import Metric
 from sceneprint.geometry.retrieval.dpp import DiversityParameters
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
@@ -78,54 +81,88 @@ def test_both_distributions_have_one_version() -> None:
         for folder in (ROOT, ROOT / "client")
     )
     assert main["version"] == client["version"] == sceneprint_client.__version__
-    major, minor, _ = client["version"].split(".")
-    wanted = f"sceneprint-client>={major}.{minor},<{major}.{int(minor) + 1}"
-    assert wanted in main["dependencies"]
+    version = client["version"]
+    # a bound of 1.0 would exclude 1.0.0rc1, which comes before it
+    least = version if "rc" in version else version.rpartition(".")[0]
+    major, minor = version.split(".")[:2]
+    assert f"sceneprint-client>={least},<{major}.{int(minor) + 1}" in main["dependencies"]
     assert {one.partition(">")[0] for one in client["dependencies"]} == {
         "httpx", "numpy", "pydantic",
     }  # fmt: skip
 
 
+def oldest_python() -> str:
+    """A Python 3.10 that starts (a shim of pyenv may not), or the Python of the tests."""
+    pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
+    for found in (shutil.which("python3.10"), *pyenv.glob("versions/3.10.*/bin/python3.10")):
+        if (
+            found
+            and not subprocess.run([found, "-c", ""], capture_output=True, check=False).returncode
+        ):
+            return str(found)
+    return sys.executable
+
+
+#: Maps a place from files, loses its way in it, and is told what it does wrong.
+ROBOT = """
+import json, sys
+from sceneprint_client import Client, errors
+from sceneprint_client.api import JobState
+url, asked, *mapped = sys.argv[1:]
+told = {"python": sys.version_info[:2], "state": [str(JobState.QUEUED), f"{JobState.QUEUED}"]}
+with Client(url) as client:
+    client.create_map("wheel", model="depth")
+    told["healthy"] = client.healthy()
+    told["uploads"] = [client.upload("wheel", path, wait_s=60).state for path in mapped]
+    answer = client.localize("wheel", asked)
+    told["status"] = answer.status
+    translation = answer.pose.translation
+    told["at"] = [translation.x, translation.y, translation.z]
+    try:
+        client.frame("wheel", "nobody")
+    except errors.UnknownFrame as error:
+        told["frame"] = str(error)
+    client.delete_map("wheel")
+try:
+    Client.embedded("nowhere")
+except errors.MissingDependency as error:
+    told["embedded"] = str(error)
+from sceneprint_client import meta_of
+told["loaded"] = sorted({"sceneprint", "numba", "scipy"} & set(sys.modules))
+print(json.dumps(told))
+"""
+
+
 @pytest.mark.thorough
-def test_the_wheel_works_alone(tmp_path: Path, service_url: str) -> None:
-    """In an empty environment, of the oldest Python that there is."""
+def test_the_wheel_localises_alone(
+    tmp_path: Path, service_url: str, references: tuple[FrameReference, ...]
+) -> None:
+    """In an empty environment, of the oldest Python that there is, against a service over HTTP."""
     source = tmp_path / "source"
     shutil.copytree(ROOT / "client", source, ignore=shutil.ignore_patterns("*.egg-info", "build"))
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     built = [*pip, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path)]
     subprocess.run([*built, str(source)], check=True)
     [wheel] = tmp_path.glob("sceneprint_client-*-py3-none-any.whl")
-    python = tmp_path / "env" / "bin" / "python"
-    oldest = shutil.which("python3.10") or sys.executable
+    python, oldest = tmp_path / "env" / "bin" / "python", oldest_python()
     subprocess.run([oldest, "-m", "venv", str(tmp_path / "env")], check=True)
     installed = [str(python), "-m", "pip", "--quiet", "--disable-pip-version-check", "install"]
     subprocess.run([*installed, str(wheel)], check=True)
-    code = f"""
-import sys
-from pathlib import Path
-from sceneprint_client import Client, errors
-from sceneprint_client.api import FrameState, JobState
-assert str(JobState.QUEUED) == f"{{JobState.QUEUED}}" == "queued"
-with Client({service_url!r}) as client:
-    client.create_map("wheel", model="depth")
-    assert client.healthy()
-    try:
-        client.frame("wheel", "nobody")
-    except errors.UnknownFrame as error:
-        print(error)
-    client.delete_map("wheel")
-try:
-    Client.embedded("nowhere")
-except errors.MissingDependency as error:
-    print(error)
-from sceneprint_client import meta_of
-print({{"sceneprint", "numba"}} & set(sys.modules))
-"""
+    mapped = references[:3]
+    asked = mapped[1]
     done = subprocess.run(
-        [str(python), "-I", "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False
-    )
+        [str(python), "-I", "-c", ROBOT, service_url, asked.path, *(one.path for one in mapped)],
+        capture_output=True, text=True, cwd=tmp_path, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    lines = done.stdout.splitlines()
-    assert lines[0].startswith("There is no frame 'nobody'")
-    assert lines[1].endswith("Run: pip install sceneprint")
-    assert lines[2] == "set()"
+    told = json.loads(done.stdout)
+    assert told["python"] == [3, 10] or oldest == sys.executable
+    assert told["state"] == ["queued", "queued"]
+    assert told["healthy"]
+    assert told["uploads"] == ["indexed"] * len(mapped)
+    assert told["status"] == "found"
+    assert asked.pose is not None
+    assert math.dist(told["at"], asked.pose[:3, 3]) < 0.10
+    assert told["frame"].startswith("There is no frame 'nobody'")
+    assert told["embedded"].endswith("Run: pip install sceneprint")
+    assert told["loaded"] == []

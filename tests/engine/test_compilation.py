@@ -16,6 +16,7 @@ from sceneprint.engine import compilation
 from sceneprint.engine.compilation import ALL, DEPTH, compile_kernels
 from sceneprint.engine.signers import warm_signing, warm_validation
 from sceneprint.formats.artifact import read_geometry
+from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES, runs_here
 from sceneprint.models import read_model
 from sceneprint.settings import Settings
 from sceneprint.signing import open_signer
@@ -62,6 +63,35 @@ def test_a_process_that_fails_is_told_of_and_costs_no_more(
     failed = [one for one in said if "failed (exit code 3): they are compiled on first use" in one]
     assert sorted(one.split()[3] for one in failed) == ["clouds", "signing", "validation"]
     assert said[-1].startswith("compilation finished in ")
+
+
+@pytest.mark.skipif(not runs_here(), reason="an older processor, or none of x86")
+@pytest.mark.parametrize(
+    ("named", "expected"),
+    [
+        (None, (TARGET, TARGET_FEATURES)),
+        ("", (TARGET, TARGET_FEATURES)),
+        ("nehalem", ("nehalem", None)),
+    ],
+)
+def test_code_is_for_all_processors_unless_one_is_named(
+    monkeypatch: pytest.MonkeyPatch, named: str | None, expected: tuple[str, str | None]
+) -> None:
+    if named is None:
+        monkeypatch.delenv("NUMBA_CPU_NAME", raising=False)
+    else:
+        monkeypatch.setenv("NUMBA_CPU_NAME", named)
+    monkeypatch.delenv("NUMBA_CPU_FEATURES", raising=False)
+    begin, found = subprocess.Popen, []
+
+    def instead(command: list[str], *, env: dict[str, str], **_: object) -> subprocess.Popen[bytes]:
+        found.append((env["NUMBA_CPU_NAME"], env.get("NUMBA_CPU_FEATURES")))
+        return begin([sys.executable, "-c", ""])
+
+    monkeypatch.setattr(compilation, "missing", tuple)
+    monkeypatch.setattr(compilation.subprocess, "Popen", instead)
+    compile_kernels(Path("nowhere"), DEPTH)
+    assert found == [expected, expected]
 
 
 def test_the_corner_is_what_signing_leaves_of_it() -> None:

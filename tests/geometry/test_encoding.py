@@ -23,7 +23,7 @@ from sceneprint.geometry.signature.fisher_vector import (
 )
 from sceneprint.geometry.signature.mixture import Mixture, posteriors
 from sceneprint.geometry.signature.pair_features import LEADING, PairCounts, PairTable, pack
-from sceneprint.types import Floats, Ints32
+from sceneprint.types import Floats, Floats32, Ints32
 
 
 def random_mixture(rng: np.random.Generator, n: int, spread: float = 1.0) -> Mixture:
@@ -167,6 +167,42 @@ def test_statistics_of_counts_by_hand() -> None:
     np.testing.assert_allclose(s.zeroth, zeroth, rtol=1e-6)
     np.testing.assert_allclose(s.first, np.outer(2 * zeroth, np.ones(12)), rtol=1e-6)
     np.testing.assert_allclose(s.second, np.outer(4 * zeroth, np.ones(12)), rtol=1e-6)
+
+
+def naive_sums(counts: Floats32, table: PairTable, n: int) -> Floats:
+    """Bin after bin, share after share, as the definition has it."""
+    sums = np.zeros((n, 32))
+    for b in np.flatnonzero(counts):
+        f = table.features[b].astype(float)
+        for k in range(LEADING):
+            share = table.posteriors[b, k]
+            if share == 0:
+                break
+            weight = float(counts[b] * share)  # rounded to single precision
+            row = np.concatenate([f, f * f, [1.0], np.zeros(7)])
+            sums[table.components[b, k]] += weight * row
+    return sums
+
+
+@pytest.mark.parametrize("filled", [0, 1, 16, 17, 400])
+def test_sums_over_the_table_are_the_same_to_the_bit(filled: int) -> None:
+    # fewer bins than are asked for ahead, and more; compiled, and without a compiler
+    rng, n = np.random.default_rng(filled), 5
+    shares = rng.uniform(0.01, 1, (400, LEADING)).astype(np.float32)
+    shares[np.arange(LEADING) > rng.integers(0, LEADING, 400)[:, None]] = 0  # one at least
+    table = pack(
+        rng.normal(size=(400, 12)).astype(np.float32),
+        shares,
+        rng.integers(0, n, (400, LEADING)).astype(np.int16),
+    )
+    counts = np.zeros(400, np.float32)
+    counts[rng.choice(400, filled, replace=False)] = rng.uniform(0.01, 99, filled)
+    expected = naive_sums(counts, table, n)
+    assert bool(expected.any()) == (filled > 0)
+    for accumulate in (module._accumulate, module._accumulate.function):
+        sums = np.zeros((n, 32))
+        accumulate(counts, table.packed, table.packed.view(np.int16), sums)
+        assert sums.tobytes() == expected.tobytes()
 
 
 def test_quantise_by_hand() -> None:

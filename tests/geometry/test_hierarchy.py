@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sceneprint.geometry.signature import segmentation as module
 from sceneprint.geometry.signature.segmentation import (
     HierarchyParameters,
     SegmentationParameters,
@@ -150,3 +152,85 @@ def test_same_input_same_bytes(scenes: ModuleType) -> None:
             assert values.tobytes() == again.tobytes()
     for c, d in zip(first.labels, second.labels, strict=True):
         np.testing.assert_array_equal(c, d)
+
+
+def naive_k_means(
+    patches: Floats, areas: Floats, n_clusters: int, scale: float, weight: float, iterations: int
+) -> Ints32:
+    """Every patch with every centre, in the order of operations that the kernel has."""
+    x, y, z, nx, ny, nz = patches
+    n = len(areas)
+
+    def distances(c: Floats) -> Floats:
+        dx, dy, dz = x - c[0], y - c[1], z - c[2]
+        cosine = nx * c[3] + ny * c[4] + nz * c[5]
+        found: Floats = (dx * dx + dy * dy + dz * dz) * scale + weight * (1.0 - cosine)
+        return found
+
+    def assigned(centres: list[Floats]) -> Ints32:
+        nearest, labels = np.full(n, np.inf), np.zeros(n, np.int32)
+        for c, centre in enumerate(centres):
+            found = distances(centre)
+            labels[found < nearest] = c
+            nearest = np.minimum(found, nearest)
+        return labels
+
+    centres = [patches[:, areas.argmax()].copy()]
+    for _ in range(n_clusters - 1):
+        worst = np.min([distances(c) for c in centres], axis=0).argmax()
+        centres.append(patches[:, worst].copy())
+    labels = assigned(centres)
+    for _ in range(iterations):
+        for c, centre in enumerate(centres):
+            total, sums = 0.0, np.zeros(6)
+            for k in np.flatnonzero(labels == c):
+                sums += areas[k] * patches[:, k]
+                total += areas[k]
+            if total > 0:
+                length = np.sqrt(sums[3] ** 2 + sums[4] ** 2 + sums[5] ** 2)
+                centre[:3] = sums[:3] / total
+                centre[3:] = sums[3:] / length if length > 1e-9 else centre[3:]
+        labels = assigned(centres)
+    return labels
+
+
+@pytest.mark.parametrize(
+    ("n", "n_clusters", "weight", "copies"),
+    [(1, 1, 3.0, 1), (8, 3, 3.0, 1), (131, 90, 3.0, 1), (131, 90, 0.0, 1), (200, 20, 0.3, 1),
+     (96, 40, 3.0, 3), (96, 60, 3.0, 3)],
+)  # fmt: skip
+def test_patches_passed_over_are_those_too_far(
+    n: int, n_clusters: int, weight: float, copies: int
+) -> None:
+    """All comparisons give the same clusters; with equal distances, and centres without patches."""
+    rng = np.random.default_rng(n + n_clusters)
+    steps = rng.normal(0, 0.3, (n // copies, 3))
+    means = np.cumsum(steps, axis=0)  # neighbours in the order of the patches, as in an image
+    normals = rng.normal([0, 0, 2], 1, (n // copies, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    patches = np.tile(np.concatenate([means, normals], axis=1).T, copies)
+    areas = rng.uniform(0.5, 1, n)
+    scale = n_clusters / 30.0
+    found = module._k_means(np.ascontiguousarray(patches), areas, n_clusters, scale, weight, 4)
+    expected = naive_k_means(patches, areas, n_clusters, scale, weight, 4)
+    np.testing.assert_array_equal(found, expected)
+    assert len(np.unique(found)) <= min(n_clusters, n // copies)
+
+
+def test_most_patches_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 400 along a line, 100 centres, and five rounds: without a compiler, to be counted."""
+    compared = []
+    nearer = module._nearer.function
+
+    def counted(*arguments: Any) -> None:
+        compared.append(arguments[6] - arguments[5])
+        nearer(*arguments)
+
+    for name in ("_k_means", "_seed", "_reassign", "_boxes", "_least_distances", "_largest_of"):
+        monkeypatch.setattr(module, name, getattr(module, name).function)
+    monkeypatch.setattr(module, "_nearer", counted)
+    line = np.zeros((6, 400))
+    line[0], line[5] = np.arange(400.0), 1.0
+    labels = module._k_means(line, np.ones(400), 100, 1.0, 3.0, 4)
+    assert len(np.unique(labels)) == 100
+    assert 400 * 5 <= sum(compared) < 0.15 * 400 * 100 * 5

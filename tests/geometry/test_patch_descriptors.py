@@ -246,6 +246,40 @@ def test_components_that_cannot_be_learnt() -> None:
     assert fit_compression(rows, 12).matrix.shape == (12, 12)
 
 
+def test_lengths_are_those_of_all_bins_to_the_last_bit() -> None:
+    rng = np.random.default_rng(7)
+    rows = rng.uniform(0.1, 9, (5, P.dimension)).astype(np.float32)
+    rows[rng.random(rows.shape) < 0.6] = 0
+    rows[1, : 4 * 5 * ANGLES**2] = 0  # nothing within the nearest reach
+    rows[2] = 0
+    expected, start = np.zeros_like(rows), 0
+    for _, distances, heights in P.scales:
+        end = start + int(distances * heights) * ANGLES**2
+        for row, own in zip(rows[:, start:end], expected[:, start:end], strict=True):
+            total = sum(float(value) for value in row)  # in their order, empty ones too
+            if total > 0:
+                own[:] = np.sqrt(row).astype(float) * (1 / np.sqrt(total * 3))
+        start = end
+    patch_descriptors_module._normalise(P.scales, ANGLES, rows)
+    assert expected.any(axis=1).tolist() == [True, True, False, True, True]
+    assert rows.tobytes() == expected.tobytes()
+
+
+def test_compression_of_long_histograms_to_the_last_bit() -> None:
+    """Longer than the bins that are multiplied at a time, whose ends are no multiple of four."""
+    rng = np.random.default_rng(8)
+    histograms = rng.random((4, 600), dtype=np.float32)
+    histograms[rng.random(histograms.shape) < 0.5] = 0
+    matrix, offset = (rng.standard_normal(n).astype(np.float32) for n in ((600, 7), 7))
+    plain = np.tile(-offset, (4, 1))
+    for row, sums in zip(histograms, plain, strict=True):
+        for b in np.flatnonzero(row):
+            sums += row[b] * matrix[b]
+    out = np.empty((4, 7), np.float32)
+    patch_descriptors_module._project(histograms, matrix, offset, out)
+    assert out.tobytes() == plain.tobytes()
+
+
 @pytest.mark.parametrize("filled", range(10))
 def test_compression_skips_empty_bins_to_the_last_bit(filled: int) -> None:
     """Any number of filled bins, of which four are taken at a time, against one after the other."""

@@ -7,13 +7,14 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from sceneprint.geometry.signature import segmentation as module
 from sceneprint.geometry.signature.segmentation import (
     SegmentationParameters,
     compact_labels,
     patches_of,
     segment,
 )
-from sceneprint.types import Surface
+from sceneprint.types import Floats32, Ints32, Surface
 
 
 def parameters(
@@ -164,3 +165,63 @@ def test_nothing_seen_gives_no_patch(scenes: ModuleType) -> None:
     labels = segment(seen, parameters())
     assert (labels == -1).all()
     assert len(patches_of(seen, labels)) == 0
+
+
+def naive_assignment(
+    pixels: Floats32, centres: Floats32, spacing: float, weight: np.float32, columns: int
+) -> Ints32:
+    """The nearest of nine centres of each pixel, one after the other, the first of equals."""
+    _, height, width = pixels.shape
+    rows = len(centres) // columns
+    labels = np.full((height, width), -1, np.int32)
+    for y, x in np.ndindex(height, width):
+        px, py, pz, nx, ny, nz = pixels[:, y, x]
+        nearest = np.float32(np.inf)
+        for n in range(9):
+            row = min(int(y / spacing), rows - 1) + n // 3 - 1
+            column = min(int(x / spacing), columns - 1) + n % 3 - 1
+            if not (0 <= row < rows and 0 <= column < columns):
+                continue
+            cx, cy, cz, mx, my, mz, scale = centres[row * columns + column]
+            dx, dy, dz = px - cx, py - cy, pz - cz
+            cosine = nx * mx + ny * my + nz * mz
+            found = (dx * dx + dy * dy + dz * dz) * scale + weight * (np.float32(1) - cosine)
+            if scale > 0 and found < nearest:
+                labels[y, x], nearest = row * columns + column, found
+    return labels
+
+
+@pytest.mark.parametrize(("height", "width", "spacing"), [(31, 23, 4.3), (9, 40, 9.0), (20, 20, 1)])
+def test_pixels_get_the_nearest_of_nine_centres(height: int, width: int, spacing: float) -> None:
+    rng = np.random.default_rng(height)
+    rows, columns = max(round(height / spacing), 1), max(round(width / spacing), 1)
+    pixels = rng.normal(size=(6, height, width)).astype(np.float32)
+    centres = rng.normal(size=(rows * columns, 7)).astype(np.float32)
+    centres[:, 6] = rng.uniform(0.5, 2, len(centres)) * (rng.random(len(centres)) < 0.8)
+    valid = rng.random((height, width)) < 0.9
+    labels, weight = np.zeros((height, width), np.int32), np.float32(6)
+    module._assign(pixels, valid, centres, spacing, weight, columns, labels)
+    expected = naive_assignment(pixels, centres, spacing, weight, columns)
+    np.testing.assert_array_equal(labels, np.where(valid, expected, -1))
+    assert len(np.unique(labels)) > 0.4 * len(centres)
+
+
+def test_centres_by_the_definition() -> None:
+    """Of labels with pixels, with none, with normals that cancel; beside numpy, bit by bit."""
+    rng = np.random.default_rng(2)
+    sums = rng.normal(size=(60, 8))
+    sums[:, 0], sums[:, 3] = rng.uniform(0.5, 40, 60), rng.uniform(1, 90, 60)
+    sums[5], sums[6, 4:7], sums[7, 4:7] = 0.0, 0.0, 1e-9
+    centres = np.empty((60, 7), np.float32)
+    module._centres(sums, 4.4, 146.0, centres)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean, normal = sums[:, 1:4] / sums[:, :1], sums[:, 4:7] / sums[:, :1]
+        length = np.linalg.norm(normal, axis=1)
+        normal = normal / length[:, None]
+        scale = (146.0 / (4.4 * mean[:, 2])) ** 2
+    live = np.delete(np.arange(60), [5, 6, 7])
+    expected = np.column_stack([mean, normal, scale]).astype(np.float32)
+    assert centres[live].tobytes() == expected[live].tobytes()
+    assert centres[5:8, 6].tolist() == [0, 0, 0]
+    np.testing.assert_array_equal(centres[5], 0)
+    np.testing.assert_array_equal(centres[6, :3], mean[6].astype(np.float32))

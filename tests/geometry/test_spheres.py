@@ -11,7 +11,14 @@ import pytest
 from sceneprint.errors import UselessFrame
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.range_image import _averaged as averaged
-from sceneprint.geometry.surface.range_image import directions, framed, range_image, to_angles
+from sceneprint.geometry.surface.range_image import _lifted as lifted
+from sceneprint.geometry.surface.range_image import (
+    directions,
+    framed,
+    pole_of,
+    range_image,
+    to_angles,
+)
 from sceneprint.types import Cloud, DepthFrame, Floats, Sphere
 
 P = CloudParameters(image_angle=0.02)
@@ -202,3 +209,43 @@ def test_agrees_with_the_depth_image_it_is_of(room_frames: tuple[DepthFrame, ...
     assert np.median(cosine) > 0.998
     off = ((image.points[rows, columns][both] - at[inside][both]) * n).sum(axis=1)
     assert np.median(np.abs(off)) < 0.002
+
+
+def test_rays_meet_planes_as_numpy_has_it() -> None:
+    """To the bit, with pixels that show nothing, are grazed, or lie out of range."""
+    rng, p = np.random.default_rng(3), replace(P, minimum_range=0.5, maximum_range=8.0)
+    camera = Sphere(40, 20, 0.05, -1.0, 0.5, 2)
+    rays = directions(camera)
+    planes = rays * rng.uniform(0.04, 6, (20, 40, 1)) + rng.normal(0, 0.5, (20, 40, 3))
+    planes[rng.random((20, 40)) < 0.2] = 0
+    found = lifted(planes, rays, camera, p)
+    inverse, length = (planes * rays).sum(axis=2), np.linalg.norm(planes, axis=2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        cosine, r = inverse / length, 1 / inverse
+    faces = cosine >= p.minimum_cosine
+    valid = faces & (inverse * 8.0 * 2 > 1) & (inverse * 0.5 < 2)
+    assert not faces.all()
+    assert not (valid == faces).all()
+    assert valid.mean() > 0.3
+    np.testing.assert_array_equal(found.valid, valid)
+    flat = np.cos(camera.top - camera.step * np.arange(20))[:, None] * np.ones(40)
+    areas = camera.step**2 * flat[valid] / inverse[valid] ** 2 / cosine[valid]
+    for ours, expected in (
+        (found.points, rays[valid] / inverse[valid][:, None]),
+        (found.normals, -planes[valid] / length[valid][:, None]),
+        (found.areas, areas),
+    ):
+        assert ours[valid].tobytes() == expected.astype(np.float32).tobytes()
+        assert not ours[~valid].any()
+    assert 0.25 < r[valid].min() < r[valid].max() <= 16
+
+
+@pytest.mark.parametrize(("spread", "pole"), [((3, 3, 1), 2), ((1, 3, 3), 0), ((3, 1, 3), 1)])
+def test_the_pole_is_the_axis_that_fewest_points_are_near(
+    spread: tuple[float, float, float], pole: int
+) -> None:
+    points = (np.random.default_rng(1).normal(size=(5000, 3)) * spread).astype(np.float32)
+    lengths = np.linalg.norm(points, axis=1)
+    near = [(np.abs(points[:, c]) > np.cos(np.pi / 6) * lengths).sum() for c in range(3)]
+    assert pole_of(points) == int(np.argmin(near)) == pole
+    assert pole_of(points[:, [0, 1, 2]] * 0) == 2  # all tie

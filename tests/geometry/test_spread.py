@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.geometry.registration.overlap import sampled, thinned
+from sceneprint.geometry.registration.overlap import one_of_each, sampled, thinned
 from sceneprint.geometry.registration.plan_search import PlanParameters, plan_of
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.range_image import SPREAD_POINTS, range_image, spread_points
@@ -132,3 +132,19 @@ def test_refinement_works_on_the_points(lidar: Model) -> None:
     coarse = refined_at(plain[0], plain[1], T, fine)
     off = math.inf if coarse is None else float(np.linalg.norm(coarse[:3, 3] - T[:3, 3]))
     assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < off
+
+
+@pytest.mark.parametrize("at", [0.0, 3e5])
+def test_the_first_point_in_each_cube_is_kept(at: float) -> None:
+    """Beside sorting; on both sides of the origin and far from it, on the cubes' faces too."""
+    rng = np.random.default_rng(5)
+    points = np.concatenate(
+        [rng.normal(at, 0.5, (900, 3)), rng.integers(-9, 9, (900, 3)) * 0.25, [[at, -at, at]] * 3]
+    ).astype(np.float32)
+    rng.shuffle(points)
+    for cube in (0.25, 0.31, 40.0):
+        cells = np.floor(points / np.float32(cube)).astype(np.int64)
+        _, first = np.unique(cells, axis=0, return_index=True)
+        assert one_of_each(points, cube).tolist() == sorted(first.tolist())
+    assert one_of_each(points[:0], 1.0).tolist() == []
+    assert one_of_each(points, 40.0).dtype == np.int32

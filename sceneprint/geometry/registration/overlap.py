@@ -32,7 +32,7 @@ from sceneprint.geometry.surface.camera import (
     transposed,
     within,
 )
-from sceneprint.geometry.surface.cloud import mixed
+from sceneprint.geometry.surface.cloud import Ints64, mixed
 from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches, Sphere, Surface
 
 # Sec. III-E, a surface made ready to be looked up: by its camera, or by place where it has none.
@@ -118,14 +118,44 @@ def nearest_alike(
     return found, least
 
 
+@kernel
+def _first_in_cubes(
+    points: Floats32, cube: np.float32, secret: int, table: Ints32, cells: Ints64, kept: Ints32
+) -> int:
+    """Points in whose cube none comes before; how many.
+
+    table: of slots, a power of two, all -1. cells: (N, 3), cubes of the points that are kept.
+    """
+    mask, found = len(table) - 1, 0
+    for n in range(len(points)):
+        i, j, k = (
+            int(np.floor(points[n, 0] / cube)), int(np.floor(points[n, 1] / cube)),
+            int(np.floor(points[n, 2] / cube)),
+        )  # fmt: skip
+        # twice, as cubes may be so many that three numbers do not fit in one
+        slot = mixed((mixed((i << 32) ^ j, secret) << 19) + k, secret) & mask
+        while True:
+            other = table[slot]
+            if other < 0:
+                table[slot] = found
+                cells[found, 0], cells[found, 1], cells[found, 2] = i, j, k
+                kept[found] = n
+                found += 1
+                break
+            if cells[other, 0] == i and cells[other, 1] == j and cells[other, 2] == k:
+                break
+            slot = (slot + 1) & mask
+    return found
+
+
 def one_of_each(points: Floats32, cube: float) -> Ints32:
     """Indices, rising, of the first point (N, 3) in each occupied cube of this width, metres."""
-    cells = np.floor(points / cube).astype(np.int64)
-    cells -= cells.min(axis=0, initial=0)
-    spans = cells.max(axis=0, initial=0) + 1
-    keys = (cells[:, 0] * spans[1] + cells[:, 1]) * spans[2] + cells[:, 2]
-    _, first = np.unique(keys, return_index=True)
-    return np.sort(first).astype(np.int32)
+    n = len(points)
+    table = np.full(1 << max((2 * n - 1).bit_length(), 1), -1, np.int32)
+    cells, kept = np.empty((n, 3), np.int64), np.empty(n, np.int32)
+    secret = secrets.randbits(62)
+    found = _first_in_cubes(points, np.float32(cube), secret, table, cells, kept)
+    return kept[:found].copy()
 
 
 @cached_per_frame

@@ -203,20 +203,35 @@ def _accumulate(
             start = end
 
 
+@disjoint_kernel
+def _filled(row: Floats32, first: int, last: int, places: Ints32) -> int:
+    """Places of bins that are not empty; how many."""
+    found = 0
+    for k in range(first, last):
+        places[found] = k
+        found += 1 if row[k] > 0 else 0
+    return found
+
+
 @kernel
 def _normalise(scales: Floats, angles: int, out: Floats32) -> None:
-    """Root of every bin, then length 1 / sqrt(scales) for every scale (Hellinger kernel)."""
+    """Root of every bin, then length 1 / sqrt(scales) for every scale (Hellinger kernel).
+
+    Two thirds of the bins are empty, and stay so.
+    """
+    places = np.empty(out.shape[1], np.int32)
     for i in range(len(out)):
-        start = 0
+        start, row = 0, out[i]
         for s in range(len(scales)):
             end = start + int(scales[s, 1]) * int(scales[s, 2]) * angles * angles
-            total = 0.0
-            for k in range(start, end):
-                total += out[i, k]
-            if total > 0:  # the root's squared length is the sum
+            found, total = _filled(row, start, end, places), 0.0
+            for n in range(found):
+                total += row[places[n]]
+            if found > 0:  # the root's squared length is the sum
                 factor = 1.0 / np.sqrt(total * len(scales))
-                for k in range(start, end):
-                    out[i, k] = np.sqrt(out[i, k]) * factor
+                for n in range(found):
+                    k = places[n]
+                    row[k] = np.sqrt(row[k]) * factor
             start = end
 
 
@@ -239,31 +254,36 @@ def patch_descriptors(patches: Patches, p: PatchDescriptorParameters) -> Floats3
     return out
 
 
-@kernel
+#: Bins whose rows of the matrix stay in the cache while all histograms are multiplied with them.
+_BINS = 256
+
+
+@disjoint_kernel
 def _project(histograms: Floats32, matrix: Floats32, offset: Floats32, out: Floats32) -> None:
     """Rows times matrix (D, d), less the offset; most bins of a histogram are empty.
 
     Four bins at a time, added in their order: a row is read and written a quarter as often.
     """
-    filled = np.empty(histograms.shape[1], np.int32)
+    places = np.empty(_BINS, np.int32)
     for i in range(len(histograms)):
-        histogram, row, count = histograms[i], out[i], 0
-        for b in range(len(histogram)):
-            filled[count] = b
-            count += 1 if histogram[b] > 0 else 0
-        for k in range(len(row)):
-            row[k] = -offset[k]
-        fours = count - count % 4
-        for at in range(0, fours, 4):
-            b0, b1, b2, b3 = filled[at], filled[at + 1], filled[at + 2], filled[at + 3]
-            h0, h1, h2, h3 = histogram[b0], histogram[b1], histogram[b2], histogram[b3]
-            m0, m1, m2, m3 = matrix[b0], matrix[b1], matrix[b2], matrix[b3]
-            for k in range(len(row)):
-                row[k] = (((row[k] + h0 * m0[k]) + h1 * m1[k]) + h2 * m2[k]) + h3 * m3[k]
-        for at in range(fours, count):
-            value, component = histogram[filled[at]], matrix[filled[at]]
-            for k in range(len(row)):
-                row[k] += value * component[k]
+        for k in range(len(offset)):
+            out[i, k] = -offset[k]
+    for start in range(0, histograms.shape[1], _BINS):
+        end = min(start + _BINS, histograms.shape[1])
+        for i in range(len(histograms)):
+            histogram, row = histograms[i], out[i]
+            count = _filled(histogram, start, end, places)
+            fours = count - count % 4
+            for at in range(0, fours, 4):
+                b0, b1, b2, b3 = places[at], places[at + 1], places[at + 2], places[at + 3]
+                h0, h1, h2, h3 = histogram[b0], histogram[b1], histogram[b2], histogram[b3]
+                m0, m1, m2, m3 = matrix[b0], matrix[b1], matrix[b2], matrix[b3]
+                for k in range(len(row)):
+                    row[k] = (((row[k] + h0 * m0[k]) + h1 * m1[k]) + h2 * m2[k]) + h3 * m3[k]
+            for at in range(fours, count):
+                value, component = histogram[places[at]], matrix[places[at]]
+                for k in range(len(row)):
+                    row[k] += value * component[k]
 
 
 def compress(histograms: Floats32, by: Compression) -> Bytes:

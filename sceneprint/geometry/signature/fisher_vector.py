@@ -17,11 +17,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.kernel import disjoint_kernel, kernel, prefetch
 from sceneprint.geometry.signature.mixture import Mixture, moments
 from sceneprint.geometry.signature.pair_features import (
     FEATURE_DIMENSION,
@@ -54,27 +55,39 @@ class LevelStatistics:
     total: float
 
 
-@kernel
+#: Rows of the table between one that is asked for and that which is read: the memory's answer
+#: takes as long as a few rows take to be added.
+_AHEAD = 16
+
+
+@disjoint_kernel
 def _accumulate(
     counts: Floats32, table: Floats32, components: NDArray[np.int16], sums: Floats
 ) -> None:
     """sums (G, 32): first 12, second 12, zeroth in the 25th; the rest fills a cache line.
 
     table, components: the packed table, and the same memory as int16.
+
+    A quarter of the bins hold pairs, and their rows lie all over the table, which no cache holds:
+    so the bins are listed, and each row is asked for while those before it are added.
     """
-    moments = np.empty(2 * FEATURE_DIMENSION)
+    used, n = np.empty(len(counts), np.int32), 0
     for b in range(len(counts)):
-        if counts[b] == 0:
-            continue
+        used[n] = b
+        n += 1 if counts[b] != 0 else 0
+    moments = np.empty(2 * FEATURE_DIMENSION)
+    for m in range(n):
+        prefetch(table, used[min(m + _AHEAD, n - 1)])
+        bin_of: Any = np.uint64(used[m])
         for d in range(FEATURE_DIMENSION):
-            moments[d] = table[b, d]
+            moments[d] = table[bin_of, d]
             moments[FEATURE_DIMENSION + d] = moments[d] * moments[d]
         for k in range(LEADING):
-            share = float(table[b, FEATURE_DIMENSION + k])
+            share = float(table[bin_of, FEATURE_DIMENSION + k])
             if share == 0.0:
                 break
-            weight = counts[b] * share
-            g = components[b, 2 * (FEATURE_DIMENSION + LEADING) + k]
+            weight = counts[bin_of] * share
+            g: Any = np.uint64(components[bin_of, 2 * (FEATURE_DIMENSION + LEADING) + k])
             for d in range(2 * FEATURE_DIMENSION):
                 sums[g, d] += weight * moments[d]
             sums[g, 2 * FEATURE_DIMENSION] += weight

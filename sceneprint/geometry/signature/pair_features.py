@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -578,6 +579,18 @@ class PairCounts:
     total: float
 
 
+@lru_cache(maxsize=8)
+def _look_up(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Floats, Floats, Ints32]:
+    """The edges of `bin_edges`, and the hints of all three (3, n); they are shared."""
+    distance, angle, dihedral = bin_edges(layout, p)
+    starts = np.stack(
+        [hints(distance, 0.0, p.radius), hints(angle, -1.0, 2.0), hints(dihedral, 0.0, 4.0)]
+    )
+    for shared in (distance, angle, dihedral, starts):
+        shared.flags.writeable = False
+    return distance, angle, dihedral, starts
+
+
 def count_pairs(
     means: Floats, normals: Floats, weights: Floats, layout: TableLayout, p: PropertyParameters
 ) -> PairCounts:
@@ -589,10 +602,7 @@ def count_pairs(
     weights : (P,) of the patches
     layout, p : of the model
     """
-    distance, angle, dihedral = bin_edges(layout, p)
-    starts = np.stack(
-        [hints(distance, 0.0, p.radius), hints(angle, -1.0, 2.0), hints(dihedral, 0.0, 4.0)]
-    )
+    distance, angle, dihedral, starts = _look_up(layout, p)
     counts = np.zeros(layout.n_bins, np.float32)
     n_pairs, total = _count(
         np.ascontiguousarray(means.T), np.ascontiguousarray(normals.T),

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,24 +52,31 @@ def _spread(
             out[d, x] = centres[row * columns + column, d]
 
 
-@kernel
-def _centre_distances(
-    pixels: Floats32, y: int, centres: Floats32, normal_weight: np.float32, distance: Floats32
-) -> None:
-    """Distance of each pixel of a row to its own centre, of (6, h, w) and (7, w); far if dead."""
+@disjoint_kernel
+def _join(
+    pixels: Floats32, y: int, centres: Floats32, normal_weight: np.float32, k: np.int32,
+    cells: Ints32, labels: Ints32, nearest: Floats32,
+) -> None:  # fmt: skip
+    """Give pixels of a row, of (6, h, w), to the centre beside each, of (7, w), where it is nearer
+    than their own; none is to a dead one.
+
+    k : of the centre beside a pixel of the first cell
+    """
     px, py, pz = pixels[0, y], pixels[1, y], pixels[2, y]
     nx, ny, nz = pixels[3, y], pixels[4, y], pixels[5, y]
     cx, cy, cz, mx, my, mz = (
         centres[0], centres[1], centres[2], centres[3], centres[4], centres[5]
     )  # fmt: skip
     scale = centres[6]  # (1 / metric seed spacing)^2; 0 for a dead centre
-    for x in range(len(distance)):
+    for x in range(len(labels)):
         dx, dy, dz = px[x] - cx[x], py[x] - cy[x], pz[x] - cz[x]
         cosine = nx[x] * mx[x] + ny[x] * my[x] + nz[x] * mz[x]
         found = (dx * dx + dy * dy + dz * dz) * scale[x] + normal_weight * (
             np.float32(1.0) - cosine
         )
-        distance[x] = found if scale[x] > 0 else np.float32(np.inf)
+        distance = found if scale[x] > 0 else np.float32(np.inf)
+        labels[x] = k + cells[x] if distance < nearest[x] else labels[x]
+        nearest[x] = min(distance, nearest[x])
 
 
 @kernel
@@ -79,33 +87,32 @@ def _assign(
     """Give every pixel, of (6, h, w), the nearest of the centres seeded in the nine cells around
     it.
 
-    Rows of pixels are compared with one centre each at a time, and loops write one array each, so
-    that the compiler works on eight pixels at once.
+    Rows of pixels are compared with one centre each at a time, so that the compiler works on
+    eight pixels at once. Centres are spread over the pixels once for each row of cells.
     """
     height, width = valid.shape
     rows = len(centres) // columns
     cells = np.empty(width, np.int32)
     for x in range(width):
         cells[x] = min(int(x / spacing), columns - 1)
-    around = np.zeros((9, 7, width), np.float32)
-    distance, best = np.empty(width, np.float32), np.empty(width, np.float32)
-    cell = -1
+    around = np.zeros((3, 3, 7, width), np.float32)  # of three rows of cells, by row modulo 3
+    nearest = np.empty(width, np.float32)
+    cell, spread = -1, -2
     for y in range(height):
         if min(int(y / spacing), rows - 1) != cell:
             cell = min(int(y / spacing), rows - 1)
-            for n in range(9):
-                _spread(centres, cell + n // 3 - 1, n % 3 - 1, cells, columns, around[n])
-        best[:] = np.inf
+            for row in range(spread + 1, cell + 2):
+                for n in range(3):
+                    _spread(centres, row, n - 1, cells, columns, around[row % 3, n])
+            spread = cell + 1
+        nearest[:] = np.inf
         own = labels[y]
         for x in range(width):
             own[x] = -1
         for n in range(9):
-            k = (cell + n // 3 - 1) * columns + n % 3 - 1
-            _centre_distances(pixels, y, around[n], normal_weight, distance)
-            for x in range(width):
-                own[x] = k + cells[x] if distance[x] < best[x] else own[x]
-            for x in range(width):
-                best[x] = min(distance[x], best[x])
+            row, shift = cell + n // 3 - 1, n % 3
+            k = np.int32(row * columns + shift - 1)
+            _join(pixels, y, around[row % 3, shift], normal_weight, k, cells, own, nearest)
         for x in range(width):
             own[x] = own[x] if valid[y, x] else -1
 
@@ -131,16 +138,34 @@ def _sums(
     return sums
 
 
-def _centres(sums: NDArray[np.float64], spacing: float, focal_length: float) -> Floats32:
-    alive = sums[:, 0] > 0
-    weight = np.where(alive, sums[:, 0], 1.0)[:, None]
-    mean, normal = sums[:, 1:4] / weight, sums[:, 4:7] / weight
-    length = np.linalg.norm(normal, axis=1)
-    alive &= length > 1e-6
-    normal = normal / np.where(alive, length, 1.0)[:, None]
-    z = np.where(alive, mean[:, 2], 1.0)
-    scale = np.where(alive, (focal_length / (spacing * z)) ** 2, 0.0)
-    return np.column_stack([mean, normal, scale]).astype(np.float32)
+@kernel
+def _centres(sums: Floats, spacing: float, focal_length: float, centres: Floats32) -> None:
+    """Mean point and normal of labels, (n, 7), and (1 / metric seed spacing)^2, 0 where dead."""
+    for k in range(len(sums)):
+        alive = sums[k, 0] > 0
+        weight = sums[k, 0] if alive else 1.0
+        x, y, z = sums[k, 1] / weight, sums[k, 2] / weight, sums[k, 3] / weight
+        nx, ny, nz = sums[k, 4] / weight, sums[k, 5] / weight, sums[k, 6] / weight
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        alive = alive and length > 1e-6
+        scale = focal_length / (spacing * z) if alive else 0.0
+        length = length if alive else 1.0
+        centres[k, 0], centres[k, 1], centres[k, 2] = x, y, z
+        centres[k, 3], centres[k, 4], centres[k, 5] = nx / length, ny / length, nz / length
+        centres[k, 6] = scale * scale
+
+
+@lru_cache(maxsize=8)
+def _seed_grid(height: int, width: int, n_patches: int) -> tuple[Ints32, float, int]:
+    """Cell of each pixel (h, w), their spacing in pixels, and cells in a row."""
+    spacing = max(math.sqrt(height * width / n_patches), 1.0)
+    rows, columns = max(round(height / spacing), 1), max(round(width / spacing), 1)
+    y, x = np.mgrid[:height, :width]
+    cell_y = np.minimum((y / spacing).astype(np.int32), rows - 1)
+    cell_x = np.minimum((x / spacing).astype(np.int32), columns - 1)
+    cells: Ints32 = (cell_y * columns + cell_x).astype(np.int32)
+    cells.flags.writeable = False
+    return cells, spacing, columns
 
 
 def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
@@ -161,21 +186,17 @@ def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
     """
     height, width = surface.valid.shape
     assert isinstance(surface.camera, Intrinsics)
-    spacing = max(math.sqrt(height * width / p.n_patches), 1.0)
-    rows, columns = max(round(height / spacing), 1), max(round(width / spacing), 1)
+    cells, spacing, columns = _seed_grid(height, width, p.n_patches)
     focal_length = math.sqrt(surface.camera.fx * surface.camera.fy)
-    y, x = np.mgrid[:height, :width]
-    cell_y = np.minimum((y / spacing).astype(np.int32), rows - 1)
-    cell_x = np.minimum((x / spacing).astype(np.int32), columns - 1)
-    labels: Ints32 = np.where(surface.valid, cell_y * columns + cell_x, -1).astype(np.int32)
+    labels: Ints32 = np.where(surface.valid, cells, np.int32(-1))
     ones = np.ones((height, width), np.float32)
-    n = rows * columns
+    n = int(cells[-1, -1]) + 1
     pixels = np.concatenate([surface.points, surface.normals], axis=2).transpose(2, 0, 1)
     pixels = np.ascontiguousarray(pixels)
+    centres = np.empty((n, 7), np.float32)
     for _ in range(p.iterations):
-        centres = _centres(
-            _sums(surface.points, surface.normals, ones, labels, n), spacing, focal_length
-        )
+        sums = _sums(surface.points, surface.normals, ones, labels, n)
+        _centres(sums, spacing, focal_length, centres)
         _assign(
             pixels, surface.valid, centres, spacing, np.float32(p.normal_weight), columns, labels
         )
@@ -240,16 +261,20 @@ class HierarchyParameters:
     normal_weight: float = 3.0  #: of 1 - cos(normals), beside squared patch diameters
 
 
+#: Patches, neighbours in their order, that are compared with a centre or passed over together.
+_BLOCK = 8
+
+
 @disjoint_kernel
 def _nearer(
-    patches: Floats, centre: Floats, scale: float, weight: float, c: int,
+    patches: Floats, centre: Floats, scale: float, weight: float, c: int, first: int, last: int,
     nearest: Floats, labels: Ints32,
 ) -> None:  # fmt: skip
-    """Move to cluster `c` all patches that are nearer to its centre than to their own."""
+    """Move to cluster `c` those of some patches that are nearer to its centre than to their own."""
     x, y, z, nx, ny, nz = (
         patches[0], patches[1], patches[2], patches[3], patches[4], patches[5]
     )  # fmt: skip
-    for k in range(len(labels)):
+    for k in range(first, last):
         dx, dy, dz = x[k] - centre[0], y[k] - centre[1], z[k] - centre[2]
         cosine = nx[k] * centre[3] + ny[k] * centre[4] + nz[k] * centre[5]
         distance = (dx * dx + dy * dy + dz * dz) * scale + weight * (1.0 - cosine)
@@ -258,26 +283,113 @@ def _nearer(
 
 
 @kernel
+def _boxes(patches: Floats, boxes: Floats) -> float:
+    """Corners (6, n) of the boxes about blocks of patches, and the longest of all normals."""
+    longest = 0.0
+    boxes[:3], boxes[3:] = np.inf, -np.inf
+    for k in range(patches.shape[1]):
+        b = k // _BLOCK
+        for d in range(3):
+            boxes[d, b] = min(boxes[d, b], patches[d, k])
+            boxes[3 + d, b] = max(boxes[3 + d, b], patches[d, k])
+        squared = patches[3, k] ** 2 + patches[4, k] ** 2 + patches[5, k] ** 2
+        longest = max(longest, np.sqrt(squared))
+    return longest
+
+
+@disjoint_kernel
+def _least_distances(
+    boxes: Floats, centre: Floats, scale: float, weight: float, longest: float, least: Floats
+) -> None:
+    """What no distance of a block's patches from a centre falls below, roundings included."""
+    cosine = longest * np.sqrt(centre[3] ** 2 + centre[4] ** 2 + centre[5] ** 2)
+    of_normals = weight * (1.0 - cosine) - 1e-9 * abs(weight) * (1.0 + cosine)
+    shrunk = scale * (1.0 - 1e-9)
+    for b in range(len(least)):
+        dx = max(max(boxes[0, b] - centre[0], centre[0] - boxes[3, b]), 0.0)
+        dy = max(max(boxes[1, b] - centre[1], centre[1] - boxes[4, b]), 0.0)
+        dz = max(max(boxes[2, b] - centre[2], centre[2] - boxes[5, b]), 0.0)
+        least[b] = (dx * dx + dy * dy + dz * dz) * shrunk + of_normals
+
+
+@kernel
+def _largest_of(values: Floats, first: int, last: int) -> float:
+    largest: float = values[first]
+    for k in range(first + 1, last):
+        largest = max(largest, values[k])
+    return largest
+
+
+@kernel
+def _seed(
+    patches: Floats, areas: Floats, boxes: Floats, longest: float, scale: float, weight: float,
+    centres: Floats, labels: Ints32,
+) -> None:  # fmt: skip
+    """Farthest-point sampling: the largest patch, then always the one that is worst served."""
+    n, n_blocks = len(labels), boxes.shape[1]
+    nearest, farthest = np.full(n, np.inf), np.full(n_blocks, np.inf)
+    least = np.empty(n_blocks)
+    chosen = int(np.argmax(areas))
+    for c in range(len(centres)):
+        centres[c] = patches[:, chosen]
+        _least_distances(boxes, centres[c], scale, weight, longest, least)
+        for b in range(n_blocks):
+            if least[b] < farthest[b]:
+                first, last = b * _BLOCK, min((b + 1) * _BLOCK, n)
+                _nearer(patches, centres[c], scale, weight, c, first, last, nearest, labels)
+                farthest[b] = _largest_of(nearest, first, last)
+        worst = int(np.argmax(farthest))  # the first of equals, in the order of the patches
+        chosen, last = worst * _BLOCK, min((worst + 1) * _BLOCK, n)
+        while chosen < last - 1 and nearest[chosen] != farthest[worst]:
+            chosen += 1
+
+
+@kernel
+def _reassign(
+    patches: Floats, boxes: Floats, longest: float, scale: float, weight: float, centres: Floats,
+    labels: Ints32,
+) -> None:  # fmt: skip
+    """Give every patch the nearest centre, the first of equals.
+
+    Its present centre is no farther than it is, so blocks of patches are compared only with
+    centres that may be as near as that to one of them.
+    """
+    n, n_blocks = len(labels), boxes.shape[1]
+    nearest, farthest, least = np.empty(n), np.empty(n_blocks), np.empty(n_blocks)
+    for k in range(n):
+        nearest[k] = np.inf
+        _nearer(patches, centres[labels[k]], scale, weight, labels[k], k, k + 1, nearest, labels)
+    for b in range(n_blocks):
+        farthest[b] = _largest_of(nearest, b * _BLOCK, min((b + 1) * _BLOCK, n))
+    nearest[:] = np.inf
+    for c in range(len(centres)):
+        _least_distances(boxes, centres[c], scale, weight, longest, least)
+        for b in range(n_blocks):
+            if least[b] <= farthest[b]:
+                first, last = b * _BLOCK, min((b + 1) * _BLOCK, n)
+                _nearer(patches, centres[c], scale, weight, c, first, last, nearest, labels)
+
+
+@kernel
 def _k_means(
     patches: Floats, areas: Floats, n_clusters: int, scale: float, weight: float, iterations: int
 ) -> Ints32:
-    """Labels of (6, P) positions and normals; clusters that end empty are numbered still."""
+    """Labels of (6, P) positions and normals; clusters that end empty are numbered still.
+
+    Neighbours are compared with a centre together, or not at all where their box is too far: of
+    the distances, a twentieth is left to be computed.
+    """
     n = patches.shape[1]
-    centres = np.empty((n_clusters, 6))
-    nearest = np.full(n, np.inf)
-    labels = np.zeros(n, np.int32)
-    chosen = int(np.argmax(areas))
-    for c in range(n_clusters):  # farthest-point sampling
-        centres[c] = patches[:, chosen]
-        _nearer(patches, centres[c], scale, weight, c, nearest, labels)
-        chosen = int(np.argmax(nearest))
+    centres, labels = np.empty((n_clusters, 6)), np.zeros(n, np.int32)
+    boxes = np.empty((6, (n + _BLOCK - 1) // _BLOCK))
+    longest = _boxes(patches, boxes)
+    _seed(patches, areas, boxes, longest, scale, weight, centres, labels)
     for _ in range(iterations):
         sums = np.zeros((n_clusters, 7))
         for k in range(n):
             for d in range(6):
                 sums[labels[k], d] += areas[k] * patches[d, k]
             sums[labels[k], 6] += areas[k]
-        nearest[:] = np.inf
         for c in range(n_clusters):
             if sums[c, 6] > 0:
                 length = np.sqrt(sums[c, 3] ** 2 + sums[c, 4] ** 2 + sums[c, 5] ** 2)
@@ -285,7 +397,7 @@ def _k_means(
                     centres[c, d] = sums[c, d] / sums[c, 6]
                     if length > 1e-9:
                         centres[c, 3 + d] = sums[c, 3 + d] / length
-            _nearer(patches, centres[c], scale, weight, c, nearest, labels)
+        _reassign(patches, boxes, longest, scale, weight, centres, labels)
     return labels
 
 

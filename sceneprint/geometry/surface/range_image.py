@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import UselessFrame
+from sceneprint.geometry.execution import cached_per_frame
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.surface.cloud import CloudParameters, within_range
 from sceneprint.geometry.surface.voxels import solve
@@ -43,11 +44,22 @@ def directions(camera: Sphere) -> Floats:
     return rays
 
 
+@kernel
+def _near_axes(points: Floats32, least: np.float32, near: NDArray[np.int64]) -> None:
+    """How many points are near each axis: that cosine or more off it."""
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        limit = least * np.sqrt(x * x + y * y + z * z)
+        near[0] += abs(x) > limit
+        near[1] += abs(y) > limit
+        near[2] += abs(z) > limit
+
+
 def pole_of(points: Floats32) -> int:
     """The axis, z, y, x where they tie, that the fewest points are near."""
-    lengths = np.linalg.norm(points, axis=1)
-    near = [int(np.count_nonzero(np.abs(points[:, c]) > _NEAR_POLE * lengths)) for c in range(3)]
-    return min((2, 1, 0), key=lambda axis: near[axis])
+    near = np.zeros(3, np.int64)
+    _near_axes(points, np.float32(_NEAR_POLE), near)
+    return min((2, 1, 0), key=lambda axis: int(near[axis]))
 
 
 @kernel
@@ -118,10 +130,7 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
     ------
     UselessFrame : fewer than `minimum_points` points are within range, or pixels show one.
     """
-    points = within_range(cloud, p)
-    pole = pole_of(points)
-    angles = np.empty((len(points), 3))
-    to_angles(points, pole, angles)
+    pole, angles = _angles_of(cloud, p.minimum_range, p.maximum_range, p.minimum_points)
     camera = framed(angles, pole, p)
     q, u = _averaged(angles, camera, p)
     if int(np.count_nonzero(q)) < p.minimum_points:
@@ -143,6 +152,18 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
     ):
         _close(view, target, ray, shown, p.gap_px, gates, p.gap_cosine)
     return _lifted(closed, rays, camera, p)
+
+
+@cached_per_frame
+def _angles_of(cloud: Cloud, nearest: float, farthest: float, least: int) -> tuple[int, Floats]:
+    """Pole of a cloud, and angles and range of each point; of its two images alike."""
+    limits = CloudParameters(
+        minimum_range=nearest, maximum_range=farthest, minimum_points=least
+    )  # fmt: skip
+    points = within_range(cloud, limits)
+    pole, angles = pole_of(points), np.empty((len(points), 3))
+    to_angles(points, pole, angles)
+    return pole, angles
 
 
 def spread_points(cloud: Cloud, image: Surface, p: CloudParameters) -> Surface:
@@ -217,6 +238,16 @@ def _sum(
         sums[k, 2 + pole] += np.int64(np.rint(np.sin(angles[i, 1]) * steps))
 
 
+@kernel
+def _divide(sums: NDArray[np.int64], least: float, q: Floats, u: Floats) -> None:
+    """Means of what `_sum` has added up: inverse range (n,) and direction (n, 3)."""
+    for k in range(len(sums)):
+        count = float(max(sums[k, 0], 1))
+        q[k] = float(sums[k, 1]) / count / _STEPS / least
+        for d in range(3):
+            u[k, d] = float(sums[k, 2 + d]) / count / _STEPS
+
+
 def _averaged(angles: Floats, camera: Sphere, p: CloudParameters) -> tuple[Floats, Floats]:
     """Inverse range (h, w) of the nearest surface in each pixel, 0 for none, and the direction
     (h, w, 3) it is the mean of: where 1/r = a . u, so are the means.
@@ -228,8 +259,9 @@ def _averaged(angles: Floats, camera: Sphere, p: CloudParameters) -> tuple[Float
     _nearest(angles, frame, pixel, nearest)
     sums = np.zeros((nearest.size, 5), np.int64)
     _sum(angles, pixel, nearest.reshape(-1), frame, p.same_surface, camera.pole, sums)
-    means = sums[:, 1:] / np.maximum(sums[:, :1], 1) / _STEPS
-    return (means[:, 0] / least).reshape(shape), means[:, 1:].reshape(*shape, 3)
+    q, u = np.empty(shape), np.empty((*shape, 3))
+    _divide(sums, least, q.reshape(-1), u.reshape(-1, 3))
+    return q, u
 
 
 @kernel
@@ -330,16 +362,35 @@ def _close(
             last = y
 
 
+@kernel
+def _lift(
+    planes: Floats, rays: Floats, flat: Floats, numbers: Floats,
+    points: Floats32, normals: Floats32, areas: Floats32, valid: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Where the rays meet the planes. numbers: least cosine, least range, most, squared step."""
+    for y in range(len(planes)):
+        for x in range(planes.shape[1]):
+            a, ray = planes[y, x], rays[y, x]
+            inverse = a[0] * ray[0] + a[1] * ray[1] + a[2] * ray[2]
+            length = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+            if not length > 0 or not inverse / length >= numbers[0]:
+                continue
+            # at most twice as far as the sensor reaches, and at least half as far as it begins
+            if not (inverse * numbers[2] * 2 > 1 and inverse * numbers[1] < 2):
+                continue
+            for d in range(3):
+                points[y, x, d] = ray[d] / inverse
+                normals[y, x, d] = -a[d] / length
+            solid = numbers[3] * max(flat[y], 0.0) / (inverse * inverse)
+            areas[y, x] = solid / (inverse / length)
+            valid[y, x] = True
+
+
 def _lifted(planes: Floats, rays: Floats, camera: Sphere, p: CloudParameters) -> Surface:
-    inverse = (planes * rays).sum(axis=2)
-    length = np.linalg.norm(planes, axis=2)
-    cosine = inverse / np.where(length > 0, length, 1.0)
-    seen = (inverse * p.maximum_range * 2 > 1) & (inverse * p.minimum_range < 2)
-    valid = (length > 0) & (cosine >= p.minimum_cosine) & seen
-    inverse, length = np.where(valid, inverse, 1.0), np.where(valid, length, 1.0)
-    points = np.where(valid[..., None], rays / inverse[..., None], 0.0).astype(np.float32)
-    normals = np.where(valid[..., None], -planes / length[..., None], 0.0).astype(np.float32)
-    flat = np.cos(camera.top - camera.step * np.arange(camera.height))[:, None]
-    solid = camera.step**2 * np.maximum(flat, 0.0) / inverse**2
-    areas = np.where(valid, solid / np.where(valid, cosine, 1.0), 0.0).astype(np.float32)
+    shape = (camera.height, camera.width)
+    flat = np.cos(camera.top - camera.step * np.arange(camera.height))
+    numbers = np.array([p.minimum_cosine, p.minimum_range, p.maximum_range, camera.step**2])
+    points, normals = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
+    areas, valid = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
+    _lift(planes, rays, flat, numbers, points, normals, areas, valid)
     return Surface(points, normals, valid, areas, camera)
