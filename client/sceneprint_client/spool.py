@@ -281,14 +281,14 @@ class Spool:
 
     def status(self) -> SpoolStatus:
         """What the spool holds, and what has become of all frames that were added."""
-        names = "waiting, refused, bytes, most_bytes, uploaded, thinned, discarded"
+        names = ("waiting", "refused", "bytes", "most_bytes", "uploaded", "thinned", "discarded")
         with self._transaction(write=False) as database:
-            counted = database.execute(f"SELECT {names} FROM counters").fetchone()
+            row = database.execute(f"SELECT {', '.join(names)} FROM counters").fetchone()
             first = database.execute(
                 "SELECT stamp FROM frames WHERE reason IS NULL ORDER BY id LIMIT 1"
             ).fetchone()
         oldest = None if first is None else datetime.fromtimestamp(first[0], timezone.utc)
-        return SpoolStatus(*counted, oldest)
+        return SpoolStatus(**dict(zip(names, row, strict=True)), oldest=oldest)
 
     def refusals(self) -> list[SpoolRefusal]:
         """Frames that the service refused, oldest first."""
@@ -313,7 +313,7 @@ class Spool:
         if_novel: float | bool | None = None, patience_s: float = 120.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> SyncReport:  # fmt: skip
-        """Upload the frames that wait now, oldest first; a frame leaves the spool once a map has it.
+        """Upload the frames that wait now, oldest first; each leaves the spool once a map has it.
 
         Call it again after any error or kill: the service recognises content and metadata that a
         map has, so that no frame is lost and none is there twice. A frame that it refuses (409,
@@ -363,22 +363,15 @@ class Spool:
                 if count and size > BATCH_BYTES:
                     break
                 count += 1
-            found = [
-                (
-                    one,
-                    *database.execute(
-                        "SELECT data, meta FROM frames WHERE id = ?", (one,)
-                    ).fetchone(),
-                )
-                for one, _ in rows[:count]
-            ]
+            query = "SELECT id, data, meta FROM frames WHERE id = ?"
+            found = [database.execute(query, (one,)).fetchone() for one, _ in rows[:count]]
         return [
             _Waiting(number, data, FrameMeta.model_validate_json(meta))
             for number, data, meta in found
         ]
 
     def _send(self, target: _Target, batch: list[_Waiting], report: SyncReport) -> None:
-        """Upload frames, and record what came of each; halves a batch that is refused as a whole."""
+        """Upload frames, and record what came of each; a batch refused as a whole is halved."""
         try:
             items = _upload(target, batch)
         except errors.SceneprintError as error:
@@ -556,11 +549,11 @@ def _renew_novelty(database: sqlite3.Connection, number: int | None) -> None:
         return
     query = "SELECT run, stamp, pose FROM frames WHERE id = ?"
     run, *own = database.execute(query, (number,)).fetchone()
-    places = []
+    places: list[SpoolPlace] = []
     for side in (-1, 1):
         beside = _neighbour(database, run, number, side)
         if beside is None:
-            places = []
+            places: list[SpoolPlace] = []
             break
         places.append(_place(*database.execute(query, (beside,)).fetchone()[1:]))
     novelty = sum(separation(_place(*own), one) for one in places) if places else None
