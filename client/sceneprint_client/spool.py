@@ -553,7 +553,7 @@ def _renew_novelty(database: sqlite3.Connection, number: int | None) -> None:
     for side in (-1, 1):
         beside = _neighbour(database, run, number, side)
         if beside is None:
-            places: list[SpoolPlace] = []
+            places = []
             break
         places.append(_place(*database.execute(query, (beside,)).fetchone()[1:]))
     novelty = sum(separation(_place(*own), one) for one in places) if places else None
