@@ -1,4 +1,4 @@
-"""A robot out of reach of its service keeps its frames in a spool, and uploads them when it is back.
+"""A robot out of reach of its service spools its frames, and uploads them when it is back.
 
     python examples/offline_robot.py drives/mapping office --spool office.spool
 

@@ -5,18 +5,19 @@ from __future__ import annotations
 import json
 import runpy
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from sceneprint_client import Client
-from tests.cli_service.conftest import Run
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_frames_are_spooled_and_uploaded(
-    sceneprint: Run, service_url: str, rooms: Path, tmp_path: Path
+    sceneprint: Callable[..., Any], service_url: str, rooms: Path, tmp_path: Path
 ) -> None:
     spool, bare = tmp_path / "robot.spool", tmp_path / "bare"
     said = sceneprint("spool", "status", spool, expect=2)
