@@ -39,10 +39,10 @@ from sceneprint_client.api.admin import EVERY, SCOPES, Scope
 from service.event_stream import Feed
 from service.limits import (
     ROWS_PER_COST,
+    BodySpool,
     Gate,
     Holdings,
     RateLimits,
-    Spool,
     TokenBucket,
     Turns,
     enforce_rate_limit,
@@ -115,7 +115,7 @@ class Context:
     wait_s: float
     requests: Holdings = field(default_factory=Holdings)
     reads: Turns = field(default_factory=lambda: Turns(READS, READS_BESIDE))
-    spool: Spool = field(default_factory=Spool)
+    spool: BodySpool = field(default_factory=BodySpool)
     lookups: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(LOOKUPS))
 
     async def run(self, do: Callable[..., T], *given: object, patient: bool = False) -> T:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sceneprint_client.client import Client, Status
     from sceneprint_client.frame_files import FrameFile, meta_of
+    from sceneprint_client.spool import Spool
     from sceneprint_client.tracker import AsyncTracker, State, Tracker
 
 __version__ = "1.0.0rc1"
@@ -23,6 +24,7 @@ __all__ = [
     "AsyncTracker",
     "Client",
     "FrameFile",
+    "Spool",
     "State",
     "Status",
     "Tracker",
@@ -34,6 +36,7 @@ _HOME = {
     "AsyncTracker": "tracker",
     "Client": "client",
     "FrameFile": "frame_files",
+    "Spool": "spool",
     "State": "tracker",
     "Status": "client",
     "Tracker": "tracker",

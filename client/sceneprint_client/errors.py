@@ -70,6 +70,9 @@ def kebab_case(name: str) -> str:
 class SceneprintError(Exception):
     """Base of every error raised on purpose."""
 
+    #: Seconds after which a service asked to come back (`Retry-After`); 0 if it did not ask.
+    retry_after_s: float = 0.0
+
 
 def printable(text: str) -> str:
     """A text from outside as it can stand in a line: names in damaged files may be anything."""

@@ -545,6 +545,12 @@ def read_record(kind: type[Record], response: httpx.Response) -> Record:
 
 def error_of(response: httpx.Response) -> errors.SceneprintError:
     """The error that an answer tells of: of the class its `type` names, or else Refused."""
+    error = _error_of(response)
+    error.retry_after_s = retry_after_s(response.headers.get("Retry-After", ""))
+    return error
+
+
+def _error_of(response: httpx.Response) -> errors.SceneprintError:
     try:
         problem = Problem.model_validate_json(response.content)
     except ValidationError:

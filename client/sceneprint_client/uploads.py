@@ -87,7 +87,7 @@ class UploadMethods(ServiceConnection):
         """
         return self._upload(
             "POST", f"{map_path(map_name)}/frames", frame, meta, wait_s or 0.0,
-            _upload_fields(priority, if_novel), up,
+            upload_fields(priority, if_novel), up,
         )  # fmt: skip
 
     def put_frame(
@@ -114,7 +114,7 @@ class UploadMethods(ServiceConnection):
         until = time.monotonic() + (wait_s or 0.0)
         added, _ = self._upload(
             "PUT", frame_path(map_name, frame_id), frame, meta, wait_s or 0.0,
-            _upload_fields(priority, if_novel), up,
+            upload_fields(priority, if_novel), up,
         )  # fmt: skip
         return self._settled(map_name, added, until)
 
@@ -151,7 +151,7 @@ class UploadMethods(ServiceConnection):
             )
         known = [None] * len(frames) if metas is None else metas
         request = frames_form(frames, known)
-        request["data"] |= _upload_fields(priority, if_novel)
+        request["data"] |= upload_fields(priority, if_novel)
         return self._ask(Batch, "POST", f"{map_path(map_name)}/frames/batch", **request).items
 
     def _upload(
@@ -180,7 +180,7 @@ class UploadMethods(ServiceConnection):
         return added
 
 
-def _upload_fields(priority: int, if_novel: float | bool | None) -> dict[str, str]:
+def upload_fields(priority: int, if_novel: float | bool | None) -> dict[str, str]:
     """Fields of an upload beside the frame; a service of before knows of none."""
     if abs(priority) > MOST_PRIORITY:
         raise InvalidRequest(

@@ -30,6 +30,7 @@ COMMANDS = {
     "audit": "audit",
     "maps": "inventory",
     "upload": "upload",
+    "spool": "spool",
     "query": "query",
     "localize": "query",
     "queries": "inventory",

@@ -43,7 +43,7 @@ from sceneprint_client.api.frames import ImportOptions
 
 if TYPE_CHECKING:
     from sceneprint_client import Client
-    from sceneprint_client.api import Added, Job
+    from sceneprint_client.api import Added, FrameMeta, Job
 
 # What has become of the frames of an upload.
 
@@ -259,30 +259,11 @@ def _count(client: Client, map_name: str, job: Job, tally: Tally) -> None:
         tally.count(item.name, added, item.status == 202)
 
 
-#: What is wrong with one frame, and says nothing of the next.
-_OF_FRAME = (
-    FrameError, DatasetError, FrameConflict, InvalidRequest, MissingDependency, Refused,
-)  # fmt: skip
+# What is said of all frames of a command.
 
 
-def add_upload(commands: Any) -> None:
-    """Describe the command to the parser.
-
-    Length: a statement for each option, in the order of `--help`.
-    """
-    command = commands.add_parser(
-        "upload",
-        help="upload depth frames and point clouds to a map of a service",
-        description="Upload every frame of the given files and folders (7-Scenes, TUM RGB-D or "
-        "plain depth images, with an intrinsics.json beside them or in a folder above; or point "
-        "clouds), and wait until they are signed. Of a recording of ROS (MCAP, rosbag2, ROS 1 "
-        "bag) keyframes are uploaded. A zip or tar archive is sent whole and unpacked by the "
-        "service. A frame that the map already has is not stored twice.",
-    )
-    command.add_argument(
-        "map", metavar="MAP", help="map to upload to; created if it does not exist"
-    )
-    command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
+def add_frame_options(command: argparse.ArgumentParser) -> None:
+    """`--robot` and its like: metadata of frames."""
     command.add_argument(
         "--robot",
         metavar="NAME",
@@ -311,6 +292,55 @@ def add_upload(commands: Any) -> None:
         "--base-frame", metavar="NAME", help="name of the robot's base frame (default: base_link)"
     )
     add_up_option(command)
+
+
+def meta_for(
+    options: argparse.Namespace, sequence: FrameSequence, reference: FrameReference
+) -> FrameMeta:
+    """What is known of a frame, with what the options say of it; raises as `meta_of`."""
+    from sceneprint.formats.dataset.frame_reference import parent_frame_of, session_of
+    from sceneprint_client.frame_files import meta_of
+
+    base = options.base
+    if base is not None and options.base_frame is not None:
+        base = base.model_copy(update={"base_frame": options.base_frame})
+    return meta_of(
+        reference,
+        robot=options.robot,
+        session=options.session or session_of(sequence),
+        tags=options.tag,
+        with_pose=not options.no_pose,
+        base=base,
+        up=options.up,
+        parent_frame=options.parent_frame or parent_frame_of(sequence, options.robot),
+    )
+
+
+#: What is wrong with one frame, and says nothing of the next.
+OF_FRAME = (
+    FrameError, DatasetError, FrameConflict, InvalidRequest, MissingDependency, Refused,
+)  # fmt: skip
+
+
+def add_upload(commands: Any) -> None:
+    """Describe the command to the parser.
+
+    Length: a statement for each option, in the order of `--help`.
+    """
+    command = commands.add_parser(
+        "upload",
+        help="upload depth frames and point clouds to a map of a service",
+        description="Upload every frame of the given files and folders (7-Scenes, TUM RGB-D or "
+        "plain depth images, with an intrinsics.json beside them or in a folder above; or point "
+        "clouds), and wait until they are signed. Of a recording of ROS (MCAP, rosbag2, ROS 1 "
+        "bag) keyframes are uploaded. A zip or tar archive is sent whole and unpacked by the "
+        "service. A frame that the map already has is not stored twice.",
+    )
+    command.add_argument(
+        "map", metavar="MAP", help="map to upload to; created if it does not exist"
+    )
+    command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
+    add_frame_options(command)
     command.add_argument(
         "--create",
         action=argparse.BooleanOptionalAction,
@@ -356,7 +386,7 @@ def run_upload(options: argparse.Namespace) -> int:
     """Upload; returns 2 where a frame was not indexed."""
     archives = [path for path in options.paths if is_archive_file(path)]
     paths = [path for path in options.paths if path not in archives]
-    sequences = _sequences_of(paths, options)
+    sequences = sequences_of(paths, options)
     found = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
     if options.base is not None and options.base_frame is not None:
         options.base = options.base.model_copy(update={"base_frame": options.base_frame})
@@ -384,7 +414,7 @@ def run_upload(options: argparse.Namespace) -> int:
     return 2 if tally.errors or stalled else 0
 
 
-def _sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSequence]:
+def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSequence]:
     """The sequences at all paths, numbered within their sessions.
 
     Raises
@@ -442,7 +472,7 @@ def _send_all(
                 name = sent.pop(future)
                 try:
                     tally.count(name, *future.result())
-                except _OF_FRAME as error:
+                except OF_FRAME as error:
                     tally.refuse(name, str(error))
                 bar.update()
     finally:  # also where Ctrl-C ends it: what is in flight arrives, nothing follows it
@@ -455,19 +485,7 @@ def _send_all(
 def _send(
     client: Client, options: argparse.Namespace, sequence: FrameSequence, reference: FrameReference
 ) -> tuple[Added, bool]:
-    from sceneprint.formats.dataset.frame_reference import parent_frame_of, session_of
-    from sceneprint_client.frame_files import meta_of
-
-    meta = meta_of(
-        reference,
-        robot=options.robot,
-        session=options.session or session_of(sequence),
-        tags=options.tag,
-        with_pose=not options.no_pose,
-        base=options.base,
-        up=options.up,
-        parent_frame=options.parent_frame or parent_frame_of(sequence, options.robot),
-    )
+    meta = meta_for(options, sequence, reference)
     return client.add(
         options.map, reference, meta, priority=options.priority, if_novel=options.if_novel
     )

@@ -1,0 +1,629 @@
+"""A spool: frames that a robot keeps on its disk while it is offline, and uploads later.
+
+frame, meta  --Spool.add-->  a durable row of one SQLite file
+rows, oldest first  --Spool.sync, Client.upload_batch-->  frames of a map, each once
+two places  --separation-->  how far apart they are, which decides what a full spool gives up
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import sqlite3
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from threading import RLock
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint_client import errors
+from sceneprint_client.api.base import FrameMeta, GivenPose
+from sceneprint_client.api.frames import MOST_OF_BATCH, BatchItem
+from sceneprint_client.http import frame_bytes, meta_json
+from sceneprint_client.poses import rotation_of
+from sceneprint_client.tracker_core import difference
+from sceneprint_client.uploads import upload_fields
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from sceneprint_client.client import Client
+    from sceneprint_client.http import FrameInput, MetaInput
+
+#: Bytes of a new spool, unless said otherwise.
+MOST_BYTES = 1 << 30
+#: What one unit of separation is: so many metres, or degrees, or seconds.
+METRES, DEGREES, SECONDS = 1.0, 30.0, 60.0
+#: Bytes of frames sent in one request; a larger frame is sent alone.
+BATCH_BYTES = 4 << 20
+#: Seconds before a busy service is asked again, if it does not say when.
+_PAUSE_S = 1.0
+#: Seconds that another process may keep the file locked.
+_LOCKED_S = 30.0
+#: Bytes of a page of the file. A frame is charged whole pages, and one for its rows of the indexes.
+_PAGE = 4096
+#: Pages that the journal keeps on disk, so that frames can be removed when the disk is full: one
+#: request's frames change fewer.
+_RESERVE = 512
+#: Marks the file as a spool, and its schema.
+_APPLICATION, _SCHEMA = 0x53705370, 1
+
+# `reason` is null while a frame waits. `data` is last, so that other columns are read without it.
+_TABLES = """
+CREATE TABLE frames (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    digest TEXT NOT NULL UNIQUE,
+    run TEXT NOT NULL,
+    stamp REAL NOT NULL,
+    pose TEXT,
+    novelty REAL,
+    bytes INTEGER NOT NULL,
+    reason TEXT,
+    meta TEXT NOT NULL,
+    data BLOB NOT NULL
+);
+CREATE INDEX waiting_by_novelty ON frames (novelty, id) WHERE reason IS NULL;
+CREATE INDEX waiting_by_run ON frames (run, id) WHERE reason IS NULL;
+CREATE INDEX refused ON frames (id) WHERE reason IS NOT NULL;
+CREATE TABLE counters (
+    most_bytes INTEGER NOT NULL,
+    bytes INTEGER NOT NULL DEFAULT 0,
+    waiting INTEGER NOT NULL DEFAULT 0,
+    refused INTEGER NOT NULL DEFAULT 0,
+    uploaded INTEGER NOT NULL DEFAULT 0,
+    thinned INTEGER NOT NULL DEFAULT 0,
+    discarded INTEGER NOT NULL DEFAULT 0
+);
+CREATE TRIGGER added AFTER INSERT ON frames BEGIN
+    UPDATE counters SET bytes = bytes + NEW.bytes, waiting = waiting + 1;
+END;
+CREATE TRIGGER removed AFTER DELETE ON frames BEGIN
+    UPDATE counters SET bytes = bytes - OLD.bytes, waiting = waiting - (OLD.reason IS NULL),
+        refused = refused - (OLD.reason IS NOT NULL);
+END;
+CREATE TRIGGER moved AFTER UPDATE OF reason ON frames BEGIN
+    UPDATE counters SET waiting = waiting + (NEW.reason IS NULL) - (OLD.reason IS NULL),
+        refused = refused + (NEW.reason IS NOT NULL) - (OLD.reason IS NOT NULL);
+END;
+"""
+
+
+@dataclass(frozen=True)
+class SpoolStatus:
+    """What a spool holds, and what has become of all frames that were added.
+
+    Parameters
+    ----------
+    waiting : frames to upload
+    refused : frames that the service refused; `Spool.refusals` has their reasons
+    bytes, most_bytes : that waiting and refused frames take on disk, and may take
+    uploaded : frames that a map has, since the spool was created
+    thinned : waiting frames that a full spool gave up
+    discarded : refused frames that a full spool gave up
+    oldest : when the first waiting frame was taken, else added; None if none waits
+    """
+
+    waiting: int
+    refused: int
+    bytes: int
+    most_bytes: int
+    uploaded: int
+    thinned: int
+    discarded: int
+    oldest: datetime | None
+
+
+@dataclass(frozen=True)
+class SpoolRefusal:
+    """A frame that the service refused, and why."""
+
+    name: str | None
+    session: str | None
+    captured_at: datetime | None
+    reason: str
+
+
+@dataclass
+class SyncReport:
+    """What one `Spool.sync` did.
+
+    Parameters
+    ----------
+    received : frames that are new to the map
+    there : frames that the map had already
+    refused : frames that were set aside
+    """
+
+    received: int = 0
+    there: int = 0
+    refused: int = 0
+
+    @property
+    def done(self) -> int:
+        """Frames that do not wait any more."""
+        return self.received + self.there + self.refused
+
+
+@dataclass(frozen=True, eq=False)
+class SpoolPlace:
+    """When a frame was taken, and from where.
+
+    Parameters
+    ----------
+    stamp : seconds
+    T : (4, 4) T_parent_sensor, or None where unknown
+    """
+
+    stamp: float
+    T: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Waiting:
+    id: int
+    data: bytes
+    meta: FrameMeta
+
+
+@dataclass(frozen=True)
+class _Target:
+    """Where frames go: arguments of `Client.upload_batch`, and how long to wait for a service."""
+
+    client: Client
+    map_name: str
+    how: dict[str, Any]
+    until: float
+
+
+class Spool:
+    """Frames on disk until they are uploaded; safe to share between threads and processes.
+
+    `add` returns when the frame is durable. A full spool gives up the waiting frame that is
+    nearest, in pose and time, to the frames before and after it in its run (one session of one
+    robot): a metre, 30 degrees and a minute weigh the same; without poses the time alone counts,
+    and of equals the oldest goes. The first and the last frame of a run stay while others can go.
+    Refused frames go before any waiting one.
+
+    Parameters
+    ----------
+    path : of the SQLite file, created if missing
+    most_bytes : that its frames may take; default: as before, 1 GiB for a new spool
+
+    Raises
+    ------
+    UnusableStore : the file is not a spool, is damaged, or cannot be opened or written.
+    InvalidRequest : `most_bytes` is not positive.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], most_bytes: int | None = None) -> None:
+        if most_bytes is not None and most_bytes <= 0:
+            raise errors.InvalidRequest(
+                f"The spool may hold {most_bytes} bytes. Give `most_bytes` above 0.",
+                (("most_bytes", "not above 0"),),
+            )
+        self._path, self._lock = Path(path), RLock()
+        with self._told():
+            self._database = sqlite3.connect(
+                self._path, timeout=_LOCKED_S, isolation_level=None, check_same_thread=False
+            )
+        try:
+            self._open(most_bytes)
+        except BaseException:
+            self._database.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        with self._lock:
+            self._database.close()
+
+    def add(
+        self, frame: FrameInput, meta: MetaInput | None = None,
+        *, up: Sequence[float] | None = None,
+    ) -> bool:  # fmt: skip
+        """Keep a frame until it is uploaded. It is durable when this returns.
+
+        Give `captured_at` in `meta`: the service knows only when the frame arrives.
+
+        Parameters
+        ----------
+        frame, meta, up : as for `Client.upload`
+
+        Returns
+        -------
+        new : False if the same content with the same metadata is in the spool
+
+        Raises
+        ------
+        StoreFull : the disk has no room, and the spool is as it was.
+        InvalidRequest : the frame is larger than `most_bytes`.
+        FrameError, DatasetError : as for `Client.upload`, if that can be seen without decoding.
+        """
+        data, known = frame_bytes(frame, meta, with_pose=True, up=up)
+        text = json.dumps(meta_json(known))
+        digest = hashlib.sha256(text.encode() + b"\0" + data).hexdigest()
+        size = (len(data) + len(text) + 2 * _PAGE - 1) // _PAGE * _PAGE
+        with self._transaction() as database:
+            most = database.execute("SELECT most_bytes FROM counters").fetchone()[0]
+            if size > most:
+                raise errors.InvalidRequest(
+                    f"The frame takes {size} bytes, and the spool {self._path} holds at most "
+                    f"{most}. Give it more `most_bytes`, or make frames smaller.",
+                    (("frame", "larger than the spool"),),
+                )
+            if database.execute("SELECT 1 FROM frames WHERE digest = ?", (digest,)).fetchone():
+                return False
+            while database.execute("SELECT bytes FROM counters").fetchone()[0] + size > most:
+                _give_up_one(database)
+            parent = None if known.pose is None else known.pose.parent_frame
+            run = json.dumps([known.robot, known.session, parent])
+            last = _neighbour(database, run, None, -1)
+            stamp = known.captured_at.timestamp() if known.captured_at else time.time()
+            T = pose_matrix(known.pose)
+            pose = None if T is None else json.dumps(T.tolist())
+            database.execute(
+                "INSERT INTO frames (digest, run, stamp, pose, bytes, meta, data) "
+                "VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (digest, run, stamp, pose, size, text, data),
+            )
+            _renew_novelty(database, last)
+        return True
+
+    def status(self) -> SpoolStatus:
+        """What the spool holds, and what has become of all frames that were added."""
+        names = ("waiting", "refused", "bytes", "most_bytes", "uploaded", "thinned", "discarded")
+        with self._transaction(write=False) as database:
+            row = database.execute(f"SELECT {', '.join(names)} FROM counters").fetchone()
+            first = database.execute(
+                "SELECT stamp FROM frames WHERE reason IS NULL ORDER BY id LIMIT 1"
+            ).fetchone()
+        oldest = None if first is None else datetime.fromtimestamp(first[0], timezone.utc)
+        return SpoolStatus(**dict(zip(names, row, strict=True)), oldest=oldest)
+
+    def refusals(self) -> list[SpoolRefusal]:
+        """Frames that the service refused, oldest first."""
+        with self._transaction(write=False) as database:
+            rows = database.execute(
+                "SELECT meta, reason FROM frames WHERE reason IS NOT NULL ORDER BY id"
+            ).fetchall()
+        known = [(FrameMeta.model_validate_json(text), reason) for text, reason in rows]
+        return [
+            SpoolRefusal(meta.name, meta.session, meta.captured_at, reason)
+            for meta, reason in known
+        ]
+
+    def retry_refused(self) -> int:
+        """Let refused frames wait again, as after an upgrade of the service; how many."""
+        with self._transaction() as database:
+            query = "UPDATE frames SET reason = NULL WHERE reason IS NOT NULL"
+            return database.execute(query).rowcount
+
+    def sync(
+        self, client: Client, map_name: str, *, priority: int = 0,
+        if_novel: float | bool | None = None, patience_s: float = 120.0,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> SyncReport:  # fmt: skip
+        """Upload the frames that wait now, oldest first; each leaves the spool once a map has it.
+
+        Call it again after any error or kill: the service recognises content and metadata that a
+        map has, so that no frame is lost and none is there twice. A frame that it refuses (409,
+        413, 415, 422) is set aside with its reason, and the next one follows.
+
+        Parameters
+        ----------
+        client : of the service
+        map_name : of the map
+        priority, if_novel : as for `Client.upload`
+        patience_s : seconds in all to wait where the service asks to come back later
+        progress : called after each request with (done, total) frames
+
+        Raises
+        ------
+        Unreachable : still offline; what was not uploaded waits on.
+        Busy, RateLimited, QuotaExceeded : as Unreachable; the service takes no more now.
+        UnknownMap, KeyRequired, Forbidden : as Unreachable; map or key are wrong.
+        UnusableStore : the spool cannot be written.
+        """
+        how = {"priority": priority, "if_novel": if_novel}
+        upload_fields(priority, if_novel)  # what is wrong with these is no fault of a frame
+        target = _Target(client, map_name, how, time.monotonic() + patience_s)
+        with self._transaction(write=False) as database:
+            query = "SELECT count(*), max(id) FROM frames WHERE reason IS NULL"
+            total, last = database.execute(query).fetchone()
+        report = SyncReport()
+        while total and (batch := self._oldest(last)):
+            self._send(target, batch, report)
+            if progress is not None:
+                progress(report.done, max(total, report.done))
+        return report
+
+    # uploads
+
+    def _oldest(self, last: int) -> list[_Waiting]:
+        """The first frames that wait, up to an id: as many as fit one request."""
+        with self._transaction(write=False) as database:
+            rows = database.execute(
+                "SELECT id, length(data) FROM frames WHERE reason IS NULL AND id <= ? "
+                "ORDER BY id LIMIT ?",
+                (last, MOST_OF_BATCH),
+            ).fetchall()
+            count, size = 0, 0
+            for _, length in rows:
+                size += length
+                if count and size > BATCH_BYTES:
+                    break
+                count += 1
+            query = "SELECT id, data, meta FROM frames WHERE id = ?"
+            found = [database.execute(query, (one,)).fetchone() for one, _ in rows[:count]]
+        return [
+            _Waiting(number, data, FrameMeta.model_validate_json(meta))
+            for number, data, meta in found
+        ]
+
+    def _send(self, target: _Target, batch: list[_Waiting], report: SyncReport) -> None:
+        """Upload frames, and record what came of each; a batch refused as a whole is halved."""
+        try:
+            items = _upload(target, batch)
+        except errors.SceneprintError as error:
+            if not _is_about_frames(error) or (
+                len(batch) == 1 and isinstance(error, errors.SlowBody)
+            ):
+                raise
+            if len(batch) == 1:
+                self._settle([], {batch[0].id: str(error)})
+                report.refused += 1
+                return
+            half = len(batch) // 2
+            self._send(target, batch[:half], report)
+            self._send(target, batch[half:], report)
+            return
+        taken, refused, beyond = [], {}, None
+        for one, item in zip(batch, items, strict=True):
+            if item.frame is not None:
+                taken.append(one.id)
+                report.received += item.status != 200
+                report.there += item.status == 200
+            elif item.status in _OF_A_FRAME:
+                refused[one.id] = item.problem.detail if item.problem else "no reason was given"
+            else:
+                beyond = item
+        self._settle(taken, refused)
+        report.refused += len(refused)
+        if beyond is not None:
+            raise _error_of(beyond)
+
+    def _settle(self, taken: list[int], refused: dict[int, str]) -> None:
+        """Remove frames that a map has, and set others aside."""
+        with self._transaction() as database:
+            for number in taken:
+                removed = database.execute("DELETE FROM frames WHERE id = ?", (number,)).rowcount
+                database.execute("UPDATE counters SET uploaded = uploaded + ?", (removed,))
+            for number, reason in refused.items():
+                database.execute("UPDATE frames SET reason = ? WHERE id = ?", (reason, number))
+
+    # the file
+
+    def _open(self, most_bytes: int | None) -> None:
+        """Create or check the tables."""
+        with self._told():
+            self._database.execute("PRAGMA journal_mode = PERSIST")
+            self._database.execute("PRAGMA synchronous = FULL")
+        with self._transaction() as database:
+            mark = database.execute("PRAGMA application_id").fetchone()[0]
+            schema = database.execute("PRAGMA user_version").fetchone()[0]
+            tables = database.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+            if tables and (mark, schema) != (_APPLICATION, _SCHEMA):
+                raise errors.UnusableStore(
+                    f"{self._path}: This is not a spool, or one of a later version. Name another "
+                    "file, or upgrade sceneprint-client."
+                )
+            if not tables:
+                for statement in _statements(_TABLES):
+                    database.execute(statement)
+                database.execute(f"PRAGMA application_id = {_APPLICATION}")
+                database.execute(f"PRAGMA user_version = {_SCHEMA}")
+                database.execute(
+                    "INSERT INTO counters (most_bytes) VALUES (?)", (most_bytes or MOST_BYTES,)
+                )
+            elif most_bytes is not None:
+                database.execute("UPDATE counters SET most_bytes = ?", (most_bytes,))
+
+        self._reserve()
+
+    def _reserve(self) -> None:
+        """Let the journal have room on disk for removing frames; it stays when transactions end.
+
+        Without that room a full disk could not be emptied: to remove is to write.
+        """
+        journal = self._path.with_name(self._path.name + "-journal")
+        if journal.is_file() and journal.stat().st_size >= _RESERVE * _PAGE:
+            return
+        with suppress(errors.StoreFull):  # the next time, then
+            with self._transaction() as database:
+                database.execute("CREATE TABLE IF NOT EXISTS reserve (data BLOB)")
+                page = [(bytes(_PAGE // 2 + 1024),)]  # two do not fit into one
+                database.executemany("INSERT INTO reserve VALUES (?)", page * _RESERVE)
+            with self._transaction() as database:  # only pages of before go into the journal
+                database.execute("UPDATE reserve SET data = CAST(x'01' || data AS BLOB)")
+                database.execute("DROP TABLE reserve")
+
+    @contextmanager
+    def _transaction(self, *, write: bool = True) -> Iterator[sqlite3.Connection]:
+        """A transaction that is committed when the block ends well, and else leaves nothing."""
+        with self._lock, self._told():
+            self._database.execute("BEGIN IMMEDIATE" if write else "BEGIN")
+            try:
+                yield self._database
+                self._database.execute("COMMIT")
+            except BaseException:
+                with suppress(sqlite3.Error):
+                    if self._database.in_transaction:
+                        self._database.execute("ROLLBACK")
+                raise
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Errors of SQLite in our words; Python 3.10 has no codes of them."""
+        try:
+            yield
+        except sqlite3.Error as error:
+            if "full" in str(error):
+                raise errors.StoreFull(
+                    f"{self._path}: The disk has no room for the spool ({error}), and nothing was "
+                    "changed. Free some, or upload what waits with `sceneprint spool sync`."
+                ) from error
+            if "locked" in str(error):
+                raise errors.StoreLocked(
+                    f"{self._path}: Another process has kept the spool locked for "
+                    f"{_LOCKED_S:.0f} s. Stop it, or try again."
+                ) from error
+            raise errors.UnusableStore(
+                f"{self._path}: The spool cannot be used ({error}), and nothing was changed. Check "
+                "the path, its permissions and the disk."
+            ) from error
+
+
+# What a full spool gives up.
+
+
+def separation(a: SpoolPlace, b: SpoolPlace) -> float:
+    """How far apart two frames are: metres / 1 + degrees / 30 + seconds / 60; without the pose of
+    one, seconds / 60 alone.
+    """
+    apart = abs(a.stamp - b.stamp) / SECONDS
+    if a.T is None or b.T is None:
+        return apart
+    metres, radians = difference(a.T, b.T)
+    return apart + metres / METRES + math.degrees(radians) / DEGREES
+
+
+def pose_matrix(pose: GivenPose | None) -> NDArray[np.float64] | None:
+    """A pose as (4, 4); None where there is none, or its numbers are none of a pose."""
+    if pose is None:
+        return None
+    T = np.eye(4)
+    if pose.matrix is not None:
+        T = np.array(pose.matrix, np.float64)
+    elif pose.translation is not None and pose.rotation is not None:
+        p, q = pose.translation, pose.rotation
+        quaternion = np.array([q.x, q.y, q.z, q.w])
+        norm = float(np.linalg.norm(quaternion))
+        if not norm > 0:
+            return None
+        T[:3, :3], T[:3, 3] = rotation_of(quaternion / norm), (p.x, p.y, p.z)
+    return T if np.isfinite(T).all() else None
+
+
+def _give_up_one(database: sqlite3.Connection) -> None:
+    """Remove the frame that is missed least; see Spool."""
+    row = database.execute("SELECT id FROM frames WHERE reason IS NOT NULL ORDER BY id").fetchone()
+    if row is not None:
+        database.execute("DELETE FROM frames WHERE id = ?", row)
+        database.execute("UPDATE counters SET discarded = discarded + 1")
+        return
+    row = database.execute(
+        "SELECT id, run FROM frames WHERE reason IS NULL AND novelty IS NOT NULL "
+        "ORDER BY novelty, id LIMIT 1"
+    ).fetchone()
+    if row is None:
+        row = database.execute(
+            "SELECT id, run FROM frames WHERE reason IS NULL ORDER BY id LIMIT 1"
+        ).fetchone()
+    number, run = row
+    before, after = _neighbour(database, run, number, -1), _neighbour(database, run, number, 1)
+    database.execute("DELETE FROM frames WHERE id = ?", (number,))
+    database.execute("UPDATE counters SET thinned = thinned + 1")
+    _renew_novelty(database, before)
+    _renew_novelty(database, after)
+
+
+def _neighbour(database: sqlite3.Connection, run: str, number: int | None, side: int) -> int | None:
+    """The waiting frame of a run before (-1) or after (1) one; of None the last."""
+    order, compared = ("DESC", "<") if side < 0 else ("ASC", ">")
+    row = database.execute(
+        f"SELECT id FROM frames WHERE reason IS NULL AND run = ? AND id {compared} ? "
+        f"ORDER BY id {order} LIMIT 1",
+        (run, 2**63 - 1 if number is None else number),
+    ).fetchone()
+    return None if row is None else int(row[0])
+
+
+def _renew_novelty(database: sqlite3.Connection, number: int | None) -> None:
+    """Set the separation of a frame from its two neighbours; null at the ends of a run."""
+    if number is None:
+        return
+    query = "SELECT run, stamp, pose FROM frames WHERE id = ?"
+    run, *own = database.execute(query, (number,)).fetchone()
+    places: list[SpoolPlace] = []
+    for side in (-1, 1):
+        beside = _neighbour(database, run, number, side)
+        if beside is None:
+            places = []
+            break
+        places.append(_place(*database.execute(query, (beside,)).fetchone()[1:]))
+    novelty = sum(separation(_place(*own), one) for one in places) if places else None
+    database.execute("UPDATE frames SET novelty = ? WHERE id = ?", (novelty, number))
+
+
+def _place(stamp: float, pose: str | None) -> SpoolPlace:
+    return SpoolPlace(stamp, None if pose is None else np.array(json.loads(pose)))
+
+
+def _statements(script: str) -> Iterator[str]:
+    """Statements of a script, one by one: `executescript` would end the transaction."""
+    statement = ""
+    for line in script.splitlines(keepends=True):
+        statement += line
+        if sqlite3.complete_statement(statement):
+            yield statement
+            statement = ""
+
+
+# What a service answers.
+
+#: Statuses that say something about the frame, and nothing of the next one.
+_OF_A_FRAME = (400, 409, 413, 415, 422)
+
+
+def _is_about_frames(error: errors.SceneprintError) -> bool:
+    """Whether a request was refused for what is in it."""
+    if isinstance(error, errors.Refused):  # a proxy before the service, or a problem we do not know
+        return error.status in (409, 413, 415, 422)
+    return isinstance(error, (errors.FrameError, errors.Conflict, errors.InvalidRequest))
+
+
+def _upload(target: _Target, batch: list[_Waiting]) -> list[BatchItem]:
+    """Upload frames; waits as long as the service asks to, while there is patience."""
+    while True:
+        try:
+            return target.client.upload_batch(
+                target.map_name, [one.data for one in batch], [one.meta for one in batch],
+                **target.how,
+            )  # fmt: skip
+        except errors.SceneprintError as error:
+            pause = max(error.retry_after_s, _PAUSE_S)
+            if not error.retry_after_s or time.monotonic() + pause > target.until:
+                raise
+        time.sleep(pause)
+
+
+def _error_of(item: BatchItem) -> errors.SceneprintError:
+    """Why the service takes no more frames."""
+    detail = "A frame was not taken." if item.problem is None else item.problem.detail
+    if item.status == 403:
+        return errors.QuotaExceeded(detail)
+    return errors.Refused(detail, item.status, item.problem.model_dump() if item.problem else {})

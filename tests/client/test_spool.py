@@ -1,0 +1,524 @@
+"""The spool of a robot that is offline: what it keeps, what it gives up, and that nothing is lost
+or doubled whatever kills it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.formats.dataset import FrameReference
+from sceneprint_client import Client, Spool, meta_of
+from sceneprint_client.api import CameraIntrinsics, FrameMeta
+from sceneprint_client.api.base import GivenPose
+from sceneprint_client.errors import (
+    InvalidRequest,
+    RateLimited,
+    UnknownMap,
+    UnusableStore,
+)
+from sceneprint_client.spool import SpoolPlace, pose_matrix, separation
+
+START = datetime(2026, 11, 26, 9, 0, tzinfo=UTC)
+CAMERA = CameraIntrinsics(width=16, height=12, fx=14, fy=14, cx=7.5, cy=5.5)
+#: A frame of these is charged two pages.
+CHARGE = 2 * 4096
+
+
+def meta(x: float | None = None, seconds: float = 0.0, **more: Any) -> FrameMeta:
+    """A frame at x metres along a line, or without a pose."""
+    pose = None
+    if x is not None:
+        matrix = np.eye(4)
+        matrix[0, 3] = x
+        pose = GivenPose(matrix=matrix.tolist(), parent_frame="hall")
+    return FrameMeta(
+        intrinsics=CAMERA, captured_at=START + timedelta(seconds=seconds), pose=pose,
+        **({"session": "drive"} | more),
+    )  # fmt: skip
+
+
+def depth(number: int) -> np.ndarray[Any, Any]:
+    """A small depth image that no other number has, millimetres."""
+    image = np.full((12, 16), 2000, np.uint16)
+    image[0, :2] = 1000 + number % 1000, 1000 + number // 1000
+    return image
+
+
+def large(number: int, known: FrameMeta) -> tuple[np.ndarray[Any, Any], FrameMeta]:
+    """A depth image of 6 kB, and what is known of it."""
+    lens = CAMERA.model_copy(update={"width": 64, "height": 48})
+    return np.tile(depth(number), (4, 4)), known.model_copy(update={"intrinsics": lens})
+
+
+def names(path: Path) -> list[str]:
+    """Names of the frames that wait, oldest first."""
+    with sqlite3.connect(path) as database:
+        rows = database.execute("SELECT meta FROM frames WHERE reason IS NULL ORDER BY id")
+        return [json.loads(text)["name"] for (text,) in rows]
+
+
+# What a full spool gives up.
+
+
+def test_a_metre_thirty_degrees_and_a_minute_weigh_the_same() -> None:
+    here, there = np.eye(4), np.eye(4)
+    there[:3, :3] = [[np.sqrt(3) / 2, -0.5, 0], [0.5, np.sqrt(3) / 2, 0], [0, 0, 1]]  # 30 degrees
+    there[:3, 3] = 0, 0.6, 0.8
+    assert separation(SpoolPlace(0, here), SpoolPlace(60, there)) == pytest.approx(3.0)
+    assert separation(SpoolPlace(30, here), SpoolPlace(0, here)) == pytest.approx(0.5)
+    assert separation(SpoolPlace(0, here), SpoolPlace(90)) == pytest.approx(1.5)
+    back = np.diag([-1.0, -1.0, 1.0, 1.0])
+    assert separation(SpoolPlace(0, here), SpoolPlace(0, back)) == pytest.approx(6.0)
+
+
+def test_a_pose_is_read_in_both_forms() -> None:
+    given = GivenPose.model_validate(
+        {
+            "translation": {"x": 1, "y": 2, "z": 3},
+            "rotation": {"x": 0, "y": 0, "z": 2, "w": 2},  # 90 degrees about z
+        }
+    )
+    expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    found = pose_matrix(given)
+    assert found is not None
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    same = pose_matrix(GivenPose(matrix=[[float(one) for one in row] for row in expected]))
+    np.testing.assert_array_equal(same, expected)
+    nowhere = {"translation": {"x": 1, "y": 2, "z": 3}, "rotation": dict.fromkeys("xyzw", 0)}
+    assert pose_matrix(GivenPose.model_validate(nowhere)) is None
+
+
+def test_a_full_spool_gives_up_the_frame_nearest_to_its_neighbours(tmp_path: Path) -> None:
+    """Sums of the distances to the frames before and after, by hand."""
+    path, kept = tmp_path / "spool", []
+    with Spool(path, 5 * CHARGE) as spool:
+        for number, x in enumerate((0, 1, 1.25, 3, 5, 7, 7.1, 9)):
+            assert spool.add(depth(number), meta(x, name=f"{x:g}"))
+            kept.append(" ".join(names(path)))
+        now = spool.status()
+    assert kept[4:] == [
+        "0 1 1.25 3 5",
+        "0 1.25 3 5 7",  # 1: 1 + 0.25; 1.25: 0.25 + 1.75; 3: 1.75 + 2
+        "0 3 5 7 7.1",  # 1.25: 1.25 + 1.75; 3: 1.75 + 2; 5: 2 + 2
+        "0 3 5 7.1 9",  # 3: 3 + 2; 5: 2 + 2; 7: 2 + 0.1
+    ]
+    assert (now.waiting, now.thinned, now.bytes) == (5, 3, 5 * CHARGE)
+
+
+def test_without_poses_time_alone_decides_and_the_oldest_of_equals_goes(tmp_path: Path) -> None:
+    path, kept = tmp_path / "spool", []
+    with Spool(path, 5 * CHARGE) as spool:
+        for minute in range(7):
+            spool.add(depth(minute), meta(seconds=60 * minute, name=f"{minute}"))
+            kept.append(" ".join(names(path)))
+    assert kept[5:] == ["0 2 3 4 5", "0 2 4 5 6"]  # all 2; then 2: 2 + 1, 3 and 4: 1 + 1
+
+
+def test_runs_are_thinned_apart_and_their_ends_stay(tmp_path: Path) -> None:
+    """Where only ends are left, the oldest goes."""
+    path, kept = tmp_path / "spool", []
+    drives = (("a", 0), ("b", 0), ("a", 9), ("b", 0.1), ("a", 9.5), ("a", 20), ("b", 5), ("b", 6))
+    with Spool(path, 5 * CHARGE) as spool:
+        for number, (session, x) in enumerate(drives):
+            spool.add(depth(number), meta(x, session=session, name=f"{session}{x:g}"))
+            kept.append(" ".join(names(path)))
+    assert kept[5:] == [
+        "a0 b0 b0.1 a9.5 a20",  # a9: 9 + 0.5, and no other lies between two
+        "a0 b0 b0.1 a20 b5",
+        "a0 b0 a20 b5 b6",
+    ]
+    with Spool(tmp_path / "ends", 2 * CHARGE) as spool:
+        for number in range(4):
+            spool.add(depth(number), meta(0, session=f"{number}", name=f"{number}"))
+    assert names(tmp_path / "ends") == ["2", "3"]
+
+
+# What a spool takes.
+
+
+def test_a_frame_is_there_once_and_survives(tmp_path: Path) -> None:
+    path = tmp_path / "spool"
+    with Spool(path, 100 * CHARGE) as spool:
+        assert spool.add(depth(1), meta(0))
+        assert not spool.add(depth(1), meta(0))
+        assert spool.add(depth(1), meta(1))
+        assert spool.add(depth(2), meta(0))
+    with Spool(path) as spool:
+        assert not spool.add(depth(2), meta(0))
+        now = spool.status()
+    assert (now.waiting, now.bytes, now.most_bytes) == (3, 3 * CHARGE, 100 * CHARGE)
+    assert (now.uploaded, now.refused, now.thinned, now.oldest) == (0, 0, 0, START)
+
+
+def test_what_a_spool_cannot_take_is_refused(tmp_path: Path) -> None:
+    with Spool(tmp_path / "spool", CHARGE) as spool:
+        with pytest.raises(InvalidRequest, match=r"takes 16384 bytes.*holds at most 8192"):
+            spool.add(np.full((64, 64), 2000, np.uint16), meta())
+        assert spool.add(depth(1), meta())
+    with pytest.raises(InvalidRequest, match="above 0"):
+        Spool(tmp_path / "spool", 0)
+    other = tmp_path / "other.db"
+    with sqlite3.connect(other) as database:
+        database.execute("CREATE TABLE a (b)")
+    with pytest.raises(UnusableStore, match="not a spool"):
+        Spool(other)
+    (tmp_path / "text").write_text("no database, " * 100)
+    with pytest.raises(UnusableStore, match="file is not a database"):
+        Spool(tmp_path / "text")
+    with pytest.raises(UnusableStore, match="unable to open"):
+        Spool(tmp_path / "nowhere" / "spool")
+
+
+@contextmanager
+def longest_file(size: int) -> Iterator[None]:
+    """No file of this process grows beyond so many bytes, as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_a_full_disk_leaves_the_spool_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "spool"
+
+    def fill(spool: Spool) -> None:
+        for number in range(1000):
+            spool.add(*large(number, meta(name=f"{number}")))
+
+    with Spool(path) as spool:
+        with longest_file(path.stat().st_size + 10 * CHARGE):
+            with pytest.raises(UnusableStore, match=r"spool: .*nothing was changed"):
+                fill(spool)
+            taken = spool.status().waiting
+        assert 200 <= taken <= 600  # also what was reserved for the journal is used for frames
+        assert spool.add(depth(taken), meta(name=f"{taken}"))
+    assert names(path) == [str(number) for number in range(taken + 1)]
+    with sqlite3.connect(path) as database:
+        assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+
+
+#: Fills the disk that the spool is on, then uploads all without any room.
+FILL = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[3])
+from sceneprint_client.errors import StoreFull
+from test_spool import Client, Spool, depth, large, meta
+path, taken = Path(sys.argv[1]), 0
+with Spool(path) as spool:
+    try:
+        while taken < 10000:
+            spool.add(*large(taken, meta(name=str(taken))))
+            taken += 1
+    except StoreFull as error:
+        print(error)
+    print(taken, spool.status().waiting)
+    with Client(sys.argv[2]) as client:
+        print(spool.sync(client, sys.argv[4]).received, spool.status().waiting)
+    print(spool.add(depth(taken), meta()))
+"""
+
+
+def test_a_full_file_system_is_told_and_emptied_by_sync(
+    remote: Client, service_url: str, map_name: str, tmp_path: Path
+) -> None:
+    """A real file system of 5 MB, where this user may mount one."""
+    mount = f"mount -t tmpfs -o size=5m t {tmp_path} && exec"
+    may = (
+        shutil.which("unshare")
+        and not subprocess.run(
+            ["unshare", "-rm", "sh", "-c", f"{mount} true"], capture_output=True, check=False
+        ).returncode
+    )
+    if not may:
+        pytest.skip("this user may not mount a file system of its own")
+    remote.create_map(map_name, model="depth")
+    script = tmp_path.with_suffix(".py")
+    script.write_text(FILL)
+    given = [sys.executable, script, tmp_path / "spool", service_url, Path(__file__).parent]
+    command = " ".join(map(str, (*given, map_name)))
+    ran = subprocess.run(
+        ["unshare", "-rm", "sh", "-c", f"{mount} {command}"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    told, counted, emptied, added = ran.stdout.splitlines()
+    assert told == (
+        f"{tmp_path}/spool: The disk has no room for the spool (database or disk is full), and "
+        "nothing was changed. Free some, or upload what waits with `sceneprint spool sync`."
+    )
+    taken = int(counted.split()[0])
+    assert 250 <= taken <= 600
+    assert (counted, emptied, added) == (f"{taken} {taken}", f"{taken} 0", "True")
+    assert sorted(int(one.name or "") for one in remote.frames(map_name)) == list(range(taken))
+
+
+# Uploads.
+
+
+def test_what_waits_is_uploaded_and_refusals_are_set_aside(
+    remote: Client, map_name: str, references: tuple[FrameReference, ...], tmp_path: Path
+) -> None:
+    remote.create_map(map_name, model="depth")
+    there = remote.upload(map_name, references[0], meta_of(references[0]))
+    told: list[tuple[int, int]] = []
+    with Spool(tmp_path / "spool") as spool:
+        for one in references[:3]:
+            spool.add(one, meta_of(one))
+        spool.add(b"no depth image", meta(name="broken"))
+        spool.add(depth(1), meta(0, name="last"))
+        with pytest.raises(UnknownMap):
+            spool.sync(remote, "nowhere")
+        assert spool.status().waiting == 5
+        report = spool.sync(remote, map_name, progress=lambda *one: told.append(one))
+        assert (report.received, report.there, report.refused) == (3, 1, 1)
+        assert told == [(5, 5)]
+        [refusal] = spool.refusals()
+        assert (refusal.name, refusal.captured_at) == ("broken", START)
+        assert "neither PNG nor NPY" in refusal.reason
+        now = spool.status()
+        assert (now.waiting, now.refused, now.uploaded, now.thinned) == (0, 1, 4, 0)
+        assert now.bytes == CHARGE
+        found = list(remote.frames(map_name))
+        assert found[0].frame_id == there.frame_id
+        assert [one.name for one in found[1:]] == [
+            *(one.path.name for one in references[1:3]), "last",
+        ]  # fmt: skip
+        assert found[-1].captured_at == START
+        assert found[-1].pose is not None
+        # sent again whole: the map has them all
+        for one in references[:3]:
+            assert spool.add(one, meta_of(one))
+        assert spool.retry_refused() == 1
+        report = spool.sync(remote, map_name)
+        assert (report.received, report.there, report.refused) == (0, 3, 1)
+    assert len(list(remote.frames(map_name))) == 4
+
+
+def test_refused_frames_go_before_any_that_waits(
+    remote: Client, map_name: str, tmp_path: Path
+) -> None:
+    remote.create_map(map_name, model="depth")
+    path = tmp_path / "spool"
+    with Spool(path, 2 * CHARGE) as spool:
+        spool.add(b"no depth image", meta(name="broken"))
+        spool.sync(remote, map_name)
+        spool.add(depth(1), meta(name="1"))
+        assert spool.status().refused == 1
+        spool.add(depth(2), meta(name="2"))
+        now = spool.status()
+    assert (now.refused, now.discarded, now.thinned, names(path)) == (0, 1, 0, ["1", "2"])
+
+
+def test_a_request_that_is_too_large_is_halved(
+    remote: Client, map_name: str, tmp_path: Path
+) -> None:
+    """The service of these tests takes 2 MiB; the third frame alone is larger."""
+    remote.create_map(map_name, model="depth")
+    sizes = {"a": 600, "b": 600, "c": 1100, "d": 600}
+    with Spool(tmp_path / "spool") as spool:
+        for number, (name, side) in enumerate(sizes.items()):
+            lens = CAMERA.model_copy(update={"width": side, "height": side})
+            image = np.full((side, side), 2000 + number, np.uint16)
+            known = meta(number, name=name).model_copy(update={"intrinsics": lens})
+            spool.add(image, known)
+        report = spool.sync(remote, map_name)
+        [refusal] = spool.refusals()
+    assert (report.received, report.refused) == (3, 1)
+    assert [one.name for one in remote.frames(map_name)] == ["a", "b", "d"]
+    assert refusal.name == "c"
+    assert "2097152" in refusal.reason
+
+
+def test_a_service_that_asks_to_come_back_is_waited_for(
+    scripted: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    problem = {"type": "/problems/rate-limited", "title": "", "status": 429, "detail": "Later."}
+    frame = {"frame_id": "f", "job_id": "j", "state": "received"}
+    done = {"items": [{"status": 202, "frame": frame, "problem": None}]}
+    busy = (429, {"Retry-After": "45"}, problem)  # longer than the client waits by itself
+    server = scripted([busy, busy, (200, {}, done)])
+    pauses: list[float] = []
+    monkeypatch.setattr(time, "sleep", pauses.append)
+    with Client(server.url) as client, Spool(tmp_path / "spool") as spool:
+        spool.add(depth(1), meta())
+        with pytest.raises(RateLimited, match="Later"):
+            spool.sync(client, "hall", patience_s=44)
+        assert (pauses, spool.status().waiting) == ([], 1)
+        assert spool.sync(client, "hall", patience_s=46).received == 1
+        assert (pauses, spool.status().waiting) == ([45.0], 0)
+    assert len(server.asked) == 3
+
+
+# Kills. A child adds frames or uploads them, and is killed; everything it said has to hold.
+
+CHILD = """
+import os, resource, signal, sys
+sys.path.insert(0, sys.argv[1])
+from test_spool import Client, Spool, UnusableStore, drive_meta, large
+what, path, *rest = sys.argv[2:]
+with Spool(path) as spool:
+    if what == "add":
+        first, count, room = map(int, rest)
+        if room:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            size = os.stat(path).st_size + room
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+        try:
+            for number in range(first, count):
+                spool.add(*large(number, drive_meta(number)))
+                os.write(1, b"%d\\n" % number)
+        except UnusableStore:
+            os.write(1, b"full\\n")
+    else:
+        url, name, answers = rest
+        with Client(url) as client:
+            send, seen = client.upload_batch, []
+            def counted(*given, **how):
+                items = send(*given, **how)
+                seen.append(items)
+                if len(seen) == int(answers):  # the map has them, and the spool does not know it
+                    os.kill(os.getpid(), signal.SIGKILL)
+                return items
+            client.upload_batch = counted
+            spool.sync(client, name, progress=lambda *_: os.write(1, b"sent\\n"))
+"""
+
+
+def drive_meta(number: int) -> FrameMeta:
+    """A drive at 0.3 m/s, a frame a second."""
+    return meta(0.3 * number, number, name=f"{number}")
+
+
+@contextmanager
+def child(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that works with the spool; killed in the end."""
+    code = [sys.executable, "-c", CHILD, str(Path(__file__).parent), *map(str, arguments)]
+    process = subprocess.Popen(code, stdout=subprocess.PIPE)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def add_until(path: Path, first: int, count: int, acknowledged: int, room: int = 0) -> list[str]:
+    """What a child said that is killed once it has said so many lines."""
+    with child("add", path, first, count, room) as process:
+        assert process.stdout is not None
+        said = []
+        for line in process.stdout:
+            said.append(line.decode().strip())
+            if len(said) == acknowledged:
+                process.kill()
+    return said  # with what was in the pipe when it died
+
+
+def test_kills_while_frames_are_added_and_uploaded_lose_and_double_nothing(
+    remote: Client, service_url: str, map_name: str, tmp_path: Path
+) -> None:
+    remote.create_map(map_name, model="depth")
+    path = tmp_path / "spool"
+    said = add_until(path, 0, 10_000, 70)
+    acknowledged = len(said)
+    assert said == [str(number) for number in range(acknowledged)]
+    waiting = names(path)
+    assert waiting[:acknowledged] == said
+    assert len(waiting) <= acknowledged + 1  # one may have been durable, and not acknowledged
+    with child("sync", path, service_url, map_name, 1) as process:
+        out, _ = process.communicate(timeout=60)
+    assert (process.returncode, out) == (-signal.SIGKILL, b"")
+    assert len(list(remote.frames(map_name))) == 64
+    assert names(path) == waiting
+    with Spool(path) as spool:
+        report = spool.sync(remote, map_name)
+        assert (report.there, report.received) == (64, len(waiting) - 64)
+        assert (spool.status().waiting, spool.status().uploaded) == (0, len(waiting))
+    assert [one.name for one in remote.frames(map_name)] == waiting
+
+
+@pytest.mark.thorough
+def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
+    """3,600 frames, a frame a second: the bound of an offline robot."""
+    count, chance = 3600, random.Random(1)
+    path, data = tmp_path / "spool", tmp_path / "data"
+    kills, full, first = 0, 0, 0
+    while first < count:
+        room = chance.randrange(1, 40) * CHARGE if path.exists() and chance.random() < 0.4 else 0
+        said = add_until(path, first, count, count if room else chance.randrange(1, 150), room)
+        full += said[-1:] == ["full"]
+        kills += said[-1:] != ["full"]
+        numbers = [int(one) for one in said if one != "full"]
+        assert numbers == list(range(first, first + len(numbers)))
+        first += len(numbers)  # one more may be durable: it is added again
+    assert names(path) == [str(number) for number in range(count)]
+    assert min(kills, full) >= 10
+    serve = ["serve", "--port", "0", "--data", str(data), "--workers", "0"]
+    with (tmp_path / "log").open("wb") as log:
+        service = subprocess.Popen(
+            [sys.executable, "-m", "sceneprint", *serve], stdout=subprocess.PIPE, stderr=log,
+            env=dict(os.environ), start_new_session=True,
+        )  # fmt: skip
+    try:
+        assert service.stdout is not None
+        url = service.stdout.readline().decode().split()[-1]
+        syncs = 0
+        with Client(url) as client:
+            client.create_map("hall", model="depth")
+            while names(path):
+                with child("sync", path, url, "hall", chance.randrange(1, 6)) as process:
+                    if chance.random() < 0.5:  # somewhere in the middle of a request
+                        try:
+                            process.wait(timeout=chance.uniform(0.5, 4.0))
+                        except subprocess.TimeoutExpired:
+                            process.kill()
+                    process.wait()
+                syncs += process.returncode == -signal.SIGKILL
+            found = [one.name for one in client.frames("hall")]
+            contents = {one.content_id for one in client.frames("hall")}
+    finally:
+        os.killpg(service.pid, signal.SIGTERM)
+        service.communicate(timeout=30)
+    with Spool(path) as spool:
+        now = spool.status()
+    sys.stdout.write(f"{count} frames: {kills} kills, {full} full disks, {syncs} kills of sync\n")
+    assert found == [str(number) for number in range(count)]  # 0 lost, 0 doubled, in order
+    assert len(contents) == count
+    assert (now.waiting, now.refused, now.thinned, now.uploaded) == (0, 0, 0, count)
+    assert syncs >= 10
+
+
+def test_a_full_spool_reports_what_it_gave_up_of_a_drive(tmp_path: Path) -> None:
+    """Every frame added is either waiting or counted, and the file keeps its bound."""
+    path, most = tmp_path / "spool", 50 * CHARGE
+    with Spool(path, most) as spool:
+        for number in range(200):
+            spool.add(depth(number), drive_meta(number))
+        now = spool.status()
+    assert (now.waiting, now.thinned) == (50, 150)
+    kept = [int(one) for one in names(path)]
+    assert (kept[0], kept[-1]) == (0, 199)
+    # even along the drive: no gap is more than twice the mean of 4 but for the ends
+    assert max(np.diff(kept)) <= 8
+    assert path.stat().st_size <= most + (2 << 20) + 20 * 4096  # what was reserved for the journal
