@@ -22,7 +22,7 @@ OF_THE_QUERY = ("query_id", "timing", "asked_at")
 
 @pytest.fixture(scope="module")
 def walk() -> tuple[DepthFrame, ...]:
-    return synthesise_room(5, 0, 12, along_path=True).frames
+    return synthesise_room(5, 0, 24, along_path=True).frames
 
 
 def camera_of(view: DepthFrame) -> CameraIntrinsics:
@@ -66,23 +66,23 @@ def test_a_copy_answers_as_the_service_did_and_is_renewed(
         pull = ["pull", "--url", url, "--data", str(copy)]
         assert main(pull) == 2
         assert "keeps no snapshot" in capsys.readouterr().err
-        upload(client, walk[:8:2])
+        upload(client, walk[:14:2])
         first = client.take_snapshot(wait_s=400)
-        online, tracked = answers(client, walk[1:6:2]), states(client, walk[1:6:2])
+        online, tracked = answers(client, walk[3:10:2]), states(client, walk[3:10:2])
         assert main(pull) == 0
-        upload(client, walk[8:9])
+        upload(client, walk[14:15])
         client.take_snapshot(wait_s=400)
         capsys.readouterr()
         second = [path.name for path in copy.parent.iterdir()]
-        renewed = answers(client, walk[9:10])
+        renewed = answers(client, walk[15:16])
     # nobody answers at the address any more
     assert first.result is not None
     assert second == ["copy"]
     assert [one["status"] for one in online].count("found") >= 2
     assert online[-1]["status"] == "not_found"
     with Client.embedded(copy) as offline:
-        assert answers(offline, walk[1:6:2]) == online
-        assert states(offline, walk[1:6:2]) == tracked
+        assert answers(offline, walk[3:10:2]) == online
+        assert states(offline, walk[3:10:2]) == tracked
         assert {one[0] for one in tracked} & {"tracking"}
     with serving(data, 1) as url:
         pull = ["pull", "--url", url, "--data", str(copy)]
@@ -91,15 +91,15 @@ def test_a_copy_answers_as_the_service_did_and_is_renewed(
         assert "the newest snapshot" in capsys.readouterr().out
         assert [path.name for path in copy.parent.iterdir()] == ["copy"]  # the first copy is gone
         with Client.embedded(copy) as offline:
-            assert answers(offline, walk[9:10]) == renewed
-            assert sum(1 for _ in offline.frames(MAP)) == 5
-            upload(offline, walk[10:11])
+            assert answers(offline, walk[15:16]) == renewed
+            assert sum(1 for _ in offline.frames(MAP)) == 8
+            upload(offline, walk[16:17])
         with Client(url) as client:
             client.take_snapshot(wait_s=400)
         assert main(pull) == 0
         aside = Path(capsys.readouterr().err.strip().splitlines()[-1].rpartition(": ")[2])
         with Client.embedded(aside) as offline:  # what a robot added is never thrown away
-            assert sum(1 for _ in offline.frames(MAP)) == 6
+            assert sum(1 for _ in offline.frames(MAP)) == 9
         assert main(["pull", "--url", url, "--data", str(data)]) == 2  # somebody's data
         assert "not empty and no copy" in capsys.readouterr().err
     assert (data / "sceneprint.db").is_file()
