@@ -31,6 +31,7 @@ EDITED = [
     "docs/clouds.md",
     "docs/recordings.md",
     "docs/tracker.md",
+    "docs/offline.md",
     "docs/associations.md",
     "docs/coverage.md",
     "docs/surface.md",

@@ -49,6 +49,9 @@ _PAUSE_S = 1.0
 _LOCKED_S = 30.0
 #: Bytes of a page of the file. A frame is charged whole pages, and one for its rows of the indexes.
 _PAGE = 4096
+#: Pages that the journal keeps on disk, so that frames can be removed when the disk is full: one
+#: request's frames change fewer.
+_RESERVE = 512
 #: Marks the file as a spool, and its schema.
 _APPLICATION, _SCHEMA = 0x53705370, 1
 
@@ -414,11 +417,7 @@ class Spool:
     # the file
 
     def _open(self, most_bytes: int | None) -> None:
-        """Create or check the tables.
-
-        The journal stays where it is when a transaction ends: its room is there when the disk is
-        full, so that frames can still be removed.
-        """
+        """Create or check the tables."""
         with self._told():
             self._database.execute("PRAGMA journal_mode = PERSIST")
             self._database.execute("PRAGMA synchronous = FULL")
@@ -441,6 +440,25 @@ class Spool:
                 )
             elif most_bytes is not None:
                 database.execute("UPDATE counters SET most_bytes = ?", (most_bytes,))
+
+        self._reserve()
+
+    def _reserve(self) -> None:
+        """Let the journal have room on disk for removing frames; it stays when transactions end.
+
+        Without that room a full disk could not be emptied: to remove is to write.
+        """
+        journal = self._path.with_name(self._path.name + "-journal")
+        if journal.is_file() and journal.stat().st_size >= _RESERVE * _PAGE:
+            return
+        with suppress(errors.StoreFull):  # the next time, then
+            with self._transaction() as database:
+                database.execute("CREATE TABLE IF NOT EXISTS reserve (data BLOB)")
+                page = [(bytes(_PAGE // 2 + 1024),)]  # two do not fit into one
+                database.executemany("INSERT INTO reserve VALUES (?)", page * _RESERVE)
+            with self._transaction() as database:  # only pages of before go into the journal
+                database.execute("UPDATE reserve SET data = CAST(x'01' || data AS BLOB)")
+                database.execute("DROP TABLE reserve")
 
     @contextmanager
     def _transaction(self, *, write: bool = True) -> Iterator[sqlite3.Connection]:

@@ -1,0 +1,67 @@
+"""A robot out of reach of its service spools its frames, and uploads them when it is back.
+
+    python examples/offline_robot.py drives/mapping office --spool office.spool
+
+`frames_of` stands for a camera: put your own there. While the service cannot be reached the
+program goes on; each frame is on disk before the next is taken, so a crash or an empty battery
+loses none. Run it again: frames that the map or the spool has are not taken twice.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint_client import Client, Spool, meta_of
+from sceneprint_client.api import FrameMeta
+from sceneprint_client.errors import Busy, RateLimited, Unreachable
+from sceneprint_client.requests import DEFAULT_URL
+
+#: Frames between two tries to upload.
+TRY_EVERY = 50
+
+
+def frames_of(folder: Path) -> Iterator[tuple[FrameReference, FrameMeta]]:
+    """Frames with what is known of them, one by one."""
+    for sequence in find_sequences(folder):
+        for frame in sequence.frames:
+            yield frame, meta_of(frame, parent_frame=sequence.parent_frame)
+
+
+def upload_waiting(client: Client, spool: Spool, map_name: str) -> bool:
+    """Upload what waits, as far as there is a connection; whether all went."""
+    try:
+        report = spool.sync(client, map_name, patience_s=30)
+    except (Unreachable, Busy, RateLimited) as error:
+        print(f"offline, {spool.status().waiting} frames wait: {error}")
+        return False
+    print(f"uploaded {report.received}, already there {report.there}, refused {report.refused}")
+    return True
+
+
+def main() -> None:
+    """Drive: spool every frame, and upload now and then."""
+    parser = argparse.ArgumentParser(description="Spool frames, and upload them when online.")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("map")
+    parser.add_argument("--spool", type=Path, default=Path("offline.spool"))
+    parser.add_argument("--most-bytes", type=int, default=1 << 30)
+    parser.add_argument("--url", default=os.environ.get("SCENEPRINT_URL") or DEFAULT_URL)
+    options = parser.parse_args()
+    with Client(options.url) as client, Spool(options.spool, options.most_bytes) as spool:
+        for number, (frame, meta) in enumerate(frames_of(options.folder), 1):
+            spool.add(frame, meta)
+            if number % TRY_EVERY == 0:
+                upload_waiting(client, spool, options.map)
+        upload_waiting(client, spool, options.map)
+        for refusal in spool.refusals():
+            print(f"{refusal.name}: {refusal.reason}")
+        now = spool.status()
+    print(f"{now.uploaded} uploaded, {now.waiting} wait, {now.thinned} thinned")
+
+
+if __name__ == "__main__":
+    main()
