@@ -17,12 +17,12 @@ from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose
 
 MAP = "hall"
 #: What tells one query from another, and says nothing of the answer.
-OF_THE_QUERY = ("query_id", "timing", "asked_at")
+OF_THE_QUERY = ("query_id", "milliseconds")
 
 
 @pytest.fixture(scope="module")
 def walk() -> tuple[DepthFrame, ...]:
-    return synthesise_room(5, 0, 24, along_path=True).frames
+    return synthesise_room(5, 1, 24, along_path=True).frames
 
 
 def camera_of(view: DepthFrame) -> CameraIntrinsics:
@@ -49,7 +49,7 @@ def states(client: Client, views: tuple[DepthFrame, ...]) -> list[tuple[Any, ...
     tracker = Tracker(client, MAP, camera=camera_of(views[0]))
     first = np.linalg.inv(np.array(views[0].pose))
     found = [
-        tracker.update(one.depth, first @ np.array(one.pose), stamp=0.5 * i)
+        tracker.update(one.depth, first @ np.array(one.pose), stamp=2.0 * i)
         for i, one in enumerate(views)
     ]
     return [(one.status, one.reason, np.asarray(one.T_map_odom).tolist()) for one in found]
@@ -78,7 +78,7 @@ def test_a_copy_answers_as_the_service_did_and_is_renewed(
     # nobody answers at the address any more
     assert first.result is not None
     assert second == ["copy"]
-    assert [one["status"] for one in online].count("found") >= 2, [(one["status"], one["reason"]) for one in online]
+    assert [one["status"] for one in online].count("found") >= 2
     assert online[-1]["status"] == "not_found"
     with Client.embedded(copy) as offline:
         assert answers(offline, walk[3:10:2]) == online
