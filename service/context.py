@@ -12,7 +12,7 @@ from fastapi import Depends, Request
 from sceneprint.engine import Engine
 from sceneprint.store.tenants import NOBODY, current_tenant
 from service.event_stream import Feed
-from service.limits import Gate, Holdings, RateLimits, Spool, Turns, take_turn
+from service.limits import BodySpool, Gate, Holdings, RateLimits, Turns, take_turn
 from service.metrics import Metrics
 
 T = TypeVar("T")
@@ -55,7 +55,7 @@ class Context:
     wait_s: float
     requests: Holdings = field(default_factory=Holdings)
     reads: Turns = field(default_factory=lambda: Turns(READS, READS_BESIDE))
-    spool: Spool = field(default_factory=Spool)
+    spool: BodySpool = field(default_factory=BodySpool)
     lookups: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(LOOKUPS))
 
     async def run(self, do: Callable[..., T], *given: object, patient: bool = False) -> T:

@@ -379,7 +379,7 @@ class Broken(Exception):
     """Stops the reading of a body; nobody but `RequestMiddleware` sees it."""
 
 
-class Spool:
+class BodySpool:
     """The temporary folder, where bodies wait to be read, and what each tenant holds of it."""
 
     def __init__(self) -> None:
@@ -436,10 +436,10 @@ class RequestBody:
         self._waited_s, self._bytes, self._whole = 0.0, 0, False
         #: Why no more of it is read.
         self.fault: SceneprintError | None = None
-        self._spool: Spool | None = None
+        self._spool: BodySpool | None = None
         self._tenant, self._charged = "", 0
 
-    def charge(self, spool: Spool, tenant: str) -> None:
+    def charge(self, spool: BodySpool, tenant: str) -> None:
         """Charge a tenant for what is written of it to disk, before it is."""
         self._spool, self._tenant = spool, tenant
 
@@ -481,7 +481,7 @@ class RequestBody:
             self._pay(self._spool)
         return message
 
-    def _pay(self, spool: Spool) -> None:
+    def _pay(self, spool: BodySpool) -> None:
         more = IN_MEMORY * math.ceil(self._bytes / IN_MEMORY - 1) - self._charged
         if more <= 0:
             return

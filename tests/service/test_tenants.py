@@ -25,10 +25,10 @@ from service.browser_security import origins_of
 from service.limits import (
     IN_MEMORY,
     REFUSALS,
+    BodySpool,
     Broken,
     Holdings,
     RequestBody,
-    Spool,
     Turns,
     share,
 )  # fmt: skip
@@ -231,7 +231,7 @@ def test_every_route_that_works_in_a_thread_takes_a_turn():
     assert [one.partition(":")[0] for one in free] == ["jobs.py"]  # which holds one by hand
 
 
-class SmallSpool(Spool):
+class SmallSpool(BodySpool):
     """With room for eight MiB."""
 
     def _room(self) -> int:
