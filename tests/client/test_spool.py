@@ -465,8 +465,8 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
     path, data = tmp_path / "spool", tmp_path / "data"
     kills, full, first = 0, 0, 0
     while first < count:
-        room = chance.randrange(1, 40) * CHARGE if path.exists() and chance.random() < 0.3 else 0
-        said = add_until(path, first, count, chance.randrange(1, 150), room)
+        room = chance.randrange(1, 40) * CHARGE if path.exists() and chance.random() < 0.4 else 0
+        said = add_until(path, first, count, count if room else chance.randrange(1, 150), room)
         full += said[-1:] == ["full"]
         kills += said[-1:] != ["full"]
         numbers = [int(one) for one in said if one != "full"]
@@ -489,12 +489,11 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
             while names(path):
                 with child("sync", path, url, "hall", chance.randrange(1, 6)) as process:
                     if chance.random() < 0.5:  # somewhere in the middle of a request
-                        with_time = chance.uniform(0.3, 2.0)
                         try:
-                            process.communicate(timeout=with_time)
+                            process.wait(timeout=chance.uniform(0.5, 4.0))
                         except subprocess.TimeoutExpired:
                             process.kill()
-                    process.communicate()
+                    process.wait()
                 syncs += process.returncode == -signal.SIGKILL
             found = [one.name for one in client.frames("hall")]
             contents = {one.content_id for one in client.frames("hall")}
