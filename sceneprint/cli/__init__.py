@@ -53,6 +53,7 @@ COMMANDS = {
     "index": "storage",
     "snapshot": "storage",
     "restore": "storage",
+    "pull": "storage",
     "sign": "offline",
     "picture": "offline",
     "evaluate": "evaluate",
