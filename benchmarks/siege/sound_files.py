@@ -5,6 +5,7 @@ Shot  --FILES[kind]-->  bytes
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import struct
@@ -234,13 +235,14 @@ def _zip(shot: Shot) -> bytes:
 
 def _tar(shot: Shot, pack: Pack) -> bytes:
     out = io.BytesIO()
-    mode: Any = f"w:{pack}"
+    mode: Any = f"w:{pack}" if pack != "gz" else "w"
     with tarfile.open(fileobj=out, mode=mode) as archive:
         for name, data in _members(shot):
             member = tarfile.TarInfo(name)
             member.size = len(data)
             archive.addfile(member, io.BytesIO(data))
-    return out.getvalue()
+    # tarfile would write the present time into the header of gzip
+    return gzip.compress(out.getvalue(), mtime=0) if pack == "gz" else out.getvalue()
 
 
 def _members(shot: Shot) -> list[tuple[str, bytes]]:

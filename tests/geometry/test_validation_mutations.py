@@ -9,6 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from sceneprint import types
 from sceneprint.geometry import rigid
 from sceneprint.geometry.registration import alignment, icp, overlap
 from sceneprint.geometry.surface import camera
@@ -50,8 +51,14 @@ PROJECTING = [
     ("if power == 2:", "if power >= 1:"),
     ("return max(1.0, ratio * ratio)", "return ratio * ratio"),
     ("return max(1.0, ratio) if", "return ratio if"),
-    ("closed = camera.width if camera.is_closed else 0", "closed = camera.width"),
     ("return float(np.sqrt(x * x + y * y + z * z))", "return z"),
+]
+
+CAMERAS = [
+    ("closed = camera.width if camera.is_closed else 0", "closed = camera.width"),
+    ("camera.fx, camera.fy, camera.cx, camera.cy, 0.0]", "camera.fy, camera.fx, camera.cx, 0, 0]"),
+    ("[NOWHERE, nearest, 0.0,", "[NOWHERE, 0.0, nearest,"),
+    ("camera.left, camera.top, camera.pole, closed]", "camera.top, camera.left, camera.pole, 0]"),
 ]
 
 TARGETS = [
@@ -164,7 +171,7 @@ CONSENSUS = [
 
 AVERAGING = [
     ("agree_m: float = 0.15", "agree_m: float = 0.2"),
-    ("math.radians(10.0)", "math.radians(15.0)"),
+    ("agree_rad: float = math.radians(10.0)", "agree_rad: float = math.radians(15.0)"),
     ("(apart[..., 0] <= p.agree_m) & (", "(apart[..., 0] <= p.agree_m) | ("),
     ("-int(near[i].sum())", "int(near[i].sum())"),
     ("float(cost[i]), i)", "-float(cost[i]), i)"),
@@ -180,6 +187,7 @@ AVERAGING = [
 
 CHECKS = {
     rigid: ("check_rigid", "check_averaging"),
+    types: ("check_cameras",),
     camera: ("check_projecting",),
     overlap: ("check_targets", "check_agreement", "check_sampling", "check_agreement_of_clouds"),
     icp: ("check_registration", "check_registration_of_clouds"),
@@ -189,6 +197,7 @@ CASES = [
     (module, line, wrong)
     for module, mutations in (
         (rigid, RIGID + AVERAGING),
+        (types, CAMERAS),
         (camera, PROJECTING),
         (overlap, TARGETS + AGREEMENT),
         (icp, REGISTRATION),
@@ -207,7 +216,7 @@ def uncompiled(module: ModuleType, line: str = "", wrong: str = "") -> ModuleTyp
     source = inspect.getsource(module)
     if line:
         assert source.count(line) == 1, f"{line!r}: {source.count(line)} in {module.__name__}"
-    source = COMPILE.sub(PLAIN, source).replace(line, wrong)
+    source = COMPILE.sub(lambda found: found.group() + PLAIN, source).replace(line, wrong)
     copy = ModuleType(module.__name__)  # dataclasses look their module up by this name
     exec(compile(source, str(module.__file__), "exec"), copy.__dict__)
     return copy

@@ -7,14 +7,22 @@ few points, so that kernels run uncompiled as well.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import astuple, replace
 from itertools import product
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from sceneprint.types import Floats, Floats32, Intrinsics, Patches, Sphere, Surface
+from sceneprint.types import (
+    Floats,
+    Floats32,
+    Intrinsics,
+    Patches,
+    Sphere,
+    Surface,
+    camera_of,
+)
 
 #: Pixels are a degree wide; the ray of pixel (20, 15) is the optical axis.
 CAMERA = Intrinsics(41, 31, 57.0, 57.0, 20.0, 15.0)
@@ -124,9 +132,24 @@ def check_rigid(module: ModuleType) -> None:
     assert not module.solve_positive(np.array([[1.0, 2], [2, 4]]), np.ones(2), x)
 
 
+def check_cameras(module: ModuleType) -> None:
+    """As kernels take them: kind, nearest, and five numbers of that kind."""
+    # a copy of the module has classes of its own
+    pinhole, ball = module.Intrinsics(9, 7, 10.0, 20.0, 1.0, 2.0), module.Sphere(*astuple(BALL))
+    assert module.camera_of(pinhole, 0.1).tolist() == [0, 0.1, 10, 20, 1, 2, 0]
+    for pole in range(3):
+        found = module.camera_of(replace(ball, pole=pole), 0.2)
+        assert found.tolist() == [1, 0.2, TEN, ball.left, ball.top, pole, 36]
+    # of an image that is no full turn the last column has no neighbour on the right
+    assert module.camera_of(replace(ball, width=34), 0.2)[6] == 0
+    assert module.camera_of(None, 0.3).tolist() == [2, 0.3, 0, 0, 0, 0, 0]
+    for camera, kind in ((pinhole, 0), (ball, 1), (None, 2)):
+        assert module.kind_of(camera) == kind
+
+
 def check_projecting(module: ModuleType) -> None:
     def seen(camera: Any, at: Any) -> tuple[float, ...]:
-        found = module.project(module.camera_of(camera, 0.1), *map(float, at))
+        found = module.project(camera_of(camera, 0.1), *map(float, at))
         return tuple(round(value, 9) for value in found)
 
     assert seen(CAMERA, (0, 0, 2)) == (20.5, 15.5, 2.0)
@@ -157,13 +180,12 @@ def check_projecting(module: ModuleType) -> None:
     assert seen(wide, ray(360 * 35.4 / 36.3, 0))[0] == 35.9
     assert seen(wide, ray(360 * 35.6 / 36.3, 0))[0] == 0.0
     assert seen(replace(wide, width=30), ray(360 * 35.6 / 36.3, 0))[0] == 36.1
-    for camera, kind, depth in ((CAMERA, 0, 3.0), (BALL, 1, 7.0), (None, 2, 0.0)):
-        assert module.kind_of(camera) == module.camera_of(camera, 0.0)[0] == kind
+    for kind, depth in ((0, 3.0), (1, 7.0), (2, 0.0)):
         assert module.depth_of(kind, 2.0, 6.0, 3.0) == depth
     points = np.zeros((3, 4, 3), np.float32)
     points[1, 2] = 2.0, 6.0, 3.0
     for camera, depth in ((CAMERA, 3.0), (BALL, 7.0)):
-        array = module.camera_of(camera, 0.0)
+        array = camera_of(camera, 0.0)
         assert module.depth_at(array, points, 1, 2) == depth
         assert module.depth_at(array, points, 2, 1) == 0.0
     for power, grown in ((0, 1.0), (1, 1.5), (2, 2.25)):

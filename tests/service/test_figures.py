@@ -59,11 +59,15 @@ def test_history_has_an_hour(served, refused, asked):
     refused(served.client.get("/v1/stats", params=asked), 422, "invalid-request")
 
 
-def test_all_figures_are_there(served, make_map):
+def test_all_figures_are_there(served, make_map, until):
     make_map(served, "plain")
-    text = served.client.get("/metrics").text
-    values = {line.rpartition(" ")[0]: float(line.split()[-1]) for line in text.splitlines()
-              if not line.startswith("#")}  # fmt: skip
+
+    def figures() -> dict[str, float]:
+        lines = served.client.get("/metrics").text.splitlines()
+        pairs = (line.rpartition(" ")[::2] for line in lines if not line.startswith("#"))
+        return {name: float(value) for name, value in pairs}
+
+    values = figures()
     assert values['sceneprint_index_tail_frames{map="plain"}'] == 0
     assert values["sceneprint_maps"] >= 1
     assert values["sceneprint_disk_free_bytes"] > 0
@@ -75,8 +79,12 @@ def test_all_figures_are_there(served, make_map):
     received = 'sceneprint_received_bytes_total{route="/v1/maps"}'
     assert values[received] >= len(json.dumps({"name": "plain", "model": "depth"}))
     with Engine(Settings(data_dir=served.folder, database_url=None)) as engine:
-        newest = served.client.get("/v1/events").json()["newest"]
-        assert values["sceneprint_newest_event"] == engine.store.seals.open("event", newest)
+
+        def agree() -> bool:  # once the jobs of the tests before have told all
+            newest = served.client.get("/v1/events").json()["newest"]
+            return figures()["sceneprint_newest_event"] == engine.store.seals.open("event", newest)
+
+        until(agree)
     streams = [name for name in values if name.startswith("sceneprint_request_seconds")]
     assert streams
     assert not any("/v1/events" in name for name in streams)
