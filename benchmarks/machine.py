@@ -96,11 +96,19 @@ def memory_of(folder: Path, command: str) -> int:
 
 
 def processor_seconds(folder: Path, command: str) -> float:
-    """Processor time that the processes of a command on a data folder have used, in seconds."""
+    """Processor time that the processes of a command on a data folder have used, in seconds.
+
+    That of processes which they have started and which still run counts as well: decoders and workers.
+    """
 
     def used(process: Path) -> int:
-        threads = process.glob("task/*/schedstat")
-        return sum(int(path.read_text().split()[0]) for path in threads)
+        total = 0
+        for task in process.glob("task/*"):
+            total += int((task / "schedstat").read_text().split()[0])
+            for child in (task / "children").read_text().split():
+                with suppress(OSError):  # it ended meanwhile
+                    total += used(Path("/proc") / child)
+        return total
 
     return 1e-9 * sum(_of_processes(folder, command, used))
 
