@@ -21,7 +21,7 @@ from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidIntrinsics, UnreadableGeometry
-from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.geometry.registration.overlap import thinned
 from sceneprint.geometry.surface.range_image import SPREAD_POINTS, directions
 from sceneprint.types import (
@@ -100,6 +100,30 @@ def _pack_image(
             out[y, x, 2] = np.uint16(v)
 
 
+@disjoint_kernel
+def _unpack_line(
+    inverse: Floats, across: Floats, down: Floats, xn: Floats, yn: float, area: float, out: Floats
+) -> None:
+    """Points, normals and areas (7, w) of a line of pixels: inverse depths, and the two numbers of
+    their normals. All pixels, valid or not: so the compiler works on several at once.
+    """
+    px, py, pz, nx, ny, nz, areas = out[0], out[1], out[2], out[3], out[4], out[5], out[6]
+    for x in range(len(inverse)):
+        z = 1.0 / inverse[x]
+        u, v = across[x] / 65535.0 * 2.0 - 1.0, down[x] / 65535.0 * 2.0 - 1.0
+        facing = -(1.0 - abs(u) - abs(v))
+        folded_u = (1.0 - abs(v)) * (1.0 if u >= 0 else -1.0)
+        folded_v = (1.0 - abs(u)) * (1.0 if v >= 0 else -1.0)
+        u, v = (folded_u if facing > 0 else u), (folded_v if facing > 0 else v)
+        length = np.sqrt(u * u + v * v + facing * facing)
+        u, v, facing = u / length, v / length, facing / length
+        px[x], py[x], pz[x] = xn[x] * z, yn * z, z
+        nx[x], ny[x], nz[x] = u, v, facing
+        ray = np.sqrt(xn[x] * xn[x] + yn * yn + 1.0)
+        cosine = -(xn[x] * u + yn * v + facing) / ray
+        areas[x] = z * z / (area * ray * max(cosine, 1e-3))
+
+
 @kernel
 def _unpack_pinhole(
     packed: Packed, scale: float, camera: Floats, points: Floats32,
@@ -107,19 +131,19 @@ def _unpack_pinhole(
 ) -> None:  # fmt: skip
     height, width = packed.shape[0], packed.shape[1]
     fx, fy, cx, cy = camera[2], camera[3], camera[4], camera[5]
+    xn, line, out = (np.arange(width) - cx) / fx, np.empty((3, width)), np.empty((7, width))
     for y in range(height):
-        yn = (y - cy) / fy
+        for x in range(width):
+            for k in range(3):
+                line[k, x] = packed[y, x, k]
+            line[0, x] = line[0, x] * scale if packed[y, x, 0] > 0 else 1.0
+        _unpack_line(line[0], line[1], line[2], xn, (y - cy) / fy, fx * fy, out)
         for x in range(width):
             if packed[y, x, 0] == 0:
                 continue
-            xn = (x - cx) / fx
-            z = 1.0 / (packed[y, x, 0] * scale)
-            u, v, nz = _of_octahedron(packed[y, x, 1], packed[y, x, 2], 65535.0)
-            points[y, x, 0], points[y, x, 1], points[y, x, 2] = xn * z, yn * z, z
-            normals[y, x, 0], normals[y, x, 1], normals[y, x, 2] = u, v, nz
-            ray = np.sqrt(xn * xn + yn * yn + 1.0)
-            cosine = -(xn * u + yn * v + nz) / ray
-            areas[y, x] = z * z / (fx * fy * ray * max(cosine, 1e-3))
+            for k in range(3):
+                points[y, x, k], normals[y, x, k] = out[k, x], out[3 + k, x]
+            areas[y, x] = out[6, x]
             valid[y, x] = True
 
 

@@ -153,16 +153,16 @@ REGISTRATION = [
 ]
 
 CONSENSUS = [
-    ("(abs(da[j] - db[j]) > tolerance)", "(da[j] - db[j] > tolerance)"),
-    ("| (da[j] < minimum)", ""),
-    ("| (db[j] < minimum)", ""),
-    ("if abs(ha - hb) > tolerance:", "if abs(ha - hb) > 9:"),
-    ("if abs(ga - gb) > tolerance:", "if abs(ga - gb) > 9:"),
-    ("if not _alike_angles(ca, cb, angle):", "if False:"),
+    ("(abs(da - db) <= tolerance)", "(da - db <= tolerance)"),
+    ("& (da >= minimum)", ""),
+    ("& (db >= minimum)", ""),
+    ("& (abs(ha - hb) <= tolerance)", ""),
+    ("& (abs(ga - gb) <= tolerance)", ""),
+    ("if alike & (apart <= most)", "if alike"),
     ("abs(ta - tb) <= 2 * tolerance", "abs(abs(ta) - abs(tb)) <= 2 * tolerance"),
     ("bits[j, i >> 6] |= np.uint64(1) << np.uint64(i & 63)", "pass"),
     ("if used < 3:", "if used < 1:"),
-    ("a[d] /= total", "a[d] /= used"),
+    ("a0 / total", "a0 / used"),
     ("b[r] - (R[r, 0] * a[0]", "b[r] + (R[r, 0] * a[0]"),
     ("(u * u if u > 0 else 0.0) if c > cosine", "(u if u > 0 else 0.0) if c > cosine"),
     ("(u * u if u > 0 else 0.0) if c > cosine", "u * u if c > cosine"),

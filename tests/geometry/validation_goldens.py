@@ -646,16 +646,16 @@ def check_consensus(module: ModuleType) -> None:
     q, m = source.means @ T[:3, :3].T + T[:3, 3], source.normals @ T[:3, :3].T
     q[3] = 0.0  # counts for nothing
     found = np.zeros((4, 4))
-    weights = np.array([1.0, 2.0, 3.0, 0.0])
+    weights, room = np.array([1.0, 2.0, 3.0, 0.0]), np.empty((9, 4))
 
     def columns(*arrays: Floats) -> list[Floats]:
         return [np.ascontiguousarray(one.T) for one in arrays]
 
     of_source = columns(source.means, source.normals)
-    assert module._fit(*of_source, *columns(q, m), weights, 0.05, found)
+    assert module._fit(*of_source, *columns(q, m), weights, 0.05, room, found)
     np.testing.assert_allclose(found, T, atol=1e-12)
     few = np.array([1.0, 0, 0, 1])
-    assert not module._fit(*of_source, *columns(q, m), few, 0.05, found)
+    assert not module._fit(*of_source, *columns(q, m), few, 0.05, room, found)
     # what it explains: off by 0, 6 cm, 16 cm, and by 0 but facing elsewhere; (1 - .16)^2
     off = q.copy()
     off[1, 0] += 0.06

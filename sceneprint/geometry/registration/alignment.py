@@ -78,7 +78,17 @@ from sceneprint.geometry.rigid import (
     rotation_of_covariance,
     slopes,
 )
-from sceneprint.types import Floats, Floats32, Geometry, Ints32, Patches, Sphere, Surface, kind_of
+from sceneprint.types import (
+    Bytes,
+    Floats,
+    Floats32,
+    Geometry,
+    Ints32,
+    Patches,
+    Sphere,
+    Surface,
+    kind_of,
+)
 
 # Consensus of correspondences.
 
@@ -98,77 +108,68 @@ class ConsensusParameters:
     inlier_cosine: float = 0.85  #: of the angle between their normals
 
 
-@disjoint_kernel
-def _lengths(points: Floats, i: int, lengths: Floats) -> None:
-    """From point i to each later one; points (3, M)."""
-    x, y, z = points[0], points[1], points[2]
-    ix, iy, iz = x[i], y[i], z[i]
-    for j in range(i + 1, len(lengths)):
-        dx, dy, dz = x[j] - ix, y[j] - iy, z[j] - iz
-        lengths[j] = np.sqrt(dx * dx + dy * dy + dz * dz)
-
-
-@disjoint_kernel
-def _as_long(
-    da: Floats, db: Floats, i: int, tolerance: float, minimum: float, places: Ints32
-) -> int:
-    """Which of the later correspondences are as far from i in both frames; how many."""
-    found = 0
-    for j in range(i + 1, len(da)):
-        apart = (abs(da[j] - db[j]) > tolerance) | (da[j] < minimum) | (db[j] < minimum)
-        places[found] = j
-        found += 0 if apart else 1
-    return found
-
-
 @kernel
 def _alike_angles(a: float, b: float, most: float) -> bool:
-    """Whether two angles, given by their cosines, differ by no more than `most`, which is below pi.
-
-    Angles differ by no less than their cosines do, and by most where one of them is 0: an
-    arccosine is needed only between these bounds.
-    """
+    """Whether two angles, given by their cosines, differ by no more than `most`."""
     a, b = min(max(a, -1.0), 1.0), min(max(b, -1.0), 1.0)
-    apart = abs(a - b)
-    if apart > most + 1e-9:
-        return False
-    if apart < 1.0 - np.cos(most) - 1e-9:
-        return True
     return not abs(np.arccos(a) - np.arccos(b)) > most
 
 
-@kernel
-def _compatible(
-    p: Floats, n: Floats, q: Floats, m: Floats, i: int, j: int, tolerance: float, angle: float
-) -> bool:
-    """Whether two pairs of correspondences whose lengths agree have alike normals as well."""
-    ax, ay, az = p[0, j] - p[0, i], p[1, j] - p[1, i], p[2, j] - p[2, i]
-    bx, by, bz = q[0, j] - q[0, i], q[1, j] - q[1, i], q[2, j] - q[2, i]
-    ha = ax * n[0, i] + ay * n[1, i] + az * n[2, i]
-    hb = bx * m[0, i] + by * m[1, i] + bz * m[2, i]
-    if abs(ha - hb) > tolerance:
-        return False
-    ga = ax * n[0, j] + ay * n[1, j] + az * n[2, j]
-    gb = bx * m[0, j] + by * m[1, j] + bz * m[2, j]
-    if abs(ga - gb) > tolerance:
-        return False
-    ca = n[0, i] * n[0, j] + n[1, i] * n[1, j] + n[2, i] * n[2, j]
-    cb = m[0, i] * m[0, j] + m[1, i] * m[1, j] + m[2, i] * m[2, j]
-    if not _alike_angles(ca, cb, angle):
-        return False
-    # the signed triple product tells a scene from its mirror image
-    ta = (
-        ax * (n[1, i] * n[2, j] - n[2, i] * n[1, j])
-        + ay * (n[2, i] * n[0, j] - n[0, i] * n[2, j])
-        + az * (n[0, i] * n[1, j] - n[1, i] * n[0, j])
-    )
-    tb = (
-        bx * (m[1, i] * m[2, j] - m[2, i] * m[1, j])
-        + by * (m[2, i] * m[0, j] - m[0, i] * m[2, j])
-        + bz * (m[0, i] * m[1, j] - m[1, i] * m[0, j])
-    )
-    alike: bool = abs(ta - tb) <= 2 * tolerance
-    return alike
+#: What `_compare` says of two correspondences: the last, that their angles have yet to be compared.
+_APART, _ALIKE, _UNDECIDED = 0, 1, 2
+
+
+@disjoint_kernel
+def _compare(
+    p: Floats, n: Floats, q: Floats, m: Floats, i: int,
+    tolerance: float, angle: float, minimum: float, said: Bytes, cosines: Floats,
+) -> None:  # fmt: skip
+    """Compare correspondence i with each later one; all arrays (3, M), said (M,), cosines (2, M).
+
+    They are compatible where lengths, heights above each other's planes, angles between normals and
+    the signed triple product, which tells a scene from its mirror image, agree. Angles differ by
+    no less than their cosines do, and by most where one of them is 0: an arccosine is needed only
+    between these bounds.
+    """
+    later = i + 1  # indices from 0 on: what might be negative is not looked up in order
+    px, py, pz, nx, ny, nz = (
+        p[0, later:], p[1, later:], p[2, later:], n[0, later:], n[1, later:], n[2, later:],
+    )  # fmt: skip
+    qx, qy, qz, mx, my, mz = (
+        q[0, later:], q[1, later:], q[2, later:], m[0, later:], m[1, later:], m[2, later:],
+    )  # fmt: skip
+    in_a, in_b = cosines[0, later:], cosines[1, later:]
+    least, most = 1.0 - math.cos(angle) - 1e-9, angle + 1e-9
+    pxi, pyi, pzi, nxi, nyi, nzi = p[0, i], p[1, i], p[2, i], n[0, i], n[1, i], n[2, i]
+    qxi, qyi, qzi, mxi, myi, mzi = q[0, i], q[1, i], q[2, i], m[0, i], m[1, i], m[2, i]
+    says = said[later:]
+    for j in range(len(says)):
+        ax, ay, az = px[j] - pxi, py[j] - pyi, pz[j] - pzi
+        bx, by, bz = qx[j] - qxi, qy[j] - qyi, qz[j] - qzi
+        da, db = np.sqrt(ax * ax + ay * ay + az * az), np.sqrt(bx * bx + by * by + bz * bz)
+        alike = (abs(da - db) <= tolerance) & (da >= minimum) & (db >= minimum)
+        ha = ax * nxi + ay * nyi + az * nzi
+        hb = bx * mxi + by * myi + bz * mzi
+        ga = ax * nx[j] + ay * ny[j] + az * nz[j]
+        gb = bx * mx[j] + by * my[j] + bz * mz[j]
+        alike = alike & (abs(ha - hb) <= tolerance) & (abs(ga - gb) <= tolerance)
+        ta = (
+            ax * (nyi * nz[j] - nzi * ny[j])
+            + ay * (nzi * nx[j] - nxi * nz[j])
+            + az * (nxi * ny[j] - nyi * nx[j])
+        )
+        tb = (
+            bx * (myi * mz[j] - mzi * my[j])
+            + by * (mzi * mx[j] - mxi * mz[j])
+            + bz * (mxi * my[j] - myi * mx[j])
+        )
+        alike = alike & (abs(ta - tb) <= 2 * tolerance)
+        ca = nxi * nx[j] + nyi * ny[j] + nzi * nz[j]
+        cb = mxi * mx[j] + myi * my[j] + mzi * mz[j]
+        in_a[j], in_b[j] = ca, cb
+        apart = abs(min(max(ca, -1.0), 1.0) - min(max(cb, -1.0), 1.0))
+        angle_says = _ALIKE if apart < least else _UNDECIDED
+        says[j] = angle_says if alike & (apart <= most) else _APART
 
 
 @kernel
@@ -178,12 +179,13 @@ def _graph(
 ) -> None:  # fmt: skip
     """Bit j of row i: correspondences i and j are compatible. All arrays (3, M)."""
     count = p.shape[1]
-    da, db, places = np.empty(count), np.empty(count), np.empty(count, np.int32)
+    said, cosines = np.empty(count, np.uint8), np.empty((2, count))
     for i in range(count):
-        _lengths(p, i, da)
-        _lengths(q, i, db)
-        for j in places[: _as_long(da, db, i, tolerance, minimum, places)]:
-            if _compatible(p, n, q, m, i, j, tolerance, angle):
+        _compare(p, n, q, m, i, tolerance, angle, minimum, said, cosines)
+        for j in range(i + 1, count):
+            if said[j] == _APART:
+                continue
+            if said[j] == _ALIKE or _alike_angles(cosines[0, j], cosines[1, j], angle):
                 bits[i, j >> 6] |= np.uint64(1) << np.uint64(j & 63)
                 bits[j, i >> 6] |= np.uint64(1) << np.uint64(i & 63)
 
@@ -209,36 +211,68 @@ def _second_order(bits: NDArray[np.uint64], common: Ints32) -> None:
             common[j, i] = total
 
 
+@disjoint_kernel
+def _shares(
+    p: Floats, n: Floats, q: Floats, m: Floats, weights: Floats, normal_weight: float,
+    a: Floats, b: Floats, shares: Floats,
+) -> None:  # fmt: skip
+    """Shares (9, M) of correspondences in the covariance about middles a and b; q by rows."""
+    p0, p1, p2, n0, n1, n2 = p[0], p[1], p[2], n[0], n[1], n[2]
+    a0, a1, a2 = a[0], a[1], a[2]
+    for r in range(3):
+        first, second, third = shares[3 * r], shares[3 * r + 1], shares[3 * r + 2]
+        qr, mr, br = q[r], m[r], b[r]
+        for i in range(len(weights)):
+            w, moved, facing = weights[i], qr[i] - br, normal_weight * mr[i]
+            first[i] = w * (moved * (p0[i] - a0) + facing * n0[i])
+            second[i] = w * (moved * (p1[i] - a1) + facing * n1[i])
+            third[i] = w * (moved * (p2[i] - a2) + facing * n2[i])
+
+
+@disjoint_kernel
+def _moments(p: Floats, q: Floats, weights: Floats, shares: Floats) -> None:
+    """Weighted coordinates (6, M)."""
+    for d in range(3):
+        of_p, of_q, in_p, in_q = p[d], q[d], shares[d], shares[3 + d]
+        for i in range(len(weights)):
+            in_p[i] = weights[i] * of_p[i]
+            in_q[i] = weights[i] * of_q[i]
+
+
 @kernel
 def _fit(
-    p: Floats, n: Floats, q: Floats, m: Floats, weights: Floats, normal_weight: float, T: Floats
-) -> bool:
+    p: Floats, n: Floats, q: Floats, m: Floats, weights: Floats, normal_weight: float,
+    shares: Floats, T: Floats,
+) -> bool:  # fmt: skip
     """Weighted Kabsch over positions and normals, (3, M) each; False where fewer than three take
-    part.
+    part. Weights of 0 or more.
+
+    shares (9, M) is scratch space: products of several correspondences are taken at once, and
+    sums in their order.
     """
     total, used = 0.0, 0
-    a, b = np.zeros(3), np.zeros(3)
     for i in range(len(weights)):
-        if weights[i] > 0:
-            used += 1
-            total += weights[i]
-            for d in range(3):
-                a[d] += weights[i] * p[d, i]
-                b[d] += weights[i] * q[d, i]
+        total += weights[i]
+        used += 1 if weights[i] > 0 else 0
     if used < 3:
         return False
-    for d in range(3):
-        a[d] /= total
-        b[d] /= total
-    H = np.zeros((3, 3))
+    a, b, H = np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    _moments(p, q, weights, shares)
+    a0, a1, a2, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    s0, s1, s2, s3, s4, s5 = shares[0], shares[1], shares[2], shares[3], shares[4], shares[5]
     for i in range(len(weights)):
-        w = weights[i]
-        if w > 0:
-            for r in range(3):
-                for c in range(3):
-                    H[r, c] += w * (
-                        (q[r, i] - b[r]) * (p[c, i] - a[c]) + normal_weight * m[r, i] * n[c, i]
-                    )
+        a0, a1, a2 = a0 + s0[i], a1 + s1[i], a2 + s2[i]
+        b0, b1, b2 = b0 + s3[i], b1 + s4[i], b2 + s5[i]
+    a[0], a[1], a[2], b[0], b[1], b[2] = (
+        a0 / total, a1 / total, a2 / total, b0 / total, b1 / total, b2 / total,
+    )  # fmt: skip
+    _shares(p, n, q, m, weights, normal_weight, a, b, shares)
+    for r in range(3):
+        s0, s1, s2 = shares[3 * r], shares[3 * r + 1], shares[3 * r + 2]
+        h0, h1, h2 = 0.0, 0.0, 0.0
+        for i in range(len(weights)):
+            h0, h1, h2 = h0 + s0[i], h1 + s1[i], h2 + s2[i]
+        H[r, 0], H[r, 1], H[r, 2] = h0, h1, h2
     R = np.empty((3, 3))
     rotation_of_covariance(H, R)
     for r in range(3):
@@ -301,7 +335,7 @@ def _hypotheses(
         for j in range(count):
             total += common[i, j]
         support[i] = total
-    weights, found = np.zeros(count), 0
+    weights, shares, found = np.zeros(count), np.empty((9, count)), 0
     order = np.empty(min(n_support, count), np.int32)
     for _ in range(n_seeds):
         seed = int(np.argmax(support))
@@ -317,11 +351,11 @@ def _hypotheses(
             if row[j] > 0:
                 support[j] *= 1.0 - 0.5 * row[j] / row[order[0]]
         support[seed] = 0.0
-        if not _fit(p, n, q, m, weights, normal_weight, T[found]):
+        if not _fit(p, n, q, m, weights, normal_weight, shares, T[found]):
             continue
         for _ in range(rounds):
             _explained(p, n, q, m, T[found], distance, cosine, weights)
-            if not _fit(p, n, q, m, weights, normal_weight, T[found]):
+            if not _fit(p, n, q, m, weights, normal_weight, shares, T[found]):
                 break
         found += 1
     return found

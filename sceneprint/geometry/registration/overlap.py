@@ -15,6 +15,7 @@ import secrets
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import cached_per_frame, disjoint_kernel, kernel
 from sceneprint.geometry.rigid import inverses
@@ -254,6 +255,22 @@ class Overlap:
         return violations / max(self.inliers + violations, 1)
 
 
+@kernel
+def _copy_valid(
+    points: Floats32, normals: Floats32, valid: NDArray[np.bool_],
+    rows: tuple[int, int], columns: tuple[int, int], out: Floats32,
+) -> int:  # fmt: skip
+    """Points and normals of valid pixels, line by line; how many. rows, columns: first and step."""
+    found = 0
+    for y in range(rows[0], valid.shape[0], rows[1]):
+        for x in range(columns[0], valid.shape[1], columns[1]):
+            if valid[y, x]:
+                for k in range(3):
+                    out[found, k], out[found, 3 + k] = points[y, x, k], normals[y, x, k]
+                found += 1
+    return found
+
+
 @cached_per_frame
 def sampled(surface: Surface, stride: int) -> Floats32:
     """Valid pixels of every `stride`-th row and column; of a cloud, about as many points.
@@ -274,14 +291,13 @@ def sampled(surface: Surface, stride: int) -> Floats32:
     if isinstance(surface.camera, Sphere) and stride > 1:
         more = surface.camera.width * surface.camera.height / DEPTH_PIXELS
         stride = round(stride * max(more, 1.0) ** 0.5)
-    half = stride // 2
-    rows, columns = slice(half, None, stride), slice(half, None, stride)
+    rows = columns = (stride // 2, stride)
     if surface.camera is None:
-        rows, columns = slice(None), slice(None, None, stride * stride)
-    valid = surface.valid[rows, columns]
-    points = surface.points[rows, columns][valid]
-    normals = surface.normals[rows, columns][valid]
-    return np.ascontiguousarray(np.concatenate([points, normals], axis=1))
+        rows, columns = (0, 1), (0, stride * stride)
+    shape = surface.valid[rows[0] :: rows[1], columns[0] :: columns[1]].shape
+    both = np.empty((shape[0] * shape[1], 6), np.float32)
+    found = _copy_valid(surface.points, surface.normals, surface.valid, rows, columns, both)
+    return both[:found].copy()
 
 
 #: What a target says of a point: nothing, that it lies on its surface, or that it saw through.

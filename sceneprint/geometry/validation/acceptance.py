@@ -22,7 +22,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sceneprint.geometry.kernel import cached_per_frame, kernel
+from sceneprint.geometry.kernel import cached_per_frame, disjoint_kernel
 from sceneprint.geometry.registration.icp import COARSE, QUICK, RefinementParameters, refined_all
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
@@ -208,11 +208,11 @@ def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
     (n, 4, 4) with n at most 3 n_axes n_planes + 2 n_shifts
     """
     left = patches.areas.copy()
-    mass = np.empty(len(patches))
+    normals, mass = np.ascontiguousarray(patches.normals.T), np.empty(len(patches))
     found: list[Floats] = []
     axes: list[Floats] = []
     for _ in range(p.n_axes):
-        _facing(patches.normals, left, math.cos(p.same_direction), mass)
+        _facing(normals, left, math.cos(p.same_direction), mass)
         most = int(np.argmax(mass))
         if left[most] <= 0:
             break
@@ -249,27 +249,30 @@ def _middles(patches: Patches, axis: Floats, area: Floats, p: AmbiguityParameter
     return middles
 
 
-@kernel
+@disjoint_kernel
 def _facing(normals: Floats, areas: Floats, cosine: float, mass: Floats) -> None:
-    """Area of the patches that face the way of each, or away from it."""
-    for i in range(len(normals)):
-        a, b, c = normals[i, 0], normals[i, 1], normals[i, 2]
-        total = 0.0
-        for j in range(len(normals)):
-            if abs(normals[j, 0] * a + normals[j, 1] * b + normals[j, 2] * c) > cosine:
-                total += areas[j]
-        mass[i] = total
+    """Area of the patches that face the way of each, or away from it; normals (3, P).
+
+    Each patch is added to all that it faces with, as this loop has no sum that must keep its order.
+    """
+    x, y, z = normals[0], normals[1], normals[2]
+    mass[:] = 0.0
+    for j in range(len(areas)):
+        a, b, c, area = x[j], y[j], z[j], areas[j]
+        if area > 0:
+            for i in range(len(areas)):
+                mass[i] += area if abs(a * x[i] + b * y[i] + c * z[i]) > cosine else 0.0
 
 
-@kernel
+@disjoint_kernel
 def _level(offsets: Floats, areas: Floats, apart: float, mass: Floats) -> None:
-    """Area of the patches whose offset is near that of each."""
-    for i in range(len(offsets)):
-        total = 0.0
-        for j in range(len(offsets)):
-            if abs(offsets[j] - offsets[i]) < apart:
-                total += areas[j]
-        mass[i] = total
+    """Area of the patches whose offset is near that of each; added up as in `_facing`."""
+    mass[:] = 0.0
+    for j in range(len(areas)):
+        offset, area = offsets[j], areas[j]
+        if area > 0:
+            for i in range(len(areas)):
+                mass[i] += area if abs(offset - offsets[i]) < apart else 0.0
 
 
 def _shift(by: Floats) -> Floats:
