@@ -98,7 +98,7 @@ def memory_of(folder: Path, command: str) -> int:
 def processor_seconds(folder: Path, command: str) -> float:
     """Processor time that the processes of a command on a data folder have used, in seconds.
 
-    That of processes which they have started and which still run counts as well: decoders and workers.
+    That of processes which they have started and which still run counts as well.
     """
 
     def used(process: Path) -> int:

@@ -223,7 +223,7 @@ def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
         axis /= np.linalg.norm(axis)
         axes.append(axis)
         middles = _middles(patches, axis, np.where(across, left, 0.0), p)
-        found += [_turn(axis, middle, k) for middle in middles for k in (1, 2, 3)]
+        found += _turns(axis, middles)
         left = np.where(across, 0.0, left)
     if len(axes) > 1:
         along = np.cross(axes[0], axes[1])
@@ -281,14 +281,21 @@ def _shift(by: Floats) -> Floats:
     return result
 
 
-def _turn(axis: Floats, middle: Floats, quarters: int) -> Floats:
-    cosine, sine = (0.0, -1.0, 0.0)[quarters - 1], (1.0, 0.0, -1.0)[quarters - 1]
+def _turns(axis: Floats, middles: list[Floats]) -> list[Floats]:
+    """By a quarter, a half and three quarters about an axis through each of some points."""
     x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    result = np.eye(4)
-    result[:3, :3] = cosine * np.eye(3) + sine * cross + (1 - cosine) * np.outer(axis, axis)
-    result[:3, 3] = middle - result[:3, :3] @ middle
-    return result
+    cross, outer = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.outer(axis, axis)
+    rotations = [
+        cosine * np.eye(3) + sine * cross + (1 - cosine) * outer
+        for cosine, sine in ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+    ]
+    found = []
+    for middle in middles:
+        for R in rotations:
+            turn = np.eye(4)
+            turn[:3, :3], turn[:3, 3] = R, middle - R @ middle
+            found.append(turn)
+    return found
 
 
 def far_from(T: Floats, others: Floats, p: AmbiguityParameters) -> Floats:

@@ -240,8 +240,9 @@ def score_pose(
                 continue
             T_view_sensor = view.inverse_pose @ T_parent_sensor
             said = look_up(points, view.target, T_view_sensor, limits)
-            count = int((said == AGREES).sum())
-            agree += said == AGREES
+            agreed = said == AGREES
+            count = int(np.count_nonzero(agreed))
+            agree += agreed
             violate += said == VIOLATES
             if count < p.least_agreeing * len(points):
                 continue
