@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+import json
 import time
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, lru_cache
 from typing import Any
 
+import numpy as np
 from sqlalchemy import (
     CTE,
     Column,
     ColumnElement,
     Connection,
     Insert,
+    Integer,
+    Select,
     String,
     Table,
+    bindparam,
     cast,
     exists,
     func,
     insert,
     literal,
+    null,
     or_,
     select,
     update,
@@ -31,12 +38,16 @@ from sqlalchemy.types import TypeEngine
 from sceneprint.errors import QuotaExceeded, UnknownFrame, UnknownMap
 from sceneprint.store.events import inherited, record_event
 from sceneprint.store.tables import (
+    FRAME_COLUMNS,
+    MAP_COLUMNS,
     TEXT,
     FrameRow,
     MapRow,
+    among_numbers,
     event_values,
     events,
     frame_row,
+    frame_rows,
     frame_tags,
     frames,
     job_values,
@@ -45,9 +56,10 @@ from sceneprint.store.tables import (
     maps,
     models,
     now,
-    rows_among,
+    rows_of_statement,
     signatures,
 )
+from sceneprint.types import Floats
 from sceneprint_client.api import FrameState
 
 
@@ -58,10 +70,15 @@ def find_map(connection: Connection, name: str) -> MapRow:
     ------
     UnknownMap : there is none.
     """
-    row = connection.execute(select(maps).where(maps.c.name == name)).mappings().first()
+    row = connection.execute(_map_of_name(), {"name": name}).first()
     if row is None:
         raise unknown_map(name)
-    return map_row(row)
+    return MapRow(*row)
+
+
+@cache
+def _map_of_name() -> Select[Any]:
+    return select(*MAP_COLUMNS).where(maps.c.name == bindparam("name"))
 
 
 def living_map(connection: Connection, of: MapRow) -> MapRow:
@@ -396,9 +413,14 @@ def frame_of(connection: Connection, number: int) -> FrameRow:
 
 def frames_of(connection: Connection, numbers: Iterable[int]) -> dict[int, FrameRow]:
     """Frames by their numbers; those that are gone are left out."""
-    asked = select(frames).where(frames.c.state != FrameState.DELETED)
-    found = rows_among(connection, asked, frames.c.number, numbers)
-    return {row.number: frame_row(row._mapping) for row in found}
+    found = rows_of_statement(connection, _frames_of_numbers, numbers)
+    return {row.number: row for row in frame_rows(found)}
+
+
+@cache
+def _frames_of_numbers(dialect: str) -> Select[Any]:
+    among = among_numbers(dialect, frames.c.number)
+    return select(*FRAME_COLUMNS).where(frames.c.state != FrameState.DELETED, among)
 
 
 def _free(connection: Connection, map_number: int, frame_id: str) -> None:
@@ -421,25 +443,44 @@ def _write_tags(connection: Connection, number: int, tags: Iterable[str]) -> Non
 
 def geometry_blobs(connection: Connection, numbers: Iterable[int], model_id: str) -> dict[int, str]:
     """Blobs of the geometry artifacts of frames."""
-    own = signatures.c.model_id == model_id
-    asked = select(signatures.c.frame_number, signatures.c.geometry).where(own)
-    found = rows_among(connection, asked, signatures.c.frame_number, numbers)
+    found = rows_of_statement(connection, _geometry_of_numbers, numbers, model_id=model_id)
     return {row.frame_number: row.geometry for row in found}
 
 
+@cache
+def _geometry_of_numbers(dialect: str) -> Select[Any]:
+    own = signatures.c.model_id == bindparam("model_id")
+    among = among_numbers(dialect, signatures.c.frame_number)
+    return select(signatures.c.frame_number, signatures.c.geometry).where(own, among)
+
+
 # Frames by where they were taken: for whoever compares poses in a map.
+#
+# A query reads hundreds of poses, mostly those that the query before it has read. They are kept by
+# the text they are stored as, which tells all of a pose: nothing has to say that one has changed.
+
+#: Poses that are kept, about 800 bytes each.
+_POSES = 8192
 
 
-@dataclass(frozen=True)
+@lru_cache(_POSES)
+def _pose_of_text(text: str) -> Floats:
+    """T_parent_sensor (4, 4) as it is stored; everybody gets the same one, which is read-only."""
+    pose = np.array(json.loads(text), np.float64)
+    pose.flags.writeable = False
+    return pose
+
+
+@dataclass(frozen=True, eq=False)
 class PlacedFrame:
-    """A posed frame: its number, T_parent_sensor (4 rows of 4), the blob of its geometry, and
-    what is known of its points where it is a cloud.
+    """A posed frame: its number, T_parent_sensor (4, 4), the blob of its geometry, and whether it
+    is a point cloud.
     """
 
     number: int
-    pose: list[list[float]]
+    pose: Floats
     geometry: str
-    cloud: dict[str, Any] | None
+    is_cloud: bool
 
 
 def placed_frames(
@@ -457,43 +498,67 @@ def placed_frames(
     within : half the width of the cube that they are in, metres
     most : of them
     """
+    values: dict[str, object] = {
+        "map_number": map_number, "parent": parent, "model_id": model_id, "most": most,
+    }  # fmt: skip
+    for axis, middle in zip("xyz", centre, strict=True):
+        values |= {axis: middle, f"least_{axis}": middle - within, f"most_{axis}": middle + within}
+    return [
+        PlacedFrame(number, _pose_of_text(pose), geometry, is_cloud)
+        for number, pose, geometry, is_cloud in connection.execute(_placed_frames(), values)
+    ]
+
+
+@cache
+def _placed_frames() -> Select[Any]:
     c = frames.c
-    axes = (c.pose_x, c.pose_y, c.pose_z)
-    apart = [(axis - middle) * (axis - middle) for axis, middle in zip(axes, centre, strict=True)]
-    asked = (
-        select(c.number, c.pose, signatures.c.geometry, c.cloud)
+    columns = {"x": c.pose_x, "y": c.pose_y, "z": c.pose_z}
+    x, y, z = (
+        (column - bindparam(axis, type_=column.type)) * (column - bindparam(axis))
+        for axis, column in columns.items()
+    )
+    return (
+        select(c.number, cast(c.pose, TEXT), signatures.c.geometry, c.cloud.is_not(null()))
         .join(signatures, signatures.c.frame_number == c.number)
         .where(
-            c.map_number == map_number,
-            c.pose_parent == parent,
+            c.map_number == bindparam("map_number"),
+            c.pose_parent == bindparam("parent"),
             *(
-                axis.between(middle - within, middle + within)
-                for axis, middle in zip(axes, centre, strict=True)
+                column.between(bindparam(f"least_{axis}"), bindparam(f"most_{axis}"))
+                for axis, column in columns.items()
             ),
             c.state == FrameState.INDEXED,
-            signatures.c.model_id == model_id,
+            signatures.c.model_id == bindparam("model_id"),
         )
-        .order_by(apart[0] + apart[1] + apart[2], c.number)
-        .limit(most)
+        .order_by(x + y + z, c.number)
+        .limit(bindparam("most", type_=Integer()))
     )
-    return [PlacedFrame(*row) for row in connection.execute(asked)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FrameViewpoint:
-    """Where a frame was taken; fields as in the table."""
+    """Where a frame was taken, with its pose T_parent_sensor (4, 4); fields as in the table."""
 
     number: int
     map_number: int
     pose_parent: str
-    pose: Any
-    cloud: Any
+    pose: Floats
+    is_cloud: bool
 
 
 def viewpoints_among(connection: Connection, numbers: Iterable[int]) -> list[FrameViewpoint]:
     """Where the frames of some numbers were taken; those without a pose are left out."""
+    return [
+        FrameViewpoint(number, of_map, parent, _pose_of_text(pose), is_cloud)
+        for number, of_map, parent, pose, is_cloud in rows_of_statement(
+            connection, _viewpoints_of_numbers, numbers
+        )
+    ]
+
+
+@cache
+def _viewpoints_of_numbers(dialect: str) -> Select[Any]:
     c = frames.c
-    asked = select(c.number, c.map_number, c.pose_parent, c.pose, c.cloud).where(
-        c.state != FrameState.DELETED, c.pose_x.is_not(None)
-    )
-    return [FrameViewpoint(*row) for row in rows_among(connection, asked, c.number, numbers)]
+    return select(
+        c.number, c.map_number, c.pose_parent, cast(c.pose, TEXT), c.cloud.is_not(null())
+    ).where(c.state != FrameState.DELETED, c.pose_x.is_not(None), among_numbers(dialect, c.number))

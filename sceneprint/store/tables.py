@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import islice
 from typing import Any
@@ -36,6 +36,7 @@ from sqlalchemy import (
     Text,
     UniqueConstraint,
     any_,
+    bindparam,
     cast,
     extract,
     func,
@@ -610,6 +611,31 @@ def rows_among(
         yield from connection.execute(asked.where(among(connection, column, some)))
 
 
+def rows_of_statement(
+    connection: Connection, statement: Callable[[str], Select[Any]], numbers: Iterable[int],
+    **values: object,
+) -> Iterator[Any]:  # fmt: skip
+    """As `rows_among`, by a statement that is built once.
+
+    Parameters
+    ----------
+    connection : of the database
+    statement : makes it for a dialect, with `among_numbers`, and returns the same one each time
+    numbers : however many
+    values : its other parameters
+    """
+    asked = statement(connection.dialect.name)
+    for some in blocks(numbers):
+        yield from connection.execute(asked, {"numbers": some, **values})
+
+
+def among_numbers(dialect: str, column: Column[int]) -> ColumnElement[bool]:
+    """As `among`, for the parameter `numbers` of a statement that is executed more than once."""
+    if dialect == "postgresql":
+        return column == any_(bindparam("numbers", type_=ARRAY(BigInteger)))
+    return column.in_(bindparam("numbers", expanding=True))
+
+
 # Rows as the rest of the package sees them.
 
 
@@ -742,7 +768,8 @@ def job_of_columns(row: Sequence[Any]) -> JobRow:
     return JobRow(*values)
 
 
-#: Columns of `frames` and of `jobs` in the order of the fields of their rows.
+#: Columns of `maps`, `frames` and `jobs` in the order of the fields of their rows.
+MAP_COLUMNS = tuple(maps.c[one.name] for one in fields(MapRow))
 FRAME_COLUMNS = tuple(frames.c[one.name] for one in fields(FrameRow))
 JOB_COLUMNS = tuple(jobs.c[one.name] for one in fields(JobRow))
 _FRAME_STATE = [column.name for column in FRAME_COLUMNS].index("state")

@@ -39,7 +39,6 @@ from sceneprint.store.frame_queries import has_parent_frame
 from sceneprint.store.maps import (
     FrameViewpoint,
     PlacedFrame,
-    frames_of,
     geometry_blobs,
     placed_frames,
     viewpoints_among,
@@ -131,7 +130,8 @@ def validated(
     with store.queried.read() as connection:
         blobs = geometry_blobs(connection, ranking.indices[list(chosen)].tolist(), model_id)
         ups = {} if up is None else known_ups(connection, ranking.indices.tolist())
-        rows = {} if known is not None else frames_of(connection, list(blobs))
+        viewpoints = [] if known is not None else viewpoints_among(connection, list(blobs))
+    posed = {one.number: (parent_key(one), one.pose) for one in viewpoints}
     unreadable: dict[int, str] = {}
     opened: dict[int, Geometry] = {}
 
@@ -147,13 +147,9 @@ def validated(
             opened[number] = geometry_of
         return geometry_of
 
-    def pose_of(number: int) -> tuple[str, Floats] | None:
-        row = rows.get(number)
-        return None if row is None or row.pose is None else (parent_key(row), np.array(row.pose))
-
     matches = associate(
         geometry, ranking, chosen, open_geometry, query.k, query.seed,
-        *thresholds(query.validation, p), deadline.allows, up=up, up_of=ups.get, pose_of=pose_of,
+        *thresholds(query.validation, p), deadline.allows, up=up, up_of=ups.get, pose_of=posed.get,
         known=known, retry=retry,
     )  # fmt: skip
     owner = dict(zip(ranking.indices.tolist(), searched.owners.tolist(), strict=True))
@@ -192,8 +188,7 @@ def validate_elsewhere(
         with store.queried.read() as connection:
             found = viewpoints_among(connection, numbers)
         return {
-            one.number: PosedFrame(parent_key(one), np.array(one.pose), one.cloud is None)
-            for one in found
+            one.number: PosedFrame(parent_key(one), one.pose, not one.is_cloud) for one in found
         }
 
     before = {match.index for match in tried.matches}
@@ -253,8 +248,8 @@ def placed(
         known = [number for number in geometries if parents.get(number) == parent]
         near = _near_frames(store, searched, parent, at, reaches)
         numbers = [*known, *(number for number in near if number not in known)]
-        at_poses = [poses[n] if n in known else np.array(near[n].pose) for n in numbers]
-        ahead = [(rows[n] if n in known else near[n]).cloud is None for n in numbers]
+        at_poses = [poses[n] if n in known else near[n].pose for n in numbers]
+        ahead = [rows[n].cloud is None if n in known else not near[n].is_cloud for n in numbers]
 
         def open_view(i: int) -> Geometry | None:
             number = numbers[i]
@@ -347,13 +342,12 @@ def nearest_first(
 ) -> list[int]:
     """Candidates, positions in R, those that were taken near a prior first, else as they were."""
     with store.queried.read() as connection:
-        rows = frames_of(connection, ranking.indices[list(chosen)].tolist())
+        found = viewpoints_among(connection, ranking.indices[list(chosen)].tolist())
+    posed = {one.number: one for one in found}
 
     def far(position: int) -> bool:
-        row = rows.get(int(ranking.indices[position]))
-        if row is None or row.pose is None or parent_key(row) != prior.parent:
-            return True
-        return not prior.reaches(np.array(row.pose))
+        one = posed.get(int(ranking.indices[position]))
+        return one is None or parent_key(one) != prior.parent or not prior.reaches(one.pose)
 
     return sorted(chosen, key=far)
 
