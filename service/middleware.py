@@ -45,7 +45,7 @@ _METHODS = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"
 #: As noted where the caller hung up before there was an answer.
 _HUNG_UP = 499
 #: Refusals that come late to who does not stop.
-_HELD_BACK = (401, 429)
+_HELD_BACK = (401, 403, 429)
 #: What machines ask every few seconds: not traced, and in the log at DEBUG alone.
 _PROBES = ("/healthz", "/readyz", "/metrics")
 #: Requests that are answered at once, those that wait or stream among them.

@@ -12,6 +12,7 @@ import httpx
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 from sqlalchemy import select
+from starlette.applications import Starlette
 
 import service
 from sceneprint.engine import Engine
@@ -21,6 +22,7 @@ from sceneprint.process import NOBODY, work_of
 from sceneprint.settings import Settings
 from sceneprint.store.queue import enqueue, waiting_by_tenant
 from sceneprint.store.tables import jobs
+from service.auth import ALL_AT_ONCE, RefusalFilter
 from service.browser_security import origins_of
 from service.limits import (
     IN_MEMORY,
@@ -180,16 +182,22 @@ def test_who_gives_up_takes_no_turn():
     asyncio.run(test())
 
 
-def test_refusals_come_late_to_who_does_not_stop():
+@pytest.mark.parametrize("status", [401, 403, 429])
+def test_refusals_come_late_to_who_does_not_stop(status):
     """Of one address; another is answered at once."""
 
     async def refuse(scope, receive, send) -> None:
         del scope, receive
-        await send({"type": "http.response.start", "status": 429, "headers": []})
+        await send({"type": "http.response.start", "status": status, "headers": []})
         await send({"type": "http.response.body", "body": b"no"})
 
     settings = Settings(host="0.0.0.0")
     assert settings.asks_for_keys
+    whole, full = Starlette(), RefusalFilter(Clock())
+    for _ in range(ALL_AT_ONCE):  # as many as the audit log notes at once, so none is noted here
+        full.count("", "192.0.2.9")
+        full.count("", "192.0.2.10")
+    whole.state.refusals = full
     app = RequestMiddleware(refuse, settings, origins_of(settings), Metrics())
     answered: list[str] = []
 
@@ -203,7 +211,7 @@ def test_refusals_come_late_to_who_does_not_stop():
 
         scope = {
             "type": "http", "method": "GET", "path": "/v1/maps", "headers": [],
-            "query_string": b"", "client": (address, 1),
+            "query_string": b"", "client": (address, 1), "app": whole,
         }  # fmt: skip
         await app(scope, receive, send)
 
