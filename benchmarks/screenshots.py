@@ -145,7 +145,7 @@ def views(client: httpx.Client, made: list[Shot]) -> list[View]:
     boxed = _ask(client, BOXES, box(0.3))
     sides = str(_ask(client, SIDES, circled([40])[0])["query_id"])
     absent = str(_ask(client, SIDES, made[0])["query_id"])
-    (dead,) = client.get("/v1/jobs", params={"state": "dead"}).json()["items"]
+    dead, *_ = client.get("/v1/jobs", params={"state": "dead"}).json()["items"]
     hall = str(_listed(client, HALL, "indexed")[0]["frame_id"])
     return [
         *_views(answer, boxed, ids[3], hall, dead["job_id"], key, made),
