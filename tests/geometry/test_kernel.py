@@ -70,6 +70,7 @@ def run(folder: Path) -> tuple[float, int]:
     return float(value), int(hits)
 
 
+@pytest.mark.thorough
 def test_a_caller_is_built_anew_with_what_it_is_made_of(tmp_path: Path) -> None:
     """A kernel two files away, or a number of another file, which numba does not look at."""
     (tmp_path / "inner.py").write_text(INNER.format(number="NUMBER = 10.0", twice="x * 2"))
