@@ -18,6 +18,9 @@ Waiter = TypeVar("Waiter")
 
 #: Seconds after it last asked in which a tenant counts as one to share turns with.
 PRESENT_S = 60.0
+#: Seconds after it last asked in which others rest after their turns for a tenant, and most that
+#: they rest.
+ACTIVE_S = 1.0
 
 
 class TurnOrder(Generic[Waiter]):
@@ -31,18 +34,24 @@ class TurnOrder(Generic[Waiter]):
     count : of turns that are held at once
     beside : most that one tenant holds while there is another; default: half of them
     clock : seconds, never going back
+    rests : whether a tenant waits after its turn as long as that took, a second at most, while
+        another is active: its work has the processors that others need for half of the time
     """
 
     def __init__(
-        self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._count, self._clock = count, clock
+        self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic,
+        *, rests: bool = False,
+    ) -> None:  # fmt: skip
+        self._count, self._clock, self._rests = count, clock, rests
         self._beside = max(count // 2, 1) if beside is None else beside
         self._held: Counter[str] = Counter()
         self._waiting: dict[str, deque[tuple[int, Waiter]]] = {}
         # when each tenant came last, and the number of its latest turn; the oldest first
         self._seen: OrderedDict[str, tuple[float, int]] = OrderedDict()
         self._given = 0
+        # when each tenant got its latest turn, and until when it rests
+        self._began: dict[str, float] = {}
+        self._resting: dict[str, float] = {}
 
     def enter(self, tenant: str, waiter: Waiter, weight: int = 1) -> int:
         """Wait for a turn, or for several at once; returns how many those are."""
@@ -69,7 +78,8 @@ class TurnOrder(Generic[Waiter]):
             may = [
                 (self._held[tenant], self._seen[tenant][1], tenant, queue[0][0])
                 for tenant, queue in self._waiting.items()
-                if not self._held[tenant] or self._held[tenant] + queue[0][0] <= most
+                if (not self._held[tenant] or self._held[tenant] + queue[0][0] <= most)
+                and self._rest_of(tenant) == 0.0
             ]
             if not may:
                 return admitted
@@ -78,6 +88,7 @@ class TurnOrder(Generic[Waiter]):
                 return admitted  # nobody overtakes who waits for several
             self._given += 1
             self._held[tenant] += weight
+            self._began[tenant] = self._clock()
             self._seen[tenant] = self._seen[tenant][0], self._given
             waiter = self._waiting[tenant][0][1]
             self.leave(tenant, waiter)
@@ -88,10 +99,34 @@ class TurnOrder(Generic[Waiter]):
         self._held[tenant] -= weight
         if not self._held[tenant]:
             del self._held[tenant]
+            now, began = self._clock(), self._began.pop(tenant)
+            if self._rests and self._is_beside(tenant, now):
+                self._resting[tenant] = now + min(now - began, ACTIVE_S)
+
+    def rest_s(self) -> float | None:
+        """Seconds until the first of those who wait has rested: `admit` then; None: none rests."""
+        rests = [self._rest_of(tenant) for tenant in self._waiting]
+        return min((one for one in rests if one > 0.0), default=None)
 
     def waiters(self) -> list[Waiter]:
         """All who wait."""
         return [one for queue in self._waiting.values() for _, one in queue]
+
+    def _rest_of(self, tenant: str) -> float:
+        """Seconds for which a tenant rests yet."""
+        until, now = self._resting.get(tenant), self._clock()
+        if until is None:
+            return 0.0
+        if until <= now or not self._is_beside(tenant, now):
+            del self._resting[tenant]
+            return 0.0
+        return until - now
+
+    def _is_beside(self, tenant: str, now: float) -> bool:
+        """Whether another tenant asked a moment ago."""
+        others = (seen for one, (seen, _) in reversed(self._seen.items()) if one != tenant)
+        latest = next(others, None)
+        return latest is not None and latest > now - ACTIVE_S
 
     def _see(self, tenant: str) -> None:
         now = self._clock()
@@ -101,6 +136,7 @@ class TurnOrder(Generic[Waiter]):
             if seen > now - PRESENT_S:
                 return
             del self._seen[first]
+            self._resting.pop(first, None)
             if first in self._held or first in self._waiting:
                 self._seen[first] = now, turn
 

@@ -184,7 +184,7 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
             # they mostly wait for the disk: the engine sees to how many are decoded at once
             uploads = Gate(
                 max(UPLOADS, settings.concurrency), settings.waiting, settings.wait_s,
-                max(settings.concurrency // 2, 1),
+                max(settings.concurrency // 2, 1), rests=True,
             )  # fmt: skip
             places = settings.concurrency + settings.waiting
             # more than the requests of one tenant hold, so that others find a thread

@@ -92,8 +92,8 @@ class Context:
     Parameters
     ----------
     engine, gate, metrics : see there
-    uploads : the gate of uploads, which wait for the disk and for other writers: of their own, so
-        that no query waits behind them
+    uploads : the gate of uploads and of edits of many frames, which wait for the disk and for other
+        writers: of their own, so that no query waits behind them
     keys : whether callers must show one
     feed : of events
     limits : how often callers may ask
@@ -115,7 +115,7 @@ class Context:
     places: int
     wait_s: float
     requests: Holdings = field(default_factory=Holdings)
-    reads: Turns = field(default_factory=lambda: Turns(READS, READS_BESIDE))
+    reads: Turns = field(default_factory=lambda: Turns(READS, READS_BESIDE, rests=True))
     spool: BodySpool = field(default_factory=BodySpool)
     lookups: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(LOOKUPS))
 
@@ -351,18 +351,16 @@ def _write_pages_of(endpoint: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(endpoint)
     def answer(*given: Any, **named: Any) -> Any:
         found = endpoint(*given, **named)
-        if not isinstance(found, Page):
-            return found
-        return Response(page_json(found), media_type="application/json")
+        return page_response(found) if isinstance(found, Page) else found
 
     return answer
 
 
-def page_json(page: Page[Any]) -> str:
+def page_response(page: Page[Any]) -> Response:
     """A page as JSON, the same text as pydantic writes in one go."""
     items = ",".join([one.model_dump_json(by_alias=True) for one in page.items])
     rest = page.model_dump_json(by_alias=True, exclude={"items"})
-    return f'{{"items":[{items}],{rest[1:]}'
+    return Response(f'{{"items":[{items}],{rest[1:]}', media_type="application/json")
 
 
 Asking = Annotated[Caller, Depends(caller)]

@@ -78,13 +78,15 @@ class Turns:
 
     Parameters
     ----------
-    count, beside, clock : see TurnOrder
+    count, beside, clock, rests : see TurnOrder
     """
 
     def __init__(
-        self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._order: TurnOrder[asyncio.Future[None]] = TurnOrder(count, beside, clock)
+        self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic,
+        *, rests: bool = False,
+    ) -> None:  # fmt: skip
+        self._order: TurnOrder[asyncio.Future[None]] = TurnOrder(count, beside, clock, rests=rests)
+        self._timer: asyncio.TimerHandle | None = None
 
     async def acquire(self, tenant: str, weight: int = 1) -> int:
         """Wait for a turn, or for several at once; returns how many: give them back."""
@@ -110,6 +112,13 @@ class Turns:
         for turn in self._order.admit():
             if not turn.cancelled():
                 turn.set_result(None)
+        if self._timer is not None:
+            self._timer.cancel()
+        rest_s = self._order.rest_s()
+        if rest_s is None:
+            self._timer = None
+        else:
+            self._timer = asyncio.get_running_loop().call_later(rest_s, self._admit)
 
 
 class Gate:
@@ -121,12 +130,15 @@ class Gate:
     waiting : at most, be it for their bodies or for their turn
     longest_s : seconds to wait for a turn: an answer that comes later helps no robot
     beside : of a tenant that run at once beside another; default: half
+    rests : whether tenants rest between turns: see TurnOrder
     """
 
     def __init__(
-        self, running: int, waiting: int, longest_s: float, beside: int | None = None
-    ) -> None:
-        self._turns, self._threads = Turns(running, beside), anyio.CapacityLimiter(running)
+        self, running: int, waiting: int, longest_s: float, beside: int | None = None,
+        *, rests: bool = False,
+    ) -> None:  # fmt: skip
+        self._turns = Turns(running, beside, rests=rests)
+        self._threads = anyio.CapacityLimiter(running)
         self._longest_s = longest_s
         self._places = running + waiting
         self._taken = Holdings()

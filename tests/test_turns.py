@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from sceneprint.turns import PRESENT_S, ThreadTurns, TurnOrder
+from sceneprint.turns import ACTIVE_S, PRESENT_S, ThreadTurns, TurnOrder
 
 
 class Clock:
@@ -106,6 +106,75 @@ def test_who_asks_for_several_gets_them_beside_another_too_where_it_holds_none()
     assert order.admit() == []
     order.release("a", 4)
     assert order.admit() == ["light"]
+
+
+def test_beside_an_active_tenant_one_rests_as_long_as_it_held_turns() -> None:
+    clock = Clock()
+    order: TurnOrder[str] = TurnOrder(4, 1, clock, rests=True)
+    order.enter("b", "b1")
+    order.enter("a", "a1")
+    assert order.admit() == ["a1", "b1"]
+    order.enter("a", "a2")
+    clock.now = 0.25
+    order.release("a")
+    assert order.admit() == []
+    assert order.rest_s() == 0.25
+    clock.now = 0.375
+    order.release("b")
+    order.enter("b", "b2")  # b rests for what it held itself
+    assert order.admit() == []
+    assert order.rest_s() == 0.125
+    clock.now = 0.5
+    assert order.admit() == ["a2"]
+    assert order.rest_s() == 0.25
+    clock.now = 0.75
+    assert order.admit() == ["b2"]
+    assert order.rest_s() is None
+
+
+def test_one_rests_for_its_latest_turn_and_a_second_at_most() -> None:
+    clock = Clock()
+    order: TurnOrder[str] = TurnOrder(4, 2, clock, rests=True)
+    order.enter("a", "a1")
+    order.admit()
+    clock.now = 100.0
+    order.enter("a", "a2")
+    order.enter("b", "b1")
+    assert order.admit() == ["b1", "a2"]
+    order.enter("a", "a3")
+    order.release("a")
+    clock.now = 100.5
+    order.release("a")
+    assert (order.admit(), order.rest_s()) == ([], 0.5)
+    clock.now = 101.0
+    order.enter("b", "b2")  # which is active still
+    assert order.admit() == ["a3", "b2"]
+    clock.now = 111.0
+    order.release("b", 2)
+    order.enter("b", "b3")
+    order.enter("a", "a4")
+    order.release("a")
+    assert (order.admit(), order.rest_s()) == (["b3"], ACTIVE_S)
+
+
+def test_nobody_rests_for_a_tenant_that_asked_long_ago() -> None:
+    clock = Clock()
+    order: TurnOrder[str] = TurnOrder(4, 1, clock, rests=True)
+    order.enter("b", "b1")
+    order.enter("a", "a1")
+    order.admit()
+    order.release("b")
+    clock.now = 0.75
+    order.release("a")
+    order.enter("a", "a2")
+    assert order.admit() == []
+    assert order.rest_s() == 0.75
+    clock.now = ACTIVE_S  # before the end of the rest
+    assert order.admit() == ["a2"]
+    clock.now = 2.0
+    order.release("a")
+    order.enter("a", "a3")
+    assert order.admit() == ["a3"]
 
 
 def test_many_threads_never_hold_more_than_there_are() -> None:

@@ -18,7 +18,16 @@ from sceneprint.store.events import Wanted
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint_client.api import Job, JobState, Page
 from sceneprint_client.api.admin import EventPage, RetriedJobs
-from service.auth import Asking, Caller, Context, Here, hold_read, release_place, v1_router
+from service.auth import (
+    Asking,
+    Caller,
+    Context,
+    Here,
+    hold_read,
+    page_response,
+    release_place,
+    v1_router,
+)
 from service.event_stream import BEGIN, MEDIA_TYPE, EventStream, Feed, alive, message
 from service.problems import declared
 
@@ -153,7 +162,7 @@ async def events(
         Header(description="Of the last event that came: a stream goes on there. Goes before "
                "`after`."),
     ] = None,
-) -> EventPage | Response:  # fmt: skip
+) -> Response:  # fmt: skip
     """What happened: frames that came, were indexed or deleted, maps made and removed.
 
     With `Accept: text/event-stream` the events come as they happen, half a second late at most,
@@ -179,11 +188,15 @@ async def events(
         return EventStream(told, partial(here.feed.leave, asking.tenant))
     await hold_read(request, here, asking.tenant)
     newest_first = order == "newest" or (order is None and last is None)
-    return await to_thread.run_sync(
-        lambda: here.engine.operations.events(
-            wanted, after=last, cursor=cursor, limit=limit, newest_first=newest_first
+
+    def page() -> Response:
+        return page_response(
+            here.engine.operations.events(
+                wanted, after=last, cursor=cursor, limit=limit, newest_first=newest_first
+            )
         )
-    )
+
+    return await to_thread.run_sync(page)
 
 
 def _wanted(here: Context, asking: Caller, map_name: str | None, kinds: list[str]) -> Wanted:

@@ -45,8 +45,8 @@ async def delete_frames(map_name: str, request: Request, here: Here) -> FramesDe
     wanted = await read_record(request, FrameSelection, "The selection")
     request.state.audited = _audited(wanted)
     engine = here.engine
-    async with here.gate.place():
-        return await here.gate.run(
+    async with here.uploads.place():
+        return await here.uploads.run(
             partial(delete_selection, engine.store, map_name, wanted, engine.undo_limits)
         )
 
@@ -63,8 +63,8 @@ async def edit_frames(map_name: str, request: Request, here: Here) -> FramesEdit
     """
     edit = await read_record(request, FramesEdit, "The edit of the frames")
     request.state.audited = _audited(edit)
-    async with here.gate.place():
-        return await here.gate.run(partial(edit_selection, here.engine.store, map_name, edit))
+    async with here.uploads.place():
+        return await here.uploads.run(partial(edit_selection, here.engine.store, map_name, edit))
 
 
 @router.post(
@@ -79,8 +79,8 @@ async def restore_frames(map_name: str, request: Request, here: Here) -> FramesR
     """
     wanted = await read_record(request, RestoreOptions, "The request to restore frames")
     request.state.audited = _audited(wanted)
-    async with here.gate.place():
-        return await here.gate.run(partial(here.engine.undo.restore, map_name, wanted))
+    async with here.uploads.place():
+        return await here.uploads.run(partial(here.engine.undo.restore, map_name, wanted))
 
 
 @router.post(

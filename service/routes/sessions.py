@@ -63,8 +63,8 @@ async def delete_session_frames(
     POST /v1/maps/{map_name}/restore undoes it.
     """
     request.state.audited = {"session": session, "robot": robot}
-    async with here.gate.place():
-        return await here.gate.run(
+    async with here.uploads.place():
+        return await here.uploads.run(
             partial(
                 delete_session,
                 here.engine.store,
@@ -105,8 +105,8 @@ async def patch_session(
     request.state.audited = {"session": session, "robot": robot} | edit.model_dump(
         exclude_defaults=True
     )
-    async with here.gate.place():
-        return await here.gate.run(
+    async with here.uploads.place():
+        return await here.uploads.run(
             partial(edit_session, here.engine.store, map_name, session, edit, robot, after)
         )
 

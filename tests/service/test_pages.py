@@ -14,7 +14,7 @@ from pydantic import TypeAdapter, field_serializer
 from sceneprint_client.api import Page
 from sceneprint_client.api.admin import EventPage
 from sceneprint_client.api.base import ApiRecord, Direction
-from service.auth import ListRoute, page_json
+from service.auth import ListRoute, page_response
 
 
 class _Row(ApiRecord):
@@ -46,13 +46,14 @@ _ROWS = [
 @pytest.mark.parametrize("cursor", [None, 'a"b'])
 def test_a_page_is_the_text_that_pydantic_writes(rows: list[_Row], cursor: str | None):
     page = Page[_Row](items=rows, next_cursor=cursor)
-    assert page_json(page).encode() == TypeAdapter(Page[_Row]).dump_json(page, by_alias=True)
+    assert page_response(page).body == TypeAdapter(Page[_Row]).dump_json(page, by_alias=True)
 
 
 def test_a_page_of_a_kind_of_its_own_keeps_what_it_has_beside_items():
     page = EventPage(items=[], next_cursor="next", newest="newest")
-    assert page_json(page) == '{"items":[],"next_cursor":"next","newest":"newest"}'
-    assert page_json(page) == page.model_dump_json(by_alias=True)
+    written = page_response(page).body
+    assert written == b'{"items":[],"next_cursor":"next","newest":"newest"}'
+    assert written == page.model_dump_json(by_alias=True).encode()
 
 
 def test_rows_are_not_written_in_the_event_loop():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 import socket
+import time
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -162,6 +163,22 @@ def test_turns_alternate_between_tenants_and_leave_half_to_others():
         return order
 
     assert asyncio.run(test()) == ["a"] * 4 + ["b", "b", "a"]
+
+
+def test_who_rested_gets_its_turn_though_nobody_asks_meanwhile():
+    async def test() -> float:
+        turns, clock = Turns(4, 1, rests=True), time.monotonic
+        await turns.acquire("b")
+        await turns.acquire("a")
+        began = clock()
+        while clock() < began + 0.05:
+            await asyncio.sleep(0)
+        turns.release("a")
+        released = clock()
+        assert await asyncio.wait_for(turns.acquire("a"), 30) == 1
+        return clock() - released
+
+    assert asyncio.run(test()) >= 0.05
 
 
 def test_who_gives_up_takes_no_turn():
