@@ -15,7 +15,7 @@ from sceneprint.store.queue import read_clock
 from sceneprint.store.tables import frames, scrubs
 
 #: Seconds between two slices, and between the beginnings of two passes at least.
-SLICE_S, PASS_S = 60.0, 86_400.0
+SLICE_S, PASS_S = 4.0, 86_400.0
 
 
 @dataclass(frozen=True)
