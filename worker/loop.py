@@ -119,7 +119,7 @@ class Worker:
         try:
             found = self._work()
             if time.monotonic() > self._upkeep_at and not self.unsound:
-                self._publish()
+                found = self._publish() or found
             if not found:
                 self._listener.wait(self._pause(), *self._wakers)
         except NewerSchema as error:  # nothing but another version can go on
@@ -157,14 +157,23 @@ class Worker:
     def _break(self) -> None:
         self.unsound = True
 
-    def _publish(self) -> None:
+    def _publish(self) -> bool:
+        """Look after the indexes, and scrub until somebody rings; whether somebody did."""
         self._upkeep_at = time.monotonic() + UPKEEP_S  # also where it fails: frames go first
+        rung = False
+
+        def is_quiet() -> bool:
+            nonlocal rung
+            rung = self._listener.wait(0.0)
+            return not rung
+
         try:
             self._engine.publish_due()
-            self._scrub.run()
+            self._scrub.run(is_quiet)
         except MemoryError:  # the next process would have no more
             log.error("not enough memory to publish an index; raise SCENEPRINT_WORKER_BYTES")
             self._upkeep_at = time.monotonic() + POOR_S
+        return rung
 
     def _pause(self) -> float:
         """Seconds until there may be something to do, if nobody rings."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from sqlalchemy import select
@@ -37,8 +37,8 @@ from sceneprint.store.tables import frames, signatures
 
 log = logging.getLogger(__name__)
 
-#: Frames that are looked at together, and the longest time for one slice: others wait to be signed.
-AT_ONCE, TURN_S = 4, 0.2
+#: Frames that are looked at together, and the longest time for one slice.
+AT_ONCE, TURN_S = 16, 0.2
 #: Of what is damaged, what can be made again from the upload.
 _DERIVED = ("damaged-artifact", "missing-artifact", "damaged-signature")
 
@@ -69,11 +69,14 @@ class Scrub:
         self._budget = int(settings.scrub_mb_per_s * 1e6 * SLICE_S)
         self._next = time.monotonic() + SLICE_S
 
-    def run(self, *, now: bool = False) -> ScrubRow | None:
+    def run(
+        self, may_go_on: Callable[[], bool] = lambda: True, *, now: bool = False
+    ) -> ScrubRow | None:
         """Read a slice, if it is due; what goes wrong is logged and tried again.
 
         Parameters
         ----------
+        may_go_on : asked after each few frames; where it says no the slice ends: a frame waits
         now : look whether one is due, although this process did a moment ago
 
         Returns
@@ -92,12 +95,12 @@ class Scrub:
                     return None
             with self._store.database.write() as connection:
                 row = claim_slice(connection)
-            return None if row is None else self._read(row)
+            return None if row is None else self._read(row, may_go_on)
         except SceneprintError as error:
             log.warning("scrub incomplete", extra={"error": str(error)})
             return None
 
-    def _read(self, row: ScrubRow) -> ScrubRow:
+    def _read(self, row: ScrubRow, may_go_on: Callable[[], bool]) -> ScrubRow:
         until, left = time.monotonic() + TURN_S, self._budget
         finished, over = False, False
         while not over:  # a few frames at least, so that every pass ends
@@ -122,7 +125,7 @@ class Scrub:
                 row, position=numbers[-1], blobs=row.blobs + folder.counts["blobs"],
                 bytes=row.bytes + size, damaged=row.damaged + damaged,
             )  # fmt: skip
-            over = left <= 0 or time.monotonic() >= until
+            over = left <= 0 or time.monotonic() >= until or not may_go_on()
         with self._store.database.write() as connection:
             record_slice(connection, row, finished=finished)
         if finished:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,13 @@ import pytest
 from sqlalchemy import select, update
 
 from sceneprint.engine import Engine
-from sceneprint.maintenance.scrub import AT_ONCE, Scrub
+from sceneprint.maintenance.scrub import Scrub
+from sceneprint.process import StopSignal
 from sceneprint.settings import Settings
 from sceneprint.store.scrub_rows import PASS_S, SLICE_S, ScrubRow, read_scrub
 from sceneprint.store.tables import frames, scrubs, signatures
 from sceneprint_client.api import JobState
+from worker.loop import Trace, Worker
 
 
 @pytest.fixture(autouse=True)
@@ -76,18 +80,22 @@ def test_all_bytes_are_read_once_a_day(full: Engine) -> None:
     assert (told.blobs, told.bytes, told.damaged) == (row.blobs, row.bytes, 0)
 
 
-def test_a_slice_ends_when_its_time_is_over_so_that_frames_are_signed(
-    full: Engine, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("reason", ["time", "ring"])
+def test_a_slice_ends_after_a_few_frames_where_its_time_is_over_or_a_frame_waits(
+    full: Engine, monkeypatch: pytest.MonkeyPatch, reason: str
 ) -> None:
     uploads, _, _ = _blobs(full)
-    monkeypatch.setattr("sceneprint.maintenance.scrub.TURN_S", 0.0)
-    rows = []
-    for _ in range(len(uploads) // AT_ONCE + 1):
-        rows.append(_scrub(full).run(now=True))
+    monkeypatch.setattr("sceneprint.maintenance.scrub.AT_ONCE", 5)
+    if reason == "time":
+        monkeypatch.setattr("sceneprint.maintenance.scrub.TURN_S", 0.0)
+    seen = []
+    for _ in range(4):
+        row = _scrub(full).run(lambda: reason == "time", now=True)
+        assert row is not None
+        seen.append(row.blobs)
         _due(full)
-    assert [row and row.blobs for row in rows[:2]] == [2 * AT_ONCE, 4 * AT_ONCE]
-    assert rows[-1] is not None
-    assert rows[-1].blobs == 2 * len(uploads)
+    assert seen == [10, 20, 2 * len(uploads), 2 * len(uploads)]
+    assert len(uploads) == 12
 
 
 def test_damage_is_told_and_what_can_be_made_again_is(
@@ -166,3 +174,32 @@ def test_none_is_read_where_it_is_switched_off(full: Engine) -> None:
 )  # fmt: skip
 def test_a_clock_that_was_set_back_does_not_stop_it(next_at: float, due: bool) -> None:
     assert ScrubRow(1, 0, next_at, 0.0, None, 0, 0, 0).is_due(100.0) is due
+
+
+@pytest.fixture
+def stop() -> Iterator[StopSignal]:
+    """One whose handlers are gone afterwards."""
+    numbers = (signal.SIGTERM, signal.SIGINT)
+    before = [signal.getsignal(one) for one in numbers]
+    yield StopSignal()
+    signal.set_wakeup_fd(-1)
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+
+
+def test_a_worker_scrubs_only_until_it_is_rung_for(
+    full: Engine, stop: StopSignal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sceneprint.maintenance.scrub.AT_ONCE", 5)
+    with full.bell.listen() as listener, closing(Trace()) as trace:
+        worker = Worker(full, listener, trace, stop)
+        listener.wait(0.0)  # what rang before
+        for blobs, rings in ((10, True), (24, False)):
+            worker._upkeep_at = worker._scrub._next = 0.0
+            if rings:
+                full.bell.ring()
+            worker.turn()
+            row = _row(full)
+            assert row is not None
+            assert row.blobs == blobs
+            _due(full)
