@@ -39,6 +39,8 @@ log = logging.getLogger(__name__)
 
 #: Frames that are looked at together, and the longest time for one slice.
 AT_ONCE, TURN_S = 16, 0.2
+#: Seconds after which a process that has begun scrubs: it has other things to do first.
+BEGIN_S = 60.0
 #: Of what is damaged, what can be made again from the upload.
 _DERIVED = ("damaged-artifact", "missing-artifact", "damaged-signature")
 
@@ -67,7 +69,7 @@ class Scrub:
     def __init__(self, settings: Settings, store: Store) -> None:
         self._settings, self._store = settings, store
         self._budget = int(settings.scrub_mb_per_s * 1e6 * SLICE_S)
-        self._next = time.monotonic() + SLICE_S
+        self._next = time.monotonic() + BEGIN_S
 
     def run(
         self, may_go_on: Callable[[], bool] = lambda: True, *, now: bool = False

@@ -82,6 +82,11 @@ class Crew:
         )
         return [count for (count,) in self.rows(asked)]
 
+    def pause(self) -> None:
+        """Stop both workers, while neither can be in the middle of a write: others would wait."""
+        with self.engine.store.database.write():
+            self.send(signal.SIGSTOP)
+
     def send(self, number: int) -> None:
         """A signal to both workers."""
         for line in self.log("worker ready"):
@@ -174,7 +179,7 @@ def slow(crew, frames) -> Callable[[str, int], Slow]:
 
     def make(name: str, number: int) -> Slow:
         crew.engine.create_map(NewMap(name=name, model="depth"))
-        crew.send(signal.SIGSTOP)
+        crew.pause()
         added, _ = crew.engine.add_frame(name, *frames[number])
         ((blob,),) = crew.rows(f"SELECT blob FROM frames WHERE id = '{added.frame_id}'")
         path = crew.engine.settings.blob_dir / blob[:2] / blob

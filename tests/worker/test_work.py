@@ -27,7 +27,7 @@ def test_two_workers_sign_each_frame_once(crew, frames):
 
 def test_frames_of_a_greater_priority_are_signed_first(crew, frames):
     crew.engine.create_map(NewMap(name="ranked", model="depth"))
-    crew.send(signal.SIGSTOP)
+    crew.pause()
     order = [-10, 0, 3, 0, 10, 3]
     jobs = [crew.engine.add_frame("ranked", *frames[46 + i], order[i])[0].job_id for i in range(6)]
     crew.send(signal.SIGCONT)
@@ -105,7 +105,7 @@ def test_a_frame_deleted_while_it_is_signed_stays_deleted(crew, slow):
 
 def test_told_to_stop_workers_give_back_what_they_have_not_begun(crew, frames):
     crew.engine.create_map(NewMap(name="stopped", model="depth"))
-    crew.send(signal.SIGSTOP)
+    crew.pause()
     added, _ = crew.engine.add_frame("stopped", *frames[44])
     # who would claim it waits for this to end
     with crew.engine.store.database.write() as connection:
