@@ -52,6 +52,7 @@ class TurnOrder(Generic[Waiter]):
         # when each tenant got its latest turn, and until when it rests
         self._began: dict[str, float] = {}
         self._resting: dict[str, float] = {}
+        self._rested_at: float | None = None
 
     def enter(self, tenant: str, waiter: Waiter, weight: int = 1) -> int:
         """Wait for a turn, or for several at once; returns how many those are."""
@@ -75,11 +76,14 @@ class TurnOrder(Generic[Waiter]):
         admitted: list[Waiter] = []
         most = self._count if len(self._seen) < 2 else self._beside
         while True:
+            now = self._clock()
+            resting = {one for one in self._waiting if self._is_resting(one, now)}
+            self._rested_at = min((self._resting[one] for one in resting), default=None)
             may = [
                 (self._held[tenant], self._seen[tenant][1], tenant, queue[0][0])
                 for tenant, queue in self._waiting.items()
-                if (not self._held[tenant] or self._held[tenant] + queue[0][0] <= most)
-                and self._rest_of(tenant) == 0.0
+                if tenant not in resting
+                and (not self._held[tenant] or self._held[tenant] + queue[0][0] <= most)
             ]
             if not may:
                 return admitted
@@ -88,7 +92,7 @@ class TurnOrder(Generic[Waiter]):
                 return admitted  # nobody overtakes who waits for several
             self._given += 1
             self._held[tenant] += weight
-            self._began[tenant] = self._clock()
+            self._began[tenant] = now
             self._seen[tenant] = self._seen[tenant][0], self._given
             waiter = self._waiting[tenant][0][1]
             self.leave(tenant, waiter)
@@ -104,23 +108,24 @@ class TurnOrder(Generic[Waiter]):
                 self._resting[tenant] = now + min(now - began, ACTIVE_S)
 
     def rest_s(self) -> float | None:
-        """Seconds until the first of those who wait has rested: `admit` then; None: none rests."""
-        rests = [self._rest_of(tenant) for tenant in self._waiting]
-        return min((one for one in rests if one > 0.0), default=None)
+        """Seconds until the first of those whom `admit` found resting has rested: call it again
+        then; None: it found none.
+        """
+        return None if self._rested_at is None else max(self._rested_at - self._clock(), 0.0)
 
     def waiters(self) -> list[Waiter]:
         """All who wait."""
         return [one for queue in self._waiting.values() for _, one in queue]
 
-    def _rest_of(self, tenant: str) -> float:
-        """Seconds for which a tenant rests yet."""
-        until, now = self._resting.get(tenant), self._clock()
+    def _is_resting(self, tenant: str, now: float) -> bool:
+        """Whether a tenant rests yet."""
+        until = self._resting.get(tenant)
         if until is None:
-            return 0.0
+            return False
         if until <= now or not self._is_beside(tenant, now):
             del self._resting[tenant]
-            return 0.0
-        return until - now
+            return False
+        return True
 
     def _is_beside(self, tenant: str, now: float) -> bool:
         """Whether another tenant asked a moment ago."""

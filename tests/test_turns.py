@@ -157,6 +157,22 @@ def test_one_rests_for_its_latest_turn_and_a_second_at_most() -> None:
     assert (order.admit(), order.rest_s()) == (["b3"], ACTIVE_S)
 
 
+def test_a_rest_that_ends_after_the_look_is_looked_at_again_at_once() -> None:
+    clock = Clock()
+    order: TurnOrder[str] = TurnOrder(4, 1, clock, rests=True)
+    order.enter("b", "b1")
+    order.enter("a", "a1")
+    order.admit()
+    clock.now = 0.25
+    order.release("a")
+    order.enter("a", "a2")
+    assert order.admit() == []
+    clock.now = 0.75  # the rest ended meanwhile: who waits would wait for ever
+    assert order.rest_s() == 0.0
+    assert order.admit() == ["a2"]
+    assert order.rest_s() is None
+
+
 def test_nobody_rests_for_a_tenant_that_asked_long_ago() -> None:
     clock = Clock()
     order: TurnOrder[str] = TurnOrder(4, 1, clock, rests=True)

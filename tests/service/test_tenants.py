@@ -181,6 +181,25 @@ def test_who_rested_gets_its_turn_though_nobody_asks_meanwhile():
     assert asyncio.run(test()) >= 0.05
 
 
+def test_everybody_gets_a_turn_however_the_rests_fall():
+    async def test() -> int:
+        turns, done = Turns(4, 1, rests=True), 0
+
+        async def ask(tenant: str, number: int) -> None:
+            nonlocal done
+            for _ in range(100):
+                held = await turns.acquire(tenant, 1 + number)
+                await asyncio.sleep(1e-5 * number)
+                turns.release(tenant, held)
+                done += 1
+
+        asking = (ask(tenant, number) for tenant in "ab" for number in range(4))
+        await asyncio.wait_for(asyncio.gather(*asking), 60)
+        return done
+
+    assert asyncio.run(test()) == 800
+
+
 def test_who_gives_up_takes_no_turn():
     async def test() -> None:
         turns = Turns(1)
