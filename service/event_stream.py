@@ -25,14 +25,20 @@ from sceneprint.engine.admin.operations import begin, missed, next_events
 from sceneprint.errors import Busy, RateLimited, SceneprintError
 from sceneprint.process import NOBODY
 from sceneprint.store import Database
-from sceneprint.store.events import EventRow, Wanted, list_events, newest_number
+from sceneprint.store.events import (
+    EventRow,
+    Wanted,
+    list_events,
+    newest_number,
+    number_events,
+)
 from sceneprint_client.api.admin import Event
 from service.limits import Broken, Holdings, share
 
 log = logging.getLogger(__name__)
 
 #: Seconds between two looks at the database, and after one that failed.
-POLL_S, TROUBLE_S = 0.25, 1.0
+POLL_S, TROUBLE_S = 0.1, 1.0
 #: Seconds of silence after which a stream says that it lives.
 ALIVE_S = 3.0
 #: Events held in memory, and read or told at once.
@@ -176,6 +182,7 @@ class Feed:
         return found, found[-1].number if found else self._newest
 
     def _look(self) -> EventRow | None:
+        number_events(self._database)
         with self._database.read() as connection:
             newest = newest_number(connection)
             found = list_events(connection, Wanted(), after=newest - 1, limit=1)
@@ -197,6 +204,7 @@ class Feed:
         self._newest = self._since = 0 if self._last is None else self._last.number
 
     def _more(self, place: int) -> list[EventRow]:
+        number_events(self._database)
         with self._database.read() as connection:
             return list_events(connection, Wanted(), after=place, limit=MOST)
 

@@ -25,11 +25,9 @@ from typing import TypeVar
 
 from benchmarks.fleet.postgres import Server
 from sceneprint.store import Database, open_database, queue
-from sceneprint.store.events import record_event
 from sceneprint.store.maps import add_map, frame_of, keep_model, receive_frame
-from sceneprint.store.signatures import StoredSignature, index_frame
+from sceneprint.store.signatures import StoredSignature, index_claimed_frame
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
-from sceneprint_client.api import JobState
 
 T = TypeVar("T")
 
@@ -85,7 +83,7 @@ def _maps(database: Database, n: int) -> list[MapRow]:
 
 def _upload(database: Database, work: tuple[MapRow, int]) -> None:
     row, number = work
-    with database.write() as connection:
+    with database.write(map_number=row.number) as connection:
         if receive_frame(connection, row, {**KNOWN, "content_id": f"{number:064x}"}, 0) is None:
             raise RuntimeError("an upload was not taken")
 
@@ -100,10 +98,9 @@ def _claim(database: Database) -> tuple[JobRow, FrameRow]:
 
 def _index(database: Database, work: tuple[JobRow, FrameRow]) -> None:
     held, frame = work
-    with database.write() as connection:
-        queue.finish(connection, held, JobState.SUCCEEDED)
-        index_frame(connection, frame, MADE)
-        record_event(connection, "frame.indexed", "map", frame.id, held.id)
+    with database.write(map_number=frame.map_number) as connection:
+        if not index_claimed_frame(connection, held, frame, "map", MADE):
+            raise RuntimeError("a frame was not indexed")
 
 
 def _timed(clients: list[Database], works: list[T], do: Callable[[Database, T], None]) -> float:

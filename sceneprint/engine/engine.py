@@ -57,6 +57,7 @@ from sceneprint.store import maps as stored_maps
 from sceneprint.store import open_store, queue
 from sceneprint.store.database_errors import PATIENCE_S, open_patiently
 from sceneprint.store.deletion import remove_map
+from sceneprint.store.events import number_events
 from sceneprint.store.reencoding_rows import models_of
 from sceneprint.store.tables import MapRow
 from sceneprint.store.undo_rows import UndoLimits
@@ -386,6 +387,7 @@ class Engine:
         fallen behind, verify a little, and remove what is no longer kept; returns how many indexes
         were published.
         """
+        number_events(self.store.database)  # where nobody reads them
         self._reencoding.run()
         self.retiring.run()
         published = self._upkeep.run()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import mmap
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -442,7 +442,7 @@ def publish(
     blocks: Iterable[Block],
     previous: Generation | None,
     drop: frozenset[int] = frozenset(),
-    anchor: str = "",
+    anchor: Callable[[], str] = str,
     clean: bool = False,
     flat_bytes: int = FLAT_BYTES,
 ) -> Generation | None:
@@ -461,7 +461,8 @@ def publish(
         a key that is there replaces the signature there. It is read once, and block by block.
     previous : the newest generation of the folder, or None to build from nothing
     drop : keys of frames that are no longer in the map
-    anchor : of the database's state; kept as it is, for whoever opens the generation to check
+    anchor : called once `blocks` are read: marks that state of the database or a later one. It is
+        kept as it is, for whoever opens the generation to check
     clean : leave no file that has a byte of a frame that is no longer there: the generation
         before is not kept
     flat_bytes : of signatures, above which there is an inverted file
@@ -496,7 +497,7 @@ def publish(
             revision=revision,
             model_id=model_id,
             dimension=draft.vectors.shape[1],
-            anchor=anchor,
+            anchor=anchor(),
             files=tuple(files),
             recall=recall,
         )

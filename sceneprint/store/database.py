@@ -52,6 +52,10 @@ _FOLDER = Path(migrations.__file__).parent
 _SAYS = re.compile(r'^(revision|down_revision) = (?:"(\w+)"|None)$', re.MULTILINE)
 
 
+#: Option of a connection: number of the only map that its transaction writes to, or None.
+MAP_OPTION = "sceneprint_map"
+#: Writers of single maps at once in a process: each keeps a connection from the readers.
+MAP_WRITERS = 8
 #: The oldest revision whose processes may write to a store of this version: what the newest
 #: migration that changed or removed something wrote in `schema_range`.
 LEAST_REVISION = "0015"
@@ -306,7 +310,7 @@ class Database:
         )  # fmt: skip
         # of the writers of this process one asks for the turn, and the others wait here: each of
         # them would keep a connection from the readers
-        self._turns = ThreadTurns(1)
+        self._turns, self._map_turns = ThreadTurns(1), ThreadTurns(MAP_WRITERS)
         file = None if sealed is not None else self.file
         self._line = None if file is None else WriterLine(file.parent)
         self._held = False  # by another process, for longer than anybody should wait
@@ -389,7 +393,9 @@ class Database:
                 self._sealed.check(before)
 
     @contextmanager
-    def write(self, *, unchecked: bool = False, turn: bool = True) -> Iterator[Connection]:
+    def write(
+        self, *, unchecked: bool = False, turn: bool = True, map_number: int | None = None
+    ) -> Iterator[Connection]:
         """A transaction that is committed at the end, or leaves no trace where it raises.
 
         Parameters
@@ -399,6 +405,9 @@ class Database:
         turn : whether others wait until it is committed. Without it, on PostgreSQL, only rows may
             be touched that are held against others, and no event may be told; SQLite has no
             writers but in turn
+        map_number : of the only map that is written to. On PostgreSQL writers of other maps do not
+            wait then, so that no row may be touched that is of several maps, but for inserting one;
+            `record_event` is the way to tell an event
 
         Raises
         ------
@@ -420,8 +429,11 @@ class Database:
         wait_s = held_s if self._held else BUSY_S
         if unchecked and not self.is_sqlite:
             wait_s = postgres.MIGRATION_S
+        if self.is_sqlite:
+            map_number = None
+        turns = self._turns if map_number is None else self._map_turns
         tenant = current_tenant()
-        if not self._turns.acquire(tenant, wait_s):
+        if not turns.acquire(tenant, wait_s):
             raise StoreLocked(
                 f"{self.shown}: other writers of this process have waited for long, and "
                 "nothing was stored. Come back later."
@@ -431,13 +443,15 @@ class Database:
                 options: dict[str, Any] = {
                     "sceneprint_write": wait_s,
                     "sceneprint_line": self._line,
+                    MAP_OPTION: map_number,
                 }
                 if unchecked and self.is_sqlite:
                     options["sceneprint_unchecked"] = True
                     connection.detach()  # nobody else gets a connection that does not look
                 writing = connection.execution_options(**options)
                 with writing.begin():
-                    self._begin_writing(writing, wait_s, checked=self._guarded and not unchecked)
+                    checked = self._guarded and not unchecked
+                    self._begin_writing(writing, wait_s, map_number, checked=checked)
                     yield writing
                 if not self.is_sqlite:
                     postgres.require_synchronous(writing)
@@ -445,13 +459,15 @@ class Database:
             self._held = True
             raise
         finally:
-            self._turns.release(tenant)
+            turns.release(tenant)
 
-    def _begin_writing(self, writing: Connection, wait_s: float, *, checked: bool) -> None:
+    def _begin_writing(
+        self, writing: Connection, wait_s: float, map_number: int | None, *, checked: bool
+    ) -> None:
         """Have the turn, which SQLite gave with the transaction, and see that it may be used."""
         row = None
         if not self.is_sqlite:
-            row = postgres.take_turn(writing, wait_s, _RANGE if checked else None)
+            row = postgres.take_turn(writing, wait_s, _RANGE if checked else None, map_number)
         self._held = False
         if row is not None:
             _allow_schema(writing, SchemaRange(*row))

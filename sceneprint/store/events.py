@@ -1,14 +1,24 @@
-"""What happened, in order: written in the transaction in which it happens."""
+"""What happened, in order: written in the transaction in which it happens.
+
+writer of all  --record_event-->  events  <--number_events--  pending_events  <--  writer of a map
+
+Numbers are in the order of the commits, so that who has read up to one never misses a smaller one.
+Writers that have the turn to themselves give them. Writers of single maps commit at the same time,
+and cannot: what they tell is pending until somebody numbers what is committed, one at a time. Of a
+map, what is pending is in the order of its commits, as its writers take turns.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import (
     ColumnElement,
     Connection,
+    Table,
     and_,
     delete,
     func,
@@ -18,7 +28,18 @@ from sqlalchemy import (
     select,
 )
 
-from sceneprint.store.tables import MapRow, among, blocks, event_values, events, former_maps, maps
+from sceneprint.errors import UnusableStore
+from sceneprint.store.database import MAP_OPTION, Database
+from sceneprint.store.tables import (
+    MapRow,
+    among,
+    blocks,
+    event_values,
+    events,
+    former_maps,
+    maps,
+    pending_events,
+)
 
 
 def record_event(
@@ -30,17 +51,64 @@ def record_event(
     **data: Any,
 ) -> None:
     """Note an event; `kind` is one of `KINDS` of the API."""
-    connection.execute(insert(events).values(event_values(kind, map_name, frame_id, job_id, data)))
+    values = event_values(kind, map_name, frame_id, job_id, data)
+    connection.execute(insert(events_table(connection)).values(values))
 
 
-def anchor_of(connection: Connection, map_name: str) -> str:
-    """The last event of a map, as a mark of the state that this transaction sees."""
-    last = connection.execute(
-        select(events.c.number, events.c.at, events.c.frame_id)
-        .where(events.c.map == map_name)
-        .order_by(events.c.number.desc())
-        .limit(1)
-    ).one()
+def events_table(connection: Connection) -> Table:
+    """Where a writer's events are inserted."""
+    of_map = connection.get_execution_options().get(MAP_OPTION) is not None
+    return pending_events if of_map else events
+
+
+#: Seconds that who numbers events waits for another who does: a long transaction may be one.
+NUMBERING_S = 1.0
+
+
+def number_events(database: Database) -> None:
+    """Give numbers to the events that are committed, before they are read.
+
+    Where that cannot be done now, such as in a database that may only be read, those that are
+    pending come later.
+    """
+    if not database.read_only:
+        with suppress(UnusableStore):
+            _number_pending(database)
+
+
+def _number_pending(database: Database) -> None:
+    """As `number_events`; UnusableStore where that cannot be done now."""
+    if database.is_sqlite:
+        return
+    with database.read() as connection:
+        if connection.execute(_PENDING).first() is None:
+            return
+    with database.write(turn=False) as connection:
+        wait_ms = str(int(1000 * NUMBERING_S))
+        connection.execute(select(func.set_config("lock_timeout", wait_ms, True)))
+        connection.execute(select(func.number_pending_events()))
+
+
+_PENDING = select(pending_events.c.number).limit(1)
+
+
+def anchor_of_now(database: Database, map_name: str) -> str:
+    """The last event of a map, as a mark of the state that it has now.
+
+    It is later than all that was committed before this is called: what is pending has no number.
+
+    Raises
+    ------
+    UnusableStore : the events that are pending cannot be numbered now.
+    """
+    _number_pending(database)
+    with database.read() as connection:
+        last = connection.execute(
+            select(events.c.number, events.c.at, events.c.frame_id)
+            .where(events.c.map == map_name)
+            .order_by(events.c.number.desc())
+            .limit(1)
+        ).one()
     return _fingerprint(*last)
 
 
@@ -138,9 +206,7 @@ def list_events(
 ) -> list[EventRow]:  # fmt: skip
     """Events between two numbers, neither of them included.
 
-    Numbers are in the order of the commits: writers are one at a time (see `Database.write`), and a
-    number is given within the writer's turn. So who has read up to one number never misses a
-    smaller one.
+    `number_events` first finds those of writers of single maps.
     """
     order = events.c.number.desc() if newest_first else events.c.number
     asked = select(events).where(events.c.number > after).order_by(order).limit(limit)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Connection, Select, delete, insert, select, tuple_, update
+from sqlalchemy import Connection, Select, delete, insert, or_, select, tuple_, update
 from sqlalchemy.dialects import postgresql, sqlite
 
 from sceneprint.errors import Conflict, IdempotencyConflict, UnknownKey
@@ -267,12 +267,28 @@ class IdempotentRequest:
 
         One statement, as others wait meanwhile. What was remembered before gives way: it is older
         than a day, or of a map that was deleted since.
+
+        Raises
+        ------
+        Overtaken : another request with this key was stored since `found`, of another map.
         """
-        own = {"actor": self.actor, "key": self.key}
-        known = {"fingerprint": self.fingerprint, "data": data, "created_at": time.time()}
+        own, at = {"actor": self.actor, "key": self.key}, time.time()
+        known = {"fingerprint": self.fingerprint, "data": data, "created_at": at}
         kind: Any = sqlite if connection.dialect.name == "sqlite" else postgresql
         made = kind.insert(idempotency).values(**own, **known)
-        connection.execute(made.on_conflict_do_update(index_elements=list(own), set_=known))
+        gives_way = or_(
+            idempotency.c.fingerprint == self.fingerprint,
+            idempotency.c.created_at <= at - KEPT_S,
+        )
+        kept = made.on_conflict_do_update(
+            index_elements=list(own), set_=known, where=gives_way
+        ).returning(idempotency.c.key)
+        if connection.execute(kept).first() is None:
+            raise Overtaken
+
+
+class Overtaken(Exception):
+    """Another transaction stored first what this one relied on being absent: do it again."""
 
 
 #: Keys that are removed in one transaction: others wait meanwhile.

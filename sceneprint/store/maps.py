@@ -26,26 +26,27 @@ from sqlalchemy import (
     exists,
     func,
     insert,
-    literal,
     null,
     or_,
     select,
     update,
 )
+from sqlalchemy.dialects.postgresql import ARRAY
 from sqlalchemy.sql.dml import ReturningUpdate
 from sqlalchemy.types import TypeEngine
 
 from sceneprint.errors import QuotaExceeded, UnknownFrame, UnknownMap
-from sceneprint.store.events import inherited, record_event
+from sceneprint.store.events import events_table, inherited, record_event
 from sceneprint.store.tables import (
     FRAME_COLUMNS,
     MAP_COLUMNS,
+    STATEMENT_TIME,
     TEXT,
+    WHOLE,
     FrameRow,
     MapRow,
     among_numbers,
     event_values,
-    events,
     frame_row,
     frame_rows,
     frame_tags,
@@ -317,34 +318,43 @@ def receive_frame(
     """
     frame_id, job = uuid.uuid4().hex, job_values(connection, "sign", priority)
     frame = _received(connection, row.number, frame_id, values)
-    of_job = {**job, "map_number": row.number}
+    job["map_number"] = row.number
     told = event_values("frame.received", row.name, frame_id, job["id"], {})
-    room, tags = _room_taken(row, values), sorted(set(values["tags"]))
+    room = {"map_number": row.number, "map_name": row.name, "size": values["bytes"],
+            "content": values["content_id"]}  # fmt: skip
+    tags = sorted(set(values["tags"]))
     if connection.dialect.name == "sqlite":
-        if connection.execute(room).first() is None:
+        if connection.execute(_room_taken(), room).first() is None:
             return None
         made = insert(frames).values(frame).returning(frames.c.number)
         number = connection.execute(made).scalar_one()
         _write_tags(connection, number, tags)
-        connection.execute(insert(jobs).values(frame_number=number, **of_job))
-        connection.execute(insert(events).values(told))
+        connection.execute(insert(jobs).values(frame_number=number, **job))
+        connection.execute(insert(events_table(connection)).values(told))
         return frame_id, job["id"]
-    new = _inserted(frames, frame, room.cte("room")).returning(frames.c.number).cte("new")
-    others = [_inserted(jobs, of_job, new, frame_number=new.c.number), _inserted(events, told, new)]
-    others += [_inserted(frame_tags, {"tag": tag}, new, frame_number=new.c.number) for tag in tags]
-    asked = select(new.c.number).add_cte(*(one.cte(f"other_{i}") for i, one in enumerate(others)))
-    return None if connection.execute(asked).first() is None else (frame_id, job["id"])
+    rows = {"frame": frame, "job": job, "event": told}
+    given = {
+        f"{of}_{name}": value for of, values in rows.items() for name, value in values.items()
+        if not isinstance(value, ColumnElement)
+    }  # fmt: skip
+    asked = _reception(events_table(connection), *map(tuple, rows.values()))
+    found = connection.execute(asked, {**given, **room, "tags": tags}).first()
+    return None if found is None else (frame_id, job["id"])
 
 
-def _room_taken(row: MapRow, values: dict[str, Any]) -> ReturningUpdate[tuple[int]]:
-    """Count a frame more, if its map is that of `row` still, has room, and lacks the content."""
-    alike = frames.c.map_number == row.number, frames.c.content_id == values["content_id"]
-    size = values["bytes"]
+@cache
+def _room_taken() -> ReturningUpdate[tuple[int]]:
+    """Count a frame more, if its map is the one that was looked at still, has room, and lacks the
+    content.
+    """
+    number, size = bindparam("map_number", type_=WHOLE), bindparam("size", type_=WHOLE)
+    content = bindparam("content", type_=TEXT)
+    alike = frames.c.map_number == number, frames.c.content_id == content
     return (
         update(maps)
         .where(
-            maps.c.number == row.number,
-            maps.c.name == row.name,
+            maps.c.number == number,
+            maps.c.name == bindparam("map_name", type_=TEXT),
             or_(maps.c.quota_frames.is_(None), maps.c.used_frames < maps.c.quota_frames),
             or_(maps.c.quota_bytes.is_(None), maps.c.used_bytes + size <= maps.c.quota_bytes),
             ~exists().where(*alike),
@@ -354,22 +364,51 @@ def _room_taken(row: MapRow, values: dict[str, Any]) -> ReturningUpdate[tuple[in
     )
 
 
+@cache
+def _reception(
+    told: Table, of_frame: tuple[str, ...], of_job: tuple[str, ...], of_event: tuple[str, ...]
+) -> Select[Any]:
+    """A frame taken with its job, its event and its tags, PostgreSQL.
+
+    Parameters
+    ----------
+    told : where the event is inserted
+    of_frame, of_job, of_event : columns of each row, whose values are named `frame_<column>` and so
+        on; times are those of the statement
+    """
+    room = _room_taken().cte("room")
+    made = _inserted(frames, "frame", of_frame, room).returning(frames.c.number)
+    new = made.cte("new")
+    tag = func.unnest(cast(bindparam("tags"), ARRAY(TEXT)))
+    others = (
+        _inserted(jobs, "job", of_job, new, frame_number=new.c.number),
+        _inserted(told, "event", of_event, new),
+        insert(frame_tags).from_select(["frame_number", "tag"], select(new.c.number, tag)),
+    )
+    return select(new.c.number).add_cte(*(one.cte(f"other_{i}") for i, one in enumerate(others)))
+
+
+#: Columns whose values are the time of the statement.
+_STAMPED = frozenset(("received_at", "run_after", "created_at"))
+
+
 def _inserted(
-    table: Table, values: dict[str, Any], source: CTE, **more: ColumnElement[Any]
+    table: Table, of: str, names: tuple[str, ...], source: CTE, **more: ColumnElement[Any]
 ) -> Insert:
     """A row inserted for each of another statement's, PostgreSQL."""
-    names = [*values, *more]
-    given = [_typed(table.c[name], value) for name, value in values.items()]
-    return insert(table).from_select(names, select(*given, *more.values()).select_from(source))
+    given = [
+        STATEMENT_TIME if name in _STAMPED else _typed(f"{of}_{name}", table.c[name])
+        for name in names
+    ]
+    rows = select(*given, *more.values()).select_from(source)
+    return insert(table).from_select([*names, *more], rows)
 
 
-def _typed(column: Column[Any], value: Any) -> ColumnElement[Any]:
+def _typed(name: str, column: Column[Any]) -> ColumnElement[Any]:
     """A value of a SELECT, whose columns have the types of the values, not of the table."""
-    if isinstance(value, ColumnElement):
-        return value
     # a cast to a length would cut off what the table refuses
     kind: TypeEngine[Any] = TEXT if isinstance(column.type, String) else column.type
-    return cast(literal(value, column.type), kind)
+    return cast(bindparam(name, type_=column.type), kind)
 
 
 def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:

@@ -2,30 +2,45 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from zlib import crc32
 
-from sqlalchemy import ColumnElement, Connection, delete, func, insert, select, update
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    TextClause,
+    delete,
+    func,
+    insert,
+    select,
+    text,
+    update,
+)
 
 from sceneprint.errors import DamagedSignature
 from sceneprint.store import reencoding_rows
+from sceneprint.store.events import events_table
 from sceneprint.store.maps import next_revision
 from sceneprint.store.postgres import vectors
 from sceneprint.store.queue import PENDING
 from sceneprint.store.surface_rows import mark_edited, note_edit
 from sceneprint.store.tables import (
     FrameRow,
+    JobRow,
     MapRow,
     count_rows,
+    event_values,
     frames,
     jobs,
     maps,
     rows_among,
     signatures,
 )
-from sceneprint_client.api import FrameState
+from sceneprint_client.api import FrameState, JobState
 
 
 @dataclass(frozen=True)
@@ -73,6 +88,81 @@ def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) 
         .values(state=FrameState.INDEXED, reason=None, indexed_at=time.time(), revision=revision)
     )
     return revision
+
+
+def index_claimed_frame(
+    connection: Connection, job: JobRow, frame: FrameRow, map_name: str, made: StoredSignature
+) -> bool:
+    """End a job and index its frame in one statement, as most signatures are on PostgreSQL: the
+    map's other writers wait for each round trip.
+
+    Parameters
+    ----------
+    connection : of a writing transaction of the frame's map
+    job : as it was claimed, of that frame
+    frame, made : see `index_frame`
+    map_name : of the frame's map
+
+    Returns
+    -------
+    done : False, and nothing was written, on SQLite; where the job is not held any more; and where
+        the map has another model, or is to have one: then what else has to be done must be found
+    """
+    if connection.dialect.name == "sqlite":
+        return False
+    told = event_values("frame.indexed", map_name, frame.id, job.id, {})
+    values = {
+        "job": job.number, "token": job.token, "worker": job.worker, "map_number": frame.map_number,
+        "frame": frame.number, "model": made.model_id, "vector": made.vector,
+        "checksum": crc32(made.vector), "geometry": made.geometry,
+        "n_patches": json.dumps(list(made.n_patches)), "n_pairs": json.dumps(list(made.n_pairs)),
+        "vectors": vectors.table_of(len(made.vector)), "indexed_at": time.time(), **told,
+        "data": json.dumps(told["data"]),
+    }  # fmt: skip
+    found = connection.execute(_index_claimed(events_table(connection).name), values).first()
+    if found is None:
+        return False
+    if found.has_vectors:
+        vectors.put(connection, frame.number, made.model_id, len(made.vector))
+    return True
+
+
+@cache
+def _index_claimed(events_name: str) -> TextClause:
+    return text(
+        f"""
+        WITH ended AS (
+            UPDATE jobs SET state = '{JobState.SUCCEEDED}', error = NULL, traceback = NULL,
+                leased_until = NULL, finished_at = extract(epoch FROM statement_timestamp())
+            WHERE number = :job AND token = :token AND worker = :worker
+                AND state = '{JobState.RUNNING}' AND EXISTS (
+                    SELECT FROM maps WHERE number = :map_number AND model_id = :model
+                        AND next_model_id IS NULL)
+            RETURNING number
+        ), revised AS (
+            UPDATE maps SET revision = revision + 1
+            WHERE number = :map_number AND EXISTS (SELECT FROM ended) RETURNING revision
+        ), signed AS (
+            INSERT INTO signatures (frame_number, model_id, vector, checksum, geometry, n_patches,
+                n_pairs)
+            SELECT :frame, :model, :vector, :checksum, :geometry, cast(:n_patches AS json),
+                cast(:n_pairs AS json) FROM revised
+            ON CONFLICT (frame_number, model_id) DO UPDATE SET vector = EXCLUDED.vector,
+                checksum = EXCLUDED.checksum, geometry = EXCLUDED.geometry,
+                n_patches = EXCLUDED.n_patches, n_pairs = EXCLUDED.n_pairs
+        ), edited AS (
+            UPDATE surface_frames SET changed = true FROM revised WHERE frame_number = :frame
+        ), found AS (
+            UPDATE frames SET state = '{FrameState.INDEXED}', reason = NULL,
+                indexed_at = :indexed_at, revision = revised.revision
+            FROM revised WHERE number = :frame
+        ), told AS (
+            INSERT INTO {events_name} (at, kind, map, frame_id, job_id, data)
+            SELECT :at, :kind, :map, :frame_id, :job_id, cast(:data AS json) FROM revised
+        )
+        SELECT to_regclass(:vectors) IS NOT NULL AS has_vectors FROM revised
+        """
+    )
 
 
 def replace_signature(connection: Connection, frame: FrameRow, made: StoredSignature) -> bool:

@@ -288,6 +288,21 @@ Index(
     sqlite_where=events.c.kind == "map.deleted", postgresql_where=events.c.kind == "map.deleted",
 )  # fmt: skip
 
+#: Events of writers of single maps of PostgreSQL, which commit in any order: `number_events` moves
+#: them into `events`, with numbers in the order of commits.
+pending_events = Table(
+    "pending_events",
+    metadata,
+    Column("number", WHOLE, primary_key=True),
+    Column("at", Float, nullable=False),
+    Column("kind", _string(32), nullable=False),
+    Column("map", _string(63)),
+    Column("frame_id", _string(64)),
+    Column("job_id", _string(32)),
+    Column("data", JSON, nullable=False),
+    sqlite_autoincrement=True,
+)
+
 #: What was done under an `Idempotency-Key`, for a day.
 idempotency = Table(
     "idempotency",
@@ -781,13 +796,17 @@ _JOB_STATE = [column.name for column in JOB_COLUMNS].index("state")
 # A SQLite file has one host, and so one clock.
 
 
+#: Seconds since 1970 at a statement of PostgreSQL: the transaction may have waited for its turn
+#: since it began. Not clock_timestamp(), which is another time for each row, so that no index would
+#: be used.
+STATEMENT_TIME: ColumnElement[float] = cast(extract("epoch", func.statement_timestamp()), Float(53))
+
+
 def now(connection: Connection) -> ColumnElement[float]:
     """The time of the statement it is part of, seconds since 1970."""
     if connection.dialect.name == "sqlite":
         return literal(time.time())
-    # of the statement: the transaction may have waited for its turn since it began. Not
-    # clock_timestamp(), which is another time for each row, so that no index would be used
-    return cast(extract("epoch", func.statement_timestamp()), Float(53))
+    return STATEMENT_TIME
 
 
 def job_values(

@@ -19,6 +19,7 @@ from sceneprint.lab.synth import SynthRoom
 from sceneprint.models import Model
 from sceneprint.pipeline import Signature, Signer, open_signer, prepare
 from sceneprint.settings import Settings
+from sceneprint.store.events import number_events
 from sceneprint.store.tables import events, jobs
 from sceneprint.types import DepthFrame, Floats, Geometry
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, JobState, NewMap
@@ -172,6 +173,7 @@ def told() -> Callable[[Engine], list[str]]:
     """Kinds of all events, in order."""
 
     def tell(engine: Engine) -> list[str]:
+        number_events(engine.store.database)
         with engine.store.database.read() as connection:
             return list(
                 connection.execute(select(events.c.kind).order_by(events.c.number)).scalars()

@@ -94,7 +94,7 @@ def test_a_frame_whose_place_the_map_has_is_not_kept(
     assert found(empty, uploads) == {first.frame_id, third.frame_id}
     assert told(empty)[1:] == ["frame.received", "frame.indexed", "frame.received",
                                "frame.redundant", "frame.received", "frame.indexed"]  # fmt: skip
-    with empty.store.database.read() as connection:
+    with empty.store.database.read() as connection:  # `told` has numbered them
         last = select(events).where(events.c.kind == "frame.redundant")
         event = connection.execute(last).mappings().one()
     assert (event["frame_id"], event["job_id"]) == (second.frame_id, second.job_id)

@@ -82,7 +82,8 @@ def test_while_others_wait_a_new_frame_takes_one_statement_or_one_for_each_table
     else:
         assert check.index("pg_advisory_xact_lock") < check.index("SELECT version_num")
         assert len(said) == 1
-        assert all(said[0].count(one) == 1 + ("tags" in one) for one in written)
+        told = "INSERT INTO pending_events"
+        assert all(said[0].count(one) == 1 for one in [*written[:-1], told])
     event.remove(database._engine, "before_cursor_execute", note)
     assert new
     found = empty.get_frame("hall", added.frame_id)

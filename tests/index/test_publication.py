@@ -54,7 +54,7 @@ def test_what_is_published_is_what_is_opened(
     walk: Walk, published: Publish, tmp_path: Path
 ) -> None:
     keys, signatures = np.arange(300)[::-1] * 7 - 50, walk(300)
-    made = published(keys, signatures, revision=41, anchor="an event")
+    made = published(keys, signatures, revision=41, anchor=lambda: "an event")
     opened = newest(tmp_path / "map", "model", LENGTH)
     for generation in (made, opened):
         assert holds(generation, frames_of(keys, signatures))

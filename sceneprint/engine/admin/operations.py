@@ -30,6 +30,7 @@ from sceneprint.store.events import (
     list_events,
     newest_number,
     newest_seen,
+    number_events,
     remove_events,
     spent_numbers,
 )
@@ -83,6 +84,7 @@ def begin(database: Database, wanted: Wanted, kept: int, after: int | None) -> E
     kept : newest events of each map that are there for sure
     after : number of the last event that the reader has had; None: it wants those from now on
     """
+    number_events(database)
     with database.read() as connection:
         newest = newest_number(connection)
         seen = newest_seen(connection, wanted)
@@ -96,6 +98,7 @@ def begin(database: Database, wanted: Wanted, kept: int, after: int | None) -> E
 
 def next_events(database: Database, wanted: Wanted, place: int, most: int) -> EventSlice:
     """The next events."""
+    number_events(database)
     with database.read() as connection:
         newest = newest_number(connection)
         found = list_events(connection, wanted, after=place, limit=most)
@@ -175,6 +178,7 @@ class OperatorTasks:
         place = seals.row("event", cursor)
         if place is not None:
             least, before = (least, place) if newest_first else (max(least, place), None)
+        number_events(self._store.database)
         with self._store.database.read() as connection:
             newest = newest_seen(connection, wanted)
             found = list_events(

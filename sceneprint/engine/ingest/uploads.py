@@ -14,6 +14,7 @@ from contextlib import suppress
 from contextvars import copy_context
 from dataclasses import dataclass
 from typing import Any, TypeVar, cast
+from weakref import WeakValueDictionary
 
 from sqlalchemy import Connection, select
 
@@ -25,7 +26,7 @@ from sceneprint.store import Store
 from sceneprint.store.database import Database
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import loosen, renew_frame, write_frame
-from sceneprint.store.keys import IdempotentRequest
+from sceneprint.store.keys import IdempotentRequest, Overtaken
 from sceneprint.store.maps import (
     add_frame,
     find_map,
@@ -258,7 +259,9 @@ class Uploads:
 
     def __init__(self, store: Store, bell: Wakeup) -> None:
         self._store, self._bell = store, bell
-        self._writes = Grouping(store.database)
+        # of each map that is written to, as long as somebody writes to it
+        self._writes = WeakValueDictionary[int | None, Grouping]()
+        self._guard = threading.Lock()
 
     def add(
         self, map_name: str, upload: Upload, once: IdempotentRequest | None = None
@@ -394,17 +397,25 @@ class Uploads:
             if fence is not None:
                 fence(connection)
             if once is not None:
-                before = _before(connection, find_map(connection, row.name), once)
+                now = find_map(connection, row.name)
+                if now.number != row.number:
+                    return None
+                before = _before(connection, now, once)
                 if before is not None:
                     left[:] = blobs
                     return list(before), True
             if not all(map(self._store.blobs.holds, blobs)):
                 return None  # a deletion has removed one
             left.clear()
-            written = {
-                i: _taken(connection, row, one) or _stored(connection, row.name, one, left)
-                for i, one in todo.items()
-            }
+            written = {}
+            for i, one in todo.items():
+                came_of = _taken(connection, row, one)
+                if came_of is None:
+                    now = find_map(connection, row.name)
+                    if now.number != row.number:
+                        return None
+                    came_of = _stored(connection, now, one, left)
+                written[i] = came_of
             outcomes = [written.get(i, one) for i, one in enumerate(known)]
             came = [one for one in outcomes if one is not None]
             # what had no room may have it when it is sent again
@@ -418,7 +429,9 @@ class Uploads:
             try:
                 for data in blobs.values():
                     self._store.blobs.put(data)
-                found = self._writes.run(do)
+                found = self._grouping(row).run(do)
+            except Overtaken:
+                continue
             except errors.SceneprintError:
                 with suppress(errors.UnusableStore):  # leave nothing, on a full disk least of all
                     garbage_collection.collect_blobs(self._store, list(blobs))
@@ -427,6 +440,17 @@ class Uploads:
                 if left:
                     garbage_collection.collect_deleted_blobs(self._store, left)
                 return found
+            with self._store.database.read() as connection:
+                row = find_map(connection, row.name)
+
+    def _grouping(self, row: MapRow) -> Grouping:
+        """Where uploads wait that may be committed together: of a map, in SQLite of all."""
+        key = None if self._store.database.is_sqlite else row.number
+        with self._guard:
+            found = self._writes.get(key)
+            if found is None:
+                found = self._writes[key] = Grouping(self._store.database, key)
+            return found
 
 
 def _before(
@@ -448,11 +472,9 @@ def _taken(connection: Connection, row: MapRow, ready: _Prepared) -> UploadResul
     return UploadResult(added, new=True)
 
 
-def _stored(
-    connection: Connection, map_name: str, ready: _Prepared, left: list[str]
-) -> UploadResult:
+def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[str]) -> UploadResult:
     """What comes of an upload; blobs that are of no use any more are added to `left`."""
-    upload, row = ready.upload, find_map(connection, map_name)
+    upload = ready.upload
     try:  # once more: another upload may have been first
         frame = find_duplicate(connection, row, ready.content, ready.known, upload.frame_id)
     except errors.FrameConflict as error:
@@ -506,10 +528,15 @@ class _Waiting:
 
 
 class Grouping:
-    """Writes of many threads to one database; safe to share between them."""
+    """Writes of many threads to one database; safe to share between them.
 
-    def __init__(self, database: Database) -> None:
-        self._database = database
+    Parameters
+    ----------
+    database, map_number : see `Database.write`
+    """
+
+    def __init__(self, database: Database, map_number: int | None = None) -> None:
+        self._database, self._map_number = database, map_number
         self._waiting: list[_Waiting] = []
         self._list = threading.Lock()
         self._writing = threading.Lock()
@@ -555,7 +582,7 @@ class Grouping:
     def _write_together(self, taken: list[_Waiting]) -> None:
         """Write what waits in one transaction, or each alone; `taken` is filled with it."""
         try:
-            with self._database.write() as connection:
+            with self._database.write(map_number=self._map_number) as connection:
                 with self._list:  # not before it is our turn: more have come since
                     taken[:], self._waiting = (
                         self._waiting[:MOST_TOGETHER],
@@ -580,7 +607,7 @@ class Grouping:
     def _write_alone(self, one: _Waiting) -> None:
         one.result = one.error = None
         try:
-            with self._database.write() as connection:
+            with self._database.write(map_number=self._map_number) as connection:
                 _do(one, connection)
         except Exception as error:
             one.result, one.error = None, error

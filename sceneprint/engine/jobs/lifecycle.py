@@ -62,7 +62,8 @@ class Outdated(Exception):
 
 def put_back(store: Store, work: Work, after_s: float = 0.0) -> None:
     """Queue again what was claimed and not begun, as when a worker is told to stop."""
-    with suppress(LostLease), store.database.write() as connection:
+    of_map = store.database.write(map_number=work.map.number)
+    with suppress(LostLease), of_map as connection:
         queue.give_back(connection, work.job, after_s)
         if not work.again:
             set_state(connection, work.frame.number, FrameState.RECEIVED)
@@ -74,7 +75,7 @@ def restart_jobs(store: Store, work: Work) -> JobState | None:
         put_back(store, work)
         return JobState.QUEUED
     try:
-        with store.database.write() as connection:
+        with store.database.write(map_number=work.map.number) as connection:
             queue.finish(connection, work.job, JobState.CANCELLED)
     except LostLease:
         return None
@@ -90,7 +91,7 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
     """A frame that holds nothing to sign: it would hold nothing the next time either."""
     reason = str(error).removeprefix(f"{work.frame.id}: ")
     try:
-        with store.database.write() as connection:
+        with store.database.write(map_number=work.map.number) as connection:
             queue.finish(connection, work.job, JobState.FAILED, reason)
             if not work.again:
                 if map_of(connection, work.frame.map_number).model_id != work.model_id:
@@ -109,7 +110,7 @@ def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
     reason, trace = failure_texts(error)
     log.error("job raised an exception", extra=about(work, error=reason, traceback=trace))
     try:
-        with store.database.write() as connection:
+        with store.database.write(map_number=work.map.number) as connection:
             state = queue.fail(connection, work.job, reason, trace)
             if work.again:
                 return state

@@ -30,6 +30,7 @@ from sceneprint.store.reencoding_rows import REENCODE, enqueue_all, models_of
 from sceneprint.store.signatures import (
     StoredSignature,
     changes_since,
+    index_claimed_frame,
     index_frame,
     replace_signature,
 )
@@ -177,12 +178,18 @@ def _store(
     if work.again:
         return _replace_signature(store, work, made)
     while True:
-        seen = None
-        if work.frame.novelty is not None:
+        seen, is_kept = None, work.frame.novelty is None
+        if not is_kept:
             seen = look(store.database, readers, work.map, made)
-        with suppress(Stale), store.database.write() as connection:
+        number = work.frame.map_number
+        with suppress(Stale), store.database.write(map_number=number) as connection:
+            is_held = store.blobs.holds(made.geometry)
+            if is_kept and is_held and index_claimed_frame(
+                connection, work.job, work.frame, work.map.name, made
+            ):  # fmt: skip
+                return []
             queue.finish(connection, work.job, JobState.SUCCEEDED)
-            row = map_of(connection, work.frame.map_number)
+            row = map_of(connection, number)
             if row.model_id != made.model_id:
                 raise lifecycle.Outdated
             reason = None
@@ -192,7 +199,7 @@ def _store(
                 set_state(connection, work.frame.number, FrameState.REDUNDANT, reason)
                 lifecycle.record_job_event(connection, "frame.redundant", work)
                 return [work.frame.blob, made.geometry]
-            if not store.blobs.holds(made.geometry):  # nothing referred to it until now
+            if not is_held:  # nothing referred to it until now
                 raise errors.DamagedBlob(
                     "A deletion elsewhere swept the artifact: it must be made again."
                 )
@@ -212,7 +219,7 @@ def _replace_signature(store: Store, work: lifecycle.Work, made: StoredSignature
     blobs : that the frame refers to no more
     """
     number = work.frame.number
-    with store.database.write() as connection:
+    with store.database.write(map_number=work.frame.map_number) as connection:
         queue.finish(connection, work.job, JobState.SUCCEEDED)
         row = map_of(connection, work.frame.map_number)
         indexed = frame_of(connection, number).state == FrameState.INDEXED

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -27,7 +28,7 @@ from sceneprint.errors import BusyIndex, InvalidRequest, ModelError, SceneprintE
 from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.index import Generation, clear, manifests, newest, newest_number, publish, scrub
 from sceneprint.store import Store
-from sceneprint.store.events import anchor_of
+from sceneprint.store.events import anchor_of_now
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.postgres import vectors
 from sceneprint.store.postgres.connection import allow
@@ -339,7 +340,7 @@ class Upkeep:
                 blocks=_blocks(connection, now, since, damaged),
                 previous=previous,
                 drop=deleted_since(connection, now.number, since),
-                anchor=anchor_of(connection, now.name),
+                anchor=partial(anchor_of_now, self._store.database, now.name),
                 clean=clean,
             )
         resign_frames(self._store, now, damaged, now.model_id)

@@ -3,6 +3,10 @@
 Writers take turns as they do in SQLite: each begins with one advisory lock of the database, held
 until its commit. So what a transaction reads stays true until it writes, and numbers that it is
 given are in the order of the commits.
+
+Writers of one map alone share that lock, and have their map's to themselves: those of other maps
+write at the same time. What they read of their map stays true, and its revisions are in the order
+of the commits. Their events get no number before they are committed (see `events`).
 """
 
 from __future__ import annotations
@@ -33,8 +37,10 @@ if TYPE_CHECKING:
 LOCKS = 0x5CE7E
 #: Whose turn it is to write; uploads that are stored or removed (see `blobs/`).
 TURN, BLOBS = 1, 2
-#: Who links vectors (see `vectors`).
-VECTORS = 7
+#: Who links vectors (see `vectors`); who numbers events (see `events`).
+VECTORS, EVENTS = 7, 8
+#: The first number of locks of single maps; the second is that of the map.
+MAP_LOCKS = 0x5CE7F
 #: Seconds for one statement, and for a transaction in which nothing is asked: a client that fell
 #: silent must not keep the turn from all others.
 STATEMENT_S, IDLE_S = 60.0, 30.0
@@ -156,7 +162,9 @@ def allow(connection: Connection, seconds: float) -> None:
             )
 
 
-def take_turn(connection: Connection, wait_s: float, asked: str | None = None) -> Any:
+def take_turn(
+    connection: Connection, wait_s: float, asked: str | None = None, map_number: int | None = None
+) -> Any:
     """Wait for a writer's turn, at the beginning of its transaction.
 
     All of it is one message, of which each statement sees what was committed before it: once the
@@ -167,6 +175,7 @@ def take_turn(connection: Connection, wait_s: float, asked: str | None = None) -
     connection : of a transaction that has only just begun
     wait_s : seconds to wait
     asked : a query of one row, answered when it is its turn
+    map_number : of the only map that is written to; None: anything may be
 
     Returns
     -------
@@ -177,6 +186,12 @@ def take_turn(connection: Connection, wait_s: float, asked: str | None = None) -
     # It is a SELECT, and the first: a message that begins without rows is taken to have none
     message = ["SELECT set_config('statement_timeout', '0', true)"]
     turn = f"SELECT pg_advisory_xact_lock({LOCKS}, {TURN})"
+    if map_number is not None:
+        turn = (
+            f"SELECT pg_advisory_xact_lock_shared({LOCKS}, {TURN}); "
+            # of maps whose numbers have the same 31 last bits, writers take turns
+            f"SELECT pg_advisory_xact_lock({MAP_LOCKS}, {map_number & 0x7FFFFFFF})"
+        )
     if wait_s == BUSY_S:
         message.append(turn)
     else:
