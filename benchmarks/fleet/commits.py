@@ -3,7 +3,8 @@
 `python -m benchmarks.fleet.commits [--maps N] [--clients N] [--delay-ms X] [--commits N]`: uploads,
 then the index commits of the same frames, as services and workers make them. Each client has a
 database of its own, as each is a process of a fleet; they are threads here, so that the
-interpreter's lock counts too.
+interpreter's lock counts too. A reader follows the events meanwhile, as services do for those who
+listen: what it misses, or sees out of a map's order, and how late it is.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection as Pipe
 from multiprocessing.process import BaseProcess
@@ -23,14 +25,20 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TypeVar
 
+import numpy as np
+
 from benchmarks.fleet.postgres import Server
+from sceneprint.engine.admin.operations import next_events
 from sceneprint.store import Database, open_database, queue
+from sceneprint.store.events import Wanted
 from sceneprint.store.maps import add_map, frame_of, keep_model, receive_frame
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
 
 T = TypeVar("T")
 
+#: Seconds between two looks for events, and events of one, as in `service/event_stream.py`.
+POLL_S, MOST = 0.1, 500
 MODEL, LEASE_S = "ab" * 32, 3600.0
 MADE = StoredSignature(MODEL, bytes(400), "00" * 32, [1], [1])
 #: What is known of each frame beside its content.
@@ -41,8 +49,26 @@ KNOWN: dict[str, object] = {
 }  # fmt: skip
 
 
-def measure(n_maps: int, n_clients: int, delay_ms: float, commits: int) -> tuple[float, float]:
-    """Uploads and index commits in a second.
+@dataclass
+class Feed:
+    """What a reader of events saw.
+
+    Parameters
+    ----------
+    missed : events of uploads and index commits that it never saw
+    disordered : frames whose end it saw before their upload
+    late_ms : from each event's time to when it was read
+    """
+
+    missed: int = 0
+    disordered: int = 0
+    late_ms: list[float] = field(default_factory=list)
+
+
+def measure(
+    n_maps: int, n_clients: int, delay_ms: float, commits: int
+) -> tuple[float, float, Feed]:
+    """Uploads and index commits in a second, and what a reader of their events saw.
 
     Parameters
     ----------
@@ -61,18 +87,55 @@ def measure(n_maps: int, n_clients: int, delay_ms: float, commits: int) -> tuple
             port, process = _delaying_proxy(server.port, delay_ms / 1e3)
             far = server.url("commits").replace(f":{server.port}/", f":{port}/")
             clients = [open_database(far) for _ in range(n_clients)]
+            reader, own = _reader(far, commits)
             try:
                 uploads = [(rows[i % n_maps], i) for i in range(commits)]
                 uploaded = _timed(clients, uploads, _upload)
                 ended = _timed(clients, [_claim(near) for _ in range(commits)], _index)
+                own.send("over")
+                feed: Feed = own.recv()
             finally:
+                reader.kill()
+                reader.join()
                 for one in (*clients, near):
                     one.close()
                 process.kill()
                 process.join()
         finally:
             server.kill()
-    return commits / uploaded, commits / ended
+    return commits / uploaded, commits / ended, feed
+
+
+def _reader(url: str, commits: int) -> tuple[BaseProcess, Pipe]:
+    """A process of its own that follows the events, as a service does, and how to end it."""
+    context = get_context("spawn")
+    own, its = context.Pipe()
+    process = context.Process(target=_follow, args=(its, url, commits), daemon=True)
+    process.start()
+    own.recv()
+    return process, own
+
+
+def _follow(pipe: Pipe, url: str, commits: int) -> None:
+    database = open_database(url)
+    feed, place, seen = Feed(), 0, dict[str | None, set[str]]()
+    pipe.send("begun")
+    is_last = False
+    while not is_last:
+        is_last = pipe.poll(POLL_S)
+        while True:
+            part = next_events(database, Wanted(kinds=("frame.",)), place, MOST)
+            now, place = time.time(), part.place
+            for one in part.found:
+                of_frame = seen.setdefault(one.frame_id, set())
+                of_frame.add(one.kind)
+                feed.disordered += "frame.received" not in of_frame
+                feed.late_ms.append(1e3 * (now - one.at))
+            if len(part.found) < MOST:
+                break
+    feed.missed = 2 * commits - sum(map(len, seen.values()))
+    pipe.send(feed)
+    database.close()
 
 
 def _maps(database: Database, n: int) -> list[MapRow]:
@@ -170,10 +233,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--delay-ms", type=float, default=0.5)
     parser.add_argument("--commits", type=int, default=1000)
     asked = parser.parse_args(arguments)
-    uploads, ends = measure(asked.maps, asked.clients, asked.delay_ms, asked.commits)
+    uploads, ends, feed = measure(asked.maps, asked.clients, asked.delay_ms, asked.commits)
+    late = np.percentile(feed.late_ms, [50, 99])
     print(
         f"{asked.maps} maps, {asked.clients} clients, {asked.delay_ms:g} ms: "
-        f"{uploads:.1f} uploads/s, {ends:.1f} index commits/s"
+        f"{uploads:.1f} uploads/s, {ends:.1f} index commits/s; events: {feed.missed} missed, "
+        f"{feed.disordered} out of order, {late[0]:.0f} ms late (p99 {late[1]:.0f} ms)"
     )
     return 0
 
