@@ -1,13 +1,14 @@
 """What a frame, a query and a commit of a fleet cost, so that more can be reckoned on paper.
 
 `python -m benchmarks.fleet.costs [--frames N] [--model NAME] [--page docs/performance.md]`: real
-PostgreSQL, fsync on, with a synchronous standby, and the engine in this process: nothing waits for
-another but for the disk, so that what is measured is work.
+PostgreSQL, fsync on, with a synchronous standby, blobs in a server of objects, and the engine in
+this process: nothing waits for another but for the disk, so that what is measured is work.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 import time
@@ -22,6 +23,7 @@ from benchmarks.fleet.paper import Costs, paper
 from benchmarks.fleet.postgres_pair import DATABASE, Pair
 from benchmarks.fleet.recordings import ROOM_FRAMES, recordings
 from benchmarks.fleet.resource_usage import Meter, Work, memory_of
+from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.machine import describe_machine
 from benchmarks.pages import put_between
 from sceneprint.engine import Engine
@@ -29,6 +31,7 @@ from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.models import read_model
 from sceneprint.settings import Settings
 from sceneprint.store.database import Database
+from sceneprint.store.events import number_events
 from sceneprint.store.postgres import vectors
 from sceneprint_client.api import NewMap, Query
 from sceneprint_client.frame_files import meta_of
@@ -51,18 +54,29 @@ def measure(folder: Path, data: Path, n: int, model: str) -> Costs:
     """
     frames = _frames(data, n + 1)
     pair = Pair(folder / "database", synchronous=True)
+    objects = ObjectServer(log=folder / "requests")
     try:
         pair.begin()
-        settings = Settings(data_dir=folder / "host", database_url=cast(Any, pair.url))
+        objects.start()
+        os.environ.update(objects.env)
+        settings = Settings(
+            data_dir=folder / "host", database_url=cast(Any, pair.url),
+            blob_url=cast(Any, objects.bucket("costs")),
+        )  # fmt: skip
         with Engine(settings) as engine:
             engine.create_map(NewMap(name=MAP, model=model))
             _through(engine, frames[:1])  # what is opened once
             tables, blobs = _tables(pair), _blobs(engine)
-            uploaded = _upload(engine, pair, frames[1:])
-            signed = _sign(engine, pair, n)
-            grown = {name: (size - tables.get(name, 0)) / n for name, size in _tables(pair).items()}
+            meter = Meter(pair, objects)
+            uploaded = _upload(engine, meter, frames[1:])
+            signed = _sign(engine, meter, n)
+            number_events(engine.store.database)
+            grown = {
+                name: (size - tables.get(name, 0)) / n for name, size in _tables(pair).items()
+                if name != "pending_events"  # which is empty again
+            }  # fmt: skip
             kept = _blobs(engine) - blobs
-            queried = _query(engine, pair, frames[1 :: max(n // 20, 1)])
+            queried = _query(engine, meter, frames[1 :: max(n // 20, 1)])
             synchronous = _commits(engine.store.database)
             pair.primary.execute("ALTER SYSTEM SET synchronous_standby_names = ''")
             pair.primary.execute("SELECT pg_reload_conf()")
@@ -70,6 +84,7 @@ def measure(folder: Path, data: Path, n: int, model: str) -> Costs:
             linked = _linked(engine.store.database)
     finally:
         pair.end()
+        objects.kill()
     uploads = sum(frame.path.stat().st_size for frame in frames[1:])
     return Costs(
         model=model,
@@ -104,9 +119,9 @@ def _sign_all(engine: Engine) -> None:
         engine.run(work)
 
 
-def _upload(engine: Engine, pair: Pair, frames: Sequence[FrameReference]) -> Work:
+def _upload(engine: Engine, meter: Meter, frames: Sequence[FrameReference]) -> Work:
     seconds = []
-    with Meter(pair).running() as told:
+    with meter.running() as told:
         for frame in frames:
             data, meta = frame.path.read_bytes(), meta_of(frame)
             begun = time.perf_counter()
@@ -115,9 +130,9 @@ def _upload(engine: Engine, pair: Pair, frames: Sequence[FrameReference]) -> Wor
         return told(seconds)
 
 
-def _sign(engine: Engine, pair: Pair, n: int) -> Work:
+def _sign(engine: Engine, meter: Meter, n: int) -> Work:
     seconds = []
-    with Meter(pair).running() as told:
+    with meter.running() as told:
         for _ in range(n):
             begun = time.perf_counter()
             work = engine.claim("costs")
@@ -128,10 +143,10 @@ def _sign(engine: Engine, pair: Pair, n: int) -> Work:
         return told(seconds)
 
 
-def _query(engine: Engine, pair: Pair, frames: Sequence[FrameReference]) -> Work:
+def _query(engine: Engine, meter: Meter, frames: Sequence[FrameReference]) -> Work:
     seconds = []
     engine.queries.upload([MAP], frames[0].path.read_bytes(), meta_of(frames[0]), Query())
-    with Meter(pair).running() as told:
+    with meter.running() as told:
         for frame in frames:
             data, meta = frame.path.read_bytes(), meta_of(frame, with_pose=False)
             begun = time.perf_counter()
@@ -213,14 +228,17 @@ def table(found: Costs) -> list[str]:
         f"### Of a frame and a query: {found.frames} frames of 640 x 480, `{found.model}` "
         f"({found.signature_bytes:,} bytes a signature)",
         "",
-        "| | wall, ms | own CPU, ms | of the database, ms | in turn, ms | commits | WAL, bytes |",
-        "|---|--:|--:|--:|--:|--:|--:|",
+        "| | wall, ms | own CPU, ms | of the database, ms | in turn, ms | commits | WAL, bytes | "
+        "requests of objects |",
+        "|---|--:|--:|--:|--:|--:|--:|---|",
     ]
     for name, one in (("upload", found.upload), ("sign", found.sign), ("query", found.query)):
         lines.append(
             f"| {name} | {one.wall_ms:.1f} | {one.own_ms:.1f} | {one.database_ms:.1f} | "
             f"{one.turn_ms:.1f} | {one.commits[0]:.1f} + {one.commits[1]:.1f} | "
-            f"{one.wal_bytes:,.0f} |"
+            f"{one.wal_bytes:,.0f} | "
+            + ", ".join(f"{n:.1f} {method}" for method, n in sorted(one.requests.items()))
+            + " |"
         )
     rows = sum(found.tables.values())
     told = ", ".join(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import cast
 from sqlalchemy import Connection
 
 from benchmarks.fleet.postgres_pair import Pair
+from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.machine import own_bytes
 from sceneprint.cli.demo import serving
 from sceneprint.formats.dataset import FrameReference
@@ -35,9 +36,10 @@ class Work:
     ----------
     wall_ms : median
     own_ms, database_ms : of a processor, in this process and in the primary's
-    turn_ms : in which no other process could write
+    turn_ms : in which no other process could write to the map
     commits : in turn, and of those that need none
     wal_bytes : of the primary's log
+    requests : to the object store, by method
     """
 
     wall_ms: float
@@ -46,6 +48,7 @@ class Work:
     turn_ms: float
     commits: tuple[float, float]
     wal_bytes: float
+    requests: Mapping[str, float]
 
 
 class Meter:
@@ -54,10 +57,11 @@ class Meter:
     Parameters
     ----------
     pair : whose primary is asked
+    objects : whose requests are counted
     """
 
-    def __init__(self, pair: Pair) -> None:
-        self._pair = pair
+    def __init__(self, pair: Pair, objects: ObjectServer) -> None:
+        self._pair, self._objects = pair, objects
         self._turn_s = 0.0
         self._commits = [0, 0]
 
@@ -69,16 +73,18 @@ class Meter:
 
         @contextmanager
         def timed(
-            database: Database, *, unchecked: bool = False, turn: bool = True
-        ) -> Iterator[Connection]:
+            database: Database, *, unchecked: bool = False, turn: bool = True,
+            map_number: int | None = None,
+        ) -> Iterator[Connection]:  # fmt: skip
             begun = time.perf_counter()
-            with write(database, unchecked=unchecked, turn=turn) as connection:
+            of = {"unchecked": unchecked, "turn": turn, "map_number": map_number}
+            with write(database, **of) as connection:  # type: ignore[arg-type]
                 yield connection
             meter._commits[not turn] += 1
             if turn:
                 meter._turn_s += time.perf_counter() - begun
 
-        before = self._reading()
+        before, asked = self._reading(), self._objects.requests()
 
         def told(seconds: Sequence[float]) -> Work:
             after = self._reading()
@@ -88,6 +94,8 @@ class Meter:
             return Work(
                 1e3 * statistics.median(seconds), 1e3 * own, 1e3 * database, 1e3 * turn,
                 (commits, others), wal,
+                {method: count / len(seconds) for method, count in
+                 (self._objects.requests() - asked).items()},
             )  # fmt: skip
 
         Database.write = timed  # type: ignore[method-assign, assignment]

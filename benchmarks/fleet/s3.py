@@ -5,12 +5,16 @@ What it keeps is gone with it. It takes any credentials, and checks no signature
 
 from __future__ import annotations
 
+import os
+import re
 import socket
 import subprocess
 import sys
 import time
 import urllib.error
 import urllib.request
+from collections import Counter
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -25,10 +29,11 @@ class ObjectServer:
     Parameters
     ----------
     port : to listen on; 0 for a free one
+    log : file that has a line for each request; None: nobody counts them
     """
 
-    def __init__(self, port: int = 0) -> None:
-        self.port = port or _free_port()
+    def __init__(self, port: int = 0, log: Path | None = None) -> None:
+        self.port, self._log = port or _free_port(), log
         self._process: subprocess.Popen[bytes] | None = None
 
     @property
@@ -54,10 +59,11 @@ class ObjectServer:
 
     def start(self) -> None:
         """Start it, and wait until it answers."""
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _MAIN, "-H", "127.0.0.1", "-p", str(self.port)],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+        with (self._log or Path(os.devnull)).open("wb") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _MAIN, "-H", "127.0.0.1", "-p", str(self.port)],
+                stdout=subprocess.DEVNULL, stderr=log,
+            )  # fmt: skip
         until = time.monotonic() + BEGIN_S
         while time.monotonic() < until and self.is_running:
             try:
@@ -73,6 +79,11 @@ class ObjectServer:
         asked = urllib.request.Request(f"{self.endpoint}/{name}", method="PUT")
         with urllib.request.urlopen(asked, timeout=10):
             return f"s3://{name}"
+
+    def requests(self) -> Counter[str]:
+        """Requests so far, by method."""
+        text = "" if self._log is None else self._log.read_text(errors="replace")
+        return Counter(re.findall(r'"(GET|HEAD|PUT|POST|DELETE) ', text))
 
     def kill(self) -> None:
         """End it as a loss of power would: what it kept is gone."""

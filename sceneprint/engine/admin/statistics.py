@@ -25,7 +25,7 @@ from sceneprint.index.generation_files import GenerationManifest, manifests, rea
 from sceneprint.process import merged, quantile
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database, FolderBlobs, Store, frame_queries, store_counts
-from sceneprint.store.events import anchor_number, newest_number
+from sceneprint.store.events import anchor_number, newest_number, number_events
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.queue import count_jobs, read_clock, waiting_by_tenant
@@ -252,6 +252,7 @@ class Statistics:
         """
         now = time.time()
         start = (now // MINUTE_S - minutes + 1) * MINUTE_S
+        number_events(self._store.database)
         with self._store.database.read() as connection:
             row = None if map_name is None else find_map(connection, map_name)
             kinds = [f"frame.{outcome}" for outcome in OUTCOMES]
