@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from benchmarks.fleet import audit, failover_client, faults
-from benchmarks.fleet.__main__ import MARKS, table
+from benchmarks.fleet.__main__ import marks, table
 from benchmarks.fleet.audit import Found, check
 from benchmarks.fleet.failover_client import FailoverClient, RequestLog, Unreachable, Wait
 from benchmarks.fleet.faults import PRIMARY, Kill, Promotion, schedule
@@ -189,6 +189,7 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         "plan": Plan(), "kills": Counter(service=2, primary=1),
         "outages": {"service": [1.25, 0.0], PRIMARY: [3.0]},
         "promotions": [Promotion(None, 10.0, 11.5, {"a": 0.5, "b": 2.0}, frozenset())],
+        "steps": (), "refused": Counter(),
         "answers": Counter(found=3), "repeated": 4, "faults": [], "damaged": 0, "leftovers": 0,
         "lost": 0, "window": 0, "seconds": 99.0,
     }  # fmt: skip
@@ -224,7 +225,7 @@ def test_what_is_wrong_fails(found: dict[str, Any], changed: dict[str, Any], sou
 
 
 def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
-    page, (begin, end) = tmp_path / "page.md", MARKS[False]
+    page, (begin, end) = tmp_path / "page.md", marks(Plan())
     page.write_text(f"before\n{begin}\nold\n{end}\nafter\n")
     put_between(page, begin, end, table(figures(Found(acknowledged=9, indexed=9, found=9))))
     text = page.read_text()
@@ -236,27 +237,50 @@ def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
     assert "each service answered 0.5, 2.0 s after that" in text
 
 
+def test_an_upgrade_tells_its_steps_and_what_was_refused(tmp_path: Path) -> None:
+    plan = Plan(seconds=60.0, before=tmp_path)
+    found = Found(acknowledged=9, indexed=9, found=9)
+    told = "\n".join(table(figures(found, plan=plan, steps=["the database", "worker-1"])))
+    assert "### 8 robots for 60 s, the version before replaced" in told
+    assert "in this order: the database, worker-1.\n" in told
+    assert told.endswith("Requests refused (429, 503): none.\n")
+    refused = Counter({"upload 503": 2})
+    told = "\n".join(table(figures(found, plan=plan, refused=refused)))
+    assert told.endswith("Requests refused (429, 503): 2 of upload 503.\n")
+    assert marks(plan)[0] != marks(Plan())[0]
+
+
 def test_what_is_on_paper_is_multiplied_right() -> None:
     costs = Costs(
         model="depth", signature_bytes=12_800, frames=50,
-        upload=Work(30.0, 12.0, 2.0, 3.0, (1.0, 0.0), 3_000.0),
-        sign=Work(90.0, 60.0, 3.0, 5.0, (1.0, 1.0), 27_000.0),
-        query=Work(200.0, 180.0, 1.0, 0.0, (0.0, 0.0), 0.0),
+        upload=Work(30.0, 12.0, 2.0, 3.0, (1.0, 0.0), 3_000.0, {"PUT": 1.0}),
+        sign=Work(90.0, 60.0, 3.0, 5.0, (1.0, 1.0), 27_000.0, {"GET": 1.0, "PUT": 1.0}),
+        query=Work(200.0, 180.0, 1.0, 0.0, (0.0, 0.0), 0.0, {"HEAD": 1.0, "POST": 0.5}),
         tables={"signatures": 14_000.0, "frames": 2_000.0}, blobs=(76_000.0, 174_000.0),
         commit_ms={"alone": (4.0, 9.0)}, linked=(2_000.0, 340.0, 560.0), memory={"worker": 10**8},
     )  # fmt: skip
-    told = {line.split(" | ")[0]: line.split(" | ")[-1] for line in paper(costs)}
+    lines = paper(costs)
+    more = lines.index("### On paper: 100,000,000 frames in 50 maps, `depth`")
+    told, tenfold = (
+        {line.split(" | ")[0]: line.split(" | ")[-1] for line in some}
+        for some in (lines[:more], lines[more:])
+    )
     assert told["| processors for signing"] == "10 |"  # 100 a second x 60 ms / 0.6
     assert told["| processors for queries"] == "30 |"
-    assert told["| processors of the database"] == "1 |"
-    assert told["| the turn is taken for"] == "80% of the time |"
-    assert told["| the turn is full at"] == "125 frames a second |"
+    assert told["| processors of the database"] == "1.0 |"
+    assert told["| a map's turn is full at"] == "125 frames a second |"
     assert (
         told["| log of the database (WAL), and to each standby"]
         == "3.0 MB a second, 259 GB a day |"
     )
+    # 100 a second x 30 days = 259 million, x 2.5 x 5 and x 2 x 0.4 dollars a million
+    assert told["| requests of objects that write"] == "$3,240 a month |"
+    assert told["| that read"] == "$207 a month |"
     assert told["| rows of the database"] == "160 GB |"
+    assert tenfold["| rows of the database"] == "1,600 GB |"
     assert told["| blobs"] == "2.5 TB |"
+    assert tenfold["| keeping them"] == "$575 a month |"
     assert told["| vectors and their graph in the database, to be held in its memory"] == "9 GB |"
     assert told["| linking all of them anew, one processor"] == "1.4 h |"
     assert told["| of one that asks all maps"] == "160 MB, 128.1 GB |"
+    assert tenfold["| reading all blobs, at 100 MB/s"] == "69 h |"

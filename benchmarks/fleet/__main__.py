@@ -17,11 +17,13 @@ from benchmarks.machine import describe_machine
 from benchmarks.pages import put_between
 from sceneprint.cli.options import ended_by_signals
 
-#: Marks in the page, by whether the standby is asynchronous.
-MARKS = {
-    False: ("<!-- fleet:begin -->", "<!-- fleet:end -->"),
-    True: ("<!-- fleet-asynchronous:begin -->", "<!-- fleet-asynchronous:end -->"),
-}
+
+def marks(plan: Plan) -> tuple[str, str]:
+    """Marks in the page of what such a run found."""
+    name = "fleet-asynchronous" if plan.asynchronous else "fleet"
+    if plan.before is not None:
+        name = "fleet-upgrade"
+    return f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
 
 
 def table(figures: FleetFigures) -> list[str]:
@@ -29,12 +31,16 @@ def table(figures: FleetFigures) -> list[str]:
     plan, found = figures.plan, figures.found
     standby = "an asynchronous" if plan.asynchronous else "a synchronous"
     blobs = "an object store" if plan.objects else "a shared folder"
+    what = f"{standby} standby"
+    done = "SIGKILL of " + ", ".join(f"{n} of {name}" for name, n in sorted(figures.kills.items()))
+    if plan.before is not None:
+        what = "the version before replaced"
+        done = "Replaced by this version, in this order: " + ", ".join(figures.steps)
     lines = [
-        f"### {plan.robots} robots for {plan.seconds:.0f} s, {standby} standby",
+        f"### {plan.robots} robots for {plan.seconds:.0f} s, {what}",
         "",
         f"PostgreSQL with {standby} standby, {plan.services} services, {plan.workers} workers, "
-        f"blobs in {blobs}; {plan.robots} robots send {plan.rate:g} frames a second each. SIGKILL "
-        "of " + ", ".join(f"{n} of {name}" for name, n in sorted(figures.kills.items())) + ".",
+        f"blobs in {blobs}; {plan.robots} robots send {plan.rate:g} frames a second each. {done}.",
         "",
         "| | |",
         "|---|--:|",
@@ -58,6 +64,11 @@ def table(figures: FleetFigures) -> list[str]:
         f"| queries answered, requests sent again, errors | {figures.answers.total()}, "
         f"{figures.repeated}, {len(figures.faults)} |",
         "",
+    ]
+    if plan.before is not None:
+        refused = ", ".join(f"{n} of {name}" for name, n in sorted(figures.refused.items()))
+        return [*lines, f"Requests refused (429, 503): {refused or 'none'}.", ""]
+    lines += [
         "| killed | longest that a robot had no answer, s |",
         "|---|--:|",
         *(
@@ -93,6 +104,10 @@ def main(arguments: list[str] | None = None) -> int:
         help="the standby need not have what is acknowledged, and is cut off for a while first",
     )  # fmt: skip
     parser.add_argument("--data", type=Path, help="folder of recordings; default: synthetic rooms")
+    parser.add_argument(
+        "--before", type=Path,
+        help="checkout of the version before: upgrade such a fleet while the robots go on",
+    )  # fmt: skip
     parser.add_argument("--page", type=Path, help="whose figures to replace")
     parser.add_argument("--keep", type=Path, help="new folder for data and logs, left there")
     options = vars(parser.parse_args(arguments))
@@ -117,7 +132,7 @@ def main(arguments: list[str] | None = None) -> int:
     lines = ["", when, "", *table(figures)]
     print("\n".join(lines))
     if page is not None:
-        put_between(page, *MARKS[plan.asynchronous], lines)
+        put_between(page, *marks(plan), lines)
     return 0 if figures.sound else 1
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -15,7 +17,6 @@ from benchmarks.fleet.failover_client import PAUSE_S
 from benchmarks.fleet.postgres_pair import Pair
 from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.soak.load import Part, free_port
-from sceneprint.engine import Engine
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
 
@@ -38,12 +39,14 @@ class Fleet:
     services, workers : how many processes of each
     synchronous : whether the database waits for its standby
     objects : keep blobs in an object store, and not in a folder that all hosts share
+    before : checkout of another version, which all processes begin as; None: of this one
     """
 
     def __init__(
-        self, folder: Path, services: int, workers: int, *, synchronous: bool, objects: bool
-    ) -> None:
-        self._folder = folder
+        self, folder: Path, services: int, workers: int, *, synchronous: bool, objects: bool,
+        before: Path | None = None,
+    ) -> None:  # fmt: skip
+        self._folder, self._before = folder, before
         (folder / "database").mkdir()
         self.pair = Pair(folder / "database", synchronous=synchronous)
         self._sizes = services, workers
@@ -65,8 +68,11 @@ class Fleet:
         self._shared = self._shared | SETTINGS | {
             "SCENEPRINT_DATABASE_URL": self.pair.url, "SCENEPRINT_BLOB_URL": blobs
         }  # fmt: skip
-        with self._here() as settings, Engine(settings) as engine:
-            secret = engine.create_key("fleet").secret
+        made = subprocess.run(
+            [sys.executable, "-c", _MAKE_KEY, str(self.host)], check=True, text=True,
+            env=self.environment() | _path_of(self._before), stdout=subprocess.PIPE,
+        )  # fmt: skip
+        secret = made.stdout.strip()
         for host in range(n_services):
             port = free_port()
             self.urls.append(f"http://127.0.0.1:{port}")
@@ -80,6 +86,15 @@ class Fleet:
         for url in self.urls:
             await_service(url)
         return secret
+
+    @property
+    def host(self) -> Path:
+        """Data folder of the first host."""
+        return self._folder / "host-1"
+
+    def environment(self) -> dict[str, str]:
+        """Of a process of this version."""
+        return os.environ | self._shared
 
     def fsck(self) -> tuple[int, int]:
         """Files that nothing refers to, and what is damaged; see `sceneprint fsck`."""
@@ -102,7 +117,8 @@ class Fleet:
 
     def _part(self, name: str, command: list[str], host: int) -> Process:
         arguments = ["sceneprint", *command, "--data", str(self._folder / f"host-{host + 1}")]
-        return Process(name, arguments, self._folder / f"{name}.log", self._shared)
+        log = self._folder / f"{name}.log"
+        return Process(name, arguments, log, self._shared, self._before)
 
     @contextmanager
     def _here(self) -> Iterator[Settings]:
@@ -110,20 +126,54 @@ class Fleet:
         before = dict(os.environ)
         os.environ.update(self._shared)
         try:
-            yield Settings(data_dir=self._folder / "host-1")
+            yield Settings(data_dir=self.host)
         finally:
             os.environ.clear()
             os.environ.update(before)
 
 
+#: Makes the key of who may do everything, as any version does.
+_MAKE_KEY = """
+import sys
+from sceneprint.engine import Engine
+from sceneprint.settings import Settings
+
+with Engine(Settings(data_dir=sys.argv[1])) as engine:
+    print(engine.create_key("fleet").secret)
+"""
+
+
+def _path_of(checkout: Path | None) -> dict[str, str]:
+    """What lets a process import the packages of a checkout, and not those that are installed or of
+    the folder that it begins in.
+    """
+    if checkout is None:
+        return {}
+    path = os.pathsep.join(map(str, (checkout.absolute(), checkout.absolute() / "client")))
+    return {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
+
+
 class Process(Part):
-    """A part whose environment has more than settings."""
+    """A part whose environment has more than settings.
+
+    Parameters
+    ----------
+    name, arguments, log : see Part
+    environment : beside this process's
+    before : see Fleet
+    """
 
     def __init__(
-        self, name: str, arguments: list[str], log: Path, environment: Mapping[str, str]
-    ) -> None:
+        self, name: str, arguments: list[str], log: Path, environment: Mapping[str, str],
+        before: Path | None = None,
+    ) -> None:  # fmt: skip
         super().__init__(name, arguments, log)
-        self._environment |= environment
+        self._present = {**self._environment, **environment}
+        self._environment = {**self._present, **_path_of(before)}
+
+    def take_present(self) -> None:
+        """From the next beginning on, be of this version."""
+        self._environment = self._present
 
 
 def await_service(url: str) -> None:

@@ -121,7 +121,7 @@ def _of_frames(found: Costs, frames: int) -> list[str]:
         "|---|---|--:|",
         f"| rows of the database | {rows:,.0f} bytes a frame | {frames * rows / 1e9:,.0f} GB |",
         f"| blobs | {blobs:,.0f} bytes a frame | {frames * blobs / 1e12:.1f} TB |",
-        f"| keeping them, at ${GB_MONTH:g} a GB and month | | "
+        f"| keeping them | ${GB_MONTH:g} a GB and month | "
         f"${frames * blobs / 1e9 * GB_MONTH:,.0f} a month |",
     ]
     if found.linked is not None:

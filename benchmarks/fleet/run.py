@@ -23,6 +23,7 @@ from benchmarks.fleet.faults import FaultInjector, Kill, Promotion, schedule
 from benchmarks.fleet.fleet import Fleet, await_service
 from benchmarks.fleet.recordings import Shot, recordings, walks
 from benchmarks.fleet.robots import Ledger, Listener, Robot, asked
+from benchmarks.fleet.rolling_upgrade import upgrade
 from sceneprint_client import Client
 
 #: The map that most robots share; every so many robots have one of their own.
@@ -46,6 +47,8 @@ class Plan:
     asynchronous : the standby does not have to have received what is acknowledged
     objects : blobs are in an object store
     data : folder of recordings; None: synthetic rooms
+    before : checkout of the version before, which the fleet begins as: instead of being killed,
+        its parts are replaced by this version
     """
 
     seconds: float = 120.0
@@ -59,6 +62,7 @@ class Plan:
     asynchronous: bool = False
     objects: bool = False
     data: Path | None = None
+    before: Path | None = None
 
     @property
     def frames(self) -> int:
@@ -77,6 +81,8 @@ class FleetFigures:
     kills : by victim
     outages : see `outages`
     promotions : of the standby
+    steps : of the upgrade
+    refused : answers that asked to come back, by request and status
     answers : queries by status
     repeated : requests that were sent again
     faults : answers that should not be, and errors in any log that are not of an outage
@@ -91,6 +97,8 @@ class FleetFigures:
     kills: Counter[str]
     outages: dict[str, list[float]]
     promotions: Sequence[Promotion]
+    steps: Sequence[str]
+    refused: Counter[str]
     answers: Counter[str]
     repeated: int
     faults: list[str]
@@ -121,7 +129,7 @@ def drive(folder: Path, plan: Plan) -> FleetFigures:
         walked = walks(data, plan.robots, plan.frames)
     fleet = Fleet(
         folder, plan.services, plan.workers, synchronous=not plan.asynchronous,
-        objects=plan.objects,
+        objects=plan.objects, before=plan.before,
     )  # fmt: skip
     try:
         return _driven(fleet, plan, walked, begun)
@@ -145,9 +153,13 @@ def _driven(fleet: Fleet, plan: Plan, walked: list[list[Shot]], begun: float) ->
         walking = time.monotonic()
         for one in (*listeners, *robots, telling):
             one.start()
+        steps = list[str]()
         try:
-            due = schedule(plan.seconds, plan.kills, plan.promotions, rng)
-            injector.run(due, bar.set_postfix_str)
+            if plan.before is not None:
+                steps = upgrade(fleet, plan.seconds, bar.set_postfix_str)
+            else:
+                due = schedule(plan.seconds, plan.kills, plan.promotions, rng)
+                injector.run(due, bar.set_postfix_str)
             stop.wait(max(walking + plan.seconds - time.monotonic(), 0.0))
         finally:
             stop.set()
@@ -171,6 +183,8 @@ def _driven(fleet: Fleet, plan: Plan, walked: list[list[Shot]], begun: float) ->
         kills=Counter(one.victim for one in injector.kills),
         outages=outages(injector.kills, log.waits),
         promotions=injector.promotions,
+        steps=steps,
+        refused=log.refused,
         answers=ledger.answers,
         repeated=log.repeated,
         faults=log.faults,
