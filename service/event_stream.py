@@ -37,7 +37,8 @@ from service.limits import Broken, Holdings, share
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two looks at the database, and after one that failed.
+#: Seconds between two looks at the database, half of them where there was something; and after one
+#: that failed.
 POLL_S, TROUBLE_S = 0.1, 1.0
 #: Seconds of silence after which a stream says that it lives.
 ALIVE_S = 3.0
@@ -232,7 +233,7 @@ class Feed:
                 log.error("events cannot be read", extra={"error": str(error)})
                 pause = TROUBLE_S
                 continue
-            pause = 0.0 if len(found) == MOST else POLL_S
+            pause = 0.0 if len(found) == MOST else POLL_S / (2 if found else 1)
             if found:
                 self._held.extend(found)
                 while len(self._held) > HELD:

@@ -120,9 +120,9 @@ def _follow(pipe: Pipe, url: str, commits: int) -> None:
     database = open_database(url)
     feed, place, seen = Feed(), 0, dict[str | None, set[str]]()
     pipe.send("begun")
-    is_last = False
+    is_last, pause_s = False, POLL_S
     while not is_last:
-        is_last = pipe.poll(POLL_S)
+        is_last, pause_s = pipe.poll(pause_s), POLL_S
         while True:
             part = next_events(database, Wanted(kinds=("frame.",)), place, MOST)
             now, place = time.time(), part.place
@@ -131,6 +131,7 @@ def _follow(pipe: Pipe, url: str, commits: int) -> None:
                 of_frame.add(one.kind)
                 feed.disordered += "frame.received" not in of_frame
                 feed.late_ms.append(1e3 * (now - one.at))
+                pause_s = POLL_S / 2
             if len(part.found) < MOST:
                 break
     feed.missed = 2 * commits - sum(map(len, seen.values()))

@@ -378,9 +378,10 @@ class Engine:
         self.bell.ring()
 
     def counts(self) -> tuple[dict[str, int], dict[str, int]]:
-        """How many frames and how many jobs are in each state."""
+        """How many frames and how many jobs are in each state; see `Statistics.counts`."""
         with self.store.database.read() as connection:
-            return stored_frames.count_states(connection), queue.count_jobs(connection)
+            found = self.operations.statistics.counts(connection)
+        return dict(found.frames), dict(found.jobs)
 
     def publish_due(self) -> int:
         """Bring maps on to their next models, delete what is too old, publish the indexes that have

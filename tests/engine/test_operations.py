@@ -151,6 +151,44 @@ def test_indexes_and_sizes_are_told(data, make_engine):
     assert told.disk == shutil.disk_usage(data).total
 
 
+def test_of_a_large_store_what_was_counted_is_told_while_a_thread_counts_again(
+    make_engine, uploads, monkeypatch
+):
+    """Whoever asks waits for no count, and of what waits is told the present number."""
+    engine = make_engine()
+    engine.create_map(NewMap(name="hall"))
+    for upload in uploads[:3]:
+        engine.add_frame("hall", upload.data, upload.meta)
+    seen = engine.operations.statistics
+    first = seen.tell()
+    assert (first.frames, first.counted_at) == ({"received": 3}, first.counted_at)
+    engine.add_frame("hall", uploads[3].data, uploads[3].meta)
+    assert seen.tell().frames == {"received": 4}  # few are counted anew
+    monkeypatch.setattr(statistics, "MANY", 8)  # four frames and their jobs
+    threads, begin = [], statistics.threading.Thread.start
+    monkeypatch.setattr(
+        statistics.threading.Thread,
+        "start",
+        lambda one: threads.append(one) if one.name == "counts" else begin(one),
+    )
+    monkeypatch.setattr(statistics, "COUNTING", 1e-12)  # what was counted is young for years
+    known = seen.tell()
+    engine.add_frame("hall", uploads[4].data, uploads[4].meta)
+    again = seen.tell()
+    assert (again.frames, again.waiting, threads) == ({"received": 4}, 5, [])
+    assert again.counted_at == known.counted_at < again.at
+    assert engine.counts()[0] == {"received": 4}
+    monkeypatch.setattr(statistics, "COUNTING", 1e12)  # and old at once
+    assert seen.tell().frames == {"received": 4}
+    assert seen.tell().frames == {"received": 4}
+    (counter,) = threads  # one of those that asked began it
+    monkeypatch.setattr(statistics, "COUNTING", 1e-12)
+    counter.run()
+    fresh = seen.tell()
+    assert fresh.frames == {"received": 5}
+    assert fresh.counted_at > again.counted_at
+
+
 def test_many_blobs_are_measured_by_a_part_of_them(make_engine, monkeypatch):
     engine = make_engine()
     for i in range(600):

@@ -67,14 +67,16 @@ def test_all_figures_are_there(served, make_map, until):
         pairs = (line.rpartition(" ")[::2] for line in lines if not line.startswith("#"))
         return {name: float(value) for name, value in pairs}
 
+    def worked() -> int:
+        seen = figures()
+        return sum(int(seen[f'sceneprint_workers{{state="{one}"}}']) for one in ("idle", "busy"))
+
+    until(lambda: worked() == len(served.workers))  # they begin after the service
     values = figures()
     assert values['sceneprint_index_tail_frames{map="plain"}'] == 0
     assert values["sceneprint_maps"] >= 1
     assert values["sceneprint_disk_free_bytes"] > 0
     assert values['sceneprint_disk_bytes{part="database"}'] > 0
-    assert values['sceneprint_workers{state="idle"}'] + values[
-        'sceneprint_workers{state="busy"}'
-    ] == len(served.workers)
     assert values["sceneprint_workers_began"] >= 1
     received = 'sceneprint_received_bytes_total{route="/v1/maps"}'
     assert values[received] >= len(json.dumps({"name": "plain", "model": "depth"}))

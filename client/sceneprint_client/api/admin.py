@@ -252,6 +252,11 @@ class Stats(ApiRecord):
     """How the service, or one map, does now and did lately."""
 
     at: datetime
+    counted_at: datetime | None = Field(
+        default=None,
+        description="When frames, ended jobs, indexes and bytes were counted. From 100,000 frames "
+        "and jobs on they are counted for 1 % of the time.",
+    )
     map: str | None = Field(description="Of which alone this tells; null: of all.")
     maps: int
     frames: dict[str, int] = Field(description="How many frames are in each state.")

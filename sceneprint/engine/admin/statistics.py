@@ -5,6 +5,7 @@ frames, jobs, events, samples  --Statistics.tell-->  Stats
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import threading
@@ -28,7 +29,7 @@ from sceneprint.store import Blobs, Database, FolderBlobs, Store, frame_queries,
 from sceneprint.store.events import anchor_number, newest_number, number_events
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import find_map, list_maps
-from sceneprint.store.queue import count_jobs, read_clock, waiting_by_tenant
+from sceneprint.store.queue import PENDING, count_jobs, read_clock, waiting_by_tenant
 from sceneprint.store.scrub_rows import ScrubRow, read_scrub
 from sceneprint.store.signatures import count_indexed
 from sceneprint.store.tables import MapRow
@@ -48,6 +49,8 @@ from sceneprint_client.api.admin import (
     Stats,
     WorkerSeen,
 )
+
+log = logging.getLogger(__name__)
 
 # How far the search indexes are behind their maps, and which events they need to be believed.
 
@@ -212,6 +215,8 @@ MINUTE_S, HOUR_S = 60.0, 3600.0
 MEASURED_S = 30.0
 #: Seconds for which figures are told again: whoever asks, and however often, it costs little.
 TOLD_S = 1.0
+#: Frames and jobs from which on a thread counts them, and the share of the time that it does.
+MANY, COUNTING = 100_000, 0.01
 #: What samples are kept of: what a service counted, and workers that began.
 SERVICE, WORKER = "service", "worker"
 
@@ -228,11 +233,44 @@ class Figures:
     waiting: Mapping[str, int]
 
 
+@dataclass(frozen=True)
+class StoreCounts:
+    """What takes the longer to count the more there is.
+
+    Parameters
+    ----------
+    frames, jobs : how many are in each state
+    indexes : see `index_states`
+    sizes : bytes on the disk
+    at : when they were counted, seconds since 1970
+    seconds : that it took
+    """
+
+    frames: Mapping[str, int]
+    jobs: Mapping[str, int]
+    indexes: Sequence[IndexState]
+    sizes: Sizes
+    at: float
+    seconds: float
+
+    @property
+    def is_large(self) -> bool:
+        """Whether there is too much to be counted for whoever asks."""
+        return sum(self.frames.values()) + sum(self.jobs.values()) >= MANY
+
+    @property
+    def is_old(self) -> bool:
+        """Whether to count again; where a clock was set back, it is."""
+        return not 0 <= time.time() - self.at < self.seconds / COUNTING
+
+
 class Statistics:
     """Figures of one store."""
 
     def __init__(self, store: Store, settings: Settings, bell: Wakeup) -> None:
         self._store, self._settings, self._bell = store, settings, bell
+        self._counts: StoreCounts | None = None
+        self._counting = threading.Lock()  # held by who counts a large store
         self._sizes: tuple[float, Sizes] | None = None
         self._sizes_of: dict[int, tuple[float, Sizes]] = {}
         self._figures: tuple[float, Figures] | None = None
@@ -259,11 +297,11 @@ class Statistics:
             happened = store_counts.count_events(connection, kinds, start, MINUTE_S, map_name)
             samples: list[store_counts.Sample] | None = None
             if row is None:
-                frames, jobs = count_states(connection), count_jobs(connection)
-                maps, indexes = (
-                    store_counts.count_maps(connection),
-                    index_states(connection, self._indexes),
-                )
+                counted = self.counts(connection)
+                frames, jobs = dict(counted.frames), dict(counted.jobs)
+                jobs |= count_jobs(connection, states=PENDING)
+                jobs = {state: count for state, count in jobs.items() if count}
+                maps, indexes = store_counts.count_maps(connection), list(counted.indexes)
                 samples = store_counts.samples_since(connection, SERVICE, start)
                 oldest = store_counts.oldest_waiting(connection)
                 workers = self.workers(connection)
@@ -273,9 +311,10 @@ class Statistics:
                 maps, indexes = 1, [index_state(connection, self._indexes, row)]
                 oldest, workers = store_counts.oldest_waiting(connection, row.number), None
             scrub = None if row is not None else _scrub_seen(read_scrub(connection))
-            taken = None if row is None else self._sizes_of_map(connection, row)
+            taken = counted.sizes if row is None else self._sizes_of_map(connection, row)
         return Stats(
             at=when(now),
+            counted_at=when(now if row is not None else counted.at),
             map=map_name,
             maps=maps,
             frames=frames,
@@ -284,7 +323,7 @@ class Statistics:
             oldest_waiting_s=None if oldest is None else max(now - oldest, 0.0),
             indexes=indexes,
             workers=workers,
-            bytes=taken or self.sizes(),
+            bytes=taken,
             use=None if row is None else _use(row),
             replica=self.replica() if row is None else None,
             scrub=scrub,
@@ -303,6 +342,41 @@ class Statistics:
             if self._figures is None or now - self._figures[0] > TOLD_S:
                 self._figures = now, self._look()
             return self._figures[1]
+
+    def counts(self, connection: Connection) -> StoreCounts:
+        """How many frames and jobs there are, how far the indexes are, and what all takes.
+
+        Of a large store it is what was counted last; a thread counts again for COUNTING of the
+        time.
+        """
+        known = self._counts
+        if known is None or not known.is_large:
+            return self._count(connection)
+        if known.is_old and self._counting.acquire(blocking=False):
+            threading.Thread(target=self._count_again, name="counts", daemon=True).start()
+        return known
+
+    def _count_again(self) -> None:
+        try:
+            with self._store.database.read() as connection:
+                self._count(connection)
+        except SceneprintError as error:
+            log.info("store not counted", extra={"error": str(error)})
+        finally:
+            self._counting.release()
+
+    def _count(self, connection: Connection) -> StoreCounts:
+        began, start = time.time(), time.monotonic()
+        found = StoreCounts(
+            frames=count_states(connection),
+            jobs=count_jobs(connection),
+            indexes=index_states(connection, self._indexes),
+            sizes=self.sizes(),
+            at=began,
+            seconds=time.monotonic() - start,
+        )
+        self._counts = found
+        return found
 
     def replica(self) -> ReplicaSeen | None:
         """How the read replica does, if there is one."""
