@@ -189,7 +189,8 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         "plan": Plan(), "kills": Counter(service=2, primary=1),
         "outages": {"service": [1.25, 0.0], PRIMARY: [3.0]},
         "promotions": [Promotion(None, 10.0, 11.5, {"a": 0.5, "b": 2.0}, frozenset())],
-        "steps": (), "refused": Counter(),
+        "steps": (), "refused": Counter(), "waits_ms": {"query": (90.0, 1200.0)},
+        "memory": (200_000_000, 100_000_000),
         "answers": Counter(found=3), "repeated": 4, "faults": [], "damaged": 0, "leftovers": 0,
         "lost": 0, "window": 0, "seconds": 99.0,
     }  # fmt: skip
@@ -233,6 +234,8 @@ def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
     assert text.endswith(f"{end}\nafter\n")
     assert "SIGKILL of 1 of primary, 2 of service." in text
     assert "| **lost** | **0** |" in text
+    assert "| query: median, p99 | 90, 1,200 ms |" in text
+    assert "of a worker's | 200, 100 MB |" in text
     assert "| service | 0.0, 1.2 |" in text
     assert "each service answered 0.5, 2.0 s after that" in text
 

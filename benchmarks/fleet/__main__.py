@@ -12,6 +12,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from benchmarks.fleet.fleet import DATABASE_S, STORE_S
 from benchmarks.fleet.run import FleetFigures, Plan, drive
 from benchmarks.machine import describe_machine
 from benchmarks.pages import put_between
@@ -21,6 +22,8 @@ from sceneprint.cli.options import ended_by_signals
 def marks(plan: Plan) -> tuple[str, str]:
     """Marks in the page of what such a run found."""
     name = "fleet-asynchronous" if plan.asynchronous else "fleet"
+    if plan.delays:
+        name = "fleet-delays"
     if plan.before is not None:
         name = "fleet-upgrade"
     return f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
@@ -31,6 +34,12 @@ def table(figures: FleetFigures) -> list[str]:
     plan, found = figures.plan, figures.found
     standby = "an asynchronous" if plan.asynchronous else "a synchronous"
     blobs = "an object store" if plan.objects else "a shared folder"
+    delayed = ""
+    if plan.delays:
+        delayed = (
+            f" (a message to the database takes {1e3 * DATABASE_S:g} ms, one to the store "
+            f"{1e3 * STORE_S:g} ms)"
+        )
     what = f"{standby} standby"
     done = "SIGKILL of " + ", ".join(f"{n} of {name}" for name, n in sorted(figures.kills.items()))
     if plan.before is not None:
@@ -40,7 +49,8 @@ def table(figures: FleetFigures) -> list[str]:
         f"### {plan.robots} robots for {plan.seconds:.0f} s, {what}",
         "",
         f"PostgreSQL with {standby} standby, {plan.services} services, {plan.workers} workers, "
-        f"blobs in {blobs}; {plan.robots} robots send {plan.rate:g} frames a second each. {done}.",
+        f"blobs in {blobs}{delayed}; {plan.robots} robots send {plan.rate:g} frames a second each. "
+        f"{done}.",
         "",
         "| | |",
         "|---|--:|",
@@ -63,6 +73,12 @@ def table(figures: FleetFigures) -> list[str]:
         f"| answers and lists that differ between the services | {found.disagreeing} |",
         f"| queries answered, requests sent again, errors | {figures.answers.total()}, "
         f"{figures.repeated}, {len(figures.faults)} |",
+        *(
+            f"| {kind}: median, p99 | {p50:,.0f}, {p99:,.0f} ms |"
+            for kind, (p50, p99) in figures.waits_ms.items()
+        ),
+        f"| most memory of a service's process, of a worker's | {figures.memory[0] / 1e6:,.0f}, "
+        f"{figures.memory[1] / 1e6:,.0f} MB |",
         "",
     ]
     if plan.before is not None:
@@ -98,7 +114,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=plan.seed)
     parser.add_argument("--services", type=int, default=plan.services)
     parser.add_argument("--workers", type=int, default=plan.workers)
+    parser.add_argument("--freezes", type=int, default=plan.freezes, help="of the primary")
     parser.add_argument("--objects", action="store_true", help="blobs in an object store")
+    parser.add_argument("--delays", action="store_true", help="messages to the servers take time")
     parser.add_argument(
         "--asynchronous", action="store_true",
         help="the standby need not have what is acknowledged, and is cut off for a while first",

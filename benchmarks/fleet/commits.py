@@ -10,13 +10,11 @@ listen: what it misses, or sees out of a map's order, and how late it is.
 from __future__ import annotations
 
 import argparse
-import socket
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection as Pipe
@@ -27,6 +25,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from benchmarks.fleet.delay_proxy import DelayProxy
 from benchmarks.fleet.postgres import Server
 from sceneprint.engine.admin.operations import next_events
 from sceneprint.store import Database, open_database, queue
@@ -84,8 +83,8 @@ def measure(
             server.create("commits")
             near = open_database(server.url("commits"))
             rows = _maps(near, n_maps)
-            port, process = _delaying_proxy(server.port, delay_ms / 1e3)
-            far = server.url("commits").replace(f":{server.port}/", f":{port}/")
+            proxy = DelayProxy(server.port, delay_ms / 1e3)
+            far = server.url("commits").replace(f":{server.port}/", f":{proxy.port}/")
             clients = [open_database(far) for _ in range(n_clients)]
             reader, own = _reader(far, commits)
             try:
@@ -99,8 +98,7 @@ def measure(
                 reader.join()
                 for one in (*clients, near):
                     one.close()
-                process.kill()
-                process.join()
+                proxy.end()
         finally:
             server.kill()
     return commits / uploaded, commits / ended, feed
@@ -194,36 +192,6 @@ def _timed(clients: list[Database], works: list[T], do: Callable[[Database, T], 
     if errors:
         raise errors[0]
     return time.perf_counter() - begun
-
-
-def _delaying_proxy(port: int, delay_s: float) -> tuple[int, BaseProcess]:
-    """A process of its own that hands on what comes to a port, later; its port."""
-    context = get_context("spawn")
-    told, tell = context.Pipe(duplex=False)
-    process = context.Process(target=_hand_on, args=(tell, port, delay_s), daemon=True)
-    process.start()
-    return told.recv(), process
-
-
-def _hand_on(tell: Pipe, port: int, delay_s: float) -> None:
-    with socket.create_server(("127.0.0.1", 0), backlog=256) as listener:
-        tell.send(listener.getsockname()[1])
-        while True:
-            near, _ = listener.accept()
-            far = socket.create_connection(("127.0.0.1", port))
-            for one in (near, far):
-                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            for pair in ((near, far), (far, near)):
-                threading.Thread(target=_pump, args=(*pair, delay_s), daemon=True).start()
-
-
-def _pump(source: socket.socket, to: socket.socket, delay_s: float) -> None:
-    with suppress(OSError):
-        while data := source.recv(1 << 16):
-            time.sleep(delay_s)
-            to.sendall(data)
-    with suppress(OSError):
-        to.shutdown(socket.SHUT_WR)
 
 
 def main(arguments: list[str] | None = None) -> int:

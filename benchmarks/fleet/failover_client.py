@@ -54,6 +54,7 @@ class RequestLog:
     answered: list[tuple[float, str]] = field(default_factory=list)
     repeated: int = 0
     refused: Counter[str] = field(default_factory=Counter)
+    seconds: dict[str, list[float]] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
 
     def note(self, kind: str, begun: float, *, tries: int) -> None:
@@ -61,6 +62,7 @@ class RequestLog:
         now = time.monotonic()
         with self.lock:
             self.answered.append((now, kind))
+            self.seconds.setdefault(kind, []).append(now - begun)
             self.repeated += tries - 1
             if tries > 1:
                 self.waits.append(Wait(kind, begun, now))

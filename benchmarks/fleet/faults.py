@@ -20,7 +20,9 @@ from benchmarks.fleet.fleet import Fleet, Process, await_service
 
 #: How often each is killed, in proportion: the process that signs, as well as who keeps it.
 VICTIMS = {"service": 3, "worker": 2, "signing process": 2}
-PRIMARY = "primary"
+PRIMARY, FROZEN = "primary", "frozen primary"
+#: Seconds for which a primary is frozen: less than a connection is believed to live.
+FROZEN_S = 5.0
 #: Part of the time before the first and after the last kill.
 CALM = 0.1
 #: Seconds until a killed part begins again; and until somebody promotes the standby.
@@ -59,7 +61,7 @@ class Promotion:
 
 
 def schedule(
-    seconds: float, kills: int, promotions: int, rng: random.Random
+    seconds: float, kills: int, promotions: int, rng: random.Random, freezes: int = 0
 ) -> list[tuple[float, str]]:
     """Seconds from the beginning, and what is killed then."""
     first, last = CALM * seconds, (1 - CALM) * seconds
@@ -67,6 +69,7 @@ def schedule(
     told = [(rng.uniform(first, last), victim) for victim in victims]
     part = (last - first) / max(promotions, 1)
     told += [(first + part * (i + rng.random()), PRIMARY) for i in range(promotions)]
+    told += [(rng.uniform(first, last), FROZEN) for _ in range(freezes)]
     return sorted(told)
 
 
@@ -97,6 +100,10 @@ class FaultInjector:
             tell(victim)
             if victim == PRIMARY:
                 self._promote()
+            elif victim == FROZEN:
+                self.kills.append(Kill(victim, time.monotonic()))
+                with self.fleet.pair.frozen():
+                    time.sleep(FROZEN_S)
             else:
                 self._kill(victim)
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
 
+from benchmarks.fleet.delay_proxy import DelayProxy
 from benchmarks.fleet.failover_client import PAUSE_S
 from benchmarks.fleet.postgres_pair import Pair
 from benchmarks.fleet.s3 import ObjectServer
@@ -30,6 +32,10 @@ SETTINGS = {
 }  # fmt: skip
 
 
+#: Seconds that a message to the database takes, and one to the object store, where asked for.
+DATABASE_S, STORE_S = 0.0005, 0.01
+
+
 class Fleet:
     """All processes; each service is a host of its own, which the workers are shared out among.
 
@@ -40,13 +46,15 @@ class Fleet:
     synchronous : whether the database waits for its standby
     objects : keep blobs in an object store, and not in a folder that all hosts share
     before : checkout of another version, which all processes begin as; None: of this one
+    delays : let messages to the database take DATABASE_S, and those to the object store STORE_S
     """
 
     def __init__(
         self, folder: Path, services: int, workers: int, *, synchronous: bool, objects: bool,
-        before: Path | None = None,
+        before: Path | None = None, delays: bool = False,
     ) -> None:  # fmt: skip
-        self._folder, self._before = folder, before
+        self._folder, self._before, self._delays = folder, before, delays
+        self._proxies: list[DelayProxy] = []
         (folder / "database").mkdir()
         self.pair = Pair(folder / "database", synchronous=synchronous)
         self._sizes = services, workers
@@ -64,9 +72,11 @@ class Fleet:
         if self._objects is not None:
             self._objects.start()
             blobs = f"{self._objects.bucket('fleet')}/blobs"
-            self._shared = self._objects.env
+            port = self._reached(self._objects.port, STORE_S)
+            self._shared = self._objects.env | {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}
+        database = self.pair.url_at([self._reached(one, DATABASE_S) for one in self.pair.ports])
         self._shared = self._shared | SETTINGS | {
-            "SCENEPRINT_DATABASE_URL": self.pair.url, "SCENEPRINT_BLOB_URL": blobs
+            "SCENEPRINT_DATABASE_URL": database, "SCENEPRINT_BLOB_URL": blobs
         }  # fmt: skip
         made = subprocess.run(
             [sys.executable, "-c", _MAKE_KEY, str(self.host)], check=True, text=True,
@@ -86,6 +96,17 @@ class Fleet:
         for url in self.urls:
             await_service(url)
         return secret
+
+    def _reached(self, port: int, delay_s: float) -> int:
+        """By which port our processes reach a server."""
+        if not self._delays:
+            return port
+        self._proxies.append(DelayProxy(port, delay_s))
+        return self._proxies[-1].port
+
+    def memory(self) -> tuple[int, int]:
+        """Most bytes that a process of the services, and one of the workers, ever had."""
+        return _most_memory(self.services), _most_memory(self.workers)
 
     @property
     def host(self) -> Path:
@@ -112,6 +133,8 @@ class Fleet:
         for part in (*self.workers, *self.services):
             part.kill()
         self.pair.end()
+        for proxy in self._proxies:
+            proxy.end()
         if self._objects is not None:
             self._objects.kill()
 
@@ -130,6 +153,21 @@ class Fleet:
         finally:
             os.environ.clear()
             os.environ.update(before)
+
+
+def _most_memory(parts: Sequence[Process]) -> int:
+    """The largest peak of resident memory of any process of some parts, bytes."""
+    groups, most = {part.pid for part in parts}, 0
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            group = int(stat.read_text().rpartition(")")[2].split()[2])
+            status = (stat.parent / "status").read_text()
+        except OSError:
+            continue  # gone
+        peak = re.search(r"^VmHWM:\s+(\d+) kB", status, re.MULTILINE)
+        if group in groups and peak is not None:
+            most = max(most, 1024 * int(peak[1]))
+    return most
 
 
 #: Makes the key of who may do everything, as any version does.

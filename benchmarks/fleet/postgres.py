@@ -173,6 +173,14 @@ class Server:
             self._remove_segment()
         self._forget()
 
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal to all its processes: first to the one that begins others."""
+        if self._process is not None and self.is_running:
+            self._process.send_signal(number)
+            for child in _children(self._process.pid):
+                with suppress(ProcessLookupError):
+                    os.kill(child, number)
+
     def create(self, database: str, template: str | None = None) -> str:
         """Make a database, empty or a copy of one that nobody is connected to; its URL."""
         copied = "" if template is None else f' TEMPLATE "{template}"'

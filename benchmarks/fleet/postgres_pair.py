@@ -8,6 +8,8 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
 
@@ -40,9 +42,18 @@ class Pair:
         self._ports = (self.primary.port, self._standby.port)
 
     @property
+    def ports(self) -> tuple[int, ...]:
+        """Of both hosts."""
+        return self._ports
+
+    @property
     def url(self) -> str:
         """Of both hosts: whoever takes writes is the primary."""
-        hosts = "&".join(f"host=127.0.0.1:{port}" for port in self._ports)
+        return self.url_at(self._ports)
+
+    def url_at(self, ports: Sequence[int]) -> str:
+        """As `url`, where the hosts are reached by other ports."""
+        hosts = "&".join(f"host=127.0.0.1:{port}" for port in ports)
         return f"postgresql+psycopg://postgres@/{DATABASE}?{hosts}&target_session_attrs=read-write"
 
     def stall(self) -> None:
@@ -50,6 +61,15 @@ class Pair:
         senders = self.primary.execute("SELECT pid FROM pg_stat_replication")
         for (pid,) in senders:
             os.kill(cast(int, pid), signal.SIGSTOP)
+
+    @contextmanager
+    def frozen(self) -> Iterator[None]:
+        """Let the primary do nothing meanwhile, as a machine whose disk hangs."""
+        self.primary.signal(signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            self.primary.signal(signal.SIGCONT)
 
     def kill_primary(self) -> None:
         """End it at once, as a machine that dies."""

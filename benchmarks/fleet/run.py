@@ -9,12 +9,13 @@ import random
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
+import numpy as np
 from tqdm import tqdm
 
 from benchmarks.fleet.audit import Found, await_idle, check
@@ -42,10 +43,12 @@ class Plan:
     robots : how many
     rate : frames a second of each
     kills, promotions : of services and workers, and of the primary
+    freezes : of the primary, for some seconds
     seed : of victims and moments
     services, workers : processes
     asynchronous : the standby does not have to have received what is acknowledged
     objects : blobs are in an object store
+    delays : messages to the database and to the object store take their time
     data : folder of recordings; None: synthetic rooms
     before : checkout of the version before, which the fleet begins as: instead of being killed,
         its parts are replaced by this version
@@ -56,11 +59,13 @@ class Plan:
     rate: float = 1.0
     kills: int = 20
     promotions: int = 2
+    freezes: int = 0
     seed: int = 0
     services: int = 2
     workers: int = 4
     asynchronous: bool = False
     objects: bool = False
+    delays: bool = False
     data: Path | None = None
     before: Path | None = None
 
@@ -83,6 +88,8 @@ class FleetFigures:
     promotions : of the standby
     steps : of the upgrade
     refused : answers that asked to come back, by request and status
+    waits_ms : milliseconds of uploads and of queries until they were answered: median, p99
+    memory : most bytes of a process of the services, and of the workers
     answers : queries by status
     repeated : requests that were sent again
     faults : answers that should not be, and errors in any log that are not of an outage
@@ -99,6 +106,8 @@ class FleetFigures:
     promotions: Sequence[Promotion]
     steps: Sequence[str]
     refused: Counter[str]
+    waits_ms: Mapping[str, tuple[float, float]]
+    memory: tuple[int, int]
     answers: Counter[str]
     repeated: int
     faults: list[str]
@@ -129,7 +138,7 @@ def drive(folder: Path, plan: Plan) -> FleetFigures:
         walked = walks(data, plan.robots, plan.frames)
     fleet = Fleet(
         folder, plan.services, plan.workers, synchronous=not plan.asynchronous,
-        objects=plan.objects, before=plan.before,
+        objects=plan.objects, before=plan.before, delays=plan.delays,
     )  # fmt: skip
     try:
         return _driven(fleet, plan, walked, begun)
@@ -158,7 +167,7 @@ def _driven(fleet: Fleet, plan: Plan, walked: list[list[Shot]], begun: float) ->
             if plan.before is not None:
                 steps = upgrade(fleet, plan.seconds, bar.set_postfix_str)
             else:
-                due = schedule(plan.seconds, plan.kills, plan.promotions, rng)
+                due = schedule(plan.seconds, plan.kills, plan.promotions, rng, plan.freezes)
                 injector.run(due, bar.set_postfix_str)
             stop.wait(max(walking + plan.seconds - time.monotonic(), 0.0))
         finally:
@@ -173,6 +182,7 @@ def _driven(fleet: Fleet, plan: Plan, walked: list[list[Shot]], begun: float) ->
         found = check(ledger.kept, clients, listeners)
         for listener in listeners:
             listener.stop()
+        memory = fleet.memory()
         fleet.stop()
         leftovers, damaged = fleet.fsck()
     unreceived = {name for one in injector.promotions for name in one.unreceived}
@@ -185,6 +195,11 @@ def _driven(fleet: Fleet, plan: Plan, walked: list[list[Shot]], begun: float) ->
         promotions=injector.promotions,
         steps=steps,
         refused=log.refused,
+        waits_ms={
+            kind: (1e3 * float(np.quantile(seconds, 0.5)), 1e3 * float(np.quantile(seconds, 0.99)))
+            for kind, seconds in sorted(log.seconds.items())
+        },
+        memory=memory,
         answers=ledger.answers,
         repeated=log.repeated,
         faults=log.faults,
