@@ -38,7 +38,7 @@ from sceneprint.store.database import Database, known_revisions, open_database
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.read_only import look_at
 from sceneprint.store.sqlite import ReadOnlyFile, read_only_file
-from sceneprint.store.tables import metadata
+from sceneprint.store.tables import metadata, pending_events
 from sceneprint_client.api import FrameState
 
 # The same rows in both databases: how they are asked for, and how they are compared.
@@ -241,11 +241,21 @@ def copy_server(database: Database, to: Path, written: Written) -> None:
                 file.execute(statement)
             for table, known in zip(metadata.sorted_tables, sums, strict=True):
                 _check(file, Form(table), known)
+            number_pending_events(file)
     except sqlite3.Error as error:
         raise UnusableStore(
             f"{to.parent}: the database cannot be copied there ({error}). See that the disk has "
             "room, and try again."
         ) from error
+
+
+def number_pending_events(file: sqlite3.Connection) -> None:
+    """Number the events that were pending on PostgreSQL: in SQLite nobody would."""
+    names = ", ".join(column.name for column in pending_events.c if column.name != "number")
+    file.execute("BEGIN")
+    file.execute(f"INSERT INTO events ({names}) SELECT {names} FROM pending_events ORDER BY number")
+    file.execute("DELETE FROM pending_events")
+    file.execute("COMMIT")
 
 
 def rows_of_server(connection: Connection, form: Form, *, hashed: bool = False) -> Iterator[Row]:

@@ -31,6 +31,7 @@ from sceneprint.settings import Settings
 from sceneprint.store import open_database
 from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.blobs.object_store import BucketOwner
+from sceneprint.store.events import record_event
 from sceneprint.store.tables import keys, metadata
 from sceneprint_client.api import Query
 
@@ -235,6 +236,23 @@ def test_the_copy_is_one_state(postgres_url, tmp_path):
     with closing(sqlite3.connect(tmp_path / "copy.db")) as copy:
         assert copy.execute("SELECT id, grants FROM keys").fetchall() == [("early", "{}")]
     assert ask(postgres_url, "SELECT id FROM keys ORDER BY id") == [("early",), ("late",)]
+
+
+def test_events_that_were_pending_have_numbers_in_the_copy(postgres_url, tmp_path):
+    with closing(open_database(postgres_url)) as database:
+        with database.write() as connection:
+            record_event(connection, "map.created", "hall")
+        for frame in ("a", "b"):
+            with database.write(map_number=1) as connection:
+                record_event(connection, "frame.received", "hall", frame)
+        copy_server(database, tmp_path / "copy.db", lambda _: None)
+    assert ask(postgres_url, "SELECT count(*) FROM pending_events") == [(2,)]  # nobody numbered
+    with closing(sqlite3.connect(tmp_path / "copy.db")) as copy:
+        found = copy.execute("SELECT number, kind, frame_id FROM events ORDER BY number").fetchall()
+        assert copy.execute("SELECT count(*) FROM pending_events").fetchall() == [(0,)]
+    assert found == [
+        (1, "map.created", None), (2, "frame.received", "a"), (3, "frame.received", "b"),
+    ]  # fmt: skip
 
 
 def test_commands(archive, postgres, tmp_path, sceneprint, monkeypatch):
