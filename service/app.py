@@ -6,7 +6,7 @@ import asyncio
 import logging
 import threading
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, nullcontext
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
 from typing import Any
 
 from anyio import to_thread
@@ -65,6 +65,7 @@ from service.routes import (
     sessions,
     surface,
 )
+from service.shared_rates import SharedRates, sharing
 
 # The OpenAPI document: FastAPI's, and the records that only bodies of our own reading use.
 
@@ -197,7 +198,10 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
             )  # fmt: skip
             loading = warming(engine) if warm else nullcontext()
             app.state.refusals = RefusalFilter()
-            async with housekeeping(engine, figures.sampler), loading:
+            shared: AbstractAsyncContextManager[None] = nullcontext()
+            if not engine.store.database.is_sqlite:  # which has one service
+                shared = sharing(SharedRates(engine.store.database, limits))
+            async with housekeeping(engine, figures.sampler), shared, loading:
                 with tracing(settings.traces_url, "sceneprint-service", __version__):
                     yield
             feed.close()

@@ -19,7 +19,7 @@ import tempfile
 import threading
 import time
 from collections import Counter, OrderedDict
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import TypeVar
@@ -257,6 +257,7 @@ class TokenBucket:
         self._name, self._per_s, self._burst = name, per_s, max(burst, 1.0)
         self._most, self._clock = most, clock
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._spent: dict[str, float] | None = None
         self._lock = threading.Lock()
 
     def take(self, caller: str, cost: float = 1.0) -> RateState | None:
@@ -270,17 +271,60 @@ class TokenBucket:
             cost = min(cost, self._burst)
             allowed = tokens >= cost
             tokens -= cost * allowed
-            self._buckets[caller] = (tokens, now)
-            if len(self._buckets) > self._most:
-                self._buckets.popitem(last=False)
+            self._keep(caller, tokens, now)
+            if allowed and self._spent is not None:
+                self._spend(self._spent, caller, cost)
         return RateState(
             self._name,
             int(self._burst),
             math.ceil(self._burst / self._per_s),
-            int(tokens),
+            max(int(tokens), 0),
             math.ceil(((1 - tokens % 1) if allowed else (cost - tokens)) / self._per_s),
             allowed,
         )
+
+    def _keep(self, caller: str, tokens: float, now: float) -> None:
+        self._buckets[caller] = (tokens, now)
+        if len(self._buckets) > self._most:
+            self._buckets.popitem(last=False)
+
+    def _spend(self, spent: dict[str, float], caller: str, cost: float) -> None:
+        if caller in spent or len(spent) < self._most:
+            spent[caller] = spent.get(caller, 0.0) + cost
+
+    def note_spending(self) -> None:
+        """From now on, note what each caller spends, for `take_spent`."""
+        with self._lock:
+            self._spent = {}
+
+    def take_spent(self) -> dict[str, float]:
+        """What each caller has spent since it was last asked for."""
+        with self._lock:
+            spent, self._spent = self._spent or {}, {}
+        return spent
+
+    def return_spent(self, spent: Mapping[str, float]) -> None:
+        """Take back what `take_spent` gave: it is for the next time."""
+        with self._lock:
+            if self._spent is not None:
+                for caller, cost in spent.items():
+                    self._spend(self._spent, caller, cost)
+
+    def charge(self, spent: Mapping[str, float]) -> None:
+        """Take tokens that callers have spent elsewhere, there or not: what is lacking is owed."""
+        if self._per_s <= 0:
+            return
+        with self._lock:
+            now = self._clock()
+            for caller, cost in spent.items():
+                tokens, seen = self._buckets.pop(caller, (self._burst, now))
+                tokens = min(tokens + (now - seen) * self._per_s, self._burst)
+                self._keep(caller, tokens - cost, now)
+
+    @property
+    def name(self) -> str:
+        """What callers are told it is called."""
+        return self._name
 
     @property
     def what(self) -> str:

@@ -18,8 +18,8 @@ CALM = 0.15
 
 
 def upgrade(fleet: Fleet, seconds: float, tell: Callable[[str], None]) -> list[str]:
-    """Migrate the database under load, then replace services and workers, as
-    docs/deployment.md says: each is asked to end, and started again as this version.
+    """Migrate the database under load, then replace workers and services, as docs/upgrading.md
+    says: each is asked to end, and started again as this version.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def upgrade(fleet: Fleet, seconds: float, tell: Callable[[str], None]) -> list[s
     steps : what was done, in order
     """
     begun = time.monotonic()
-    parts = [*fleet.services, *fleet.workers]
+    parts = [*fleet.workers, *fleet.services]
     each = seconds * (1 - 2 * CALM) / (len(parts) + 1)
     steps = []
     for i in range(len(parts) + 1):

@@ -142,6 +142,25 @@ def samples_since(connection: Connection, kind: str, at: float) -> list[Sample]:
     return [Sample(*row) for row in connection.execute(of_kind.order_by(samples.c.at))]
 
 
+def newest_sample(connection: Connection) -> int:
+    """Number of the newest sample of any kind; 0 where there is none."""
+    return int(connection.execute(select(func.max(samples.c.number))).scalar() or 0)
+
+
+def numbered_samples(
+    connection: Connection, kind: str, after: int
+) -> list[tuple[int, str, dict[str, Any]]]:
+    """Number, process and data of samples after a number, in order. Those of processes that write
+    at the same moment may be committed in another.
+    """
+    asked = select(samples.c.number, samples.c.process, samples.c.data).where(
+        samples.c.number > after, samples.c.kind == kind
+    )
+    return [
+        (row[0], row[1], row[2]) for row in connection.execute(asked.order_by(samples.c.number))
+    ]
+
+
 def count_samples(connection: Connection, kind: str, at: float) -> int:
     """How many samples of a kind there are from a time on."""
     return count_rows(connection, samples.c.kind == kind, samples.c.at >= at)
