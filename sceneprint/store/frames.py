@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import (
@@ -97,20 +97,27 @@ def delete_frame(
 
 
 def refers_to(connection: Connection, blob: str) -> bool:
-    """Whether a frame that is there or can be restored, a signature, a job, a tile or a kept answer
-    refers to a blob.
+    """Whether anything refers to a blob; see `referred_blobs`."""
+    return bool(referred_blobs(connection, [blob]))
+
+
+def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
+    """Those of some blobs, a thousand at most, that a frame which is there or can be restored, a
+    signature, a job, a tile or a kept answer refers to.
     """
-    kept = frames.c.state.not_in(ROOMLESS)
-    of_frame = select(frames.c.number).where(frames.c.blob == blob, kept)
-    of_artifact = select(signatures.c.frame_number).where(signatures.c.geometry == blob)
-    of_job = select(job_files.c.job_number).where(job_files.c.blob == blob)
-    c = surface_tiles.c
-    of_tile = select(c.number).where(c.blob == blob)
-    of_draft = select(c.number).where(c.draft == blob)
-    of_deleted = select(deleted_frames.c.frame_number).where(deleted_frames.c.blob == blob)
-    of_answer = select(kept_answers.c.number).where(kept_answers.c.blob == blob)
-    every = (of_frame, of_artifact, of_job, of_tile, of_draft, of_deleted, of_answer)
-    return any(connection.execute(one.limit(1)).first() for one in every)
+    found: set[str] = set()
+    for column, *conditions in (
+        (frames.c.blob, frames.c.state.not_in(ROOMLESS)),
+        (signatures.c.geometry,),
+        (job_files.c.blob,),
+        (surface_tiles.c.blob,),
+        (surface_tiles.c.draft,),
+        (deleted_frames.c.blob,),
+        (kept_answers.c.blob,),
+    ):
+        asked = select(column).distinct().where(column.in_(blobs), *conditions)
+        found.update(connection.execute(asked).scalars())
+    return found
 
 
 def count_states(connection: Connection, map_number: int | None = None) -> dict[str, int]:

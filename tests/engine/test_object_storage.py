@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.fleet.s3 import ObjectServer
 from sceneprint.engine import Engine
 from sceneprint.engine.admin import statistics as measuring
 from sceneprint.engine.engine import open_engine
@@ -64,6 +65,33 @@ def test_what_one_node_takes_another_works_on(
     assert len(keys(objects, "blobs/")) == 2
     one.delete_map("hall")
     assert keys(objects, "blobs/") == []
+
+
+def test_objects_are_removed_by_one_request_and_those_that_are_needed_stay(
+    make_engine: Callable[..., Engine], postgres_url: str, uploads: Any, tmp_path: Path,
+    work_off: Callable[[Engine], list[Any]], monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Writers wait meanwhile, and a store of objects may be far away."""
+    with ObjectServer(log=tmp_path / "requests") as server:
+        for name, value in server.env.items():
+            monkeypatch.setenv(name, value)
+        bucket = server.bucket("counted")
+        engine = make_engine(tmp_path / "node", database_url=postgres_url, blob_url=bucket)
+        for name in ("hall", "shop"):
+            engine.create_map(NewMap(name=name, model="depth"))
+        for each in uploads[:5]:
+            engine.add_frame("hall", each.data, each.meta)
+        engine.add_frame("shop", uploads[0].data, uploads[0].meta)
+        assert work_off(engine) == ["succeeded"] * 6
+        objects = open_objects(bucket)
+        assert len(keys(objects, "blobs/")) == 10
+        before = server.requests()
+        engine.delete_map("hall")
+        asked = server.requests() - before
+        assert (asked["POST"], asked["DELETE"]) == (1, 0)
+        assert len(keys(objects, "blobs/")) == 2
+        told = engine.queries.upload(["shop"], uploads[0].data, uploads[0].meta, Query(k=1))
+        assert told.status == "found"
 
 
 def test_an_archive_is_read_where_it_lies(

@@ -14,13 +14,13 @@ from collections.abc import Sequence
 from sceneprint.errors import UnusableStore
 from sceneprint.store import Store
 from sceneprint.store.deletion import doom, doomed_blobs, settle
-from sceneprint.store.frames import refers_to
+from sceneprint.store.frames import referred_blobs
 
 log = logging.getLogger(__name__)
 
-#: Blobs that are removed in one transaction, and seconds after which it ends anyhow: writers wait
-#: meanwhile, and a store of objects may be far away.
-SWEPT_AT_ONCE, SWEPT_S = 200, 0.5
+#: Blobs that are removed in one transaction, and of a store of objects by one request: writers wait
+#: meanwhile, and it may be far away.
+SWEPT_AT_ONCE = 200
 #: Blobs of deleted frames that are asked for at once.
 _LEFT_AT_ONCE = 1_000
 
@@ -41,16 +41,11 @@ def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
                 done += SWEPT_AT_ONCE
                 log.info("blob removal deferred", extra={"blobs": len(blobs)})
                 continue
-            until, block = time.monotonic() + SWEPT_S, blobs[done : done + SWEPT_AT_ONCE]
-            swept = 0
-            for blob in block:
-                if not refers_to(connection, blob):
-                    store.blobs.remove(blob)
-                swept += 1
-                if time.monotonic() > until:
-                    break
-            settle(connection, block[:swept])
-            done += swept
+            block = blobs[done : done + SWEPT_AT_ONCE]
+            kept = referred_blobs(connection, block)
+            store.blobs.remove(*(blob for blob in block if blob not in kept))
+            settle(connection, block)
+            done += len(block)
 
 
 def collect_deleted_blobs(store: Store, blobs: Sequence[str]) -> None:

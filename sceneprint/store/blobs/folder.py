@@ -262,8 +262,8 @@ class Blobs(ABC):
         return self._locks.removing()
 
     @abstractmethod
-    def remove(self, digest: str) -> None:
-        """Forget a blob that nothing refers to; only within `removing`."""
+    def remove(self, *digests: str) -> None:
+        """Forget blobs that nothing refers to; only within `removing`."""
 
     @abstractmethod
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
@@ -429,9 +429,10 @@ class FolderBlobs(Blobs):
         """A blob as a file that can be sought in; see `Blobs.open`."""
         return self.path(digest).open("rb")
 
-    def remove(self, digest: str) -> None:
-        """Forget a blob that nothing refers to; only within `removing`."""
-        self.path(digest).unlink(missing_ok=True)
+    def remove(self, *digests: str) -> None:
+        """Forget blobs that nothing refers to; only within `removing`."""
+        for digest in digests:
+            self.path(digest).unlink(missing_ok=True)
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
         """Whether a blob is as it was stored; see `Blobs.condition`."""

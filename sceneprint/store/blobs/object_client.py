@@ -288,7 +288,9 @@ class Objects:
         """Remove objects; of no consequence where there are none."""
         import obstore
 
-        with self._explained(f"{keys[0] if keys else 'nothing'} cannot be removed"):
+        if not keys:
+            return
+        with self._explained(f"{keys[0]} cannot be removed"):
             try:
                 obstore.delete(self._small, keys)
             except FileNotFoundError as error:

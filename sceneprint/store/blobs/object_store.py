@@ -246,13 +246,15 @@ class ObjectBlobs(Blobs):
         require_digest(digest)
         return self.objects.size(_key(digest))
 
-    def remove(self, digest: str) -> None:
-        """Forget a blob that nothing refers to; only within `removing`."""
-        require_digest(digest)
+    def remove(self, *digests: str) -> None:
+        """Forget blobs that nothing refers to, by few requests; only within `removing`."""
+        for digest in digests:
+            require_digest(digest)
         self.claim()
         with self._lock:
-            self._put.pop(digest, None)
-        self.objects.delete(_key(digest))
+            for digest in digests:
+                self._put.pop(digest, None)
+        self.objects.delete(*map(_key, digests))
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
         """Whether a blob is as it was stored; see `Blobs.condition`."""
