@@ -44,8 +44,16 @@ def _hand_on(tell: Pipe, port: int, delay_s: float) -> None:
                 continue
             for one in (near, far):
                 one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            for pair in ((near, far), (far, near)):
-                threading.Thread(target=_pump, args=(*pair, delay_s), daemon=True).start()
+            threading.Thread(target=_join, args=(near, far, delay_s), daemon=True).start()
+
+
+def _join(near: socket.socket, far: socket.socket, delay_s: float) -> None:
+    """Hand on in both directions, until both have ended."""
+    with near, far:
+        back = threading.Thread(target=_pump, args=(far, near, delay_s), daemon=True)
+        back.start()
+        _pump(near, far, delay_s)
+        back.join()
 
 
 def _pump(source: socket.socket, to: socket.socket, delay_s: float) -> None:
@@ -53,6 +61,5 @@ def _pump(source: socket.socket, to: socket.socket, delay_s: float) -> None:
         while data := source.recv(1 << 16):
             time.sleep(delay_s)
             to.sendall(data)
-    for one, how in ((to, socket.SHUT_WR), (source, socket.SHUT_RD)):
-        with suppress(OSError):
-            one.shutdown(how)
+    with suppress(OSError):
+        to.shutdown(socket.SHUT_WR)
