@@ -20,6 +20,7 @@ from sceneprint.engine.compilation import compile_kernels
 from sceneprint.errors import SceneprintError
 from sceneprint.process import tracing
 from sceneprint.settings import Settings
+from sceneprint.store.database_errors import open_patiently
 from sceneprint_client.api import (
     Diversity,
     Filter,
@@ -179,7 +180,8 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        engine = await to_thread.run_sync(Engine, settings)
+        # it was there when the process began, and may have gone since
+        engine = await to_thread.run_sync(open_patiently, lambda: Engine(settings))
         try:
             gate = Gate(settings.concurrency, settings.waiting, settings.wait_s)
             # they mostly wait for the disk: the engine sees to how many are decoded at once

@@ -11,6 +11,7 @@ long may be forgotten.
 from __future__ import annotations
 
 import asyncio
+import heapq
 import ipaddress
 import math
 import os
@@ -22,6 +23,7 @@ from collections import Counter, OrderedDict
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import TypeVar
 
 import anyio
@@ -266,8 +268,7 @@ class TokenBucket:
             return None
         with self._lock:
             now = self._clock()
-            tokens, seen = self._buckets.pop(caller, (self._burst, now))
-            tokens = min(tokens + (now - seen) * self._per_s, self._burst)
+            tokens = self._tokens(caller, now)
             cost = min(cost, self._burst)
             allowed = tokens >= cost
             tokens -= cost * allowed
@@ -283,6 +284,11 @@ class TokenBucket:
             allowed,
         )
 
+    def _tokens(self, caller: str, now: float) -> float:
+        """What a caller has now; `_keep` puts its bucket back."""
+        tokens, seen = self._buckets.pop(caller, (self._burst, now))
+        return min(tokens + (now - seen) * self._per_s, self._burst)
+
     def _keep(self, caller: str, tokens: float, now: float) -> None:
         self._buckets[caller] = (tokens, now)
         if len(self._buckets) > self._most:
@@ -297,11 +303,17 @@ class TokenBucket:
         with self._lock:
             self._spent = {}
 
-    def take_spent(self) -> dict[str, float]:
-        """What each caller has spent since it was last asked for."""
+    def take_spent(self, most: int) -> dict[str, float]:
+        """What callers have spent since it was last asked for: at most so many, the greatest; what
+        the others spent waits for the next time.
+        """
         with self._lock:
             spent, self._spent = self._spent or {}, {}
-        return spent
+            if len(spent) <= most:
+                return spent
+            told = dict(heapq.nlargest(most, spent.items(), key=itemgetter(1)))
+            self._spent = {caller: cost for caller, cost in spent.items() if caller not in told}
+        return told
 
     def return_spent(self, spent: Mapping[str, float]) -> None:
         """Take back what `take_spent` gave: it is for the next time."""
@@ -317,9 +329,7 @@ class TokenBucket:
         with self._lock:
             now = self._clock()
             for caller, cost in spent.items():
-                tokens, seen = self._buckets.pop(caller, (self._burst, now))
-                tokens = min(tokens + (now - seen) * self._per_s, self._burst)
-                self._keep(caller, tokens - cost, now)
+                self._keep(caller, self._tokens(caller, now) - cost, now)
 
     @property
     def name(self) -> str:

@@ -18,7 +18,7 @@ from anyio import to_thread
 
 from sceneprint.errors import SceneprintError
 from sceneprint.store import Database
-from sceneprint.store.store_counts import add_sample, newest_sample, numbered_samples
+from sceneprint.store.store_counts import add_sample, newest_sample, other_samples
 from sceneprint.store.wakeup import process_name
 from service.limits import RateLimits
 
@@ -28,6 +28,10 @@ log = logging.getLogger(__name__)
 EXCHANGE_S = 1.0
 #: What samples are kept of, and how far behind the newest one may be committed.
 RATES, BEHIND = "rates", 500
+#: Seconds that they are kept: every service hears of them in the next one.
+KEPT_S = 60.0
+#: Callers of each limit of whom one sample tells: a row stays some ten kilobytes.
+MOST_TOLD = 500
 
 
 class SharedRates:
@@ -54,14 +58,14 @@ class SharedRates:
         """Tell what was spent here since the last time, and charge callers for what they spent
         elsewhere; what cannot be told now is told the next time.
         """
-        spent = {name: bucket.take_spent() for name, bucket in self._buckets.items()}
+        spent = {name: bucket.take_spent(MOST_TOLD) for name, bucket in self._buckets.items()}
         try:
             if self._first is None:
                 with self._database.read() as connection:
                     self._first = self._newest = newest_sample(connection)
             if any(spent.values()):
                 with self._database.write(turn=False) as connection:
-                    add_sample(connection, RATES, self._process, spent)
+                    add_sample(connection, RATES, self._process, spent, kept_s=KEPT_S)
         except SceneprintError as error:
             for name, bucket in self._buckets.items():
                 bucket.return_spent(spent[name])
@@ -76,13 +80,14 @@ class SharedRates:
 
     def _hear(self, first: int) -> None:
         with self._database.read() as connection:
-            found = numbered_samples(connection, RATES, max(self._newest - BEHIND, first))
-        for number, process, data in found:
-            if process != self._process and number not in self._seen:
+            after = max(self._newest - BEHIND, first)
+            found = other_samples(connection, RATES, self._process, after)
+        for number, data in found.items():
+            if number not in self._seen:
                 for name in self._buckets.keys() & data.keys():
                     self._buckets[name].charge(data[name])
-        self._newest = max([self._newest, *(number for number, _, _ in found)])
-        self._seen = {number for number, _, _ in found if number > self._newest - BEHIND}
+        self._newest = max([self._newest, *found])
+        self._seen = {number for number in found if number > self._newest - BEHIND}
 
     def _note_away(self, error: SceneprintError) -> None:
         if not self._is_away:

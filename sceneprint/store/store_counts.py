@@ -122,12 +122,15 @@ class Sample:
     data: dict[str, Any]
 
 
-def add_sample(connection: Connection, kind: str, process: str, data: dict[str, Any]) -> None:
-    """Keep a sample, and remove some that are too old."""
+def add_sample(
+    connection: Connection, kind: str, process: str, data: dict[str, Any], *,
+    kept_s: float = KEPT_S,
+) -> None:  # fmt: skip
+    """Keep a sample, and remove some of its kind that are older than `kept_s` seconds."""
     now = time.time()
     old = (
         select(samples.c.number)
-        .where(samples.c.kind == kind, samples.c.at < now - KEPT_S)
+        .where(samples.c.kind == kind, samples.c.at < now - kept_s)
         .order_by(samples.c.number)
         .limit(_SWEPT)
         .with_for_update(skip_locked=True)  # writers of samples wait for no turn, nor each other
@@ -147,18 +150,16 @@ def newest_sample(connection: Connection) -> int:
     return int(connection.execute(select(func.max(samples.c.number))).scalar() or 0)
 
 
-def numbered_samples(
-    connection: Connection, kind: str, after: int
-) -> list[tuple[int, str, dict[str, Any]]]:
-    """Number, process and data of samples after a number, in order. Those of processes that write
-    at the same moment may be committed in another.
+def other_samples(
+    connection: Connection, kind: str, process: str, after: int
+) -> dict[int, dict[str, Any]]:
+    """Data of samples of all processes but one after a number, by their numbers, in order. Those of
+    processes that write at the same moment may be committed in another.
     """
-    asked = select(samples.c.number, samples.c.process, samples.c.data).where(
-        samples.c.number > after, samples.c.kind == kind
+    asked = select(samples.c.number, samples.c.data).where(
+        samples.c.number > after, samples.c.kind == kind, samples.c.process != process
     )
-    return [
-        (row[0], row[1], row[2]) for row in connection.execute(asked.order_by(samples.c.number))
-    ]
+    return {row[0]: row[1] for row in connection.execute(asked.order_by(samples.c.number))}
 
 
 def count_samples(connection: Connection, kind: str, at: float) -> int:

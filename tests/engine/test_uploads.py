@@ -13,7 +13,13 @@ from sqlalchemy import event
 
 from sceneprint.engine import Engine
 from sceneprint.engine.upkeep import garbage_collection
-from sceneprint.errors import FrameConflict, InvalidIntrinsics, UnknownFrame, UselessFrame
+from sceneprint.errors import (
+    FrameConflict,
+    InvalidIntrinsics,
+    UnknownFrame,
+    UnknownMap,
+    UselessFrame,
+)
 from sceneprint.store.undo_rows import NO_UNDO
 from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
 
@@ -230,3 +236,29 @@ def test_a_blob_swept_while_its_upload_comes_in_is_put_again(
     assert len(puts) == 2
     assert blobs(empty) == puts[:1]
     assert empty.store.blobs.get(puts[0]) == uploads[0].data
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_an_upload_into_a_map_that_is_deleted_meanwhile_leaves_no_blob(
+    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch, again: bool
+) -> None:
+    """Deleted between the upload's blob and its commit; with `again`, another has its name."""
+    put = empty.store.blobs.put
+
+    def deleted(data: bytes) -> str:
+        digest = put(data)
+        monkeypatch.undo()
+        empty.delete_map("hall")
+        if again:
+            empty.create_map(NewMap(name="hall"))
+        return digest
+
+    monkeypatch.setattr(empty.store.blobs, "put", deleted)
+    if again:
+        _, new = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+        assert new
+        assert len(blobs(empty)) == 1
+        return
+    with pytest.raises(UnknownMap):
+        empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    assert blobs(empty) == []

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -16,8 +18,11 @@ from typing import Any
 
 import httpx
 import pytest
+from fastapi import FastAPI
 
 from benchmarks.fleet.postgres import Server
+from sceneprint.settings import Settings
+from service.app import create_app
 
 #: What is promised: seconds from the promotion to the first answer, and to the first job.
 RESUMES_S = 10.0
@@ -135,3 +140,33 @@ def test_nothing_acknowledged_is_lost_and_all_goes_on_by_itself(
     assert len(fleet.log("worker ready")) == 1  # it waited, and was not replaced
     assert fleet.log("worker died") == []
     assert fleet.process.poll() is None
+
+
+async def _states_told(app: FastAPI) -> dict[str, int]:
+    """Frames by state, as the application tells them once it has begun."""
+    async with app.router.lifespan_context(app):
+        return dict(app.state.context.engine.operations.statistics.tell().frames)
+
+
+def test_a_database_that_goes_while_a_service_starts_is_waited_for(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, until: Callable[..., Any]
+) -> None:
+    """Gone between the first look of the process at its store, and that of the application."""
+    server = Server(tmp_path / "primary")
+    server.start()
+    server.create("fleet")
+    server.stop()
+    url = f"postgresql+psycopg://postgres@127.0.0.1:{server.port}/fleet"
+    settings = Settings(database_url=url, data_dir=tmp_path / "data")
+
+    def return_once_waited_for() -> None:
+        until(lambda: "waiting for the database" in caplog.messages)
+        server.start()
+
+    returns = threading.Thread(target=return_once_waited_for)
+    returns.start()
+    try:
+        assert asyncio.run(_states_told(create_app(settings, warm=False))) == {}
+    finally:
+        returns.join()
+        server.kill()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import httpx
 import pytest
-from sqlalchemy import delete, insert, text
+from sqlalchemy import delete, insert, select, text
 
 from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
@@ -123,6 +124,37 @@ def test_what_could_not_be_told_is_told_later(
     first.rates.exchange()
     second.rates.exchange()
     assert not second.admits("fleet")
+
+
+def test_the_greatest_spenders_are_told_first_and_the_others_the_next_time(
+    hosts: list[Host], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.shared_rates.MOST_TOLD", 2)
+    first, second = hosts[:2]
+    for caller, cost in {"a": 3.0, "b": 50.0, "c": 40.0}.items():
+        assert first.admits(caller, cost)
+    first.rates.exchange()
+    second.rates.exchange()
+    assert [second.admits(one, 48.0) for one in "abc"] == [True, False, False]
+    first.rates.exchange()
+    second.rates.exchange()
+    assert not second.admits("a")  # 48 here and 3 there
+
+
+def test_samples_of_rates_go_after_a_minute_and_no_others(
+    hosts: list[Host], server_store: Store
+) -> None:
+    old = time.time() - 61
+    with server_store.database.write() as connection:
+        for kind in ("rates", "service"):
+            connection.execute(insert(samples).values(at=old, process="old", kind=kind, data={}))
+    assert hosts[0].admits("fleet")
+    hosts[0].rates.exchange()
+    with server_store.database.read() as connection:
+        left = connection.execute(
+            select(samples.c.kind, samples.c.process).order_by(samples.c.number)
+        )
+        assert [tuple(one) for one in left] == [("service", "old"), ("rates", "host-0")]
 
 
 @contextmanager

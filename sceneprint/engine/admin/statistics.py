@@ -353,7 +353,11 @@ class Statistics:
         if known is None or not known.is_large:
             return self._count(connection)
         if known.is_old and self._counting.acquire(blocking=False):
-            threading.Thread(target=self._count_again, name="counts", daemon=True).start()
+            try:
+                threading.Thread(target=self._count_again, name="counts", daemon=True).start()
+            except BaseException:  # the system has no thread left: the next request tries again
+                self._counting.release()
+                raise
         return known
 
     def _count_again(self) -> None:

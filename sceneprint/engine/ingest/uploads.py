@@ -430,6 +430,9 @@ class Uploads:
                 for data in blobs.values():
                     self._store.blobs.put(data)
                 found = self._grouping(row).run(do)
+                if found is None:
+                    with self._store.database.read() as connection:
+                        row = find_map(connection, row.name)
             except Overtaken:
                 continue
             except errors.SceneprintError:
@@ -440,8 +443,6 @@ class Uploads:
                 if left:
                     garbage_collection.collect_deleted_blobs(self._store, left)
                 return found
-            with self._store.database.read() as connection:
-                row = find_map(connection, row.name)
 
     def _grouping(self, row: MapRow) -> Grouping:
         """Where uploads wait that may be committed together: of a map, in SQLite of all."""

@@ -1,0 +1,228 @@
+"""What takes one statement on PostgreSQL leaves what several statements leave."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from sqlalchemy import Connection, Table, insert, select, update
+
+from sceneprint.store import Store, queue
+from sceneprint.store.events import record_event
+from sceneprint.store.maps import add_frame, add_map, keep_model, map_of, receive_frame
+from sceneprint.store.signatures import StoredSignature, index_claimed_frame, index_frame
+from sceneprint.store.tables import (
+    JobRow,
+    MapRow,
+    frame_row,
+    frame_tags,
+    frames,
+    jobs,
+    maps,
+    pending_events,
+    signatures,
+    surface_frames,
+)
+from sceneprint_client.api import JobState
+
+MODEL, OTHER = "ab" * 32, "cd" * 32
+MADE = StoredSignature(MODEL, b"signature", "e" * 64, [3, 2], [5, 4])
+#: Columns that differ between any two frames that are otherwise alike.
+CHANCE = {
+    "number", "id", "frame_number", "map_number", "frame_id", "job_id", "name", "map",
+    "received_at", "run_after", "created_at", "at", "indexed_at", "finished_at",
+    "started_at", "token", "turn",
+}  # fmt: skip
+POSE = [[1.0, 0.0, 0.0, 2.5], [0.0, 1.0, 0.0, -1.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.0, 1.0]]
+VALUES: dict[str, Any] = {
+    "content_id": "c" * 64, "blob": "b" * 64, "bytes": 70, "novelty": None,
+    "intrinsics": {"width": 4, "height": 3, "fx": 1.0, "fy": 1.0, "cx": 2.0, "cy": 1.5},
+    "depth_scale": 1000.0, "depth_along_ray": False, "robot": "cart", "session": "monday",
+    "captured_at": 12.5, "tags": ["wet", "dark", "wet"], "pose_parent": "odom", "pose": POSE,
+    "base_frame": None, "base": None, "up": [0.0, -1.0, 0.0], "sequence": 7, "cloud": None,
+}  # fmt: skip
+
+
+@pytest.fixture
+def pair(server_store: Store) -> list[MapRow]:
+    """Two maps that are alike: one for each way."""
+    with server_store.database.write() as connection:
+        for model in (MODEL, OTHER):
+            keep_model(connection, model, "toy", model.encode())
+        return [add_map(connection, name, None, MODEL) for name in ("single", "parts")]
+
+
+def received(store: Store, row: MapRow, *, at_once: bool) -> None:
+    with store.database.write(map_number=row.number) as connection:
+        if at_once:
+            assert receive_frame(connection, row, VALUES, 3) is not None
+            return
+        frame = add_frame(connection, row.number, VALUES)
+        job = queue.enqueue(connection, "sign", frame.number, 3)
+        record_event(connection, "frame.received", row.name, frame.id, job.id)
+
+
+def claimed(store: Store, row: MapRow) -> JobRow:
+    with store.database.write() as connection:
+        held = queue.claim(connection, "worker", 60.0)
+    assert held is not None
+    assert held.map_number == row.number
+    return held
+
+
+def indexed(
+    store: Store, row: MapRow, job: JobRow, made: StoredSignature = MADE, *, at_once: bool
+) -> bool:
+    with store.database.write(map_number=row.number) as connection:
+        asked = select(frames).where(frames.c.number == job.frame_number)
+        frame = frame_row(connection.execute(asked).mappings().one())
+        if at_once:
+            return index_claimed_frame(connection, job, frame, row.name, made)
+        queue.finish(connection, job, JobState.SUCCEEDED)
+        index_frame(connection, frame, made)
+        record_event(connection, "frame.indexed", row.name, frame.id, job.id)
+        return True
+
+
+def rows(store: Store, row: MapRow) -> dict[str, list[dict[str, Any]]]:
+    """All that a map has, but for what is chance."""
+    with store.database.read() as connection:
+        own = list(
+            connection.execute(select(frames.c.number).where(frames.c.map_number == row.number))
+            .scalars()
+        )  # fmt: skip
+        of_frames = {one.name: one.c.frame_number.in_(own)
+                     for one in (frame_tags, signatures, surface_frames)}  # fmt: skip
+        which = {
+            maps.name: maps.c.number == row.number,
+            frames.name: frames.c.map_number == row.number,
+            jobs.name: jobs.c.map_number == row.number,
+            pending_events.name: pending_events.c.map == row.name,
+            **of_frames,
+        }
+        return {name: _told(connection, maps.metadata.tables[name], of)
+                for name, of in which.items()}  # fmt: skip
+
+
+def _told(connection: Connection, table: Table, of: Any) -> list[dict[str, Any]]:
+    found = connection.execute(select(table).where(of).order_by(*table.primary_key)).mappings()
+    return [{name: one[name] for name in one if name not in CHANCE} for one in found]
+
+
+def test_a_frame_is_received_as_by_its_parts(server_store: Store, pair: list[MapRow]) -> None:
+    for row, at_once in zip(pair, (True, False), strict=True):
+        received(server_store, row, at_once=at_once)
+    single, parts = (rows(server_store, row) for row in pair)
+    assert single == parts
+    assert [one["tag"] for one in single["frame_tags"]] == ["dark", "wet"]
+    assert single["frames"][0]["pose_x"] == 2.5
+    assert single["jobs"][0] | {"priority": 3, "state": "queued"} == single["jobs"][0]
+    assert (single["maps"][0]["used_frames"], single["maps"][0]["used_bytes"]) == (1, 70)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"quota_frames": 0}, {"quota_bytes": 69}, {"name": "renamed"},
+        pytest.param(None, id="the content is there"),
+    ],
+)  # fmt: skip
+def test_a_frame_that_has_no_place_leaves_nothing(
+    server_store: Store, pair: list[MapRow], change: dict[str, Any] | None
+) -> None:
+    row = pair[0]
+    if change is None:
+        received(server_store, row, at_once=True)
+    else:
+        with server_store.database.write() as connection:
+            connection.execute(update(maps).where(maps.c.number == row.number).values(**change))
+    before = rows(server_store, row)
+    with server_store.database.write(map_number=row.number) as connection:
+        assert receive_frame(connection, row, VALUES, 0) is None
+    assert rows(server_store, row) == before
+
+
+def test_a_quota_that_a_frame_fills_has_room_for_it(
+    server_store: Store, pair: list[MapRow]
+) -> None:
+    row = pair[0]
+    full = update(maps).where(maps.c.number == row.number).values(quota_frames=1, quota_bytes=70)
+    with server_store.database.write() as connection:
+        connection.execute(full)
+    received(server_store, row, at_once=True)
+    assert rows(server_store, row)["maps"][0]["used_bytes"] == 70
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_a_frame_is_indexed_as_by_its_parts(
+    server_store: Store, pair: list[MapRow], fused: bool
+) -> None:
+    """Also one that is signed anew, whose surface has to be fused anew."""
+    held = []
+    for row in pair:
+        received(server_store, row, at_once=True)
+        held.append(job := claimed(server_store, row))
+        if fused:
+            with server_store.database.write() as connection:
+                there = {"frame_number": job.frame_number, "map_number": row.number}
+                connection.execute(
+                    insert(surface_frames).values(**there, parent="odom", changed=False)
+                )
+                of = {"frame_number": job.frame_number, "model_id": MODEL}
+                old = {"vector": b"old", "checksum": 1, "geometry": "0" * 64}
+                counts = {"n_patches": [1], "n_pairs": [1]}
+                connection.execute(insert(signatures).values(**of, **old, **counts))
+    for row, job, at_once in zip(pair, held, (True, False), strict=True):
+        assert indexed(server_store, row, job, at_once=at_once)
+    single, parts = (rows(server_store, row) for row in pair)
+    assert single == parts
+    assert single["frames"][0]["state"] == "indexed"
+    assert single["frames"][0]["revision"] == single["maps"][0]["revision"]
+    assert [one["vector"] for one in single["signatures"]] == [b"signature"]
+    assert [one["changed"] for one in single["surface_frames"]] == [True] * fused
+    assert [one["kind"] for one in single["pending_events"]] == ["frame.received", "frame.indexed"]
+
+
+def _lost(connection: Connection, job: JobRow) -> None:
+    connection.execute(update(jobs).where(jobs.c.number == job.number).values(token=job.token + 1))
+
+
+def _cancelled(connection: Connection, job: JobRow) -> None:
+    connection.execute(update(jobs).where(jobs.c.number == job.number).values(state="cancelled"))
+
+
+def _switching(connection: Connection, job: JobRow) -> None:
+    of = maps.c.number == job.map_number
+    connection.execute(update(maps).where(of).values(next_model_id=OTHER))
+
+
+def _switched(connection: Connection, job: JobRow) -> None:
+    connection.execute(update(maps).where(maps.c.number == job.map_number).values(model_id=OTHER))
+
+
+@pytest.mark.parametrize("happened", [_lost, _cancelled, _switching, _switched])
+def test_a_job_that_is_lost_or_of_another_model_indexes_nothing(
+    server_store: Store, pair: list[MapRow], happened: Callable[[Connection, JobRow], None]
+) -> None:
+    row = pair[0]
+    received(server_store, row, at_once=True)
+    job = claimed(server_store, row)
+    with server_store.database.write() as connection:
+        happened(connection, job)
+    before = rows(server_store, row)
+    assert not indexed(server_store, row, job, at_once=True)
+    assert rows(server_store, row) == before
+
+
+def test_revisions_of_a_map_follow_each_other(server_store: Store, pair: list[MapRow]) -> None:
+    row = pair[0]
+    with server_store.database.write(map_number=row.number) as connection:
+        for i in range(3):
+            values = {**VALUES, "content_id": f"{i}" * 64}
+            assert receive_frame(connection, row, values, 0) is not None
+    for _ in range(3):
+        assert indexed(server_store, row, claimed(server_store, row), at_once=True)
+    assert [one["revision"] for one in rows(server_store, row)["frames"]] == [1, 2, 3]
+    with server_store.database.read() as connection:
+        assert map_of(connection, row.number).revision == 3
