@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from sqlalchemy import event
+from sqlalchemy import Connection, event
 
 from sceneprint.engine import Engine
+from sceneprint.engine.ingest.uploads import Grouping
 from sceneprint.engine.upkeep import garbage_collection
 from sceneprint.errors import (
     FrameConflict,
@@ -238,27 +239,46 @@ def test_a_blob_swept_while_its_upload_comes_in_is_put_again(
     assert empty.store.blobs.get(puts[0]) == uploads[0].data
 
 
-@pytest.mark.parametrize("again", [False, True])
 def test_an_upload_into_a_map_that_is_deleted_meanwhile_leaves_no_blob(
-    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch, again: bool
+    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Deleted between the upload's blob and its commit; with `again`, another has its name."""
-    put = empty.store.blobs.put
+    """Deleted and made anew before the commit, and deleted again before the next try."""
+    put, run = empty.store.blobs.put, Grouping.run
 
-    def deleted(data: bytes) -> str:
+    def made_anew(data: bytes) -> str:
         digest = put(data)
-        monkeypatch.undo()
         empty.delete_map("hall")
-        if again:
-            empty.create_map(NewMap(name="hall"))
+        empty.create_map(NewMap(name="hall"))
         return digest
 
-    monkeypatch.setattr(empty.store.blobs, "put", deleted)
-    if again:
-        _, new = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
-        assert new
-        assert len(blobs(empty)) == 1
-        return
+    def deleted_after(grouping: Grouping, do: Callable[[Connection], Any]) -> Any:
+        found = run(grouping, do)
+        assert found is None
+        monkeypatch.undo()
+        empty.delete_map("hall")
+        return found
+
+    monkeypatch.setattr(empty.store.blobs, "put", made_anew)
+    monkeypatch.setattr(Grouping, "run", deleted_after)
     with pytest.raises(UnknownMap):
         empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     assert blobs(empty) == []
+
+
+def test_an_upload_into_a_map_that_is_made_anew_meanwhile_is_in_the_new_one(
+    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put = empty.store.blobs.put
+
+    def made_anew(data: bytes) -> str:
+        digest = put(data)
+        monkeypatch.undo()
+        empty.delete_map("hall")
+        empty.create_map(NewMap(name="hall"))
+        return digest
+
+    monkeypatch.setattr(empty.store.blobs, "put", made_anew)
+    added, new = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    assert new
+    assert len(blobs(empty)) == 1
+    assert empty.get_frame("hall", added.frame_id).state == FrameState.RECEIVED
