@@ -128,6 +128,8 @@ class Settings(BaseSettings):
     undo_s: float = Field(default=600.0, ge=0, le=31_536_000)
     #: Uploads of deleted frames of a map that are kept for it, bytes; more are deleted for good.
     undo_bytes: int = Field(default=4 << 30, ge=0)
+    #: Days for which rows of deleted and of redundant frames, and of their jobs, stay.
+    deleted_rows_days: float = Field(default=7.0, ge=1, le=36_500)
     #: Streams of events that one service process keeps open at once; more are refused (503).
     event_streams: int = Field(default=64, ge=0, le=10_000)
     #: Newest events of each map that are kept; older ones are removed, 200 bytes each.

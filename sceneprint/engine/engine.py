@@ -111,7 +111,12 @@ class Engine:
         )  # fmt: skip
         self.signers = Signers(self.store.database, settings.cache_dir)
         self._upkeep = Upkeep(
-            self.store, self.signers, settings.indexes, settings.tail_frames, settings.scrub_s
+            self.store,
+            self.signers,
+            settings.indexes,
+            settings.tail_frames,
+            settings.scrub_s,
+            settings.deleted_rows_days,
         )
         self._reencoding = Reencodings(self.store, self._upkeep)
         self._readers = Readers(self.signers, settings.indexes, settings.search)
@@ -150,7 +155,7 @@ class Engine:
         self.outputs = FrameFiles(self.store, self.signers)
         self.points = PointClouds(self.store, self.signers, self.inspection.pairs, self.kept)
         self.reconstructions = ReconstructionJobs(self.store, self.tasks)
-        self.retiring = Retention(self.store)
+        self.retiring = Retention(self.store, settings.deleted_rows_days)
         self.undo_limits = UndoLimits(settings.undo_s, settings.undo_bytes)
         self.undo = FrameUndo(self.store, self.bell.ring)
         self.purging = Purging(

@@ -1,9 +1,9 @@
 """Frames and maps deleted: what is left in the database, and which blobs must go.
 
-Of a deleted frame the row stays, as every reader learns by its revision that it is gone: its id,
-its state, when it came, and how its samples were to be read. Its blobs are noted as doomed in the
-same transaction, so that they go whatever happens to this process. Where the deletion can be
-undone, `undo_rows` has what the row was, and refers to the upload.
+Of a deleted frame the row stays for some days, as every reader learns by its revision that it is
+gone: its id, its state, when it came, and how its samples were to be read. Its blobs are noted as
+doomed in the same transaction, so that they go whatever happens to this process. Where the deletion
+can be undone, `undo_rows` has what the row was, and refers to the upload.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from sqlalchemy import (
     insert,
     literal,
     literal_column,
+    not_,
+    or_,
     select,
     union,
     update,
@@ -34,6 +36,7 @@ from sceneprint.store.events import record_event, remember
 from sceneprint.store.maps import ROOMLESS, count_on, next_revision
 from sceneprint.store.queue import cancel_jobs
 from sceneprint.store.tables import (
+    ENDED,
     MapRow,
     count_rows,
     deleted_frames,
@@ -45,8 +48,10 @@ from sceneprint.store.tables import (
     job_files,
     job_items,
     jobs,
+    kept_answer_frames,
     map_row,
     maps,
+    now,
     query_records,
     signatures,
     surface_frames,
@@ -56,7 +61,7 @@ from sceneprint.store.tables import (
 )
 from sceneprint.store.tenants import keep_turns
 from sceneprint.store.undo_rows import Deletion, remember_frames
-from sceneprint_client.api import FrameState
+from sceneprint_client.api import FrameState, JobState
 
 #: What is known of a frame, and not of its camera; cleared with it.
 _KNOWN = (
@@ -107,7 +112,8 @@ def delete_frames(
         update(frames)
         .where(frames.c.number == bindparam("of"))
         .values(
-            state=FrameState.DELETED, revision=bindparam("at"), tags=[], **dict.fromkeys(_KNOWN)
+            state=FrameState.DELETED, revision=bindparam("at"), tags=[],
+            ended_at=now(connection), **dict.fromkeys(_KNOWN),
         ),
         [{"of": n, "at": last - len(living) + i} for i, n in enumerate(living, 1)],
     )  # fmt: skip
@@ -271,3 +277,113 @@ def count_old(connection: Connection, map_number: int, before: float) -> int:
 
 def _old(map_number: int, before: float) -> ColumnElement[bool]:
     return and_(frames.c.map_number == map_number, frames.c.received_at < before, _LIVING)
+
+
+# Rows of frames that ended some days ago.
+#
+# Whoever holds signatures of a map learns of deletions by these rows. The map keeps the greatest
+# revision whose row is gone: who stands before it cannot be told any more, and begins anew.
+
+
+def maps_with_ended(connection: Connection, before: float) -> list[MapRow]:
+    """Maps with frames that ended before a time, or of which nobody knows when."""
+    spent = (
+        select(frames.c.number)
+        .where(_ended(maps.c.number, state), or_(frames.c.ended_at.is_(None), _before(before)))
+        .exists()
+        for state in ROOMLESS
+    )
+    return [map_row(one) for one in connection.execute(select(maps).where(or_(*spent))).mappings()]
+
+
+def date_ended(connection: Connection, map_number: int, limit: int) -> int:
+    """Give frames of a map that ended before this was noted the time of now, at most so many of
+    each state; returns how many.
+    """
+    dated = 0
+    for state in ROOMLESS:
+        asked = select(frames.c.number).where(
+            _ended(map_number, state), frames.c.ended_at.is_(None)
+        )
+        numbers = list(connection.execute(asked.limit(limit)).scalars())
+        change = update(frames).where(frames.c.number.in_(numbers))
+        connection.execute(change.values(ended_at=now(connection)))
+        dated += len(numbers)
+    return dated
+
+
+def remove_ended(connection: Connection, map_number: int, before: float, limit: int) -> int:
+    """Remove rows of frames of a map that ended before a time, with their jobs.
+
+    Those stay that can be restored, that an answer or a surface shows, and whose job has not ended.
+
+    Parameters
+    ----------
+    connection : of a writing transaction of the map
+    map_number : of the map
+    before : seconds since 1970
+    limit : at most so many of each state
+
+    Returns
+    -------
+    how many were removed
+    """
+    removed = 0
+    for state in ROOMLESS:
+        asked = (
+            select(frames.c.number, frames.c.revision)
+            .where(_ended(map_number, state), _before(before), *_unreferred())
+            .order_by(frames.c.ended_at)
+            .limit(limit)
+        )
+        found = connection.execute(asked).all()
+        if found:
+            _remove_rows(connection, [one.number for one in found])
+            last = max((one.revision or 0 for one in found), default=0)
+            own = (maps.c.number == map_number) & (maps.c.pruned_revision < last)
+            connection.execute(update(maps).where(own).values(pruned_revision=last))
+        removed += len(found)
+    return removed
+
+
+def newest_deletion(connection: Connection, map_number: int, before: float) -> int:
+    """Revision of the newest of the frames of a map that were deleted before a time; 0: of none."""
+    asked = (
+        select(frames.c.revision)
+        .where(_ended(map_number, FrameState.DELETED), _before(before))
+        .order_by(frames.c.ended_at.desc())
+        .limit(1)
+    )
+    return connection.execute(asked).scalar() or 0
+
+
+def _ended(of_map: int | ColumnElement[int], state: FrameState) -> ColumnElement[bool]:
+    own = frames.c.state == literal_column(f"'{state}'")
+    return and_(frames.c.map_number == of_map, own, ENDED)
+
+
+def _before(at: float) -> ColumnElement[bool]:
+    return frames.c.ended_at < at
+
+
+def _unreferred() -> list[ColumnElement[bool]]:
+    """That nothing needs the row of a frame any more."""
+    unfinished = select(jobs.c.number).where(
+        jobs.c.frame_number == frames.c.number,
+        jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING)),
+    )
+    shown = (
+        select(table.c.frame_number).where(table.c.frame_number == frames.c.number)
+        for table in (deleted_frames, kept_answer_frames, surface_frames, surface_touches)
+    )
+    return [not_(one.exists()) for one in (unfinished, *shown)]
+
+
+def _remove_rows(connection: Connection, numbers: Sequence[int]) -> None:
+    of_frames = select(jobs.c.number).where(jobs.c.frame_number.in_(numbers))
+    for made in (job_items, job_files):
+        connection.execute(delete(made).where(made.c.job_number.in_(of_frames)))
+    keep_turns(connection)
+    for table in (jobs, frame_tags, signatures):
+        connection.execute(delete(table).where(table.c.frame_number.in_(numbers)))
+    connection.execute(delete(frames).where(frames.c.number.in_(numbers)))

@@ -28,6 +28,7 @@ from sceneprint.store.tables import (
     job_files,
     kept_answers,
     maps,
+    now,
     signatures,
     surface_tiles,
 )
@@ -41,7 +42,7 @@ def renew_frame(connection: Connection, number: int, values: dict[str, Any]) -> 
     connection.execute(
         update(frames)
         .where(frames.c.number == number)
-        .values(state=FrameState.RECEIVED, reason=None, **values)
+        .values(state=FrameState.RECEIVED, reason=None, ended_at=None, **values)
     )
     return frame_of(connection, number)
 
@@ -67,12 +68,14 @@ def set_state(
     connection: Connection, number: int, state: FrameState, reason: str | None = None
 ) -> None:
     """Move a frame to a state in which it is not searched; a deleted frame stays deleted."""
+    ended_at = None
     if state == FrameState.REDUNDANT:
         _weigh(connection, number, state, None)
+        ended_at = now(connection)
     connection.execute(
         update(frames)
         .where(frames.c.number == number, frames.c.state != FrameState.DELETED)
-        .values(state=state, reason=reason)
+        .values(state=state, reason=reason, ended_at=ended_at)
     )
 
 

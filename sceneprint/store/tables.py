@@ -41,6 +41,7 @@ from sqlalchemy import (
     extract,
     func,
     literal,
+    literal_column,
     select,
 )
 from sqlalchemy.types import TypeEngine
@@ -95,6 +96,8 @@ maps = Table(
     Column("used_frames", BigInteger, nullable=False, server_default="0"),
     Column("used_bytes", BigInteger, nullable=False, server_default="0"),
     Column("up", JSON(none_as_null=True)),  # unit vector in the parent frames; null: learnt
+    # greatest revision of a deleted frame whose row is gone: who stands before it must begin anew
+    Column("pruned_revision", WHOLE, nullable=False, server_default="0"),
     sqlite_autoincrement=True,
 )
 
@@ -131,6 +134,7 @@ frames = Table(
     Column("up", JSON(none_as_null=True)),  # unit vector in the sensor's axes
     Column("name", _string(255)),  # of the original file or message; a label, never a path
     Column("sequence", WHOLE),  # place within the session
+    Column("ended_at", Float),  # when it was deleted, or found redundant
     UniqueConstraint("map_number", "id"),
     Index(None, "map_number", "content_id"),
     Index(None, "map_number", "revision"),
@@ -154,10 +158,20 @@ frames = Table(
     Index("ix_frames_placed", "map_number", "pose_parent", "pose_x", "pose_y", "pose_z"),
     sqlite_autoincrement=True,
 )
-#: The oldest frames of a map that are still there: rows of deleted ones stay for ever.
+#: The oldest frames of a map that are still there: rows of deleted ones stay for some days.
 Index(
     "ix_frames_aging", frames.c.map_number, frames.c.received_at,
     sqlite_where=frames.c.state != "deleted", postgresql_where=frames.c.state != "deleted",
+)  # fmt: skip
+
+#: Frames whose rows go in the end. As the index says it: of values that are bound to a statement no
+#: planner knows that they are these.
+ENDED: ColumnElement[bool] = frames.c.state.in_(
+    [literal_column("'deleted'"), literal_column("'redundant'")]
+)
+Index(
+    "ix_frames_ended", frames.c.map_number, frames.c.state, frames.c.ended_at,
+    sqlite_where=ENDED, postgresql_where=ENDED,
 )  # fmt: skip
 
 #: `frames.tags` once more, a row each, to be searched for.
@@ -671,6 +685,7 @@ class MapRow:
     used_frames: int = 0
     used_bytes: int = 0
     up: list[float] | None = None
+    pruned_revision: int = 0
 
 
 @dataclass(frozen=True)
@@ -707,6 +722,7 @@ class FrameRow:
     up: list[float] | None = None
     name: str | None = None
     sequence: int | None = None
+    ended_at: float | None = None
 
     @property
     def kind(self) -> Kind:

@@ -24,6 +24,7 @@ from sceneprint.store.tables import (
     deletions,
     frame_tags,
     frames,
+    now,
 )
 from sceneprint_client.api import FrameState
 
@@ -254,6 +255,7 @@ def restore_frame(connection: Connection, row: MapRow, one: DeletedFrame) -> Non
     """
     values = dict(one.data)
     was = FrameState(values["state"])
+    values["ended_at"] = now(connection) if was == FrameState.REDUNDANT else None
     if one.is_counted:
         require_room(connection, row, one.bytes)
         count_on(connection, row.number, 1, one.bytes)

@@ -17,6 +17,9 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, signatures
 from sceneprint_client.api import NewMap
 
+#: Longer than any test goes on: rows are those of test_ended_rows.
+ROWS_DAYS = 1000.0
+
 
 @pytest.fixture
 def aged(full, ids):
@@ -36,7 +39,7 @@ def test_what_is_too_old_goes_with_its_bytes(aged, ids, uploads, monkeypatch):
         made = select(signatures.c.geometry).order_by(signatures.c.frame_number).limit(5)
         first = list(connection.execute(made).scalars())
     assert aged.get_map("hall").overdue is None
-    assert Retention(aged.store).run() == 0  # nobody has said how long
+    assert Retention(aged.store, ROWS_DAYS).run() == 0  # nobody has said how long
     told = edit_map(aged.store, "hall", {"retention_days": 7.0})
     assert told.overdue == 5
     assert aged.publish_due() == 0  # workers look after it
@@ -61,14 +64,14 @@ def test_what_is_too_old_goes_with_its_bytes(aged, ids, uploads, monkeypatch):
 
 
 def test_time_goes_on_and_keeping_all_stops_it(aged, ids):
-    names, worker = ids(aged), Retention(aged.store)
+    names, worker = ids(aged), Retention(aged.store, ROWS_DAYS)
     edit_map(aged.store, "hall", {"retention_days": 20})
     now = time.time()
     assert worker.run(now) == 0
     assert worker.run(now + 100 * DAY_S) == 0  # it has just looked
-    assert Retention(aged.store).run(now + 9 * DAY_S) == 1
+    assert Retention(aged.store, ROWS_DAYS).run(now + 9 * DAY_S) == 1
     edit_map(aged.store, "hall", {"retention_days": None})
-    assert Retention(aged.store).run(now + 100 * DAY_S) == 0
+    assert Retention(aged.store, ROWS_DAYS).run(now + 100 * DAY_S) == 0
     assert ids(aged) == names[1:]
 
 
@@ -76,7 +79,7 @@ def test_a_turn_is_short_and_goes_on_with_the_next(aged, ids, monkeypatch):
     monkeypatch.setattr(purge, "AT_ONCE", 3)
     monkeypatch.setattr(purge, "TURN_S", 0.0)
     edit_map(aged.store, "hall", {"retention_days": 0.01})
-    worker = Retention(aged.store)
+    worker = Retention(aged.store, ROWS_DAYS)
     assert [worker.run() for _ in range(6)] == [3, 3, 3, 3, 0, 0]
     assert ids(aged) == []
 
@@ -86,7 +89,7 @@ def test_what_it_would_do_is_told_and_not_done(aged, ids):
     told = edit_map(aged.store, "hall", {"retention_days": 3}, dry_run=True)
     assert (told.retention_days, told.overdue) == (3.0, 9)
     assert (aged.get_map("hall").etag, aged.get_map("hall").retention_days) == (etag, None)
-    assert Retention(aged.store).run() == 0
+    assert Retention(aged.store, ROWS_DAYS).run() == 0
     assert ids(aged) == before
     with pytest.raises(InvalidRequest):
         edit_map(aged.store, "hall", {"retention_days": -3}, dry_run=True)
@@ -99,9 +102,9 @@ def test_a_store_without_a_turn_is_asked_again_later(aged, ids, monkeypatch):
     edit_map(aged.store, "hall", {"retention_days": 3})
     with monkeypatch.context() as patch:
         patch.setattr(purge, "delete_frames", locked)
-        assert Retention(aged.store).run() == 0
+        assert Retention(aged.store, ROWS_DAYS).run() == 0
     assert len(ids(aged)) == 12
-    assert Retention(aged.store).run() == 9
+    assert Retention(aged.store, ROWS_DAYS).run() == 9
 
 
 @pytest.mark.sqlite_only("it asks SQLite for its plan")
@@ -128,6 +131,6 @@ def test_a_host_whose_clock_is_wrong_deletes_nothing(make_engine, postgres_url, 
         added, _ = engine.add_frame("hall", one.data, one.meta)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(time, "time", lambda: right() + 30 * DAY_S)
-        assert Retention(engine.store).run() == 0
+        assert Retention(engine.store, ROWS_DAYS).run() == 0
     assert engine.get_frame("hall", added.frame_id).state == "received"
-    assert Retention(engine.store).run(right() + 30 * DAY_S) == 1
+    assert Retention(engine.store, ROWS_DAYS).run(right() + 30 * DAY_S) == 1

@@ -62,7 +62,7 @@ def index_state(connection: Connection, indexes: Path, row: MapRow) -> IndexStat
     """The newest index of a map that can be read, by its manifest alone."""
     for _, path in manifests(index_folder(indexes, row)):
         found = _read(path)
-        if found is not None and found.revision <= row.revision:
+        if found is not None and row.pruned_revision <= found.revision <= row.revision:
             tail = count_indexed(connection, row.number, found.revision)
             recall = IndexRecall(**asdict(found.recall))
             return IndexState(map=row.name, generation=found.number, tail=tail, recall=recall)

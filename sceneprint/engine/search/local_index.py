@@ -295,8 +295,10 @@ def is_index_folder(name: str) -> bool:
 
 
 def trusted(connection: Connection, row: MapRow, found: Generation | None) -> Generation | None:
-    """A generation, unless the database was put back to a state before it, and went on."""
-    if found is None:
+    """A generation, unless the database was put back to a state before it, and went on; or rows of
+    frames that were deleted since are gone, so that nobody can tell which.
+    """
+    if found is None or found.revision < row.pruned_revision:
         return None
     if found.revision <= row.revision and holds_anchor(connection, found.manifest.anchor):
         return found
@@ -311,10 +313,14 @@ class Reader:
         self._folder, self._model = folder, model
         self._looked = time.monotonic()
         self._lock = threading.Lock()
-        self._tail = AppendBuffer(model.signature_bytes, folder.parent)
+        self._unsound = 0, 0.0  # number of a generation that cannot be used, until the next try
+        self._begin(connection, row)
+
+    def _begin(self, connection: Connection, row: MapRow) -> None:
+        """Hold the newest generation, and nothing else."""
+        self._tail = AppendBuffer(self._model.signature_bytes, self._folder.parent)
         self._dead: dict[int, int] = {}  # what was deleted after the generation, and when
         self._damaged: set[int] = set()
-        self._unsound = 0, 0.0  # number of a generation that cannot be used, until the next try
         found = self._newest(connection, row, None)
         self._publish(found, 0 if found is None else found.revision)
 
@@ -370,6 +376,8 @@ class Reader:
         return time.monotonic() - self._looked >= _LOOK_S
 
     def _catch_up(self, connection: Connection, row: MapRow) -> None:
+        if 0 < self._view.revision < row.pruned_revision:
+            self._begin(connection, row)
         view = self._view
         self._tail.reserve(count_indexed(connection, row.number, view.revision))
         for block in changes_since(connection, row, view.revision):

@@ -28,10 +28,12 @@ from sceneprint.errors import BusyIndex, InvalidRequest, ModelError, SceneprintE
 from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.index import Generation, clear, manifests, newest, newest_number, publish, scrub
 from sceneprint.store import Store
+from sceneprint.store.deletion import DAY_S, newest_deletion
 from sceneprint.store.events import anchor_of_now
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.postgres import vectors
 from sceneprint.store.postgres.connection import allow
+from sceneprint.store.queue import read_clock
 from sceneprint.store.reencoding_rows import is_complete, models_of
 from sceneprint.store.signatures import changes_since, count_gone, count_indexed, deleted_since
 from sceneprint.store.tables import MapRow
@@ -110,6 +112,8 @@ log = logging.getLogger(__name__)
 #: A map is published when so large a share of it is new, or deleted: to publish writes all of it,
 #: so that what is written in all stays proportional to the map.
 SHARE = 1 / 16
+#: Seconds between two looks for deletions that an index should know of, at most.
+AGING_S = 3600.0
 #: In the folder of an index: read from its times, when it was purged, and when it may be again.
 _REST = ".rest"
 
@@ -124,17 +128,23 @@ class Upkeep:
     tail_frames : frames that a generation may lack, and deleted ones that it may hold; of a large
         map SHARE of its frames
     scrub_s : seconds after which all files are read again, to see that they are sound
+    rows_days : for which rows of deleted frames stay: an index that is as old cannot be brought up
+        to date
     """
 
     def __init__(
-        self, store: Store, signers: Signers, indexes: Path, tail_frames: int, scrub_s: float
-    ) -> None:
+        self, store: Store, signers: Signers, indexes: Path, tail_frames: int, scrub_s: float,
+        rows_days: float,
+    ) -> None:  # fmt: skip
         self._store, self._signers = store, signers
         self._indexes, self._tail_frames = indexes, tail_frames
         # map and model: number of their index, revision, frames
         self._published: dict[tuple[int, str], tuple[int, int, int]] = {}
         self._metrics: dict[str, Metric | None] = {}
         self._scrubber = Scrubber(indexes, scrub_s)
+        self._rows_s = DAY_S * rows_days
+        # map and model: when it is looked next for deletions that the index should know of by now
+        self._aged = dict[tuple[int, str], float]()
 
     def run(self) -> int:
         """Publish what is due, and verify a little; returns how many generations were published.
@@ -234,13 +244,31 @@ class Upkeep:
         return self._is_long(connection, row, since, frames)
 
     def _is_long(self, connection: Connection, row: MapRow, since: int, frames: int) -> bool:
-        """Whether a generation of that revision and size lacks, or holds too much, too many."""
+        """Whether a generation of that revision and size lacks, or holds too much, too many; or
+        will soon be too old to be brought up to date.
+        """
+        if since < row.pruned_revision:
+            since = frames = 0
+        if since and self._is_aging(connection, row, since):
+            return True
         most = max(self._tail_frames, int(SHARE * frames))
         if row.revision - since <= most:  # spares the counting
             return False
         return count_indexed(connection, row.number, since) > most or (
             count_gone(connection, row.number, since) > most
         )
+
+    def _is_aging(self, connection: Connection, row: MapRow, since: int) -> bool:
+        """Whether a generation lacks a deletion whose row has had half of its days."""
+        if row.revision == since or time.monotonic() < self._aged.get(
+            (row.number, row.model_id), 0
+        ):
+            return False
+        before = read_clock(connection) - self._rows_s / 2
+        if newest_deletion(connection, row.number, before) > since:
+            return True
+        self._aged[row.number, row.model_id] = time.monotonic() + min(self._rows_s / 24, AGING_S)
+        return False
 
     def purge(self, row: MapRow) -> bool:
         """Leave no byte of a deleted frame in the index of a map; whether anything was done.
@@ -269,8 +297,10 @@ class Upkeep:
                 return False
             gone = deleted_since(connection, row.number, 0 if found is None else found.revision)
             empty = count_indexed(connection, row.number, 0) == 0
+            if found is not None and found.revision < now.pruned_revision:
+                found = None  # of what it has too much, no row tells any more
             left = found is None or len(listed) > 1
-            older = left and count_gone(connection, row.number, 0) > 0
+            older = left and (now.pruned_revision > 0 or count_gone(connection, row.number, 0) > 0)
         if empty or (found is None and older):
             done = clear(folder)  # of what is damaged, nothing is read: it is made anew in time
         elif found is None:

@@ -1,6 +1,7 @@
 """Frames that are too old are deleted, and no byte of a deleted frame is left some time later.
 
 maps with `retention_days`  --Retention.run-->  frames deleted for good, each with its event
+frames deleted or redundant for some days  --Retention.run-->  no row of them or of their jobs
 
 A deletion takes the frame out of all searches at once, and its rows and blobs when it can no longer
 be undone. Left are then blobs of a process that died half way, surfaces, differences and answers
@@ -13,8 +14,11 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import chain
+
+from sqlalchemy import Connection
 
 from sceneprint.engine.maps.selections import FrameUndo
 from sceneprint.engine.reconstruction import ReconstructionJobs
@@ -25,7 +29,16 @@ from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs, c
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.errors import BusyIndex, SceneprintError, UnknownJob, UnknownMap
 from sceneprint.store import Store
-from sceneprint.store.deletion import DAY_S, aging_maps, delete_frames, old_frames
+from sceneprint.store.deletion import (
+    BLOCK,
+    DAY_S,
+    aging_maps,
+    date_ended,
+    delete_frames,
+    maps_with_ended,
+    old_frames,
+    remove_ended,
+)
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.queue import read_clock
 from sceneprint.store.tables import MapRow
@@ -43,14 +56,21 @@ REASON = "retention"
 
 
 class Retention:
-    """Deletes what is too old; any number of processes may."""
+    """Deletes what is too old; any number of processes may.
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    Parameters
+    ----------
+    store : see Store
+    rows_days : for which rows of deleted and redundant frames stay
+    """
+
+    def __init__(self, store: Store, rows_days: float) -> None:
+        self._store, self._rows_s = store, DAY_S * rows_days
         self._next = 0.0
 
     def run(self, now: float | None = None) -> int:
-        """Delete some of what is too old, where it is time to look; returns how many frames.
+        """Delete some of what is too old, where it is time to look; returns how many frames and
+        rows of frames.
 
         Where that cannot be written, it is logged and tried again.
 
@@ -63,19 +83,40 @@ class Retention:
             return 0
         self._next = time.monotonic() + LOOK_S
         try:
-            with self._store.database.read() as connection:
-                rows = aging_maps(connection)
-            until, deleted = time.monotonic() + TURN_S, 0
-            for row in rows:
-                while (found := self._block(row, now)) > 0:
-                    deleted += found
-                    if time.monotonic() > until:
-                        self._next = 0.0  # the next turn goes on
-                        return deleted
-            return deleted
+            until, removed = time.monotonic() + TURN_S, 0
+            for found in chain(self._old_frames(now), self._ended_rows(now)):
+                removed += found
+                if found and time.monotonic() > until:
+                    self._next = 0.0  # the next turn goes on
+                    break
+            return removed
         except SceneprintError as error:
             log.warning("retention failed", extra={"error": str(error)})
             return 0
+
+    def _old_frames(self, at: float | None) -> Iterator[int]:
+        """Delete frames, block by block; how many each."""
+        with self._store.database.read() as connection:
+            rows = aging_maps(connection)
+        for row in rows:
+            while (found := self._block(row, at)) > 0:
+                yield found
+
+    def _ended_rows(self, at: float | None) -> Iterator[int]:
+        """Remove rows, block by block; how many each."""
+        with self._store.database.read() as connection:
+            before = (read_clock(connection) if at is None else at) - self._rows_s
+            rows = maps_with_ended(connection, before)
+        for row in rows:
+            while self._write(row, lambda c, of: date_ended(c, of, BLOCK)):
+                yield 0  # frames of the version before: their days begin now
+            while found := self._write(row, lambda c, of: remove_ended(c, of, before, BLOCK)):
+                log.info("ended rows removed", extra={"map": row.name, "frames": found})
+                yield found
+
+    def _write(self, row: MapRow, do: Callable[[Connection, int], int]) -> int:
+        with self._store.database.write(map_number=row.number) as connection:
+            return do(connection, row.number)
 
     def _block(self, row: MapRow, at: float | None) -> int:
         """Delete the oldest frames of a map, a few of them; returns how many."""

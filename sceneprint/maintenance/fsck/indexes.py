@@ -330,7 +330,8 @@ def _differing_generations(folder: Folder, row: MapRow, place: Path) -> Iterator
         yield Finding(
             "foreign-index", str(place), "note",
             f"the index of map {row.name} is of another history of the database, as after a "
-            "restore: it is passed over, and made again by a worker",
+            "restore, or older than rows of deleted frames stay: it is passed over, and made again "
+            "by a worker",
             map=row.name, path=place,
         )  # fmt: skip
         return
