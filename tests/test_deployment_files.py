@@ -6,9 +6,18 @@ import os
 import re
 import shlex
 import shutil
+import socket
 import subprocess
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import cast
 
+import httpx
 import pytest
 
 from sceneprint.cli import parser
@@ -46,6 +55,135 @@ def test_haproxy_takes_its_file(tmp_path: Path) -> None:
     returned, said = said_by_haproxy(text.replace("option httpchk", "option httpcheck"), tmp_path)
     assert returned != 0
     assert "httpcheck" in said
+
+
+class _Api(ThreadingHTTPServer):
+    """Stands in for an API process: it says which one it is, and holds `/hold` requests open."""
+
+    daemon_threads = True
+
+    def __init__(self, name: str) -> None:
+        super().__init__(("127.0.0.1", 0), _Answer)
+        self.name, self.release, self.held = name, threading.Event(), threading.Semaphore(0)
+        threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.02}).start()
+
+    def end(self) -> None:
+        self.release.set()
+        self.shutdown()
+        self.server_close()
+
+
+class _Answer(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        api = cast(_Api, self.server)
+        if self.path.endswith("/hold"):
+            api.held.release()
+            api.release.wait(30)
+        body = api.name.encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@pytest.fixture
+def proxied(tmp_path: Path) -> Iterator[tuple[httpx.Client, dict[str, _Api]]]:
+    """The file run by haproxy in front of three processes."""
+    apis = {name: _Api(name) for name in ("a", "b", "c")}
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    text = (FOLDER / "haproxy.cfg").read_text().replace("bind :8008", f"bind 127.0.0.1:{port}")
+    # few processes are named one by one, as the file says
+    text = re.sub(r"(?ms)^resolvers names.*?(?=^frontend)", "", text).replace(
+        "inter 2s", "inter 50"
+    )
+    lines = [f"    server {n} 127.0.0.1:{api.server_port} check" for n, api in apis.items()]
+    text = re.sub(r"(?m)^ +server-template.*$", "\n".join(lines), text)
+    path = tmp_path / "run.cfg"
+    path.write_text(text)
+    program = subprocess.Popen(
+        [tool("haproxy", "haproxy"), "-db", "-f", str(path)], stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    transport = httpx.HTTPTransport(retries=20)  # until it listens
+    try:
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}", transport=transport) as client:
+            until(lambda: {client.get("/v1/jobs").text for _ in range(6)} == set(apis))
+            yield client, apis
+    finally:
+        program.terminate()
+        program.wait()
+        for api in apis.values():
+            api.end()
+
+
+def until(holds: Callable[[], bool]) -> None:
+    """Ask until it holds, at most for some seconds."""
+    end = time.monotonic() + 20
+    while not holds():
+        assert time.monotonic() < end
+
+
+MAPS = [f"map-{i}" for i in range(60)]
+
+
+def homes(client: httpx.Client, rest: str = "frames") -> dict[str, str]:
+    return {name: client.get(f"/v1/maps/{name}/{rest}").text for name in MAPS}
+
+
+def test_requests_for_one_map_go_to_one_process(
+    proxied: tuple[httpx.Client, dict[str, _Api]],
+) -> None:
+    client, apis = proxied
+    first = homes(client)
+    assert homes(client) == homes(client, "query?k=1") == first
+    counted = Counter(first.values())
+    assert set(counted) == set(apis)
+    assert min(counted.values()) >= 8  # of 20 on average
+
+
+def test_a_process_that_ends_moves_only_its_own_maps(
+    proxied: tuple[httpx.Client, dict[str, _Api]],
+) -> None:
+    client, apis = proxied
+    first = homes(client)
+    apis["b"].end()
+    until(lambda: "b" not in {client.get("/v1/jobs").text for _ in range(6)})
+    after = homes(client)
+    moved = {name for name in MAPS if after[name] != first[name]}
+    assert moved == {name for name in MAPS if first[name] == "b"}
+    assert {after[name] for name in moved} == {"a", "c"}
+
+
+def test_a_busy_map_spills_over_to_other_processes(
+    proxied: tuple[httpx.Client, dict[str, _Api]],
+) -> None:
+    """Of 30 open requests for one map, no process has more than 1.5 times the mean, rounded up."""
+    client, apis = proxied
+    ports = client.base_url.port
+    with ThreadPoolExecutor(30) as pool:
+        asked = [
+            pool.submit(httpx.get, f"http://127.0.0.1:{ports}/v1/maps/busy/hold", timeout=40)
+            for _ in range(30)
+        ]
+        taken: Counter[str] = Counter()
+
+        def all_taken() -> bool:
+            for name, api in apis.items():
+                while api.held.acquire(blocking=False):
+                    taken[name] += 1
+            return taken.total() == 30
+
+        until(all_taken)
+        for api in apis.values():
+            api.release.set()
+        assert Counter(one.result().text for one in asked) == taken
+    assert len(taken) >= 2
+    assert max(taken.values()) <= 16
 
 
 def said_of_unit(text: str, name: str, folder: Path) -> str:
