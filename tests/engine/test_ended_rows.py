@@ -1,0 +1,229 @@
+"""Rows of deleted and redundant frames go after some days, and what was deleted stays deleted."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import event, insert, select, update
+
+from sceneprint.engine import Engine
+from sceneprint.engine.search import local_index
+from sceneprint.engine.search.local_index import index_folder
+from sceneprint.engine.upkeep import purge
+from sceneprint.engine.upkeep.purge import Retention
+from sceneprint.errors import UnknownFrame, UnknownJob
+from sceneprint.store.deletion import DAY_S, maps_with_ended
+from sceneprint.store.maps import find_map
+from sceneprint.store.tables import frames, jobs, maps, surface_frames
+from sceneprint.store.undo_rows import NO_UNDO
+from sceneprint_client.api import FrameState, Query
+
+Make = Callable[..., Engine]
+Ids = Callable[[Engine], list[str]]
+DAYS = 7.0
+ALL = Query(stages=("retrieve",), k=50)
+
+
+@pytest.fixture(autouse=True)
+def _always_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
+
+
+@pytest.fixture
+def data(signed_folder: Path, tmp_path: Path) -> Path:
+    shutil.copytree(signed_folder, tmp_path / "data")
+    return tmp_path / "data"
+
+
+def after(engine: Engine, days: float) -> int:
+    """What retention removes so many days from now."""
+    return Retention(engine.store, DAYS).run(time.time() + DAY_S * days)
+
+
+def rows(engine: Engine) -> list[tuple[str, str]]:
+    """Id and state of all frames that have a row."""
+    with engine.store.database.read() as connection:
+        found = connection.execute(select(frames.c.id, frames.c.state).order_by(frames.c.number))
+        return [(one[0], one[1]) for one in found]
+
+
+def found(engine: Engine, uploads: Any) -> list[str]:
+    answer = engine.queries.upload(["hall"], uploads[2].data, uploads[2].meta, ALL)
+    return sorted(match.frame_id for match in answer.matches)
+
+
+def pruned(engine: Engine) -> int:
+    with engine.store.database.read() as connection:
+        return find_map(connection, "hall").pruned_revision
+
+
+def test_rows_of_deleted_frames_go_with_their_jobs_once_their_days_are_over(
+    full: Engine, ids: Ids
+) -> None:
+    full.undo_limits = NO_UNDO
+    names, use = ids(full), full.get_map("hall").used_frames
+    with full.store.database.read() as connection:
+        of = select(jobs.c.id).join(frames, frames.c.number == jobs.c.frame_number)
+        job = connection.execute(of.where(frames.c.id == names[1])).scalar_one()
+    for name in names[1:3]:
+        full.delete_frame("hall", name)
+    revision = full.get_map("hall").revision
+    assert after(full, DAYS - 0.01) == 0
+    assert len(rows(full)) == 12
+    assert after(full, DAYS + 0.01) == 2
+    assert rows(full) == [(name, "indexed") for name in names if name not in names[1:3]]
+    assert pruned(full) == revision
+    assert full.get_map("hall").used_frames == use - 2
+    for missing in names[1:3]:
+        with pytest.raises(UnknownFrame):
+            full.get_frame("hall", missing)
+    with pytest.raises(UnknownJob):
+        full.get_job(job)
+    assert after(full, 1000) == 0  # the living stay
+
+
+def test_a_frame_that_can_be_restored_keeps_its_row(full: Engine, ids: Ids) -> None:
+    name = ids(full)[0]
+    full.delete_frame("hall", name)
+    assert after(full, 2 * DAYS) == 0
+    assert (name, "deleted") in rows(full)
+    full.undo.restore_one("hall", name)
+    with full.store.database.read() as connection:
+        assert connection.execute(select(frames.c.ended_at)).scalars().all() == [None] * 12
+
+
+@pytest.mark.parametrize("needed", ["job", "surface"])
+def test_a_row_that_is_needed_stays(full: Engine, ids: Ids, needed: str) -> None:
+    full.undo_limits = NO_UNDO
+    full.delete_frame("hall", ids(full)[0])
+    with full.store.database.write() as connection:
+        number = connection.execute(
+            select(frames.c.number).where(frames.c.state == "deleted")
+        ).scalar_one()
+        if needed == "job":
+            own = jobs.c.frame_number == number
+            connection.execute(update(jobs).where(own).values(state="running"))
+        else:
+            of_map = connection.execute(select(maps.c.number)).scalar_one()
+            there = {"frame_number": number, "map_number": of_map, "parent": "a", "changed": True}
+            connection.execute(insert(surface_frames).values(**there))
+    assert after(full, 2 * DAYS) == 0
+    assert len(rows(full)) == 12
+    assert pruned(full) == 0
+
+
+def test_a_redundant_frame_goes_and_is_judged_anew_when_it_comes_again(
+    full: Engine, uploads: Any, work_off: Any
+) -> None:
+    camera = uploads[0].meta.intrinsics.model_copy(update={"cx": uploads[0].meta.intrinsics.cx + 1})
+    meta = uploads[0].meta.model_copy(update={"intrinsics": camera})
+    first, _ = full.add_frame("hall", uploads[0].data, meta, if_novel=0.9)
+    work_off(full)
+    assert full.get_frame("hall", first.frame_id).state == FrameState.REDUNDANT
+    assert after(full, DAYS + 0.01) == 1
+    assert pruned(full) == 0  # nobody searched it
+    second, new = full.add_frame("hall", uploads[0].data, meta)
+    assert new
+    assert second.frame_id != first.frame_id
+
+
+def test_frames_of_the_version_before_have_their_days_from_now_on(
+    full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(purge, "BLOCK", 2)
+    full.undo_limits = NO_UNDO
+    for name in ids(full)[:5]:
+        full.delete_frame("hall", name)
+    with full.store.database.write() as connection:
+        connection.execute(update(frames).values(ended_at=None))
+    assert after(full, 2 * DAYS) == 5  # given the time of now, which is long before then
+    with full.store.database.write() as connection:
+        connection.execute(update(frames).values(ended_at=None))
+    full.delete_frame("hall", ids(full)[0])
+    with full.store.database.write() as connection:
+        connection.execute(update(frames).values(ended_at=None))
+    assert after(full, 0) == 0
+    with full.store.database.read() as connection:
+        dated = connection.execute(select(frames.c.ended_at).where(frames.c.state == "deleted"))
+        assert dated.scalar_one() == pytest.approx(time.time(), abs=60)
+
+
+@pytest.mark.parametrize("tail_frames", [3, 100], ids=["index", "no index"])
+def test_a_reader_that_missed_deletions_begins_anew(
+    data: Path, make_engine: Make, uploads: Any, ids: Ids, tail_frames: int
+) -> None:
+    reader, builder = (make_engine(data, tail_frames=tail_frames) for _ in range(2))
+    assert builder.publish_due() == (tail_frames == 3)
+    names = ids(builder)
+    assert found(reader, uploads) == sorted(names)
+    builder.undo_limits = NO_UNDO
+    for name in names[4:6]:
+        builder.delete_frame("hall", name)
+    assert after(builder, DAYS + 1) == 2
+    left = sorted(set(names) - set(names[4:6]))
+    for engine in (reader, make_engine(data, tail_frames=tail_frames)):
+        assert found(engine, uploads) == left
+        assert engine.view("hall")[2].size == 10
+
+
+def test_an_index_is_published_before_it_would_be_too_old(
+    data: Path, make_engine: Make, uploads: Any, ids: Ids
+) -> None:
+    """Of ten thousand frames, one deletion would else be no reason for a year."""
+    engine = make_engine(data, tail_frames=5, deleted_rows_days=DAYS)
+    assert engine.publish_due() == 1
+    engine.undo_limits = NO_UNDO
+    names = ids(engine)
+    engine.delete_frame("hall", names[4])
+    assert engine.publish_due() == 0
+    with engine.store.database.write() as connection:
+        aged = frames.c.state == "deleted"
+        old = time.time() - DAY_S * DAYS / 2 - 60
+        connection.execute(update(frames).where(aged).values(ended_at=old))
+    late = make_engine(data, tail_frames=5, deleted_rows_days=DAYS)
+    assert late.publish_due() == 1
+    assert late.publish_due() == 0
+    assert after(late, DAYS) == 1
+    generation = make_engine(data, tail_frames=5).view("hall")[2].generation
+    assert generation is not None
+    assert generation.revision == pruned(late)
+    assert found(late, uploads) == sorted(set(names) - {names[4]})
+
+
+def test_purging_leaves_no_byte_of_a_frame_whose_row_is_gone(
+    data: Path, make_engine: Make, ids: Ids
+) -> None:
+    """On a node that was off meanwhile, where too little is left for another index."""
+    engine = make_engine(data, tail_frames=11)
+    assert engine.publish_due() == 1
+    engine.undo_limits = NO_UNDO
+    for name in ids(engine)[:6]:
+        engine.delete_frame("hall", name)
+    assert after(engine, DAYS + 1) == 6
+    with engine.store.database.read() as connection:
+        row = find_map(connection, "hall")
+    folder = index_folder(engine.settings.indexes, row)
+    assert list(folder.glob("*.json"))
+    assert engine.purging.now().indexes == 1
+    assert not list(folder.glob("*.json"))
+    assert engine.purging.now().indexes == 0
+
+
+def test_rows_that_are_due_are_found_by_an_index(full: Engine, ids: Ids) -> None:
+    asked: list[str] = []
+    database = full.store.database
+    with database.read() as connection:
+        event.listen(connection, "before_cursor_execute", lambda *given: asked.append(given[2]))
+        assert maps_with_ended(connection, 1.0) == []
+        if not database.is_sqlite:
+            return
+        statement = next(one for one in asked if one.startswith("SELECT"))
+        plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", (1.0, 1.0)).all()
+    told = [one[3] for one in plan]
+    assert sum("ix_frames_ended" in one for one in told) >= 2, told
+    assert not any("SCAN frames" in one for one in told), told
