@@ -57,6 +57,12 @@ class Settings(BaseSettings):
     #: Folder of search indexes, of this machine alone. Deleting it loses nothing but minutes;
     #: default: `index` in the data folder.
     index_dir: Path | None = None
+    #: Where a fleet shares search indexes: s3://bucket/prefix, gs://, az:// or file:///; each is
+    #: then built once, and fetched by nodes that serve its map. Default: each host builds its own.
+    index_url: str | None = None
+    #: Room for search indexes on this machine where they are shared, bytes; those of maps that were
+    #: not asked for longest are removed.
+    index_bytes: int = Field(default=16 << 30, ge=0)
     #: Address the service listens on. Any but a loopback address asks callers for a key.
     host: str = "127.0.0.1"
     #: Port of the service; 0 for a free one.
@@ -161,7 +167,14 @@ class Settings(BaseSettings):
             raise ValueError("HTTPS needs SCENEPRINT_TLS_CERT and SCENEPRINT_TLS_KEY; set both")
         return given
 
-    @field_validator("blob_url", "snapshot_url")
+    @field_validator("index_url")
+    @classmethod
+    def _is_shared(cls, given: str | None) -> str | None:
+        if given is not None and given.startswith("memory:"):
+            raise ValueError("memory:/// is inside one process; use file:///folder")
+        return given
+
+    @field_validator("blob_url", "snapshot_url", "index_url")
     @classmethod
     def _holds_objects(cls, given: SecretStr | str | None) -> SecretStr | str | None:
         if given is not None:

@@ -61,6 +61,7 @@ class _Api(ThreadingHTTPServer):
     """Stands in for an API process: it says which one it is, and holds `/hold` requests open."""
 
     daemon_threads = True
+    request_queue_size = 128
 
     def __init__(self, name: str) -> None:
         super().__init__(("127.0.0.1", 0), _Answer)
@@ -85,7 +86,7 @@ class _Answer(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(body)
 
-    def log_message(self, format: str, *args: object) -> None:
+    def log_message(self, *_: object) -> None:
         pass
 
 
@@ -99,7 +100,7 @@ def proxied(tmp_path: Path) -> Iterator[tuple[httpx.Client, dict[str, _Api]]]:
     text = (FOLDER / "haproxy.cfg").read_text().replace("bind :8008", f"bind 127.0.0.1:{port}")
     # few processes are named one by one, as the file says
     text = re.sub(r"(?ms)^resolvers names.*?(?=^frontend)", "", text).replace(
-        "inter 2s", "inter 50"
+        "inter 2s", "inter 300"
     )
     lines = [f"    server {n} 127.0.0.1:{api.server_port} check" for n, api in apis.items()]
     text = re.sub(r"(?m)^ +server-template.*$", "\n".join(lines), text)
@@ -132,7 +133,13 @@ MAPS = [f"map-{i}" for i in range(60)]
 
 
 def homes(client: httpx.Client, rest: str = "frames") -> dict[str, str]:
-    return {name: client.get(f"/v1/maps/{name}/{rest}").text for name in MAPS}
+    """Where each map is answered; of three times, as one that has just ended may still count."""
+
+    def home(name: str) -> str:
+        asked = Counter(client.get(f"/v1/maps/{name}/{rest}").text for _ in range(3))
+        return asked.most_common(1)[0][0]
+
+    return {name: home(name) for name in MAPS}
 
 
 def test_requests_for_one_map_go_to_one_process(

@@ -190,6 +190,7 @@ def object_stores(settings: Settings) -> Iterator[Check]:
     for subject, setting, url in (
         ("blobs", "SCENEPRINT_BLOB_URL", blobs),
         ("snapshots", "SCENEPRINT_SNAPSHOT_URL", settings.snapshot_url),
+        ("indexes", "SCENEPRINT_INDEX_URL", settings.index_url),
     ):
         if url is not None:
             yield _looked_at(subject, setting, url)

@@ -34,6 +34,7 @@ from sceneprint.engine.results.stored_results import ResultValidity, open_result
 from sceneprint.engine.search.local_index import IndexView
 from sceneprint.engine.search.query import Queries
 from sceneprint.engine.search.retrieval import Readers
+from sceneprint.engine.search.shared_index import open_shared
 from sceneprint.engine.serializers import frame_records, map_record
 from sceneprint.engine.sessions.association_job import Associating
 from sceneprint.engine.sessions.associations import ASSOCIATE, AssociationJobs
@@ -110,16 +111,10 @@ class Engine:
             settings.geometry_bytes, decoders_of(settings),
         )  # fmt: skip
         self.signers = Signers(self.store.database, settings.cache_dir)
-        self._upkeep = Upkeep(
-            self.store,
-            self.signers,
-            settings.indexes,
-            settings.tail_frames,
-            settings.scrub_s,
-            settings.deleted_rows_days,
-        )
+        self._shared = open_shared(self.store, settings)
+        self._upkeep = Upkeep(self.store, self.signers, settings, self._shared)
         self._reencoding = Reencodings(self.store, self._upkeep)
-        self._readers = Readers(self.signers, settings.indexes, settings.search)
+        self._readers = Readers(self.signers, settings.indexes, settings.search, self._shared)
         self._vector_tables = VectorTables(self.signers, settings.search)
         self.kept_answers = KeptAnswers(self.store, settings)
         self.kept = open_results(
@@ -167,6 +162,8 @@ class Engine:
 
     def close(self) -> None:
         """Give back what was opened."""
+        if self._shared is not None:
+            self._shared.close()
         self.history.close()
         self._limits.restore_original_limits()
         self._cores.close()
@@ -226,6 +223,10 @@ class Engine:
             self._purged = time.monotonic()
             self.store.geometries.forget_older(self.settings.purge_s / 2)
             self._readers.purge(connection)
+        if self._shared is not None:
+            self._shared.purge_local()
+            with self.store.database.read() as connection:
+                self._readers.purge(connection)
         self.kept.forget(
             ResultValidity(self.store, restorable=True).all_of
         )  # this node may have no worker

@@ -83,6 +83,11 @@ class Generation:
         return self.manifest.revision
 
     @property
+    def anchor(self) -> str:
+        """By which whoever published it knows the state of the database."""
+        return self.manifest.anchor
+
+    @property
     def model_id(self) -> str:
         """Of the model that signed them."""
         return self.manifest.model_id
@@ -445,6 +450,8 @@ def publish(
     anchor: Callable[[], str] = str,
     clean: bool = False,
     flat_bytes: int = FLAT_BYTES,
+    after: int = 0,
+    share: Callable[[GenerationManifest], bool] = lambda _: True,
 ) -> Generation | None:
     """Publish the generation that follows `previous`.
 
@@ -466,11 +473,14 @@ def publish(
     clean : leave no file that has a byte of a frame that is no longer there: the generation
         before is not kept
     flat_bytes : of signatures, above which there is an inverted file
+    after : its number is larger than that
+    share : called with the manifest once all files are there and before it is: False where another
+        generation was published by that number elsewhere, so that this one is not published
 
     Returns
     -------
-    the generation, open; None where somebody else is building, or `previous` is no longer the
-    newest of the folder: then open the newest and try again
+    the generation, open; None where somebody else is building or has published, or `previous` is
+    no longer the newest of the folder: then open the newest and try again
 
     Raises
     ------
@@ -493,7 +503,7 @@ def publish(
         if lists is not None:
             files.append(put(folder, "lists", lambda take: faiss_index.write_lists(lists, take)))
         manifest = GenerationManifest(
-            number=listed[0][0] + 1 if listed else 1,
+            number=max(after, listed[0][0] if listed else 0) + 1,
             revision=revision,
             model_id=model_id,
             dimension=draft.vectors.shape[1],
@@ -501,6 +511,9 @@ def publish(
             files=tuple(files),
             recall=recall,
         )
+        if not share(manifest):
+            remove_unneeded(folder)
+            return None
         own = write_manifest(folder, manifest)
         if previous is not None:  # known to be sound, whatever lies between
             listed = [each for each in listed if each[0] == previous.number]
@@ -518,6 +531,21 @@ def clear(folder: Path, but: int | None = None) -> bool:
         if mine:
             _clean(folder, {path for number, path in manifests(folder) if number == but})
         return mine
+
+
+def remove_all_but(folder: Path, manifest: GenerationManifest) -> None:
+    """Publish a generation whose files are in a folder, and remove all others; while building.
+
+    Raises
+    ------
+    OSError : it cannot be written.
+    """
+    _clean(folder, {write_manifest(folder, manifest)})
+
+
+def remove_unneeded(folder: Path) -> None:
+    """Remove files that no generation of a folder needs; while building."""
+    _clean(folder, {path for _, path in manifests(folder)})
 
 
 def _overtaken(folder: Path, previous: Generation | None) -> bool:

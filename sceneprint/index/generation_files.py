@@ -51,6 +51,11 @@ def is_name(name: str, kind: str) -> bool:
     return found is not None and found[1] == kind
 
 
+def is_file_name(name: str) -> bool:
+    """Whether a file of a generation can have this name: it is in no other folder."""
+    return _NAME.fullmatch(name) is not None
+
+
 def is_ours(name: str) -> bool:
     """Whether a file was made here, and may be removed where no manifest needs it."""
     return bool(_NAME.fullmatch(name) or _LEFT.fullmatch(name))
@@ -252,6 +257,12 @@ class GenerationManifest:
     files: tuple[tuple[str, int], ...]
     recall: Recall
 
+    @property
+    def frames(self) -> int:
+        """How many it holds."""
+        found = self.file("keys")
+        return 0 if found is None else found[1] // 8
+
     def file(self, kind: str) -> tuple[str, int] | None:
         """The file of a kind, by name and bytes; None where there is none."""
         return next((each for each in self.files if is_name(each[0], kind)), None)
@@ -278,12 +289,21 @@ def write_manifest(folder: Path, manifest: GenerationManifest) -> Path:
     ------
     OSError : it cannot be written.
     """
-    record = {"schema_version": SCHEMA_VERSION} | asdict(manifest)
-    data = (json.dumps(record, indent=1) + "\n").encode()
-    name = f"{manifest.number:010d}-{hashlib.sha256(data).hexdigest()[:32]}"
-    path = folder / f"{name}.{SCHEMA_VERSION}.json"
-    write_durable(path, data)
+    path = folder / manifest_name(manifest)
+    write_durable(path, encode_manifest(manifest))
     return path
+
+
+def encode_manifest(manifest: GenerationManifest) -> bytes:
+    """A manifest as bytes; the same manifest gives the same."""
+    record = {"schema_version": SCHEMA_VERSION} | asdict(manifest)
+    return (json.dumps(record, indent=1) + "\n").encode()
+
+
+def manifest_name(manifest: GenerationManifest) -> str:
+    """The name of a manifest in a folder."""
+    digest = hashlib.sha256(encode_manifest(manifest)).hexdigest()[:32]
+    return f"{manifest.number:010d}-{digest}.{SCHEMA_VERSION}.json"
 
 
 def read_manifest(path: Path) -> GenerationManifest:
@@ -300,6 +320,21 @@ def read_manifest(path: Path) -> GenerationManifest:
         raise DamagedIndex(f"{path}: cannot be read ({error.strerror or error}).") from error
     if found is None or hashlib.sha256(data).hexdigest()[:32] != found[2]:
         raise DamagedIndex(f"{path}: its bytes are not those that were written.")
+    return decode_manifest(path, data)
+
+
+def decode_manifest(path: Path, data: bytes) -> GenerationManifest:
+    """A manifest from its bytes.
+
+    Parameters
+    ----------
+    path : to show
+    data : of `encode_manifest`
+
+    Raises
+    ------
+    DamagedIndex : they are none, or of another schema.
+    """
     try:
         record: dict[str, Any] = json.loads(data)
         if record.pop("schema_version") != SCHEMA_VERSION:

@@ -19,7 +19,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ from sceneprint.index import (
     search,
     signatures_of,
 )
-from sceneprint.index.generation_files import Keys
+from sceneprint.index.generation_files import GenerationManifest, Keys
 from sceneprint.models import Model
 from sceneprint.store import require_primary
 from sceneprint.store.events import holds_anchor
@@ -294,13 +294,17 @@ def is_index_folder(name: str) -> bool:
     return re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,62}-\d+-[0-9a-f]+(-[0-9a-f]{12})?", name) is not None
 
 
-def trusted(connection: Connection, row: MapRow, found: Generation | None) -> Generation | None:
+#: A generation, or its manifest alone.
+Published = TypeVar("Published", Generation, GenerationManifest)
+
+
+def trusted(connection: Connection, row: MapRow, found: Published | None) -> Published | None:
     """A generation, unless the database was put back to a state before it, and went on; or rows of
     frames that were deleted since are gone, so that nobody can tell which.
     """
     if found is None or found.revision < row.pruned_revision:
         return None
-    if found.revision <= row.revision and holds_anchor(connection, found.manifest.anchor):
+    if found.revision <= row.revision and holds_anchor(connection, found.anchor):
         return found
     require_primary("the state of an index")
     return None
@@ -311,7 +315,7 @@ class Reader:
 
     def __init__(self, connection: Connection, row: MapRow, folder: Path, model: Model) -> None:
         self._folder, self._model = folder, model
-        self._looked = time.monotonic()
+        self._looked = self._asked = time.monotonic()
         self._lock = threading.Lock()
         self._unsound = 0, 0.0  # number of a generation that cannot be used, until the next try
         self._begin(connection, row)
@@ -323,6 +327,11 @@ class Reader:
         self._damaged: set[int] = set()
         found = self._newest(connection, row, None)
         self._publish(found, 0 if found is None else found.revision)
+
+    @property
+    def generation(self) -> Generation | None:
+        """That is used."""
+        return self._view.generation
 
     @property
     def bytes_held(self) -> int:
@@ -345,8 +354,14 @@ class Reader:
             number != unsound or time.monotonic() > until
         )
 
+    def lost_index(self, idle_s: float) -> bool:
+        """Whether nobody asked for so long, and the index that it uses is not on the disk."""
+        idle = time.monotonic() - self._asked > idle_s
+        return idle and self._view.number > 0 and newest_number(self._folder) is None
+
     def view(self, connection: Connection, row: MapRow) -> IndexView:
         """The map as of the row's revision, or later."""
+        self._asked = time.monotonic()
         behind = self._view.revision < row.revision
         if self._view.revision > row.revision:
             require_primary("what is held of a map")
@@ -413,6 +428,8 @@ class Reader:
             found is None or found.number == view.number
             or not since <= found.revision <= view.revision
         ):  # fmt: skip
+            if found is not None and found.revision < since:  # a fleet's, older than one made here
+                self._unsound = found.number, time.monotonic() + _AGAIN_S
             return
         self._tail = self._tail.after(found.revision)
         self._dead = {n: deleted for n, deleted in self._dead.items() if deleted > found.revision}

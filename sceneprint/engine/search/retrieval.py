@@ -22,6 +22,7 @@ from sceneprint import errors
 from sceneprint.decoders import Decoders
 from sceneprint.engine.ingest.frame_decoder import read_upload
 from sceneprint.engine.search.local_index import READ_MOST, IndexView, MapView, Reader, index_folder
+from sceneprint.engine.search.shared_index import IN_USE_S, SharedIndexes
 from sceneprint.engine.search.stored_maps import Stored, StoredMaps, search_stored
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.signers import Signers
@@ -61,9 +62,14 @@ class Readers:
     indexes : folder of all indexes
     setting : `local` never asks the database; `database` wherever it can; `auto` where much is
         missing here
+    shared : indexes of the fleet, of which maps that are asked are fetched
     """
 
-    def __init__(self, signers: Signers, indexes: Path, setting: Setting = "local") -> None:
+    def __init__(
+        self, signers: Signers, indexes: Path, setting: Setting = "local",
+        shared: SharedIndexes | None = None,
+    ) -> None:  # fmt: skip
+        self._shared = shared
         self._signers, self._indexes, self._setting = signers, indexes, setting
         self._stored = StoredMaps()
         self._database, self._history = signers.database, signers.database.history
@@ -138,7 +144,9 @@ class Readers:
             while len(self._open) > 1 and held_bytes > HELD_BYTES:
                 _, (_, oldest) = self._open.popitem(last=False)
                 held_bytes -= oldest.bytes_held
-            return reader
+        if self._shared is not None and self._signers(row.model_id).model.metric == "l2":
+            self._shared.want(row, reader.generation)
+        return reader
 
     def forget(self, name: str) -> None:
         """Give up what is held of a map that was deleted."""
@@ -167,6 +175,9 @@ class Readers:
             self._tidied = time.monotonic()
             for name in [name for name, (held, _) in self._open.items() if there.get(name) != held]:
                 del self._open[name]
+            for name, (_, reader) in list(self._open.items()) if self._shared is not None else ():
+                if reader.lost_index(IN_USE_S):  # to make room; its files take it while mapped
+                    del self._open[name]
 
 
 # A query made ready: its signature and, for validation, its geometry.

@@ -7,7 +7,7 @@ import os
 import shutil
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -22,11 +22,22 @@ from sqlalchemy.exc import SQLAlchemyError
 from sceneprint.atomic_files import PRIVATE_FILE, make_folder
 from sceneprint.engine.search.local_index import READ_MOST, index_folder, is_index_folder, trusted
 from sceneprint.engine.search.retrieval import Setting
+from sceneprint.engine.search.shared_index import SHARE, SharedIndexes
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
-from sceneprint.errors import BusyIndex, InvalidRequest, ModelError, SceneprintError, UnknownMap
+from sceneprint.errors import (
+    BusyIndex,
+    DamagedIndex,
+    InvalidRequest,
+    ModelError,
+    SceneprintError,
+    UnknownMap,
+    UnusableStore,
+)
 from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.index import Generation, clear, manifests, newest, newest_number, publish, scrub
+from sceneprint.index.generation_files import GenerationManifest
+from sceneprint.settings import Settings
 from sceneprint.store import Store
 from sceneprint.store.deletion import DAY_S, newest_deletion
 from sceneprint.store.events import anchor_of_now
@@ -109,11 +120,10 @@ class Scrubber:
 
 log = logging.getLogger(__name__)
 
-#: A map is published when so large a share of it is new, or deleted: to publish writes all of it,
-#: so that what is written in all stays proportional to the map.
-SHARE = 1 / 16
 #: Seconds between two looks for deletions that an index should know of, at most.
 AGING_S = 3600.0
+#: Seconds until a host looks again at a map whose index another builds, or could not be shared.
+ELSEWHERE_S = 30.0
 #: In the folder of an index: read from its times, when it was purged, and when it may be again.
 _REST = ".rest"
 
@@ -124,25 +134,24 @@ class Upkeep:
     Parameters
     ----------
     store, signers : see there
-    indexes : folder of all indexes
-    tail_frames : frames that a generation may lack, and deleted ones that it may hold; of a large
-        map SHARE of its frames
-    scrub_s : seconds after which all files are read again, to see that they are sound
-    rows_days : for which rows of deleted frames stay: an index that is as old cannot be brought up
-        to date
+    settings : `indexes` is the folder of all indexes; a generation may lack `tail_frames` frames,
+        and hold as many deleted ones, of a large map SHARE of its frames; after `scrub_s` seconds
+        all files are read again, to see that they are sound; an index that lacks a
+        deletion of `deleted_rows_days` ago cannot be brought up to date
+    shared : indexes of the fleet; None where each host builds its own
     """
 
     def __init__(
-        self, store: Store, signers: Signers, indexes: Path, tail_frames: int, scrub_s: float,
-        rows_days: float,
-    ) -> None:  # fmt: skip
-        self._store, self._signers = store, signers
-        self._indexes, self._tail_frames = indexes, tail_frames
+        self, store: Store, signers: Signers, settings: Settings, shared: SharedIndexes | None
+    ) -> None:
+        self._store, self._signers, self._shared = store, signers, shared
+        self._indexes, self._tail_frames = settings.indexes, settings.tail_frames
+        self._elsewhere: dict[int, float] = {}  # by map, when it may be looked at again
         # map and model: number of their index, revision, frames
         self._published: dict[tuple[int, str], tuple[int, int, int]] = {}
         self._metrics: dict[str, Metric | None] = {}
-        self._scrubber = Scrubber(indexes, scrub_s)
-        self._rows_s = DAY_S * rows_days
+        self._scrubber = Scrubber(settings.indexes, settings.scrub_s)
+        self._rows_s = DAY_S * settings.deleted_rows_days
         # map and model: when it is looked next for deletions that the index should know of by now
         self._aged = dict[tuple[int, str], float]()
 
@@ -157,7 +166,7 @@ class Upkeep:
         rows = [row for row in listed if self._metric(row.model_id) == "l2"]
         with self._store.database.read() as connection:
             due = [row for row in rows if self._due(connection, row)]
-        published = sum(self._tried(row) for row in due)
+        published = sum(self._tried(row) for row in due if self._is_ours(row))
         self._clean(listed)
         damaged = self._scrubber.step([index_folder(self._indexes, row) for row in rows])
         for row in rows:
@@ -214,18 +223,29 @@ class Upkeep:
                             "model that it is switching to. Wait until the switch is done."
                         )
             length = self._signers(coming.model_id).model.signature_bytes
+            if self._shared is not None:
+                self._shared.sync(coming)
             return newest(index_folder(self._indexes, coming), coming.model_id, length)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, UnusableStore, DamagedIndex) as error:
             log.error("index publication failed", extra={"map": row.name, "error": str(error)})
             return None
 
+    def _is_ours(self, row: MapRow) -> bool:
+        """Whether no other host was at a map's index a moment ago."""
+        return time.monotonic() >= self._elsewhere.get(row.number, 0.0)
+
     def _tried(self, row: MapRow, *, anyway: bool = False) -> bool:
         try:
+            if anyway and self._shared is not None:
+                self._shared.sync(row)  # what was damaged here is fetched again
+                return False
             return self._publish(row, anyway=anyway) is not None
         except UnknownMap:
             return False  # deleted in the meantime
         except (OSError, SceneprintError, ValueError) as error:
             log.error("index publication failed", extra={"map": row.name, "error": str(error)})
+            if self._shared is not None:  # to build it all again each time would be too dear
+                self._elsewhere[row.number] = time.monotonic() + ELSEWHERE_S
             return False
 
     def _metric(self, model_id: str) -> Metric | None:
@@ -239,7 +259,8 @@ class Upkeep:
 
     def _due(self, connection: Connection, row: MapRow) -> bool:
         number, since, frames = self._published.get((row.number, row.model_id), (None, 0, 0))
-        if newest_number(index_folder(self._indexes, row)) != number:
+        here = newest_number(index_folder(self._indexes, row))
+        if self._shared is None and here != number:
             since = frames = 0  # published by another process, or removed: to be looked at
         return self._is_long(connection, row, since, frames)
 
@@ -271,14 +292,17 @@ class Upkeep:
         return False
 
     def purge(self, row: MapRow) -> bool:
-        """Leave no byte of a deleted frame in the index of a map; whether anything was done.
+        """Leave no byte of a deleted frame in the index of a map, be it here or shared; whether
+        anything was done.
 
         Raises
         ------
         UnknownMap : the map is gone, and with it soon its index.
         BusyIndex : another process is building it, and may not know of the latest deletions.
-        OSError : it cannot be written; what was there stays.
+        OSError, UnusableStore : it cannot be written; what was there stays.
         """
+        if self._shared is not None and self._metric(row.model_id) == "l2":
+            return self._purge_shared(row, self._shared)
         folder = index_folder(self._indexes, row)
         if self._metric(row.model_id) == "l1":  # version 0.1 may have left one
             left = any(folder.glob("*.json"))
@@ -319,6 +343,54 @@ class Upkeep:
             )
         return True
 
+    def _purge_shared(self, row: MapRow, shared: SharedIndexes) -> bool:
+        """As `purge`: of what the fleet shares, and then of what is here of it."""
+        head, folder = shared.head(row), index_folder(self._indexes, row)
+        with self._store.database.read() as connection:
+            allow(connection, 0)
+            now = find_map(connection, row.name)
+            if now.number != row.number:
+                return False
+            since = 0 if head is None else head.revision
+            gone = np.fromiter(deleted_since(connection, row.number, since), np.int64)
+            empty = count_indexed(connection, row.number, 0) == 0
+            older = now.pruned_revision > 0 or count_gone(connection, row.number, 0) > 0
+        done = done_here = True
+        stale = head is not None and (
+            head.revision < now.pruned_revision  # of what it has too much, no row tells any more
+            or bool(np.isin(gone, shared.keys(row, head)).any())
+        )
+        if stale and not empty:
+            done = self._publish(row, anyway=True, clean=True) is not None
+        elif older:  # also what a builder left that died
+            with shared.turn(row) as mine:
+                if mine is None:
+                    done = False
+                elif empty:
+                    shared.withdraw(row)
+                else:
+                    shared.tidy(row, clean=True)
+        if done and manifests(folder):
+            found = None if empty else shared.sync(row)
+            if found is None or len(manifests(folder)) > 1:
+                done_here = clear(folder, but=None if found is None else found.number)
+        if not (done and done_here):
+            raise BusyIndex(
+                f"Another process is building the index of map {row.name!r}, so it may still "
+                "contain bytes of deleted frames. Try again later."
+            )
+        return stale
+
+    def sweep(self, *, now: bool = False) -> None:
+        """Remove shared indexes of maps that are gone, and of models that they had.
+
+        Raises
+        ------
+        UnusableStore : the object store cannot be used.
+        """
+        if self._shared is not None:
+            self._shared.sweep(lambda: self._known_folders(()), now=now)
+
     def rest(self, row: MapRow, seconds: float) -> None:
         """Leave the index of a map in peace for so long, whichever process looks after it."""
         now = time.time()
@@ -338,6 +410,47 @@ class Upkeep:
     def _publish(
         self, row: MapRow, *, anyway: bool = False, anew: bool = False, clean: bool = False
     ) -> Generation | None:
+        shared = self._shared
+        if shared is None:
+            return self._build(row, anyway=anyway, anew=anew, clean=clean)
+        if not anyway and self._is_up_to_date(row, shared):
+            return None
+        with shared.turn(row) as mine:
+            if mine is None:  # another host builds it
+                self._elsewhere[row.number] = time.monotonic() + ELSEWHERE_S
+                return None
+            if not anyway and self._is_up_to_date(row, shared):
+                return None  # it has built it meanwhile
+            if not anew:
+                shared.sync(row)
+            folder = index_folder(self._indexes, row)
+
+            def share(manifest: GenerationManifest) -> bool:
+                mine()
+                return shared.share(folder, manifest)
+
+            after = shared.newest_number(row)
+            made = self._build(row, anyway=anyway, anew=anew, clean=clean, after=after, share=share)
+            if made is not None:
+                shared.tidy(row, clean=clean)
+            return made
+
+    def _is_up_to_date(self, row: MapRow, shared: SharedIndexes) -> bool:
+        """Whether what the fleet shares of a map is near enough to it."""
+        head = shared.head(row)
+        with self._store.database.read() as connection:
+            now = replace(find_map(connection, row.name), model_id=row.model_id)
+            found = trusted(connection, now, head)
+            since, frames = (0, 0) if found is None else (found.revision, found.frames)
+            if found is not None:
+                own = (found.number, since, frames)
+                self._published[row.number, row.model_id] = own
+            return not self._is_long(connection, now, since, frames)
+
+    def _build(
+        self, row: MapRow, *, anyway: bool = False, anew: bool = False, clean: bool = False,
+        after: int = 0, share: Callable[[GenerationManifest], bool] = lambda _: True,
+    ) -> Generation | None:  # fmt: skip
         signer = self._signers(row.model_id)  # before a connection is held: it takes one itself
         damaged: list[int] = []
         with self._store.database.read() as connection:
@@ -372,6 +485,8 @@ class Upkeep:
                 drop=deleted_since(connection, now.number, since),
                 anchor=partial(anchor_of_now, self._store.database, now.name),
                 clean=clean,
+                after=after,
+                share=share,
             )
         resign_frames(self._store, now, damaged, now.model_id)
         if generation is None:
@@ -391,15 +506,19 @@ class Upkeep:
         """Remove the indexes of maps that are no more, of models that they had, and of psi."""
         if not self._indexes.is_dir():
             return
-        with self._store.database.read() as connection:  # a map may have been made since
-            known = [*rows, *list_maps(connection)]
-        known += [_coming(row) for row in known if row.next_model_id is not None]
-        known = [row for row in known if self._metric(row.model_id) != "l1"]
-        kept = {index_folder(self._indexes, row).name for row in known}
+        kept = self._known_folders(rows)
         for folder in self._indexes.iterdir():
             if is_index_folder(folder.name) and folder.name not in kept:
                 shutil.rmtree(folder, ignore_errors=True)
                 log.info("index removed", extra={"folder": folder.name})
+
+    def _known_folders(self, rows: Sequence[MapRow]) -> set[str]:
+        """Names of the folders of indexes of these maps, and of those that there are now."""
+        with self._store.database.read() as connection:  # a map may have been made since
+            known = [*rows, *list_maps(connection)]
+        known += [_coming(row) for row in known if row.next_model_id is not None]
+        known = [row for row in known if self._metric(row.model_id) != "l1"]
+        return {index_folder(self._indexes, row).name for row in known}
 
 
 def _coming(row: MapRow) -> MapRow:

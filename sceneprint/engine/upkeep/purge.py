@@ -235,10 +235,16 @@ class Purging:
             differences=tried(self._differences.forget),
             answers=tried(lambda: self._kept.forget(standing.all_of))
             + tried(self._kept_answers.remove_spent),
-            indexes=sum(tried(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]
+            indexes=tried(lambda: self._swept(now=before is None))
+            + sum(tried(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]
         )
         self._store.database.shrink_log()
         return found
+
+    def _swept(self, *, now: bool) -> int:
+        """Of maps that are gone, nothing is shared."""
+        self._upkeep.sweep(now=now)
+        return 0
 
     def _index(self, row: MapRow) -> int:
         start = time.monotonic()

@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 import threading
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -41,6 +41,8 @@ TURN, BLOBS = 1, 2
 VECTORS, EVENTS = 7, 8
 #: The first number of locks of single maps; the second is that of the map.
 MAP_LOCKS = 0x5CE7F
+#: That of who builds the index of a map for its fleet; the second is that of the map.
+INDEX_LOCKS = 0x5CE80
 #: Seconds for one statement, and for a transaction in which nothing is asked: a client that fell
 #: silent must not keep the turn from all others.
 STATEMENT_S, IDLE_S = 60.0, 30.0
@@ -349,6 +351,46 @@ class SessionLocks(Locks):
     def _end(self) -> None:
         if self._removes.ask(_NEXT) is None or not self._removes.ask(_GIVE, LOCKS, BLOBS):
             self._removes.drop()  # the lock goes with its connection
+
+
+@contextmanager
+def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], None] | None]:
+    """Have the turn to build a map's index for the fleet, as long as a connection lasts.
+
+    SQLite is of one machine, whose builders have the lock of the index's folder.
+
+    Yields
+    ------
+    what sees that the turn was not lost, and raises UnusableStore where it was; None where
+    somebody else has the turn
+
+    Raises
+    ------
+    UnusableStore : the database cannot be asked.
+    """
+    import psycopg
+
+    if database.is_sqlite:
+        yield lambda: None
+        return
+    connection = database.driver_connection()
+
+    def require() -> None:
+        try:
+            connection.execute("SELECT 1")
+        except psycopg.Error as error:
+            raise UnusableStore(
+                f"{database.shown}: the connection was lost that kept others from building the "
+                "same index. It is built again."
+            ) from error
+
+    try:
+        with database.explained():
+            values = (INDEX_LOCKS, map_number & 0x7FFFFFFF)
+            mine = bool(_one(connection, _TAKE, values))
+        yield require if mine else None
+    finally:
+        connection.close()
 
 
 class _Line:

@@ -1,0 +1,436 @@
+"""Indexes that a fleet shares: built once, fetched whole or not at all, forgotten everywhere."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+from sqlalchemy import select
+
+from benchmarks.fleet.s3 import ObjectServer
+from sceneprint.engine import Engine
+from sceneprint.engine.search import local_index, shared_index
+from sceneprint.engine.search.local_index import index_folder
+from sceneprint.engine.search.shared_index import IN_USE_S, SharedIndexes
+from sceneprint.engine.upkeep import index_upkeep
+from sceneprint.errors import BusyIndex, DamagedIndex, UnusableStore
+from sceneprint.index import manifests
+from sceneprint.index.generation_files import building
+from sceneprint.settings import Settings
+from sceneprint.store.blobs.object_client import Objects, open_objects
+from sceneprint.store.maps import find_map
+from sceneprint.store.postgres.connection import index_turn
+from sceneprint.store.tables import MapRow, frames, signatures
+from sceneprint_client.api import Answer, NewMap, Query
+
+Make = Callable[..., Engine]
+WorkOff = Callable[[Engine], list[Any]]
+ALL = Query(stages=("retrieve",), k=50)
+
+
+@pytest.fixture(autouse=True)
+def _always_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
+    monkeypatch.setattr(shared_index, "LOOK_S", 0.0)
+    monkeypatch.setattr(index_upkeep, "ELSEWHERE_S", 0.0)
+
+
+@pytest.fixture
+def place(store_url: str, request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """URL of what is shared: a bucket beside a server, a folder beside SQLite."""
+    if store_url.startswith("sqlite"):
+        return f"file://{tmp_path}/shared"
+    return f"{request.getfixturevalue('bucket')}/fleet"
+
+
+@pytest.fixture
+def host(make_engine: Make, store_url: str, place: str, tmp_path: Path) -> Callable[..., Engine]:
+    """Another host of the fleet, with a folder of its own."""
+    (tmp_path / "common" / "blobs").mkdir(parents=True)
+
+    def make(name: str, **more: object) -> Engine:
+        given = {
+            "database_url": store_url, "blob_url": f"file://{tmp_path}/common",
+            "index_url": place, "tail_frames": 2, "undo_s": 0,
+        }  # fmt: skip
+        return make_engine(tmp_path / name, **{**given, **more})
+
+    return make
+
+
+@pytest.fixture
+def fill(uploads: Any, work_off: WorkOff) -> Callable[..., list[str]]:
+    """Index uploads in a map; returns their ids."""
+
+    def add(engine: Engine, which: range, name: str = "hall") -> list[str]:
+        added = [engine.add_frame(name, uploads[i].data, uploads[i].meta)[0] for i in which]
+        assert work_off(engine) == ["succeeded"] * len(which)
+        return [one.frame_id for one in added]
+
+    return add
+
+
+@pytest.fixture
+def built(host: Callable[..., Engine], fill: Callable[..., list[str]]) -> Engine:
+    """A host that has built and shared an index of four frames."""
+    engine = host("one")
+    engine.create_map(NewMap(name="hall", model="depth"))
+    fill(engine, range(4))
+    assert engine.publish_due() == 1
+    return engine
+
+
+def shared(engine: Engine) -> SharedIndexes:
+    assert engine._shared is not None
+    return engine._shared
+
+
+def row_of(engine: Engine, name: str = "hall") -> MapRow:
+    with engine.store.database.read() as connection:
+        return find_map(connection, name)
+
+
+def folder_of(engine: Engine, name: str = "hall") -> Path:
+    return index_folder(engine.settings.indexes, row_of(engine, name))
+
+
+def numbers(engine: Engine) -> list[int]:
+    return [number for number, _ in manifests(folder_of(engine))]
+
+
+def ask(engine: Engine, uploads: Any, which: int = 1, name: str = "hall") -> Answer:
+    return engine.queries.upload([name], uploads[which].data, uploads[which].meta, ALL)
+
+
+def found(answer: Answer) -> list[tuple[str, int]]:
+    return [(match.frame_id, match.distance) for match in answer.matches]
+
+
+def keys(objects: Objects) -> list[str]:
+    return sorted(one.key.rpartition("/")[2] for one in objects.list("index/"))
+
+
+def test_one_host_builds_and_others_fetch_what_they_serve(
+    built: Engine, host: Callable[..., Engine], fill: Any, uploads: Any, place: str
+) -> None:
+    other, objects = host("two"), open_objects(place)
+    assert other.publish_due() == 0  # it is built, and nobody has asked this host for the map
+    assert numbers(other) == []
+    own = {path.name: path.read_bytes() for path in folder_of(built).glob("[0-9a-f]*")}
+    stored = {one.key.rpartition("/")[2]: objects.get(one.key) for one in objects.list("index/")}
+    ((_, manifest),) = manifests(folder_of(built))
+    assert stored == {
+        "0000000001.json" if name == manifest.name else name: data for name, data in own.items()
+    }
+    first = ask(other, uploads)  # it waits for nothing
+    shared(other).finish()
+    second = ask(other, uploads)
+    assert second.index_generation == 1
+    assert found(second) == found(first) == found(ask(built, uploads))
+    fetched = {path.name: path.read_bytes() for path in folder_of(other).glob("[0-9a-f]*")}
+    assert fetched == own
+    fill(other, range(4, 8))
+    assert (other.publish_due(), built.publish_due()) == (1, 0)
+    ask(built, uploads)
+    shared(built).finish()
+    assert ask(built, uploads).index_generation == 2
+    assert found(ask(built, uploads)) == found(ask(other, uploads))
+    assert ask(built, uploads).counts.map == 8
+
+
+def test_a_host_goes_on_from_what_another_built(
+    built: Engine, host: Callable[..., Engine], fill: Any
+) -> None:
+    """The one that builds next fetches what it has not, and reads the rest from the database."""
+    other = host("two")
+    fill(built, range(4, 8))
+    assert numbers(other) == []
+    assert other.publish_due() == 1
+    assert numbers(other) == [2, 1]
+    head = shared(built).head(row_of(built))
+    assert head is not None
+    assert (head.number, head.frames) == (2, 8)
+
+
+def test_while_one_host_builds_no_other_does(host: Callable[..., Engine], fill: Any) -> None:
+    engine = host("one")
+    if engine.store.database.is_sqlite:
+        pytest.skip("the builders of one machine have the lock of a folder")
+    engine.create_map(NewMap(name="hall", model="depth"))
+    fill(engine, range(4))
+    with index_turn(engine.store.database, row_of(engine).number) as mine:
+        assert mine is not None
+        with index_turn(engine.store.database, row_of(engine).number) as again:
+            assert again is None
+        with index_turn(engine.store.database, row_of(engine).number + 1) as others:
+            assert others is not None
+        assert engine.publish_due() == 0
+        with pytest.raises(BusyIndex):
+            engine.rebuild_index("hall")
+    assert engine.publish_due() == 1
+
+
+def test_who_lost_the_turn_publishes_nothing(built: Engine) -> None:
+    database = built.store.database
+    if database.is_sqlite:
+        pytest.skip("it is of one machine")
+    with index_turn(database, 7) as mine:
+        assert mine is not None
+        mine()
+        with database.read() as connection:
+            connection.exec_driver_sql(
+                "SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' "
+                f"AND classid = {0x5CE80} AND objid = 7"
+            )
+        with pytest.raises(UnusableStore, match="built again"):
+            mine()
+
+
+def test_a_number_is_given_once(built: Engine) -> None:
+    """Two that publish the same number: the second finds out, and what is there stays."""
+    row, folder = row_of(built), folder_of(built)
+    head = shared(built).head(row)
+    assert head is not None
+    assert shared(built).share(folder, head)  # a try whose answer was lost
+    assert not shared(built).share(folder, replace(head, anchor="another"))
+    assert shared(built).head(row) == head
+
+
+def test_a_restored_database_is_not_given_what_came_after(
+    make_engine: Make, tmp_path: Path, fill: Any, uploads: Any, put_back: Any
+) -> None:
+    """Put back to two frames, the database gives the numbers of the next three out again."""
+    given: dict[str, Any] = {"index_url": f"file://{tmp_path}/shared", "tail_frames": 2}
+    data, kept = tmp_path / "data", tmp_path / "kept"
+    engine = make_engine(data, **given)
+    engine.create_map(NewMap(name="hall", model="depth"))
+    fill(engine, range(2))
+    engine.close()
+    shutil.copytree(data, kept)
+    engine = make_engine(data, **given)
+    fill(engine, range(2, 5))
+    assert engine.publish_due() == 1
+    engine.close()
+    (kept / "index").mkdir(exist_ok=True)
+    put_back(kept, data)
+    shutil.rmtree(data / "index", ignore_errors=True)  # a node that has nothing of it
+    engine = make_engine(data, **given)
+    names = fill(engine, range(5, 8))
+    answer = ask(engine, uploads, 5)
+    shared(engine).finish()
+    assert numbers(engine) == []  # not even fetched
+    assert (answer.matches[0].frame_id, answer.counts.map) == (names[0], 5)
+    assert engine.publish_due() == 1
+    answer = ask(engine, uploads, 5)
+    assert (answer.index_generation, answer.matches[0].frame_id) == (2, names[0])
+    assert answer.counts.map == 5
+
+
+def signature(engine: Engine, frame_id: str) -> bytes:
+    with engine.store.database.read() as connection:
+        return bytes(
+            connection.execute(
+                select(signatures.c.vector).join(frames).where(frames.c.id == frame_id)
+            ).scalar_one()
+        )
+
+
+def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(
+    built: Engine, host: Callable[..., Engine], uploads: Any, ids: Any, place: str, tmp_path: Path
+) -> None:
+    """In the store, on the host that publishes, on one with workers, and on one without."""
+    other, service = host("two"), host("three", purge_s=1)
+    for engine in (other, service):
+        ask(engine, uploads)
+        shared(engine).finish()
+        assert numbers(engine) == [1]
+    objects, secret = open_objects(place), signature(built, ids(built)[0])
+
+    def held() -> set[str]:
+        stored = (objects.get(one.key) for one in objects.list("index/"))
+        files = {name: tmp_path.glob(f"{name}/index/*/*.*") for name in ("one", "two", "three")}
+        return {
+            *(["store"] if any(secret in data for data in stored) else []),
+            *(name for name, of in files.items() if any(secret in p.read_bytes() for p in of)),
+        }  # fmt: skip
+
+    assert held() == {"store", "one", "two", "three"}
+    built.delete_frame("hall", ids(built)[0])
+    assert built.purging.now().indexes == 1
+    assert held() == {"two", "three"}
+    assert other.purging.now().indexes == 0  # it fetches the other's
+    assert held() == {"three"}
+    service._purged = time.monotonic() - 1
+    service.forget_gone()
+    assert held() == set()
+    assert keys(objects)[:2] == [".swept", "0000000002.json"]
+    assert [ask(engine, uploads).counts.map for engine in (built, other, service)] == [3, 3, 3]
+    assert ask(other, uploads).index_generation == 2
+
+
+def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(
+    built: Engine, host: Callable[..., Engine], uploads: Any, ids: Any
+) -> None:
+    service = host("two", purge_s=1)
+    ask(service, uploads)
+    shared(service).finish()
+    built.delete_frame("hall", ids(built)[0])
+    left = []
+    for _ in range(2):
+        service._purged = time.monotonic() - 1
+        service.forget_gone()
+        left.append(numbers(service))
+    assert left == [[1], []]
+    assert ask(service, uploads).counts.map == 3
+
+
+def test_a_number_of_an_index_that_was_emptied_is_not_used_again(
+    built: Engine, ids: Any, fill: Any, place: str
+) -> None:
+    for name in ids(built):
+        built.delete_frame("hall", name)
+    built.purging.now()
+    objects = open_objects(place)
+    assert keys(objects) == [".swept", "0000000001.json"]
+    assert numbers(built) == []
+    fill(built, range(4, 8))
+    assert built.publish_due() == 1
+    assert numbers(built) == [2]
+
+
+def test_nothing_is_shared_of_maps_that_are_gone(
+    built: Engine, fill: Any, place: str, host: Callable[..., Engine], uploads: Any
+) -> None:
+    service = host("two", purge_s=1)
+    built.create_map(NewMap(name="other", model="depth"))
+    fill(built, range(4, 8), "other")
+    assert built.publish_due() == 1
+    ask(service, uploads)
+    shared(service).finish()
+    folder, objects = folder_of(service), open_objects(place)
+    name = folder_of(built).name
+    built.delete_map("hall")
+    built.purging.now()
+    left = {one.key.split("/")[1] for one in objects.list("index/")}
+    assert left == {".swept", folder_of(built, "other").name}
+    assert name not in left
+    service._purged = time.monotonic() - 1
+    service.forget_gone()
+    assert not folder.exists()
+
+
+def test_what_is_damaged_in_the_store_is_withdrawn_and_built_anew(
+    built: Engine, host: Callable[..., Engine], uploads: Any, place: str
+) -> None:
+    objects, other = open_objects(place), host("two")
+    (key,) = [one.key for one in objects.list("index/") if one.key.endswith(".faiss")]
+    data = bytearray(objects.get(key))
+    data[-5] ^= 1
+    objects.put(key, bytes(data))
+    with pytest.raises(DamagedIndex, match="generation 1 of map 'hall' is damaged"):
+        shared(other).sync(row_of(other))
+    assert list(folder_of(other).glob("[0-9a-f]*.faiss")) == []
+    assert host("three").publish_due() == 1
+    shared(other).sync(row_of(other))
+    assert numbers(other) == [2]
+    assert ask(other, uploads).index_generation == 2
+
+
+def test_what_was_removed_while_it_is_fetched_is_not_damage(built: Engine, fill: Any) -> None:
+    """Number 1 stays what it is where 2 has come: only the newest can be withdrawn."""
+    fill(built, range(4, 8))
+    assert built.publish_due() == 1
+    row = row_of(built)
+    shared(built).tidy(row, clean=True)
+    head = shared(built).head(row)
+    assert head is not None
+    assert head.number == 2
+    assert shared(built).sync(row) == head
+
+
+def test_a_file_that_is_damaged_here_is_fetched_again(
+    built: Engine, host: Callable[..., Engine]
+) -> None:
+    (path,) = folder_of(built).glob("*.faiss")
+    sound = path.read_bytes()
+    path.write_bytes(b"x" + sound[1:])
+    (built.settings.indexes / ".scrubbed").unlink(missing_ok=True)
+    again = host("one")
+    assert sum(again.publish_due() for _ in range(10)) == 0  # nothing is built
+    assert path.read_bytes() == sound
+
+
+def test_queries_go_on_without_the_store_and_workers_try_again(
+    make_engine: Make, postgres_url: str, bucket: str, object_server: ObjectServer, fill: Any,
+    uploads: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any,
+) -> None:  # fmt: skip
+    (tmp_path / "common" / "blobs").mkdir(parents=True)
+    given: dict[str, Any] = {
+        "database_url": postgres_url, "blob_url": f"file://{tmp_path}/common", "tail_frames": 2,
+    }  # fmt: skip
+    with monkeypatch.context() as away:
+        away.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")  # where nobody listens
+        engine = make_engine(tmp_path / "one", index_url=f"{bucket}/x", **given)
+        engine.create_map(NewMap(name="hall", model="depth"))
+        names = fill(engine, range(4))
+        assert engine.publish_due() == 0
+        answer = ask(engine, uploads)
+        shared(engine).finish()
+        assert (answer.matches[0].frame_id, answer.index_generation) == (names[1], 0)
+        assert numbers(engine) == []
+    said = {record.message for record in caplog.records}
+    assert said >= {"index publication failed", "index not fetched"}
+    there = make_engine(tmp_path / "one", index_url=f"{bucket}/x", **given)
+    assert there.publish_due() == 1
+
+
+@pytest.mark.parametrize(("idle_s", "left"), [(IN_USE_S + 60, False), (IN_USE_S - 60, True)])
+def test_room_is_made_of_indexes_that_nobody_uses(
+    built: Engine, host: Callable[..., Engine], fill: Any, uploads: Any, idle_s: float, left: bool
+) -> None:
+    built.create_map(NewMap(name="other", model="depth"))
+    fill(built, range(4), "other")
+    assert built.publish_due() == 1
+    one = sum(path.stat().st_size for path in folder_of(built).glob("*.*"))
+    node = host("two", index_bytes=one + one // 2)
+    ask(node, uploads)
+    shared(node).finish()
+    ago = time.time() - idle_s
+    os.utime(folder_of(node) / ".used", (ago, ago))
+    ask(node, uploads, name="other")
+    shared(node).finish()
+    assert bool(manifests(folder_of(node))) == left
+    assert bool(manifests(folder_of(node, "other"))) != left
+    for name in ("hall", "other"):
+        assert ask(node, uploads, name=name).counts.map == 4
+
+
+def test_another_database_is_refused(
+    built: Engine, make_engine: Make, place: str, tmp_path: Path
+) -> None:
+    stranger = make_engine(tmp_path / "stranger", index_url=place)
+    stranger.create_map(NewMap(name="hall", model="depth"))
+    with pytest.raises(UnusableStore, match="another database"):
+        shared(stranger).head(row_of(stranger))
+
+
+def test_a_folder_where_somebody_builds_is_left_alone(
+    built: Engine, host: Callable[..., Engine]
+) -> None:
+    other = host("two")
+    with building(folder_of(other)) as mine:
+        assert mine
+        assert shared(other).sync(row_of(other)) is None
+    assert shared(other).sync(row_of(other)) is not None
+
+
+def test_memory_is_shared_with_nobody() -> None:
+    with pytest.raises(ValidationError, match="inside one process"):
+        Settings(index_url="memory:///")
