@@ -356,7 +356,7 @@ def definitions(path: Path) -> set[str]:
     [
         ("upload", "service/middleware.py", "sceneprint/store/signatures.py", 17),
         ("query", "service/routes/queries.py", "sceneprint/engine/results/query_history.py", 12),
-        ("deletion", "service/routes/frames.py", "sceneprint/engine/upkeep/purge.py", 5),
+        ("deletion", "service/routes/frames.py", "sceneprint/engine/upkeep/purge.py", 6),
         ("re-encoding", "service/routes/admin.py", "sceneprint/store/signatures.py", 4),
     ],
 )
