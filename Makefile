@@ -107,7 +107,7 @@ soak: $(STAMP)
 siege: $(STAMP)
 	$(BIN)/python -m benchmarks.siege --page docs/reliability.md
 
-fleet: $(STAMP)
+fleet: $(STAMP) kernels
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --asynchronous
 

@@ -62,6 +62,14 @@ def pruned(engine: Engine) -> int:
         return find_map(connection, "hall").pruned_revision
 
 
+def ended_ago(engine: Engine, state: FrameState) -> list[float | None]:
+    """How many seconds ago frames in a state ended."""
+    with engine.store.database.read() as connection:
+        of = select(frames.c.ended_at).where(frames.c.state == state)
+        ended = connection.execute(of).scalars().all()
+    return [None if at is None else time.time() - at for at in ended]
+
+
 def test_rows_of_deleted_frames_go_with_their_jobs_once_their_days_are_over(
     full: Engine, ids: Ids
 ) -> None:
@@ -73,6 +81,9 @@ def test_rows_of_deleted_frames_go_with_their_jobs_once_their_days_are_over(
     for name in names[1:3]:
         full.delete_frame("hall", name)
     revision = full.get_map("hall").revision
+    assert [0.0 <= (ago or -1.0) < 60.0 for ago in ended_ago(full, FrameState.DELETED)] == [
+        True
+    ] * 2
     assert after(full, DAYS - 0.01) == 0
     assert len(rows(full)) == 12
     assert after(full, DAYS + 0.01) == 2
@@ -125,6 +136,9 @@ def test_a_redundant_frame_goes_and_is_judged_anew_when_it_comes_again(
     first, _ = full.add_frame("hall", uploads[0].data, meta, if_novel=0.9)
     work_off(full)
     assert full.get_frame("hall", first.frame_id).state == FrameState.REDUNDANT
+    (ago,) = ended_ago(full, FrameState.REDUNDANT)
+    assert ago is not None
+    assert 0.0 <= ago < 60.0
     assert after(full, DAYS + 0.01) == 1
     assert pruned(full) == 0  # nobody searched it
     second, new = full.add_frame("hall", uploads[0].data, meta)
