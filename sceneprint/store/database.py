@@ -132,32 +132,27 @@ def schema_range_of(connection: Connection) -> SchemaRange | None:
 _RANGE = "SELECT version_num, (SELECT max(least_revision) FROM schema_range) FROM alembic_version"
 
 
-def require_schema(connection: Connection, *, locked: bool = False) -> None:
+def require_schema(connection: Connection) -> None:
     """See that a store has not been brought beyond what this process may write.
-
-    Parameters
-    ----------
-    connection : of a writing transaction
-    locked : keep a migration from beginning until the transaction is over
 
     Raises
     ------
     NewerSchema : it has, since this process opened it; nothing may be written.
     """
-    row = connection.exec_driver_sql(f"{_RANGE} FOR KEY SHARE" if locked else _RANGE).one()
-    _allow_schema(connection, SchemaRange(*row))
+    row = connection.exec_driver_sql(_RANGE).one()
+    _allow_schema(connection.engine, SchemaRange(*row))
 
 
-def _allow_schema(connection: Connection, found: SchemaRange) -> None:
+def _allow_schema(engine: Engine, found: SchemaRange) -> None:
     own = known_revisions()[0]
     if not found.allows(own):
-        raise _outdated(connection, found, own)
+        raise _outdated(engine, found, own)
 
 
-def _outdated(connection: Connection, found: SchemaRange, own: str) -> NewerSchema:
+def _outdated(engine: Engine, found: SchemaRange, own: str) -> NewerSchema:
     what = "later" if found.revision > own else "earlier"
     return NewerSchema(
-        f"{database_label(connection.engine.url)} was brought to schema {found.revision} of a "
+        f"{database_label(engine.url)} was brought to schema {found.revision} of a "
         f"{what} version of sceneprint while this process ran, and this process works with {own}. "
         "Nothing was stored. Stop this process, and start the version that the others run."
     )
@@ -308,6 +303,10 @@ class Database:
         self._readers = engine if self.is_sqlite else engine.execution_options(
             isolation_level="REPEATABLE READ", postgresql_readonly=True
         )  # fmt: skip
+        # of PostgreSQL they begin their transactions themselves, see `postgres.begin`
+        self._writers = engine if self.is_sqlite else engine.execution_options(
+            isolation_level="AUTOCOMMIT"
+        )  # fmt: skip
         # of the writers of this process one asks for the turn, and the others wait here: each of
         # them would keep a connection from the readers
         self._turns, self._map_turns = ThreadTurns(1), ThreadTurns(MAP_WRITERS)
@@ -394,8 +393,9 @@ class Database:
 
     @contextmanager
     def write(
-        self, *, unchecked: bool = False, turn: bool = True, map_number: int | None = None
-    ) -> Iterator[Connection]:
+        self, *, unchecked: bool = False, turn: bool = True, map_number: int | None = None,
+        pending: bool = False,
+    ) -> Iterator[Connection]:  # fmt: skip
         """A transaction that is committed at the end, or leaves no trace where it raises.
 
         Parameters
@@ -408,6 +408,8 @@ class Database:
         map_number : of the only map that is written to. On PostgreSQL writers of other maps do not
             wait then, so that no row may be touched that is of several maps, but for inserting one;
             `record_event` is the way to tell an event
+        pending : whether its turn comes with its first statement, which saves a round trip; before
+            it nothing is held against others. It has no say on SQLite, nor for several maps
 
         Raises
         ------
@@ -420,9 +422,12 @@ class Database:
         """
         self.require_writable()
         if not turn and not self.is_sqlite:
-            with self.explained(), self._engine.begin() as connection:
-                if self._guarded:
-                    require_schema(connection, locked=True)
+            # a migration begins once what holds its row is over
+            asked = (f"{_RANGE} FOR KEY SHARE",) if self._guarded else ()
+            with self.explained(), self._writers.begin() as connection:
+                row = postgres.begin(connection, *asked)
+                if row is not None:
+                    self._check_schema(row)
                 yield connection
             return
         held_s = HELD_S if self.is_sqlite else postgres.HELD_S
@@ -439,7 +444,7 @@ class Database:
                 "nothing was stored. Come back later."
             )
         try:
-            with self.explained(), self._engine.connect() as connection:
+            with self.explained(), self._writers.connect() as connection:
                 options: dict[str, Any] = {
                     "sceneprint_write": wait_s,
                     "sceneprint_line": self._line,
@@ -448,10 +453,13 @@ class Database:
                 if unchecked and self.is_sqlite:
                     options["sceneprint_unchecked"] = True
                     connection.detach()  # nobody else gets a connection that does not look
+                if pending and map_number is not None and wait_s == BUSY_S:
+                    options[postgres.PENDING_TURN] = self._pending_turn(map_number)
                 writing = connection.execution_options(**options)
                 with writing.begin():
-                    checked = self._guarded and not unchecked
-                    self._begin_writing(writing, wait_s, map_number, checked=checked)
+                    if postgres.PENDING_TURN not in options:
+                        checked = self._guarded and not unchecked
+                        self._begin_writing(writing, wait_s, map_number, checked=checked)
                     yield writing
                 if not self.is_sqlite:
                     postgres.require_synchronous(writing)
@@ -470,9 +478,16 @@ class Database:
             row = postgres.take_turn(writing, wait_s, _RANGE if checked else None, map_number)
         self._held = False
         if row is not None:
-            _allow_schema(writing, SchemaRange(*row))
+            self._check_schema(row)
         elif checked:
             require_schema(writing)
+
+    def _pending_turn(self, map_number: int) -> postgres.PendingTurn:
+        asked = _RANGE if self._guarded else None
+        return postgres.PendingTurn(map_number, asked, self._check_schema)
+
+    def _check_schema(self, row: Any) -> None:
+        _allow_schema(self._engine, SchemaRange(*row))
 
     def shrink_log(self) -> bool:
         """Leave nothing of what was deleted in SQLite's log; False where that has to wait."""

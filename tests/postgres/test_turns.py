@@ -43,7 +43,7 @@ def test_who_waited_for_a_migration_finds_its_schema_and_writes_nothing(
             raised.append(error)
 
     writer = threading.Thread(target=late)
-    with server_store.database._engine.begin() as other:  # as another process would
+    with server_store.database._writers.begin() as other:  # as another process would
         postgres.take_turn(other, 10.0)
         writer.start()
         until(lambda: waiting(server_store) == 1)
@@ -63,7 +63,7 @@ def test_a_turn_answers_the_last_question_and_leaves_the_usual_limits(
     server_store: Store, wait_s: float, after: tuple[str, str]
 ) -> None:
     limits = "SELECT current_setting('lock_timeout'), current_setting('statement_timeout')"
-    engine = server_store.database._engine
+    engine = server_store.database._writers
     with engine.begin() as connection:
         assert tuple(postgres.take_turn(connection, wait_s, "SELECT 7, 'x'")) == (7, "x")
         assert tuple(connection.exec_driver_sql(limits).one()) == after
@@ -73,7 +73,7 @@ def test_a_turn_answers_the_last_question_and_leaves_the_usual_limits(
 
 def test_a_turn_that_does_not_come_in_time_is_said_and_given_up(server_store: Store) -> None:
     database = server_store.database
-    with database._engine.begin() as other:
+    with database._writers.begin() as other:
         postgres.take_turn(other, 10.0)
         database._held = True  # somebody has waited in vain before: two seconds are enough
         with pytest.raises(StoreLocked):

@@ -35,6 +35,7 @@ from sceneprint.store.maps import (
     receive_frame,
     require_room,
 )
+from sceneprint.store.postgres.connection import has_turn
 from sceneprint.store.queue import enqueue, job_ids_of
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
 from sceneprint.store.wakeup import Wakeup
@@ -404,7 +405,8 @@ class Uploads:
                 if before is not None:
                     left[:] = blobs
                     return list(before), True
-            if not all(map(self._store.blobs.holds, blobs)):
+            is_held = has_turn(connection)  # then nobody removes a blob any more
+            if is_held and not all(map(self._store.blobs.holds, blobs)):
                 return None  # a deletion has removed one
             left.clear()
             written = {}
@@ -416,13 +418,11 @@ class Uploads:
                         return None
                     came_of = _stored(connection, now, one, left)
                 written[i] = came_of
+            if not is_held and not all(map(self._store.blobs.holds, blobs)):
+                raise Overtaken
             outcomes = [written.get(i, one) for i, one in enumerate(known)]
-            came = [one for one in outcomes if one is not None]
-            # what had no room may have it when it is sent again
-            if once is not None and not any(
-                isinstance(one.error, errors.QuotaExceeded) for one in came
-            ):
-                once.keep(connection, {"frames": [_stored_outcome(one) for one in came]})
+            if once is not None:
+                _keep(connection, once, [one for one in outcomes if one is not None])
             return outcomes, False
 
         while True:
@@ -460,6 +460,12 @@ def _before(
     """What came of the same request before."""
     data = None if once is None else once.found(connection)
     return None if data is None else replayed(connection, row, data)
+
+
+def _keep(connection: Connection, once: IdempotentRequest, came: list[UploadResult]) -> None:
+    """Remember what came of a request; what had no room may have it when it is sent again."""
+    if not any(isinstance(one.error, errors.QuotaExceeded) for one in came):
+        once.keep(connection, {"frames": [_stored_outcome(one) for one in came]})
 
 
 def _taken(connection: Connection, row: MapRow, ready: _Prepared) -> UploadResult | None:
@@ -582,8 +588,10 @@ class Grouping:
 
     def _write_together(self, taken: list[_Waiting]) -> None:
         """Write what waits in one transaction, or each alone; `taken` is filled with it."""
+        with self._list:  # of one alone, the turn comes with its first statement
+            pending = len(self._waiting) == 1
         try:
-            with self._database.write(map_number=self._map_number) as connection:
+            with self._database.write(map_number=self._map_number, pending=pending) as connection:
                 with self._list:  # not before it is our turn: more have come since
                     taken[:], self._waiting = (
                         self._waiting[:MOST_TOGETHER],

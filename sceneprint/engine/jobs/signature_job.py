@@ -182,13 +182,18 @@ def _store(
         if not is_kept:
             seen = look(store.database, readers, work.map, made)
         number = work.frame.map_number
-        with suppress(Stale), store.database.write(map_number=number) as connection:
-            is_held = store.blobs.holds(made.geometry)
-            if is_kept and is_held and index_claimed_frame(
+        with (
+            suppress(Stale),
+            store.database.write(map_number=number, pending=True) as connection,
+        ):
+            is_indexed = is_kept and index_claimed_frame(
                 connection, work.job, work.frame, work.map.name, made
-            ):  # fmt: skip
+            )
+            if not is_indexed:
+                queue.finish(connection, work.job, JobState.SUCCEEDED)
+            is_held = store.blobs.holds(made.geometry)  # in its turn nobody removes a blob
+            if is_indexed and is_held:
                 return []
-            queue.finish(connection, work.job, JobState.SUCCEEDED)
             row = map_of(connection, number)
             if row.model_id != made.model_id:
                 raise lifecycle.Outdated

@@ -12,15 +12,19 @@ of the commits. Their events get no number before they are committed (see `event
 from __future__ import annotations
 
 import logging
+import select
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import URL, Connection, Engine, create_engine, event, text
+from sqlalchemy import URL, Connection, Dialect, Engine, create_engine, event, text
 from sqlalchemy.engine import ExceptionContext
+from sqlalchemy.exc import InvalidatePoolError
 
 from sceneprint.errors import StoreAway, UnusableStore
 from sceneprint.store.blobs.folder import Locks
@@ -41,6 +45,8 @@ TURN, BLOBS = 1, 2
 VECTORS, EVENTS = 7, 8
 #: The first number of locks of single maps; the second is that of the map.
 MAP_LOCKS = 0x5CE7F
+#: Of maps whose numbers have the same last bits, writers take turns.
+_LOCK_BITS = 0x7FFFFFFF
 #: That of who builds the index of a map for its fleet; the second is that of the map.
 INDEX_LOCKS = 0x5CE80
 #: Seconds for one statement, and for a transaction in which nothing is asked: a client that fell
@@ -53,6 +59,9 @@ MIGRATION_S = 600.0
 HELD_S = 2.0
 #: Connections that a process keeps, and has at most.
 KEPT, MOST = 8, 32
+#: Seconds without use after which a connection is tried before it is used: that costs a round trip.
+#: One that the server ended is found out at once.
+UNTRIED_S = 1.0
 #: Seconds after which a connection is made anew, so that servers added since get their share.
 _OLD_S = 1800
 #: What of libpq is set where the URL does not: a server that is gone, and sent no word, is found
@@ -68,7 +77,11 @@ _CONNECT = {
 }
 #: Oldest version that is known to do.
 _OLDEST = 14
-_WARNED = "sceneprint_warned"
+_WARNED, _USED = "sceneprint_warned", "sceneprint_used"
+#: Option of a connection: the turn that its first statement brings along.
+PENDING_TURN = "sceneprint_turn"
+#: Option of a statement: it is several, of which the last one has the answer.
+_MESSAGE = "sceneprint_message"
 
 
 def open_postgres(url: URL) -> Engine:
@@ -77,7 +90,6 @@ def open_postgres(url: URL) -> Engine:
         url,
         connect_args=connect_options(url),
         isolation_level="READ COMMITTED",  # a writer's statements see all that was committed
-        pool_pre_ping=True,
         pool_recycle=_OLD_S,
         pool_size=KEPT,
         max_overflow=MOST - KEPT,
@@ -85,6 +97,11 @@ def open_postgres(url: URL) -> Engine:
     )
     event.listen(engine, "connect", configure)
     event.listen(engine, "connect", _watch_commits)
+    event.listen(engine, "checkin", _note_use)
+    event.listen(engine, "checkout", partial(_require_alive, engine.dialect))
+    event.listen(engine, "do_execute", _execute)
+    event.listen(engine, "do_execute_no_params", _require_turn)
+    event.listen(engine, "do_executemany", _require_turn)
     event.listen(engine, "commit", _forget_warnings)
     event.listen(engine, "handle_error", _leave_behind)
     return engine
@@ -164,17 +181,106 @@ def allow(connection: Connection, seconds: float) -> None:
             )
 
 
-def take_turn(
-    connection: Connection, wait_s: float, asked: str | None = None, map_number: int | None = None
-) -> Any:
-    """Wait for a writer's turn, at the beginning of its transaction.
-
-    All of it is one message, of which each statement sees what was committed before it: once the
-    turn is there, nobody else writes until what is sent next has come, and that takes a round trip.
+def begin(connection: Connection, *statements: str) -> Any:
+    """Begin a transaction, in one message with its first statements, of which each sees what was
+    committed before it.
 
     Parameters
     ----------
-    connection : of a transaction that has only just begun
+    connection : that commits each statement at once, as its `isolation_level` says: what begins
+        transactions by itself takes a round trip for that
+    statements : without parameters
+
+    Returns
+    -------
+    row : of the last statement; None where it has none
+    """
+    message = "; ".join(("BEGIN", *statements))
+    answer = connection.exec_driver_sql(message, execution_options={_MESSAGE: True})
+    return answer.first() if answer.returns_rows else None
+
+
+@dataclass(eq=False)
+class PendingTurn:
+    """A turn that comes with the first statement of a transaction, in one round trip.
+
+    Each sees what was committed before it, so that the statement is executed in the turn; what was
+    read before it was not. It is waited for `BUSY_S`.
+
+    Parameters
+    ----------
+    map_number : of the only map that is written to
+    asked : a query of one row, answered when it is its turn; None: nothing is
+    check : called with that row; whatever it raises ends the transaction
+    taken : whether it has come
+    """
+
+    map_number: int
+    asked: str | None
+    check: Callable[[Any], None]
+    taken: bool = False
+
+    def execute(self, cursor: Any, statement: str, parameters: Any) -> None:
+        """Execute the first statement on a cursor of psycopg."""
+        self.taken, connection, answer = True, cursor.connection, None
+        try:
+            with connection.pipeline():
+                connection.execute("BEGIN")
+                # a COMMIT that waits for its standby would be cut off by the limit of statements,
+                # and be acknowledged although the standby may lack it
+                connection.execute(
+                    "SELECT set_config('statement_timeout', '0', true),"
+                    " pg_advisory_xact_lock_shared(%s, %s), pg_advisory_xact_lock(%s, %s)",
+                    (LOCKS, TURN, MAP_LOCKS, self.map_number & _LOCK_BITS),
+                )
+                if self.asked is not None:
+                    answer = connection.execute(self.asked)
+                cursor.execute(statement, parameters)
+        finally:  # a statement may have failed because of what is found
+            if answer is not None and answer.description is not None:
+                self.check(answer.fetchone())
+
+
+def has_turn(connection: Connection) -> bool:
+    """Whether nobody else writes to what a transaction may write to."""
+    turn = connection.get_execution_options().get(PENDING_TURN)
+    return turn is None or turn.taken
+
+
+def _execute(cursor: Any, statement: str, parameters: Any, context: Any) -> bool:
+    """Execute what is several statements, and go to the answer of the last one; or what brings a
+    turn along. Any other statement is SQLAlchemy's.
+    """
+    if _MESSAGE in context.execution_options:
+        cursor.execute(statement)
+        while cursor.nextset():
+            pass
+        return True
+    turn = context.execution_options.get(PENDING_TURN)
+    if turn is None or turn.taken:
+        return False
+    turn.execute(cursor, statement, parameters)
+    return True
+
+
+def _require_turn(_cursor: Any, _statement: str, *others: Any) -> None:
+    """See that what cannot bring a turn along does not come before it."""
+    turn = others[-1].execution_options.get(PENDING_TURN)
+    if turn is not None and not turn.taken:
+        raise ValueError("a transaction whose turn is pending begins with a single statement")
+
+
+def take_turn(
+    connection: Connection, wait_s: float, asked: str | None = None, map_number: int | None = None
+) -> Any:
+    """Begin a transaction, and wait for a writer's turn.
+
+    All of it is one message: once the turn is there, nobody else writes until what is sent next has
+    come, and that takes a round trip.
+
+    Parameters
+    ----------
+    connection : see `begin`
     wait_s : seconds to wait
     asked : a query of one row, answered when it is its turn
     map_number : of the only map that is written to; None: anything may be
@@ -183,16 +289,12 @@ def take_turn(
     -------
     row : of `asked`
     """
-    # a COMMIT that waits for its standby would be cut off by the limit of statements, and be
-    # acknowledged although the standby may lack it; what waits so goes on when there is one again.
-    # It is a SELECT, and the first: a message that begins without rows is taken to have none
-    message = ["SELECT set_config('statement_timeout', '0', true)"]
+    message = ["SET LOCAL statement_timeout = 0"]  # see PendingTurn
     turn = f"SELECT pg_advisory_xact_lock({LOCKS}, {TURN})"
     if map_number is not None:
         turn = (
             f"SELECT pg_advisory_xact_lock_shared({LOCKS}, {TURN}); "
-            # of maps whose numbers have the same 31 last bits, writers take turns
-            f"SELECT pg_advisory_xact_lock({MAP_LOCKS}, {map_number & 0x7FFFFFFF})"
+            f"SELECT pg_advisory_xact_lock({MAP_LOCKS}, {map_number & _LOCK_BITS})"
         )
     if wait_s == BUSY_S:
         message.append(turn)
@@ -201,17 +303,10 @@ def take_turn(
         after = "0" if wait_s > BUSY_S else _milliseconds(BUSY_S)
         message += [f"SET LOCAL lock_timeout = {_milliseconds(wait_s)}", turn]
         message.append(f"SET LOCAL lock_timeout = {after}")
-    if asked is not None:
-        message.append(asked)
-    answer = connection.exec_driver_sql("; ".join(message))
-    cursor: Any = answer.cursor
-    while asked is not None and cursor.nextset():
-        pass  # to that of the last statement
-    row = None if asked is None else cursor.fetchone()
-    answer.close()
+    row = begin(connection, *message, *(() if asked is None else (asked,)))
     if wait_s > BUSY_S:
         allow(connection, 0)
-    return row
+    return None if asked is None else row
 
 
 def require_synchronous(connection: Connection) -> None:
@@ -227,6 +322,34 @@ def require_synchronous(connection: Connection) -> None:
             "hand. What was written is there, and lost if the server falls before a standby "
             "follows. Bring the standby back, or take it out of synchronous_standby_names."
         )
+
+
+def _note_use(_connection: Any, record: Any) -> None:
+    record.info[_USED] = time.monotonic()
+
+
+def _require_alive(dialect: Dialect, connection: Any, record: Any, _proxy: object) -> None:
+    """Try a connection that was not used for a while, or to which the server has said something
+    since: as a rule that it ends. Where it is broken, none is kept.
+    """
+    used = record.info.get(_USED)
+    if used is None:  # it is new
+        return
+    if time.monotonic() - used < UNTRIED_S and not _has_input(connection):
+        return
+    try:
+        dialect.do_ping(connection)
+    except dialect.loaded_dbapi.Error as error:
+        if dialect.is_disconnect(error, connection, None):
+            raise InvalidatePoolError from error
+        raise
+
+
+def _has_input(connection: Any) -> bool:
+    """Whether a server has sent something that was not asked for."""
+    found = select.poll()
+    found.register(connection.fileno(), select.POLLIN)
+    return bool(found.poll(0))
 
 
 def _watch_commits(connection: Any, record: Any) -> None:
@@ -386,7 +509,7 @@ def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], Non
 
     try:
         with database.explained():
-            values = (INDEX_LOCKS, map_number & 0x7FFFFFFF)
+            values = (INDEX_LOCKS, map_number & _LOCK_BITS)
             mine = bool(_one(connection, _TAKE, values))
         yield require if mine else None
     finally:

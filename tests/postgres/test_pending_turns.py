@@ -1,0 +1,279 @@
+"""A turn that comes with the first statement of a transaction: what it costs, and what it holds."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import pytest
+from sqlalchemy import func, insert, select, text, update
+
+from sceneprint.errors import NewerSchema, StoreLocked
+from sceneprint.store import Database, Store, open_database, queue
+from sceneprint.store.maps import add_map, frame_of, keep_model, receive_frame
+from sceneprint.store.postgres import connection as postgres
+from sceneprint.store.postgres.connection import has_turn
+from sceneprint.store.signatures import StoredSignature, index_claimed_frame
+from sceneprint.store.tables import FrameRow, JobRow, MapRow, frames, maps, pending_events
+
+Until = Callable[[Callable[[], Any]], Any]
+MODEL = "ab" * 32
+#: What is known of a frame beside its content.
+KNOWN: dict[str, Any] = {
+    "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1}, "depth_scale": 1000.0,
+    "depth_along_ray": False, "robot": None, "session": None, "captured_at": None, "tags": ["a"],
+    "pose_parent": None, "pose": None, "name": None, "sequence": None,
+}  # fmt: skip
+LOCKS_HELD = text(
+    "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND granted "
+    "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
+)
+WAITING = text(str(LOCKS_HELD).replace("AND granted", "AND NOT granted"))
+
+
+class TripCounter:
+    """A server's port that counts round trips: how often one asks after the other has answered."""
+
+    def __init__(self, port: int) -> None:
+        self._to, self._asks, self.trips = port, False, 0
+        self._lock = threading.Lock()
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listener.getsockname()[1]
+        self._open: list[socket.socket] = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                far = socket.create_connection(("127.0.0.1", self._to))
+                self._open += [near, far]
+                for pair in ((near, far, True), (far, near, False)):
+                    threading.Thread(target=self._pump, args=pair, daemon=True).start()
+
+    def _pump(self, source: socket.socket, to: socket.socket, asks: bool) -> None:
+        with suppress(OSError):
+            while data := source.recv(1 << 16):
+                with self._lock:
+                    self.trips += asks and not self._asks
+                    self._asks = asks
+                to.sendall(data)
+            to.shutdown(socket.SHUT_WR)
+
+    def close(self) -> None:
+        for one in (self._listener, *self._open):
+            one.close()
+
+
+@pytest.fixture
+def row(server_store: Store) -> MapRow:
+    with server_store.database.write() as connection:
+        keep_model(connection, MODEL, "toy", b"a model")
+        return add_map(connection, "hall", None, MODEL)
+
+
+@pytest.fixture
+def counted(server_store: Store, row: MapRow) -> Iterator[tuple[Database, TripCounter]]:
+    """The same database by way of one who counts."""
+    url = server_store.database._engine.url
+    assert url.port is not None
+    counter = TripCounter(url.port)
+    database = open_database(url.set(port=counter.port).render_as_string(hide_password=False))
+    yield database, counter
+    database.close()
+    counter.close()
+
+
+def upload(database: Database, row: MapRow, number: int) -> None:
+    with database.write(map_number=row.number, pending=True) as connection:
+        values = {**KNOWN, "content_id": f"{number:064x}"}
+        assert receive_frame(connection, row, values, 0) is not None
+
+
+def claimed(database: Database) -> tuple[JobRow, FrameRow]:
+    with database.write(turn=False) as connection:
+        job = queue.claim(connection, "worker", 60.0)
+        assert job is not None
+        return job, frame_of(connection, job.frame)
+
+
+def sign(database: Database, job: JobRow, frame: FrameRow) -> None:
+    made = StoredSignature(MODEL, bytes(400), "00" * 32, [1], [1])
+    with database.write(map_number=frame.map_number, pending=True) as connection:
+        assert index_claimed_frame(connection, job, frame, "hall", made)
+
+
+def edit(database: Database, row: MapRow, note: str, *, pending: bool = True) -> None:
+    with database.write(map_number=row.number, pending=pending) as connection:
+        connection.execute(update(maps).where(maps.c.number == row.number).values(name=note))
+
+
+def named(store: Store) -> str:
+    with store.database.read() as connection:
+        return str(connection.execute(select(maps.c.name)).scalar_one())
+
+
+def locks(store: Store, which: Any = LOCKS_HELD) -> int:
+    with store.database.read() as connection:
+        return int(connection.execute(which).scalar_one())
+
+
+@contextmanager
+def held(store: Store, row: MapRow) -> Iterator[Any]:
+    """The map's turn, of another process."""
+    with store.database._writers.begin() as other:
+        postgres.take_turn(other, 10.0, None, row.number)
+        yield other
+
+
+def test_an_upload_and_a_signature_take_two_round_trips_each(
+    counted: tuple[Database, TripCounter], row: MapRow
+) -> None:
+    database, counter = counted
+    for number in range(8):  # what is asked often is prepared, which has its own messages
+        upload(database, row, number)
+        sign(database, *claimed(database))
+    begun = counter.trips
+    upload(database, row, 90)
+    assert counter.trips - begun == 2
+    work = claimed(database)
+    begun = counter.trips
+    sign(database, *work)
+    assert counter.trips - begun == 2
+    begun = counter.trips
+    edit(database, row, "later", pending=False)
+    assert counter.trips - begun == 3  # the turn takes its own
+    with database.read() as connection:
+        counts = select(frames.c.state, func.count()).group_by(frames.c.state)
+        assert [tuple(one) for one in connection.execute(counts)] == [("indexed", 9)]
+
+
+def test_the_turn_is_there_from_the_first_statement_on(server_store: Store, row: MapRow) -> None:
+    database = server_store.database
+    with database.write(map_number=row.number, pending=True) as connection:
+        assert not has_turn(connection)
+        assert locks(server_store) == 0
+        connection.execute(select(maps)).all()
+        assert has_turn(connection)
+        assert locks(server_store) == 2
+        limits = connection.exec_driver_sql("SHOW statement_timeout")
+        assert limits.scalar_one() == "0"  # or a COMMIT that waits for a standby is cut off
+    assert locks(server_store) == 0
+    with database.write(map_number=row.number) as connection:
+        assert has_turn(connection)
+
+
+def test_the_first_statement_sees_what_was_committed_while_its_turn_was_waited_for(
+    server_store: Store, row: MapRow, until: Until
+) -> None:
+    found = list[str]()
+
+    def late() -> None:
+        with server_store.database.write(map_number=row.number, pending=True) as connection:
+            found.append(connection.execute(select(maps.c.name)).scalar_one())
+
+    writer = threading.Thread(target=late)
+    with held(server_store, row) as other:
+        writer.start()
+        until(lambda: locks(server_store, WAITING) == 1)
+        other.execute(update(maps).values(name="renamed"))
+    writer.join(60)
+    assert found == ["renamed"]
+
+
+def test_who_waited_for_a_migration_writes_nothing(
+    server_store: Store, row: MapRow, until: Until
+) -> None:
+    raised = list[Exception]()
+
+    def late() -> None:
+        try:
+            edit(server_store.database, row, "late")
+        except NewerSchema as error:
+            raised.append(error)
+
+    writer = threading.Thread(target=late)
+    with held(server_store, row) as other:
+        writer.start()
+        until(lambda: locks(server_store, WAITING) == 1)
+        other.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+        other.exec_driver_sql("UPDATE schema_range SET least_revision = '9999'")
+        other.exec_driver_sql("ALTER TABLE maps RENAME COLUMN name TO gone")  # it would fail, too
+    writer.join(60)
+    assert [str(one).partition("schema ")[2][:4] for one in raised] == ["9999"]
+
+
+def test_a_turn_that_does_not_come_in_time_is_said(
+    server_store: Store, row: MapRow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = server_store.database._engine
+    with engine.connect() as connection:  # of all, the one that is used next
+        connection.exec_driver_sql("SET lock_timeout = 100")
+        connection.commit()
+        other = open_database(engine.url.render_as_string(hide_password=False))
+        with other._writers.begin() as writer:
+            postgres.take_turn(writer, 10.0, None, row.number)
+            connection.close()
+            with pytest.raises(StoreLocked):
+                edit(server_store.database, row, "late")
+        other.close()
+    assert named(server_store) == "hall"
+    edit(server_store.database, row, "later")  # that it waited in vain is not held against it
+    assert named(server_store) == "later"
+    edit(server_store.database, row, "last")
+    assert named(server_store) == "last"
+
+
+def test_what_fails_with_its_turn_leaves_nothing(server_store: Store, row: MapRow) -> None:
+    database = server_store.database
+    writing = database.write(map_number=row.number, pending=True)
+    with pytest.raises(Exception, match="division by zero"), writing as connection:
+        connection.exec_driver_sql("UPDATE maps SET revision = 1 / 0")
+
+    def fall() -> None:
+        with database.write(map_number=row.number, pending=True) as connection:
+            connection.execute(update(maps).values(name="half"))
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fall()
+    assert named(server_store) == "hall"
+    assert locks(server_store) == 0
+    with database.write(map_number=row.number, pending=True):
+        pass  # nothing was asked: nothing has begun
+    edit(database, row, "after")
+    assert named(server_store) == "after"
+
+
+def test_many_rows_at_once_do_not_begin_a_transaction_whose_turn_is_pending(
+    server_store: Store, row: MapRow
+) -> None:
+    rows = [{"at": 0.0, "kind": "late", "map": "hall", "data": {}}] * 2
+    many = insert(pending_events)
+    with (
+        pytest.raises(ValueError, match="single statement"),
+        server_store.database.write(map_number=row.number, pending=True) as connection,
+    ):
+        connection.execute(many, rows)
+    with server_store.database.write(map_number=row.number, pending=True) as connection:
+        connection.execute(select(maps.c.number)).all()
+        connection.execute(many, rows)
+    with server_store.database.read() as connection:
+        assert connection.execute(select(func.count()).select_from(pending_events)).scalar() == 2
+
+
+def test_a_connection_that_was_ended_a_moment_ago_is_not_used(
+    server_store: Store, row: MapRow
+) -> None:
+    database = server_store.database
+    with database.read() as connection:
+        mine = connection.exec_driver_sql("SELECT pg_backend_pid()").scalar_one()
+    other = open_database(database._engine.url.render_as_string(hide_password=False))
+    with other.read() as connection:
+        connection.execute(text("SELECT pg_terminate_backend(:pid, 60000)"), {"pid": mine})
+    other.close()
+    edit(database, row, "after")
+    assert named(server_store) == "after"
