@@ -1,6 +1,10 @@
 """A robot out of reach of its service spools its frames, and uploads them when it is back.
 
     python examples/offline_robot.py drives/mapping office --spool office.spool
+    python examples/offline_robot.py drives/mapping office --spool office.spool --copy copy
+
+With `--copy`, a folder that `sceneprint pull` made, it also localises by itself, and the records of
+these queries go to the service's history later.
 
 `frames_of` stands for a camera: put your own there. While the service cannot be reached the
 program goes on; each frame is on disk before the next is taken, so a crash or an empty battery
@@ -12,6 +16,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 from sceneprint.formats.dataset import FrameReference, find_sequences
@@ -39,26 +44,41 @@ def upload_waiting(client: Client, spool: Spool, map_name: str) -> bool:
         print(f"offline, {spool.status().waiting} frames wait: {error}")
         return False
     print(f"uploaded {report.received}, already there {report.there}, refused {report.refused}")
+    if report.queries:
+        print(f"the history has {report.queries} records of queries more")
     return True
 
 
+def localise(robot: Client, map_name: str, frame: FrameReference, meta: FrameMeta) -> None:
+    """Say where a frame was taken, by the robot's own copy of the map."""
+    place = robot.localize(map_name, frame, meta.model_copy(update={"pose": None}))
+    print(f"{frame.path.name}: {place.status}")
+
+
 def main() -> None:
-    """Drive: spool every frame, and upload now and then."""
+    """Drive: spool every frame, localise and upload now and then."""
     parser = argparse.ArgumentParser(description="Spool frames, and upload them when online.")
     parser.add_argument("folder", type=Path)
     parser.add_argument("map")
     parser.add_argument("--spool", type=Path, default=Path("offline.spool"))
     parser.add_argument("--most-bytes", type=int, default=1 << 30)
+    parser.add_argument("--copy", type=Path, help="folder of `sceneprint pull`, to localise by")
     parser.add_argument("--url", default=os.environ.get("SCENEPRINT_URL") or DEFAULT_URL)
     options = parser.parse_args()
-    with Client(options.url) as client, Spool(options.spool, options.most_bytes) as spool:
+    with ExitStack() as stack:
+        client = stack.enter_context(Client(options.url))
+        spool = stack.enter_context(Spool(options.spool, options.most_bytes))
+        robot = stack.enter_context(Client.embedded(options.copy)) if options.copy else None
         for number, (frame, meta) in enumerate(frames_of(options.folder), 1):
             spool.add(frame, meta)
+            if robot is not None and number % TRY_EVERY == 1:
+                localise(robot, options.map, frame, meta)
+                spool.add_queries(robot)
             if number % TRY_EVERY == 0:
                 upload_waiting(client, spool, options.map)
         upload_waiting(client, spool, options.map)
         for refusal in spool.refusals():
-            print(f"{refusal.name}: {refusal.reason}")
+            print(f"{refusal.name or refusal.query_id}: {refusal.reason}")
         now = spool.status()
     print(f"{now.uploaded} uploaded, {now.waiting} wait, {now.thinned} thinned")
 

@@ -30,6 +30,7 @@ from sceneprint_client.api.results import (
     OverlayColour,
     OverlayTransform,
     QueryRecord,
+    QueryRecordsAdded,
     RecordStatus,
     Similarities,
 )
@@ -226,6 +227,26 @@ class QueryMethods(ServiceConnection):
         """
         self._send("DELETE", "/v1/queries", params={"map": map_name})
 
+    def add_query_records(
+        self, map_name: str, records: Iterable[QueryRecord | dict[str, Any]]
+    ) -> QueryRecordsAdded:
+        """Add records of queries that a robot answered itself, each once; see `Spool.add_queries`.
+
+        Parameters
+        ----------
+        map_name : of the map that was asked
+        records : of `queries` of an embedded client, or NewQueryRecord as JSON; at most 100
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        Forbidden : the key does not have `write` for it.
+        InvalidRequest : a record is invalid, and none was stored.
+        """
+        sent = [one if isinstance(one, dict) else record_json(one) for one in records]
+        path = f"{map_path(map_name)}/queries/records"
+        return self._ask(QueryRecordsAdded, "POST", path, json={"records": sent})
+
     # what can be looked at after a query
 
     def answer(self, query_id: str) -> Answer:
@@ -351,6 +372,16 @@ class QueryMethods(ServiceConnection):
             f"{match_path(query_id, frame_id)}/overlay.ply",
             params=given(map=map_name, color=color, transform=transform),
         )
+
+
+#: Fields of a record that a service gives, and does not take.
+_OF_THE_SERVICE = {"map", "maps", "key", "kept_until", "keep", "offline"}
+
+
+def record_json(record: QueryRecord) -> dict[str, Any]:
+    """A record of an embedded client as it is sent to a service: NewQueryRecord as JSON."""
+    told = record.model_dump(mode="json", exclude_none=True, exclude=_OF_THE_SERVICE)
+    return told if record.maps == [record.map] else told | {"maps": record.maps}
 
 
 def _as_text(at: datetime | str | None) -> str | None:

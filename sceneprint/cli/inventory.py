@@ -411,7 +411,8 @@ def _print_queries(queries: Iterable[QueryRecord], *, as_json: bool) -> None:
             any_yet = True
         who = one_line(f"{one.robot or '-'}/{one.session or '-'}")
         came = f"{one.at:%Y-%m-%d %H:%M:%S}  {one.status:11}  {one.milliseconds:5.0f}"
-        print(f"{one.query_id}  {came}  {one.map}  {who}  {_where_or_why(one)}")
+        late = ", offline" if one.offline else ""
+        print(f"{one.query_id}  {came}  {one.map}  {who}  {_where_or_why(one)}{late}")
     if not any_yet and not as_json:
         print("no queries match")
 

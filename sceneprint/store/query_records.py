@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, delete, func, insert, select, tuple_
 
-from sceneprint.store.tables import among, blocks, events, keys, maps, query_records
+from sceneprint.store.queue import read_clock
+from sceneprint.store.tables import MapRow, among, blocks, events, keys, maps, query_records
 from sceneprint_client.api.frames import Kind
-from sceneprint_client.api.results import RecordStatus
+from sceneprint_client.api.results import MOST_REASON, RecordStatus
 
 _c = query_records.c
 
@@ -40,6 +41,7 @@ class _Recorded:
     frame_map: str | None
     frame_id: str | None
     kept: bool
+    offline: bool = field(default=False, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class NewRecord(_Recorded):
     kind : of the frame that was asked for, as far as it was read
     frame_map, frame_id : the stored frame that was asked for
     kept : whether the answer was to be kept
+    offline : whether a robot answered it itself, and sent this later
     """
 
     map: str
@@ -75,8 +78,6 @@ class RecordRow(_Recorded):
     map_number: int
 
 
-#: Characters of a reason; that of an answer has some 200.
-MOST_REASON = 1000
 #: Of the event that tells of a query, beside what `_told` adds.
 EVENT = "query.answered"
 _TOLD = ("status", "robot", "session", "cause", "support", "milliseconds")
@@ -99,9 +100,14 @@ def add_records(connection: Connection, records: Sequence[NewRecord]) -> int:
     ]  # fmt: skip
     if not found:
         return 0
-    connection.execute(insert(query_records), [_row(one, there[one.map].number) for one in found])
-    connection.execute(insert(events), [_event(one) for one in found])
+    _insert(connection, [(one, there[one.map].number) for one in found])
     return len(found)
+
+
+def _insert(connection: Connection, found: Sequence[tuple[NewRecord, int]]) -> None:
+    """Store records with the numbers of their maps, an event for each."""
+    connection.execute(insert(query_records), [_row(*one) for one in found])
+    connection.execute(insert(events), [_event(one) for one, _ in found])
 
 
 def _row(one: NewRecord, map_number: int) -> dict[str, Any]:
@@ -113,6 +119,8 @@ def _row(one: NewRecord, map_number: int) -> dict[str, Any]:
 def _event(one: NewRecord) -> dict[str, Any]:
     data: dict[str, Any] = {"query_id": one.id}
     data |= {name: getattr(one, name) for name in _TOLD if getattr(one, name) is not None}
+    if one.offline:
+        data["offline"] = True
     if one.pose is not None:
         x, y, z, qx, qy, qz, qw = one.pose
         data["pose"] = {
@@ -126,6 +134,93 @@ def _event(one: NewRecord) -> dict[str, Any]:
         "at": time.time(), "kind": EVENT, "map": one.map, "frame_id": own, "job_id": None,
         "data": data,
     }  # fmt: skip
+
+
+# Records that robots send of queries that they answered themselves.
+
+
+@dataclass(frozen=True)
+class OfflineOutcome:
+    """What came of records that a robot sent.
+
+    Parameters
+    ----------
+    received, there, expired : how many; see QueryRecordsAdded
+    refused : ids of others, and why
+    """
+
+    received: int
+    there: int
+    expired: int
+    refused: dict[str, str]
+
+
+def add_offline_records(
+    connection: Connection, row: MapRow, records: Sequence[NewRecord], kept_s: float, kept: int
+) -> OfflineOutcome:
+    """Store records that a robot sends, each once, an event for each that is new.
+
+    Parameters
+    ----------
+    connection : of a transaction that other writers wait for
+    row : of the map that they belong to
+    records : at most a few hundred, none with the id of another
+    kept_s : seconds that records are kept
+    kept : how many a map keeps: the oldest beyond go at once, or a robot could fill the disk
+    """
+    clock = read_clock(connection)
+    stored = _stored_offline(connection, row.number, records)
+    new, there, expired, refused = [], 0, 0, {}
+    for one in records:
+        before = stored.get(one.id)
+        if before is not None:
+            if _is_same(before, one):
+                there += 1
+            else:
+                refused[one.id] = "the map has another record with this id"
+        elif one.at < clock - kept_s:
+            expired += 1
+        elif one.at < row.created_at:
+            refused[one.id] = (
+                "the query is older than the map: this is another map of that name, or the robot's "
+                "clock was wrong"
+            )
+        else:
+            new.append(replace(one, at=min(one.at, clock)))
+    if new:
+        _insert(connection, [(one, row.number) for one in new])
+        remove_records(connection, _surplus(connection, row.number, kept, 2 * len(records)))
+    return OfflineOutcome(len(new), there, expired, refused)
+
+
+def _stored_offline(
+    connection: Connection, map_number: int, records: Sequence[NewRecord]
+) -> dict[str, RecordRow]:
+    """Records of the map that have the ids of some, by these; each way by its index."""
+    ids = [one.id for one in records]
+
+    def found(own: ColumnElement[bool]) -> dict[str, RecordRow]:
+        asked = select(query_records).where(_c.map_number == map_number, own, _c.id.in_(ids))
+        return {row["id"]: RecordRow(**row) for row in connection.execute(asked).mappings()}
+
+    # those that the service answered itself are found by their times, if a robot sends them back
+    return found(_c.at.in_([one.at for one in records])) | found(_c.offline)
+
+
+def _is_same(stored: RecordRow, one: NewRecord) -> bool:
+    """Whether a record is stored already with the same content."""
+    if stored.at != one.at and not (stored.offline and stored.at < one.at):
+        return False  # a time in the future is stored as that of the request
+    told = _row(one, stored.map_number)
+    return all(
+        _plain(getattr(stored, name)) == _plain(value)
+        for name, value in told.items()
+        if name not in ("at", "key_id", "kept", "offline")
+    )
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
 
 
 @dataclass(frozen=True)
@@ -179,7 +274,10 @@ def record_of_answer(
     at : when it was given, seconds since 1970: the query came at most an hour before
     """
     asked = select(query_records).where(
-        _c.map_number.in_(map_numbers), _c.at.between(at - 3600.0, at + 60.0), _c.id == query_id
+        _c.map_number.in_(map_numbers),
+        _c.at.between(at - 3600.0, at + 60.0),
+        _c.id == query_id,
+        ~_c.offline,
     )
     row = connection.execute(asked).mappings().first()
     return None if row is None else RecordRow(**row)
@@ -228,22 +326,31 @@ def surplus_records(connection: Connection, kept: int, limit: int) -> list[int]:
     """Numbers of the oldest records of maps that have more than so many."""
     found: list[int] = []
     for number in connection.execute(select(maps.c.number)).scalars().all():
-        own = _c.map_number == number
-        newest = select(_c.at, _c.number).where(own).order_by(_c.at.desc(), _c.number.desc())
-        oldest = select(_c.number).where(own).order_by(_c.at, _c.number)
-        first = connection.execute(oldest.limit(1)).scalar()
-        last = connection.execute(newest.limit(1)).first()
-        # numbers are given to the records of all maps: this one has no more than lie between
-        if first is None or last is None or last.number - first < kept:
-            continue
-        beyond = connection.execute(newest.offset(kept).limit(1)).first()
-        if beyond is None:
-            continue
-        spent = oldest.where(tuple_(_c.at, _c.number) <= (beyond.at, beyond.number))
-        found += connection.execute(spent.limit(limit - len(found))).scalars()
+        found += _surplus(connection, number, kept, limit - len(found))
         if len(found) >= limit:
             break
     return found
+
+
+def _surplus(connection: Connection, map_number: int, kept: int, limit: int) -> list[int]:
+    """Numbers of the oldest records of a map that has more than so many."""
+    own = _c.map_number == map_number
+    newest = select(_c.at, _c.number).where(own).order_by(_c.at.desc(), _c.number.desc())
+    oldest = select(_c.number).where(own).order_by(_c.at, _c.number)
+    first = connection.execute(oldest.limit(1)).scalar()
+    last = connection.execute(newest.limit(1)).first()
+    if first is None or last is None:
+        return []
+    # numbers are given to the records of all maps, in the order of their times but for those that
+    # robots sent later: without these a map has no more than lie between
+    late = connection.execute(select(_c.number).where(own, _c.offline).limit(1)).first()
+    if late is None and last.number - first < kept:
+        return []
+    beyond = connection.execute(newest.offset(kept).limit(1)).first()
+    if beyond is None:
+        return []
+    spent = oldest.where(tuple_(_c.at, _c.number) <= (beyond.at, beyond.number))
+    return list(connection.execute(spent.limit(limit)).scalars())
 
 
 def records_of_map(connection: Connection, map_number: int, limit: int) -> list[int]:

@@ -39,6 +39,7 @@ from sqlalchemy import (
     bindparam,
     cast,
     extract,
+    false,
     func,
     literal,
     literal_column,
@@ -434,6 +435,8 @@ query_records = Table(
     Column("frame_map", _string(63)),  # the stored frame that was asked for
     Column("frame_id", _string(64)),
     Column("kept", Boolean, nullable=False),  # whether its answer was to be kept
+    # a robot answered it itself, and sent the record later
+    Column("offline", Boolean, nullable=False, server_default=false()),
     Index(None, "at", "number"),
     Index(None, "map_number", "at", "number"),
     Index(None, "map_number", "status", "at", "number"),
@@ -441,6 +444,11 @@ query_records = Table(
     Index(None, "key_id"),
     sqlite_autoincrement=True,
 )
+#: Records that robots send, each once.
+Index(
+    "ix_query_records_offline", query_records.c.map_number, query_records.c.id, unique=True,
+    sqlite_where=literal_column("offline = 1"), postgresql_where=literal_column("offline"),
+)  # fmt: skip
 
 #: The fused surface of a map: where its making stands.
 surfaces = Table(

@@ -6,7 +6,7 @@ import time
 from functools import partial
 from typing import Annotated, Any
 
-from fastapi import Query, Request, Response
+from fastapi import Depends, Query, Request, Response
 from pydantic import AwareDatetime
 
 from sceneprint.engine.maps.map_frames import PLY, PNG
@@ -24,15 +24,17 @@ from sceneprint_client.api.results import (
     AnswerRetention,
     KeepOptions,
     MatchDetails,
+    NewQueryRecords,
     OverlayColour,
     OverlayTransform,
     QueryRecord,
+    QueryRecordsAdded,
     Question,
     RecordStatus,
     Similarities,
     View,
 )
-from service.auth import Asking, Caller, Context, Here, v1_router
+from service.auth import Asking, Caller, Context, Here, may_write, v1_router
 from service.bodies import media_type, read_record
 from service.problems import declared
 from service.routes.queries import JSON, TEMPLATE, checked, read_object, run_query
@@ -345,3 +347,33 @@ def delete_queries(
     """Remove the records of all queries of a map, for good. Needs `admin` of the map."""
     asking.require(map_name, "admin")
     here.engine.history.remove_of_map(map_name)
+
+
+_RECORDS: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {JSON: {"schema": {"$ref": "#/components/schemas/NewQueryRecords"}}},
+    }
+}
+
+offline_router = v1_router("/maps/{map_name}", "queries")
+
+
+@offline_router.post(
+    "/queries/records", responses=declared(400, 404, 413, 415, 422), openapi_extra=_RECORDS,
+    dependencies=[Depends(may_write)],
+)  # fmt: skip
+async def add_query_records(
+    map_name: str, request: Request, here: Here, asking: Asking
+) -> QueryRecordsAdded:
+    """Store records of queries that a robot answered itself while it was offline, each once.
+
+    The history lists them with `offline`. An invalid record refuses the whole request; the same
+    records may be sent again. It takes the scope `write`: the service cannot check what they say.
+    """
+    given = await read_record(request, NewQueryRecords, "The list of records")
+    request.state.audited = {"records": len(given.records)}
+    async with here.uploads.place():
+        return await here.uploads.run(
+            partial(here.engine.history.add_offline, map_name, given, asking.key_id)
+        )

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import logging
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import pytest
 from sqlalchemy import event, func, select, update
 
 from sceneprint.engine.results import query_history
 from sceneprint.engine.results.query_history import AskedQuery, QueryHistory, record_of
-from sceneprint.errors import FrameError, InvalidRequest, StoreLocked
+from sceneprint.errors import FrameError, InvalidRequest, StoreLocked, UnknownMap
 from sceneprint.settings import Settings
 from sceneprint.store import deletion
 from sceneprint.store.deletion import DAY_S
 from sceneprint.store.events import Wanted, list_events
-from sceneprint.store.query_records import NewRecord, WantedRecords
-from sceneprint.store.tables import query_records
+from sceneprint.store.maps import find_map
+from sceneprint.store.query_records import NewRecord, WantedRecords, record_of_answer
+from sceneprint.store.tables import maps, query_records
 from sceneprint_client.api import NewMap, Query
+from sceneprint_client.api.results import NewQueryRecord, NewQueryRecords
+from sceneprint_client.queries import record_json
 
 EVERY = WantedRecords()
 
@@ -260,3 +265,141 @@ def test_a_revoked_key_takes_its_records_along(engine):
     assert engine.history.flush(60)
     assert engine.history.remove_spent() == 1
     assert told(engine) == [3, 1]
+
+
+# Records that robots send of queries that they answered themselves.
+
+
+def sent(number: int, **more: object) -> dict[str, object]:
+    """A record as a robot sends it, a minute for each number ago."""
+    at = datetime.fromtimestamp(round(time.time() - 60 * number, 3), UTC)
+    one = {
+        "query_id": f"{number:032x}", "at": at.isoformat(), "robot": "spot", "session": "monday",
+        "status": "found", "reason": "why", "support": 2, "rival_ratio": 0.125,
+        "milliseconds": 31.75, "kind": "depth", "frame": {"map": "attic", "frame_id": "f"},
+        "pose": {
+            "parent_frame": "room", "translation": {"x": 1.1, "y": -2.2, "z": 0.3},
+            "rotation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8},
+        },
+    }  # fmt: skip
+    return one | more
+
+
+def add(history, *records, key_id=None, name="hall"):
+    done = history.add_offline(name, NewQueryRecords(records=list(records)), key_id)
+    refused = {int(one.query_id, 16): one.reason for one in done.refused}
+    return done.received, done.there, done.expired, refused
+
+
+@pytest.fixture
+def aged(engine):
+    """The engine, whose maps are a day old."""
+    with engine.store.database.write() as connection:
+        connection.execute(update(maps).values(created_at=time.time() - DAY_S))
+    return engine
+
+
+def test_a_robots_records_are_stored_once_with_all_that_they_say(aged):
+    one, two = sent(1), sent(2, status="ambiguous", pose=None, alternatives=3, maps=["attic"])
+    assert add(aged.history, one, two) == (2, 0, 0, {})
+    page = aged.history.page(EVERY, None, None, 9)
+    assert [item.model_dump(mode="json") | {"at": None} for item in page.items] == [
+        {
+            **{name: value for name, value in given.items() if name != "maps"}, "at": None,
+            "map": "hall", "maps": asked, "key": None, "cause": None, "kept_until": None,
+            "keep": None, "offline": True, "alternatives": given.get("alternatives", 0),
+        }
+        for given, asked in ((one, ["hall"]), (two, ["attic"]))
+    ]  # fmt: skip
+    assert [item.at.isoformat() for item in page.items] == [one["at"], two["at"]]
+    assert add(aged.history, one, two, sent(3)) == (1, 2, 0, {})
+    for changed in (
+        {"status": "not_found", "pose": None}, {"reason": "other"}, {"support": 3},
+        {"rival_ratio": None}, {"robot": None}, {"maps": ["hall", "attic"]}, {"frame": None},
+        {"milliseconds": 31.5}, {"at": sent(4)["at"]}, {"cause": "deadline"}, {"kind": "cloud"},
+    ):  # fmt: skip
+        done = add(aged.history, one | changed, sent(3) | {"at": told_at(aged, 3)})
+        assert done == (0, 1, 0, {1: "the map has another record with this id"}), changed
+    assert told(aged) == [1, 2, 3]
+    # another map knows nothing of it
+    assert add(aged.history, one, name="attic") == (1, 0, 0, {})
+    with aged.store.database.read() as connection:
+        found = list_events(connection, Wanted(kinds=("query.",)))
+    assert [int(event.data["query_id"], 16) for event in found] == [1, 2, 3, 1]
+    assert found[0].data == {
+        "query_id": one["query_id"], "status": "found", "robot": "spot", "session": "monday",
+        "support": 2, "milliseconds": 31.75, "pose": one["pose"], "offline": True,
+    }  # fmt: skip
+
+
+def told_at(engine, number):
+    items = engine.history.page(EVERY, None, None, 9).items
+    return next(one.at.isoformat() for one in items if int(one.query_id, 16) == number)
+
+
+def test_records_sent_at_once_by_two_are_there_once(aged):
+    records = [sent(i) for i in range(1, 21)]
+    with ThreadPoolExecutor(4) as pool:
+        done = list(pool.map(lambda _: add(aged.history, *records), range(4)))
+    assert sorted(one[:2] for one in done) == [(0, 20), (0, 20), (0, 20), (20, 0)]
+    assert told(aged) == list(range(1, 21))
+
+
+def test_times_that_cannot_be_are_refused_or_put_right(aged):
+    before = datetime.fromtimestamp(time.time() - 2 * DAY_S, UTC).isoformat()
+    done = add(aged.history, sent(1, at=before), sent(2))
+    assert done[:3] == (1, 0, 0)
+    assert done[3][1].startswith("the query is older than the map")
+    start = time.time()
+    ahead = datetime.fromtimestamp(start + DAY_S, UTC).isoformat()
+    for expected in ((1, 0, 0, {}), (0, 1, 0, {})):  # and it is recognised later
+        assert add(aged.history, sent(3, at=ahead)) == expected
+    newest = aged.history.page(EVERY, None, None, 9).items[0]
+    assert int(newest.query_id, 16) == 3
+    assert start - 1 <= newest.at.timestamp() <= time.time() + 1
+    short = QueryHistory(aged.store, Settings(history_days=0.001))  # 86 s
+    assert add(short, sent(5), sent(1)) == (1, 0, 1, {})
+    none = QueryHistory(aged.store, Settings(history_days=0))
+    assert add(none, sent(6)) == (0, 0, 1, {})
+    with pytest.raises(UnknownMap):
+        add(aged.history, sent(7), name="cellar")
+
+
+def test_a_map_keeps_no_more_than_it_may_however_many_are_sent(aged):
+    few = QueryHistory(aged.store, Settings(history_queries=5))
+    for start in (100, 80, 60):
+        add(few, *(sent(i) for i in range(start, start - 20, -1)))
+        assert count(aged) == 5
+    assert told(aged) == list(range(41, 46))
+    add(few, *(sent(i) for i in range(70, 50, -1)))  # older than all that are kept
+    assert told(aged) == list(range(41, 46))
+    # what came in another order than that of its times is counted all the same
+    aged.history.note(record(0, at=time.time()))
+    assert aged.history.flush(60)
+    assert few.remove_spent() == 1
+    assert told(aged) == [0, 41, 42, 43, 44]
+
+
+def test_a_robots_records_go_with_its_key(aged):
+    key = aged.find_key(aged.create_key("cart").secret).id
+    add(aged.history, sent(1), key_id=key)
+    assert aged.history.page(EVERY, None, None, 9).items[0].key == "cart"
+    aged.revoke_key("cart")
+    assert told(aged) == []
+
+
+def test_what_the_service_answered_itself_is_known_when_it_comes_back(aged):
+    """As from a copy of before copies left the service's records out."""
+    aged.history.note(record(1, at=round(time.time() - 5, 6)))
+    [online] = aged.history.page(EVERY, None, None, 9).items
+    back = NewQueryRecord.model_validate(record_json(online))
+    assert add(aged.history, back) == (0, 1, 0, {})
+    assert [one.offline for one in aged.history.page(EVERY, None, None, 9).items] == [False]
+    # what a robot sends under the id of another's query is never taken for that query's record
+    forged = sent(1, at=datetime.fromtimestamp(online.at.timestamp() + 1, UTC).isoformat())
+    add(aged.history, forged)
+    with aged.store.database.read() as connection:
+        number = find_map(connection, "hall").number
+        found = record_of_answer(connection, [number], f"{1:032x}", online.at.timestamp())
+    assert found is not None
+    assert (found.offline, found.status) == (False, "not_found")

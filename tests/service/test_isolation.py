@@ -76,6 +76,21 @@ OF_A_MAP = {
     "GET /v1/maps/{map_name}/trajectory": Case(query={"session": "{session}"}),
     "GET /v1/maps/{map_name}/growth": Case(query={"by": "hour"}),
     "POST /v1/maps/{map_name}/queries": Case(body={"frame_id": "{frame}"}),
+    "POST /v1/maps/{map_name}/queries/records": Case(
+        "write",
+        body={
+            "records": [
+                {
+                    "query_id": "5" * 32,
+                    "at": "2026-11-16T09:30:00Z",
+                    "status": "failed",
+                    "reason": "",
+                    "milliseconds": 1,
+                    "frame": {"map": "{map}", "frame_id": "{frame}"},
+                }
+            ]
+        },
+    ),
     "POST /v1/maps/{map_name}/localize": Case(body={"frame_id": "{frame}"}),
     "POST /v1/maps/{map_name}/localize/sequence": Case(),
     "POST /v1/queries": Case(body={"maps": [OWN, "{map}"], "frame": FRAME}),
@@ -142,7 +157,7 @@ MADE_OF_ANYTHING = (
     "PUT /v1/maps/{map_name}/frames/{frame_id}", "POST /v1/maps/{map_name}/associations",
     "POST /v1/maps/{map_name}/coverage", "POST /v1/maps/{map_name}/differences",
     "POST /v1/maps/{map_name}/frames/delete", "POST /v1/maps/{map_name}/frames/edit",
-    "POST /v1/maps/{map_name}/restore",
+    "POST /v1/maps/{map_name}/restore", "POST /v1/maps/{map_name}/queries/records",
 )  # fmt: skip
 #: The operator's: 403 for who has a map, whatever is asked for.
 OF_ALL = (
@@ -531,4 +546,5 @@ def test_what_is_not_noted_is_said(operations):
         "begin_surface", "delete_surface",
         "reconstruct", "delete_reconstruction",
         "add_import", "take_snapshot", "delete_snapshot", "delete_queries",
+        "add_query_records",
     }  # fmt: skip

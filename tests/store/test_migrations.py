@@ -10,15 +10,18 @@ from pathlib import Path
 
 import pytest
 from sqlalchemy import text
+from sqlalchemy.exc import IntegrityError
 
 from benchmarks.fleet.postgres import Server
 from sceneprint.store import open_database
+from sceneprint.store.database import reach_database, schema_range_of
 from sceneprint.store.deletion import doomed_blobs
 from sceneprint.store.events import last_event
 from sceneprint.store.frame_queries import frame_ups
 from sceneprint.store.frames import write_frame, write_map
 from sceneprint.store.keys import list_keys
 from sceneprint.store.maps import MapUsage, add_frame, counted_usage, find_map, frame_of, use_of
+from sceneprint.store.query_records import WantedRecords, list_records
 from sceneprint.store.queue import enqueue, find_job
 from sceneprint.store.tables import frame_tags
 from sceneprint_client.api import FrameState
@@ -188,3 +191,46 @@ def test_frames_of_before_there_were_names_have_none(
     assert "captured_at, sequence, pose_parent" in indexes["ix_frames_searched"]
     assert "map_number, name, state" in indexes["ix_frames_named"]
     database.close()
+
+
+#: As a process of the schema before writes a record.
+RECORD = (
+    "INSERT INTO query_records (id, at, map_number, status, reason, alternatives, milliseconds, "
+    "kept) VALUES (:id, 1.0, 1, 'found', '', 0, 1.0, {})"
+)
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_processes_of_before_there_were_offline_queries_go_on(
+    kind: str, tmp_path: Path, postgres: Server, bring_to: Callable[[str, str], None]
+) -> None:
+    url = f"sqlite:///{tmp_path}/truth.db" if kind == "sqlite" else postgres.create("offline")
+    bring_to(url, "0018")
+    record = text(RECORD.format("0" if kind == "sqlite" else "false"))
+    with closing(reach_database(url)) as former, former.write() as connection:
+        connection.execute(text("INSERT INTO models VALUES ('m', 'depth', '', 1.0)"))
+        connection.execute(
+            text(
+                "INSERT INTO maps (number, name, model_id, revision, created_at) "
+                "VALUES (1, 'hall', 'm', 0, 0.5)"
+            )
+        )
+        connection.execute(record, {"id": "a"})
+    with closing(open_database(url)) as database:
+        with database.write() as connection:
+            connection.execute(record, {"id": "a"})  # and nothing keeps it from that
+            connection.execute(record, {"id": "b"})
+            allowed = schema_range_of(connection)
+            assert allowed is not None
+            assert allowed.allows("0018")
+            found = list_records(connection, WantedRecords(), None, 9)
+        assert [(one.id, one.offline) for one in found] == [
+            ("b", False), ("a", False), ("a", False)
+        ]  # fmt: skip
+        late = text("UPDATE query_records SET offline = (1 = 1) WHERE id = :id")
+        with database.write() as connection:
+            connection.execute(late, {"id": "b"})
+        with pytest.raises(IntegrityError), database.write() as connection:
+            connection.execute(late, {"id": "a"})  # a robot's record is there once
+    if kind == "postgresql":
+        postgres.drop("offline")

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-from datetime import datetime
+import math
+from datetime import datetime, timezone
 from typing import Annotated, Any, Literal
 
-from pydantic import AwareDatetime, Field
+from pydantic import AwareDatetime, Field, StringConstraints, model_validator
 
-from sceneprint_client.api.base import ApiRecord, Given, Note, Quaternion, Transform, Vector
-from sceneprint_client.api.frames import Kind
-from sceneprint_client.api.maps import Preset
+from sceneprint_client.api.base import (
+    ApiRecord,
+    Given,
+    GivenQuaternion,
+    GivenVector,
+    Label,
+    Note,
+    Quaternion,
+    Transform,
+    Vector,
+)
+from sceneprint_client.api.frames import FRAME_ID, Kind
+from sceneprint_client.api.maps import Preset, Slug
 from sceneprint_client.api.query import (
+    MOST_MAPS,
     FrameName,
     JsonText,
     NamedFrame,
@@ -131,6 +143,116 @@ class QueryRecord(ApiRecord):
     )
     keep: KeptAnswer | None = Field(
         default=None, description="Where somebody keeps the answer for longer."
+    )
+    offline: bool = Field(
+        default=False,
+        description="The robot answered the query itself, from a copy of the map, and sent this "
+        "record later. The service never had the answer.",
+    )
+
+
+# Records of queries that a robot answered itself, as JSON.
+
+#: Most records in one request.
+MOST_OF_RECORDS = 100
+#: Characters of a record's reason; that of an answer has some 200.
+MOST_REASON = 1000
+#: Longest that a query may have taken, milliseconds: a day.
+MOST_MS = 86_400_000.0
+#: Farthest place of a pose along each axis, metres, and what a quaternion's norm may miss 1 by.
+FARTHEST_POSE, NORM_TOLERANCE = 1e9, 1e-3
+#: Most matches or alternatives that a record may count.
+MOST_COUNTED = 1_000_000
+
+
+class NewRecordedPose(Given):
+    """T_parent_query, metres and a unit quaternion."""
+
+    parent_frame: Label
+    translation: GivenVector
+    rotation: GivenQuaternion
+
+    @model_validator(mode="after")
+    def _is_pose(self) -> NewRecordedPose:
+        t, r = self.translation, self.rotation
+        if max(abs(t.x), abs(t.y), abs(t.z)) > FARTHEST_POSE:
+            raise ValueError(f"farther than {FARTHEST_POSE:g} m from the origin")
+        if abs(math.hypot(r.x, r.y, r.z, r.w) - 1.0) > NORM_TOLERANCE:
+            raise ValueError("its rotation is not a unit quaternion")
+        return self
+
+
+class NewRecordedFrame(Given):
+    """The stored frame that was asked for."""
+
+    map: Slug
+    frame_id: Annotated[str, StringConstraints(pattern=f"^{FRAME_ID}$")]
+
+
+class NewQueryRecord(Given):
+    """What came of a query that a robot answered itself; fields as in QueryRecord."""
+
+    query_id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
+    at: AwareDatetime = Field(
+        description="When the query came, on the robot's clock. The service stores a time in the "
+        "future as that of the request."
+    )
+    maps: Annotated[list[Slug], Field(min_length=1, max_length=MOST_MAPS)] | None = Field(
+        default=None, description="All that were asked, if more than this map."
+    )
+    robot: Label | None = None
+    session: Label | None = None
+    status: RecordStatus
+    cause: Annotated[str, StringConstraints(pattern=r"^[a-z0-9_-]{1,64}$")] | None = None
+    reason: Annotated[str, StringConstraints(max_length=MOST_REASON, pattern=r"^[^\x00]*$")]
+    pose: NewRecordedPose | None = None
+    support: int | None = Field(default=None, ge=0, le=MOST_COUNTED)
+    rival_ratio: float | None = Field(default=None, ge=0, le=MOST_COUNTED)
+    alternatives: int = Field(default=0, ge=0, le=MOST_COUNTED)
+    milliseconds: float = Field(ge=0, le=MOST_MS)
+    kind: Kind | None = None
+    frame: NewRecordedFrame | None = None
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> NewQueryRecord:
+        if self.pose is not None and self.status != "found":
+            raise ValueError(f"pose: of a query that was {self.status}; only `found` has one")
+        try:  # as it will be told
+            datetime.fromtimestamp(self.at.timestamp(), timezone.utc)
+        except (ValueError, OverflowError) as error:
+            raise ValueError("at: not within the years 1 to 9999 of UTC") from error
+        return self
+
+
+class NewQueryRecords(Given):
+    """Records of queries of one map."""
+
+    records: list[NewQueryRecord] = Field(min_length=1, max_length=MOST_OF_RECORDS)
+
+    @model_validator(mode="after")
+    def _once_each(self) -> NewQueryRecords:
+        ids = {one.query_id for one in self.records}
+        if len(ids) < len(self.records):
+            raise ValueError("records: a `query_id` is there twice")
+        return self
+
+
+class RefusedRecord(ApiRecord):
+    """A record that the service did not store, and why."""
+
+    query_id: str
+    reason: str
+
+
+class QueryRecordsAdded(ApiRecord):
+    """What came of some records; each is counted or named once."""
+
+    received: int = Field(description="Stored.")
+    there: int = Field(description="Stored before, with the same content.")
+    expired: int = Field(description="Older than the service keeps records, and so not stored.")
+    refused: list[RefusedRecord] = Field(
+        description="Not stored: the id belongs to another record, or the query is older than the "
+        "map."
     )
 
 

@@ -2,6 +2,7 @@
 
 Asked, Answer | error  --record_of-->  NewRecord  --QueryHistory.note-->  written together, by a
 thread of its own, at most a second later  --QueryHistory.page-->  QueryRecord, ...
+NewQueryRecord, ... of a robot  --QueryHistory.add_offline-->  the same, each once
 
 No query waits for its record, and none fails for it. What cannot be written waits in memory while
 the database is away; what is lost all the same is logged and counted.
@@ -30,6 +31,7 @@ from sceneprint.store.query_records import (
     NewRecord,
     RecordRow,
     WantedRecords,
+    add_offline_records,
     add_records,
     list_records,
     names_of,
@@ -43,7 +45,16 @@ from sceneprint.store.queue import read_clock
 from sceneprint_client.api import Answer, FrameName, Page, Query
 from sceneprint_client.api.base import Quaternion, Vector
 from sceneprint_client.api.frames import Kind
-from sceneprint_client.api.results import KeptAnswer, QueryRecord, RecordedPose, RecordStatus
+from sceneprint_client.api.results import (
+    KeptAnswer,
+    NewQueryRecord,
+    NewQueryRecords,
+    QueryRecord,
+    QueryRecordsAdded,
+    RecordedPose,
+    RecordStatus,
+    RefusedRecord,
+)
 from sceneprint_client.errors import kebab_case
 
 log = logging.getLogger(__name__)
@@ -90,6 +101,30 @@ def record_of(asked: AskedQuery, came_of_it: Answer | Exception, seconds: float)
         frame_map=None if frame is None else frame.map,
         frame_id=None if frame is None else frame.frame_id,
         kept=asked.query.keep and not failed,
+    )  # fmt: skip
+
+
+def offline_record(map_name: str, one: NewQueryRecord, key_id: str | None) -> NewRecord:
+    """The record of a query that a robot answered itself, as the robot sends it.
+
+    Parameters
+    ----------
+    map_name : of the map that it belongs to
+    one : see NewQueryRecord
+    key_id : of the key that was shown
+    """
+    pose = one.pose
+    t, r = (None, None) if pose is None else (pose.translation, pose.rotation)
+    return NewRecord(
+        id=one.query_id, at=round(one.at.timestamp(), 6), map=map_name,
+        maps=None if one.maps is None else tuple(one.maps), robot=one.robot, session=one.session,
+        key_id=key_id, status=one.status, cause=one.cause, reason=one.reason,
+        pose_parent=None if pose is None else pose.parent_frame,
+        pose=None if t is None or r is None else (t.x, t.y, t.z, r.x, r.y, r.z, r.w),
+        support=one.support, rival_ratio=one.rival_ratio, alternatives=one.alternatives,
+        milliseconds=one.milliseconds, kind=one.kind,
+        frame_map=None if one.frame is None else one.frame.map,
+        frame_id=None if one.frame is None else one.frame.frame_id, kept=False, offline=True,
     )  # fmt: skip
 
 
@@ -257,6 +292,34 @@ class QueryHistory:
         if len(str(self._lost)) > len(str(self._lost - count)) or self._lost == count:
             log.warning("query records lost", extra={"lost": self._lost, "error": why})
 
+    def add_offline(
+        self, map_name: str, given: NewQueryRecords, key_id: str | None
+    ) -> QueryRecordsAdded:
+        """Store records of queries that a robot answered itself, each once.
+
+        Parameters
+        ----------
+        map_name : of the map that they belong to
+        given : the records
+        key_id : of the key that was shown; the records go with it
+
+        Raises
+        ------
+        UnknownMap : there is none of that name.
+        ReadOnlyStore, StoreLocked, StoreFull, UnusableStore : nothing was stored.
+        """
+        new = [offline_record(map_name, one, key_id) for one in given.records]
+        kept_s = DAY_S * self._settings.history_days
+        with self._store.database.write() as connection:
+            row = find_map(connection, map_name)
+            done = add_offline_records(
+                connection, row, new, kept_s, self._settings.history_queries
+            )  # fmt: skip
+        refused = [RefusedRecord(query_id=one, reason=why) for one, why in done.refused.items()]
+        return QueryRecordsAdded(
+            received=done.received, there=done.there, expired=done.expired, refused=refused
+        )
+
     # read
 
     def page(
@@ -370,7 +433,7 @@ def query_record(
         robot=row.robot, session=row.session, key=key, status=row.status, cause=row.cause,
         reason=row.reason, pose=_pose(row), support=row.support, rival_ratio=row.rival_ratio,
         alternatives=row.alternatives, milliseconds=row.milliseconds, kind=row.kind, frame=frame,
-        kept_until=when(until) if stays else None, keep=keep,
+        kept_until=when(until) if stays else None, keep=keep, offline=bool(row.offline),
     )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ const PERIODS = [["", "Any time"], ["1", "Last hour"], ["24", "Last 24 hours"], 
 const KEPT = [["", "All queries"], ["true", "Kept answers"]];
 const HOUR_MS = 3_600_000;
 const AT_ONCE = 50;
+const OFFLINE = "The robot answered this query itself, and sent the record later.";
 const TOGETHER_MS = 500; // events of a burst are one look
 
 /** @param {HTMLElement} root @param {Object<string, any>} context see main.js */
@@ -114,7 +115,8 @@ function row(one) {
   return h("tr", { role: "row", dataset: { query: one.query_id, status: one.status } },
     cell("when", time(one.at)),
     h("th", { class: "queries-who", scope: "row", role: "rowheader" }, one.robot ?? h("span", { class: "muted", title: "The query did not say who asked." }, one.key ? `key ${one.key}` : "not named"),
-      one.session && h("span", { class: "queries-more muted" }, one.session)),
+      one.session && h("span", { class: "queries-more muted" }, one.session),
+      one.offline && h("span", { class: "queries-more muted", title: OFFLINE }, "offline")),
     cell("outcome", h("span", { class: "badge", dataset: { kind } }, text)),
     cell("pose", pose(one)),
     cell("views number", one.pose ? count(one.support) : "–"),
@@ -137,10 +139,10 @@ function why({ reason, frame }) {
 }
 
 /** The answer while it is there, and afterwards that it is not. */
-function answer({ query_id: id, kept_until: until, keep, status }) {
+function answer({ query_id: id, kept_until: until, keep, status, offline }) {
   if (keep) return [h("a", { class: "mono", href: link("queries", id), "aria-label": `Answer ${shortId(id)}` }, shortId(id)), h("span", { class: "queries-more muted" }, keep.title ? `kept: ${keep.title}` : "kept")];
   if (until && Date.parse(until) > Date.now()) return h("a", { class: "mono", href: link("queries", id), "aria-label": `Answer ${shortId(id)}` }, shortId(id));
-  const text = status === "failed" ? ["no answer", "The query failed."] : ["expired", "Answers expire after about an hour; this record stays longer."];
+  const text = offline ? ["on the robot", OFFLINE] : status === "failed" ? ["no answer", "The query failed."] : ["expired", "Answers expire after about an hour; this record stays longer."];
   return h("span", { class: "muted", title: `${text[1]} Query ${id}.` }, text[0]);
 }
 

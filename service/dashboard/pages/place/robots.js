@@ -139,6 +139,7 @@ export class Robots {
       const page = await this.#page({ limit: 100 });
       const known = new Set(this.#records.map((one) => one.query_id));
       this.#records.push(...page.items.reverse().filter((one) => !known.has(one.query_id)));
+      this.#records.sort((a, b) => Date.parse(a.at) - Date.parse(b.at)); // a robot may send old ones later
       this.#records = this.#records.slice(-MOST);
       this.draw();
     }, TOGETHER_MS);
