@@ -1,4 +1,5 @@
-"""What a search costs by the number of frames in a map: all compared, and by inverted lists.
+"""What a search costs by the number of frames in a map: all compared, and by inverted lists; and
+what it costs to keep its index while the map grows.
 
 `python -m benchmarks.search`
 
@@ -12,7 +13,7 @@ import argparse
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,6 +31,8 @@ from sceneprint.types import Bytes
 SIZE = 200
 #: Frames of a place, and of a block.
 PLACE, BLOCK = 50, 1 << 16
+#: Equal steps in which a map grows: after them it has as many segments as it ever has.
+STEPS = 127
 #: Bytes of a map from which inverted lists are made: never, and always.
 FLAT, LISTS = 1 << 62, 0
 
@@ -79,6 +82,35 @@ class SearchFigures:
     ratio: float
     held: float
     shared: float
+
+
+@dataclass(frozen=True)
+class GrowthFigures:
+    """Of a map that grew to `frames` in STEPS equal steps; milliseconds.
+
+    `segments` is how many it has in the end, `written` the bytes of all files written on the way,
+    in times the size of the index in the end, and `share` what the median publication of the last
+    half writes of the index. `append` is the median time of these, `largest` that of the dearest;
+    `whole`, the median of five, writes all of it anew, and `append_ratio` is `append` over `whole`.
+    `search` is of the segments and `one` of the same frames in one segment, medians; `search_ratio`
+    is the median of the one over the other, in turn. `recall` and `recall_one` are the shares of
+    the ten nearest that these find.
+    """
+
+    frames: int
+    signature_bytes: int
+    segments: int
+    written: float
+    share: float
+    append: float
+    largest: float
+    whole: float
+    append_ratio: float
+    search: float
+    one: float
+    search_ratio: float
+    recall: float
+    recall_one: float
 
 
 def signatures(keys: NDArray[np.int64], length: int) -> Bytes:
@@ -164,6 +196,85 @@ def measure(
     )
 
 
+def measure_growth(
+    frames: int = 100_000, length: int | None = None, flat_bytes: int = FLAT, runs: int = 15
+) -> GrowthFigures:
+    """Let a map grow, publish it anew as a whole, and search both in turn; see `measure`."""
+    length = read_model(PRESETS[0]).signature_bytes if length is None else length
+    keys = np.arange(frames)
+    keys = keys[keys % PLACE != 0]  # the others are asked
+    step = len(keys) // STEPS
+    keys = keys[: STEPS * step]
+    rows, clock = signatures(keys, length), Clock()
+    queries = signatures((np.arange(runs) * len(keys) // runs) // PLACE * PLACE, length)
+
+    def published(folder: Path, previous: Generation | None, some: slice) -> Generation:
+        made = publish(
+            folder, model_id="bench", revision=0, blocks=[(keys[some], rows[some])],
+            previous=previous, flat_bytes=flat_bytes,
+        )  # fmt: skip
+        if made is None:
+            raise RuntimeError(f"{folder} is being built in")
+        return made
+
+    with tempfile.TemporaryDirectory() as name:
+        folder, made, known = Path(name), None, set[str]()
+        appends, written = list[float](), list[int]()
+        for first in range(0, len(keys), step):
+            before, some = made, slice(first, first + step)
+            made = clock.run("append", partial(published, folder / "map", before, some))
+            appends.append(clock.stages.pop("append"))
+            written.append(sum(size for file, size in made.manifest.files if file not in known))
+            known = {file for file, _ in made.manifest.files}
+        assert made is not None
+        wholes = list[float]()
+        for _ in range(5):
+            one = clock.run("whole", partial(published, folder / "one", None, slice(None)))
+            wholes.append(clock.stages.pop("whole"))
+        times, found = _in_turn(made, one, queries)
+    size, late = sum(size for _, size in made.manifest.files), STEPS // 2
+    median, append, whole = np.median(times, axis=0), median_of(appends[late:]), median_of(wholes)
+    return GrowthFigures(
+        frames=len(made),
+        signature_bytes=length,
+        segments=len(made.segments),
+        written=sum(written) / size,
+        share=median_of(written[late:]) / size,
+        append=append,
+        largest=max(appends),
+        whole=whole,
+        append_ratio=append / whole,
+        search=float(median[0]),
+        one=float(median[1]),
+        search_ratio=float(np.median(times[:, 0] / times[:, 1])),
+        recall=found[0],
+        recall_one=found[1],
+    )
+
+
+def median_of(values: Sequence[float]) -> float:
+    """Of some values."""
+    return float(np.median(values))
+
+
+def _in_turn(
+    several: Generation, one: Generation, queries: Bytes
+) -> tuple[NDArray[np.float64], tuple[float, float]]:
+    """Milliseconds (n, 2) of searches of two indexes of the same frames, and what each finds."""
+    times, found, none = [], [0.0, 0.0], Tail.empty(queries.shape[1])
+    for query in [queries[0], *queries]:  # the first warms up
+        right = set(search(query, one, none, 10, metric="l2", exact=True).keys.tolist())
+        own = list[float]()
+        for which, generation in enumerate((several, one)):
+            clock = Clock()
+            hits = clock.run("search", partial(search, query, generation, none, SIZE, metric="l2"))
+            own.append(clock.stages["search"])
+            found[which] += len(right & set(hits.keys[:10].tolist())) / 10
+        times.append(own)
+    share = found[0] / len(times), found[1] / len(times)
+    return np.array(times[1:]), share
+
+
 def _probed(folder: Path, queries: Bytes) -> list[float]:
     asked = folder.parent / "asked.npy"
     np.save(asked, queries)
@@ -194,16 +305,41 @@ def table(figures: list[SearchFigures]) -> list[str]:
     ]
 
 
+def growth_table(figures: list[GrowthFigures]) -> list[str]:
+    """The figures as lines of Markdown."""
+    return [
+        f"### An index that grows to its size in {STEPS} equal steps",
+        "",
+        "| frames | bytes | segments | written, times its size | an append writes of it "
+        "| append, ms: median, dearest | whole, ms | append / whole | search, ms: segments, one "
+        "| segments / one | recall@10: segments, one |",
+        "|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
+        *(
+            f"| {f.frames:,} | {f.signature_bytes} | {f.segments} | {f.written:.1f} "
+            f"| {f.share:.3f} | {f.append:.0f}, {f.largest:.0f} | {f.whole:.0f} "
+            f"| {f.append_ratio:.3f} | {f.search:.2f}, {f.one:.2f} | {f.search_ratio:.2f} "
+            f"| {f.recall:.4f}, {f.recall_one:.4f} |"
+            for f in figures
+        ),
+        "",
+    ]
+
+
 def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, nargs="+", default=[10_000, 100_000, 1_000_000])
     parser.add_argument("--lists", action="store_true", help="by inverted lists as well")
+    parser.add_argument("--growth", action="store_true", help="only what a growing index costs")
     parser.add_argument("--runs", type=int, default=15)
     options = parser.parse_args()
     pin_to_one_processor()
     kinds = (FLAT, LISTS) if options.lists else (FLAT,)
     sizes = [(n, kind) for kind in kinds for n in options.frames]
+    if options.growth:
+        grown = [measure_growth(n, flat_bytes=kind, runs=options.runs) for n, kind in sizes]
+        print("\n".join(growth_table(grown)))
+        return 0
     figures = [measure(n, flat_bytes=kind, runs=options.runs) for n, kind in sizes]
     print("\n".join(table(figures)))
     return 0

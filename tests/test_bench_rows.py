@@ -332,6 +332,20 @@ def test_a_search_is_compared_with_the_scan_of_all(flat_bytes: int) -> None:
     assert found.recall >= 0.995
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("flat_bytes", [search.FLAT, search.LISTS])
+def test_a_map_that_grew_is_compared_with_one_published_at_once(flat_bytes: int) -> None:
+    found = search.measure_growth(frames=1300, length=64, flat_bytes=flat_bytes, runs=3)
+    assert (found.frames, found.segments) == (127 * (1300 * 49 // 50 // 127), 4)
+    assert 4 < found.written < 12  # lists are written too
+    assert 0 < found.share < 0.2
+    assert found.append_ratio == found.append / found.whole > 0
+    assert min(found.largest, found.search, found.one, found.search_ratio) > 0
+    assert found.recall == found.recall_one == 1
+    (row,) = [line for line in search.growth_table([found]) if line.startswith("| 1,")]
+    assert row.startswith(f"| {found.frames:,} | 64 | 4 | {found.written:.1f} |")
+
+
 def test_signatures_of_a_place_are_near_each_other() -> None:
     rows = search.signatures(np.arange(200), 448)
     assert rows.dtype == np.uint8

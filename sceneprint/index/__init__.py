@@ -3,10 +3,11 @@
     blocks of (keys, signatures)  --publish-->  Generation --\\
     frames newer than that        ----------->  Tail       ---+--search-->  Hits
 
-A generation is numbered and never changes: the signatures of the map, in a FAISS file that all
-processes of a machine share in memory. A search compares all of them; only a map of more than
-`generation.FLAT_BYTES` has an inverted file, which chooses what is compared. The database is the
-truth: deleting the folder loses nothing but the time to publish it again.
+A generation is numbered and never changes: the signatures of the map in a few segments, each a
+FAISS file that all processes of a machine share in memory, and that the next generation most often
+shares too. A search compares all of them; only a map of more than `segment.FLAT_BYTES` has inverted
+files, which choose what is compared. The database is the truth: deleting the folder loses nothing
+but the time to publish it again.
 """
 
 from sceneprint.index.generation import (

@@ -1,49 +1,48 @@
 """Generations: one published state of the cache, opened, searched with newer frames, and published.
 
-What is published is what stays of the generation before and what is new, in the order of the keys.
-Every file is durable before the manifest that names it, and the manifest comes last: a builder
-killed at any moment leaves the generation before, and files that the next builder removes.
+A generation is a list of segments. The next one adds a segment of what is new, and merges some;
+most files stay what they are. Every file is durable before the manifest that names it, and the
+manifest comes last: a builder killed at any moment leaves the generation before, and files that
+the next builder removes.
 """
 
 from __future__ import annotations
 
 import logging
-import mmap
-import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.atomic_files import create_private
 from sceneprint.errors import DamagedIndex
 from sceneprint.geometry.retrieval.ranking import Metric, distances
-from sceneprint.index import faiss_index, generation_files
-from sceneprint.index.faiss_index import Lists, codes_of, map_index, map_lists, nearest
+from sceneprint.index import generation_files
 from sceneprint.index.generation_files import (
-    BLOCK_BYTES,
     Block,
     GenerationManifest,
     Keys,
-    Recall,
+    SegmentFiles,
     building,
-    check_block,
     is_ours,
     manifests,
-    put,
     read_manifest,
-    unfinished,
     write_manifest,
 )
+from sceneprint.index.segment import (
+    FLAT_BYTES,
+    Places,
+    Segment,
+    list_threshold,
+    merge_plan,
+    open_segment,
+    segment_sources,
+    spool_blocks,
+    write_segment,
+)
 from sceneprint.types import Bytes
-
-if TYPE_CHECKING:
-    from faiss import IndexScalarQuantizer
-
 
 log = logging.getLogger(__name__)
 
@@ -56,21 +55,17 @@ class Generation:
 
     Parameters
     ----------
-    manifest : see Manifest
-    keys : (N,) int64 of the frames, rising
-    index : of FAISS, over their signatures in the same order
-    lists : the inverted file of a very large map; None where all of it is compared
+    manifest : see GenerationManifest
+    segments : that together hold each frame once
     inodes : of the files by their names: another may have taken a name since
     """
 
-    manifest: generation_files.GenerationManifest
-    keys: generation_files.Keys
-    index: IndexScalarQuantizer
-    lists: Lists | None
+    manifest: GenerationManifest
+    segments: tuple[Segment, ...]
     inodes: Mapping[str, int]
 
     def __len__(self) -> int:
-        return len(self.keys)
+        return sum(len(one) for one in self.segments)
 
     @property
     def number(self) -> int:
@@ -93,30 +88,67 @@ class Generation:
         return self.manifest.model_id
 
     @cached_property
-    def vectors(self) -> Bytes:
-        """Signatures (N, D) uint8 where they are mapped, read-only, in the order of the keys."""
-        return codes_of(self.index)
+    def keys(self) -> Keys:
+        """Of the frames (N,), rising."""
+        standing = [one.keys[one.standing_rows(one.gone)] for one in self.segments]
+        return np.sort(np.concatenate([np.empty(0, np.int64), *standing]))
 
-    @cached_property
-    def places(self) -> Places:
-        """Rows of the frames by their keys."""
-        return Places(self.keys)
+    def has(self, keys: Keys) -> NDArray[np.bool_]:
+        """Which frames (n,) it holds."""
+        held = np.zeros(len(keys), np.bool_)
+        for one in self.segments:
+            held |= one.rows_of(keys) >= 0
+        return held
 
-    def vectors_of(self, keys: generation_files.Keys) -> Bytes:
+    def holds_any(self, keys: Keys) -> bool:
+        """Whether a signature of one of these frames is in its files, or of any that is gone."""
+        rising = np.sort(keys)
+        return any(len(one.gone) or len(one.places.found(rising)) for one in self.segments)
+
+    def vectors_of(self, keys: Keys) -> Bytes:
         """Signatures (r, D) of some frames, a copy.
 
         Raises
         ------
         ValueError : there is no such frame in it.
         """
-        at = self.places.of(keys)
-        if (at < 0).any():
-            raise ValueError(f"no frames {keys[at < 0][:5].tolist()} in this index")
-        return self.vectors[at]
+        result = np.empty((len(keys), self.manifest.dimension), np.uint8)
+        for one, at, rows in self._located(keys):
+            result[at] = one.vectors[rows]
+        return result
+
+    def distances_to(self, query: Bytes, keys: Keys) -> NDArray[np.int64]:
+        """Exact distances (r,) of a signature (D,) to some frames.
+
+        Raises
+        ------
+        ValueError : there is no such frame in it.
+        """
+        result = np.empty(len(keys), np.int64)
+        for one, at, rows in self._located(keys):
+            result[at] = distances(query, one.vectors, "l2", rows)
+        return result
+
+    def _located(self, keys: Keys) -> list[tuple[Segment, NDArray[np.intp], NDArray[np.int64]]]:
+        """Segments, the places in `keys` of the frames that each holds, and their rows there."""
+        found, missing = [], np.ones(len(keys), np.bool_)
+        for one in self.segments:
+            rows = one.rows_of(keys)
+            at = np.flatnonzero(rows >= 0)
+            missing[at] = False
+            found.append((one, at, rows[at]))
+        if missing.any():
+            raise ValueError(f"no frames {keys[missing][:5].tolist()} in this index")
+        return found
 
 
 def newest(
-    folder: Path, model_id: str, dimension: int, *, known: Generation | None = None
+    folder: Path,
+    model_id: str,
+    dimension: int,
+    *,
+    known: Generation | None = None,
+    sound: Mapping[str, int] | None = None,
 ) -> Generation | None:
     """Open the newest sound generation of a folder.
 
@@ -129,6 +161,7 @@ def newest(
     model_id, dimension : of the signatures; generations of others are passed over
     known : a generation of this folder that is open: files that it has are not verified again,
         and where it is the newest it is returned itself
+    sound : inodes, by name, of files that this process has verified before
 
     Returns
     -------
@@ -140,7 +173,7 @@ def newest(
             try:
                 manifest = generation_files.read_manifest(path)
                 if (manifest.model_id, manifest.dimension) == (model_id, dimension):
-                    found = open_generation(folder, manifest, known)
+                    found = open_generation(folder, manifest, known, sound)
                     break
             except DamagedIndex as error:
                 errors.append(error)
@@ -152,39 +185,41 @@ def newest(
 
 
 def open_generation(
-    folder: Path, manifest: generation_files.GenerationManifest, known: Generation | None = None,
-    written: Mapping[str, int] | None = None,
+    folder: Path, manifest: GenerationManifest, known: Generation | None = None,
+    sound: Mapping[str, int] | None = None,
 ) -> Generation:  # fmt: skip
     """Open the files of a generation.
 
     Parameters
     ----------
     folder, manifest : of the generation
-    known : see `newest`
-    written : inodes, by name, of files that were verified as they were written
+    known, sound : see `newest`
 
     Raises
     ------
     DamagedIndex : one of them is missing or damaged.
     """
-    sound = {} if known is None else dict(known.inodes)
+    verified = {**(known.inodes if known is not None else {}), **(sound or {})}
     inodes = {name: _inode(folder / name) for name, _ in manifest.files}
     if known is not None and known.manifest == manifest and known.inodes == inodes:
         return known
-    sound.update(written or {})
     for name, size in manifest.files:
-        if inodes[name] != sound.get(name, -1):
+        if inodes[name] != verified.get(name, -1):
             for _ in generation_files.check(folder, name, size):
                 pass
-    names = {name.rpartition(".")[2]: folder / name for name, _ in manifest.files}
-    keys = np.frombuffer(generation_files.mapped(names["keys"]), "<i8")
-    if (keys[1:] <= keys[:-1]).any():
-        raise DamagedIndex(f"{names['keys']}: its keys are not in order.")
-    n, lists = len(keys), None
-    index = map_index(names["faiss"], n, manifest.dimension)
-    if "lists" in names:
-        lists = map_lists(names["lists"], n, manifest.dimension, manifest.recall.probes)
-    return Generation(manifest, keys, index, lists, inodes)
+    # what is open already has its rows by key, and its pages, at hand
+    open_ones = {} if known is None else {one.record: one for one in known.segments}
+    segments = tuple(
+        open_ones[record]
+        if record in open_ones and known is not None and _same(known.inodes, inodes, record)
+        else open_segment(folder, record, manifest.dimension)
+        for record in manifest.segments
+    )
+    return Generation(manifest, segments, inodes)
+
+
+def _same(known: Mapping[str, int], inodes: Mapping[str, int], record: SegmentFiles) -> bool:
+    return all(known[name] == inodes[name] for name, _ in record.files)
 
 
 def _inode(path: Path) -> int:
@@ -197,7 +232,7 @@ def _inode(path: Path) -> int:
 
 # Search: the nearest frames of a map by exact distance of signatures, Sec. III-C.
 #
-# The tail is compared whole, and so is a generation; of one with an inverted file only the lists
+# The tail is compared whole, and so is each segment; of one with an inverted file only the lists
 # that are nearest to the query. What they miss is missed, and measured when it is published.
 
 # Tails: frames newer than a generation, held in memory and always compared exactly.
@@ -219,7 +254,7 @@ class Tail:
     ValueError : other arrays, or a key that is there twice.
     """
 
-    keys: generation_files.Keys
+    keys: Keys
     signatures: Bytes
 
     def __post_init__(self) -> None:
@@ -239,8 +274,16 @@ class Tail:
         """Rows of the frames by their keys."""
         return Places(self.keys)
 
+    def rows_among(self, gone: Keys, among: Keys | None) -> NDArray[np.int64]:
+        """Rows of the frames among some, None for all, that are not gone; both lists rise."""
+        free = np.full(len(self), among is None)
+        if among is not None:
+            free[self.places.found(among)] = True
+        free[self.places.found(gone)] = False
+        return np.flatnonzero(free)
 
-def signatures_of(keys: generation_files.Keys, generation: Generation | None, tail: Tail) -> Bytes:
+
+def signatures_of(keys: Keys, generation: Generation | None, tail: Tail) -> Bytes:
     """Signatures of some frames: of the hits of a search, to compare them among each other.
 
     Parameters
@@ -283,15 +326,6 @@ def check_lengths(dimension: int, generation: Generation | None, tail: Tail) -> 
         raise ValueError(f"signatures of {sorted(found)} bytes where {dimension} were expected")
 
 
-#: Where fewer than one in this many frames may be found, they are compared one by one: FAISS reads
-#: all of them.
-FEW = 8
-#: Longest answer that FAISS gives: of a longer one, ordering costs more than comparing.
-LONGEST = 2048
-
-Found = tuple[NDArray[np.int64], NDArray[np.int64]]
-
-
 @dataclass(frozen=True, eq=False)
 class SearchHits:
     """The nearest frames that a search found.
@@ -304,7 +338,7 @@ class SearchHits:
     compared : frames whose exact distance was computed
     """
 
-    keys: generation_files.Keys
+    keys: Keys
     distances: NDArray[np.int64]
     exact: bool
     compared: int
@@ -321,7 +355,7 @@ def search(
     *,
     metric: Metric,
     dead: frozenset[int] = frozenset(),
-    among: generation_files.Keys | None = None,
+    among: Keys | None = None,
     exact: bool = False,
 ) -> SearchHits:
     """Find the nearest frames of a map. Any number of threads may search one generation.
@@ -344,71 +378,26 @@ def search(
     if query.ndim != 1 or query.dtype != np.uint8 or size < 0:
         raise ValueError(f"{size} for a query {query.dtype} {query.shape}")
     check_lengths(len(query), generation, tail)
-    gone = np.fromiter(dead, np.int64, len(dead))
-    alive = np.flatnonzero(_free(tail, gone, among))
-    keys, found, whole = tail.keys[alive], distances(query, tail.signatures, metric, alive), True
-    compared = len(alive)
+    gone = np.sort(np.fromiter(dead, np.int64, len(dead)))
+    among = None if among is None else np.sort(among)
+    alive = tail.rows_among(gone, among)
+    keys, whole, compared = [tail.keys[alive]], True, len(alive)
+    found = [distances(query, tail.signatures, metric, alive)]
     if generation is not None and len(generation):
         if metric != "l2":
             raise ValueError(f"an index of metric 'l2' searched by {metric!r}")
-        free = _free(generation, np.concatenate([gone, tail.keys]), among)
-        count = int(free.sum())
-        own, whole = _candidates(query, generation, free, count, size, exact)
-        compared += count if own is None else len(own)
-        rows, distant = _compared(query, generation, free, count, size, own)
-        keys = np.concatenate([keys, generation.keys[rows]])
-        found = np.concatenate([found, distant])
-    first = _nearest(keys, found, size)
-    return SearchHits(keys[first], found[first], whole, compared)
+        gone = np.sort(np.concatenate([gone, tail.keys]))
+        for one in generation.segments:
+            (own, distant), all_of_it, count = one.nearest(query, size, gone, among, exact=exact)
+            keys.append(own)
+            found.append(distant)
+            whole, compared = whole and all_of_it, compared + count
+    every, distant = np.concatenate(keys), np.concatenate(found)
+    first = _nearest(every, distant, size)
+    return SearchHits(every[first], distant[first], whole, compared)
 
 
-def _free(
-    part: Generation | Tail, gone: generation_files.Keys, among: generation_files.Keys | None
-) -> NDArray[np.bool_]:
-    """Which frames of a part may be found: those among the given ones that are not gone."""
-    free = np.full(len(part), among is None)
-    if among is not None:
-        free[_known(part.places, among)] = True
-    if len(gone):
-        free[_known(part.places, gone)] = False
-    return free
-
-
-def _known(places: Places, keys: generation_files.Keys) -> NDArray[np.int64]:
-    at = places.of(keys)
-    return at[at >= 0]
-
-
-def _candidates(
-    query: Bytes, generation: Generation, free: NDArray[np.bool_], count: int, size: int,
-    exact: bool,
-) -> tuple[NDArray[np.int64] | None, bool]:  # fmt: skip
-    """Rows that are compared one by one, None for all that are free; and whether these are all."""
-    if count < len(generation) // FEW:
-        return np.flatnonzero(free), True
-    if generation.lists is None or exact:
-        return None, True
-    all_free = count == len(generation)
-    rows = generation.lists.candidates(query, min(size, count), None if all_free else free)
-    return rows, len(rows) == count
-
-
-def _compared(
-    query: Bytes, generation: Generation, free: NDArray[np.bool_], count: int, size: int,
-    rows: NDArray[np.int64] | None,
-) -> Found:  # fmt: skip
-    """Rows among which the nearest are, and their distances."""
-    if rows is None and size <= LONGEST:
-        all_free = count == len(generation)
-        found = nearest(generation.index, query, min(size, count), None if all_free else free)
-        if found is not None:
-            return found
-    if rows is None:
-        rows = np.flatnonzero(free)
-    return rows, distances(query, generation.vectors, "l2", rows)
-
-
-def _nearest(keys: generation_files.Keys, found: NDArray[np.int64], size: int) -> NDArray[np.intp]:
+def _nearest(keys: Keys, found: NDArray[np.int64], size: int) -> NDArray[np.intp]:
     """Places of the smallest `size`, rising, ties by key."""
     size = min(size, len(keys))
     if size == 0:
@@ -420,23 +409,6 @@ def _nearest(keys: generation_files.Keys, found: NDArray[np.int64], size: int) -
 
 
 # Publication.
-
-#: Bytes of signatures up to which a map has no inverted file: comparing all takes a fifth of a
-#: second.
-FLAT_BYTES = 1 << 30
-
-
-@dataclass(frozen=True, eq=False)
-class Draft:
-    """Signatures of a generation to be, in memory: `keys` (N,), rising, and `vectors` (N, D).
-
-    `before` (N,) are their rows in the generation before; -1 where they are new.
-    """
-
-    keys: Keys
-    before: NDArray[np.int64]
-    index: IndexScalarQuantizer
-    vectors: Bytes
 
 
 def publish(
@@ -455,9 +427,10 @@ def publish(
 ) -> Generation | None:
     """Publish the generation that follows `previous`.
 
-    One process builds in a folder at a time. The two newest generations are kept, and files of
-    older ones removed; readers that hold them go on undisturbed. Memory holds the signatures once,
-    and the disk once more than what is published.
+    One process builds in a folder at a time. The two newest generations are kept, and files that
+    only older ones need removed; readers that hold them go on undisturbed. What is new is written,
+    and the segments that it is merged with; all others stay. Memory holds the signatures of what
+    is written, one segment at a time.
 
     Parameters
     ----------
@@ -494,22 +467,14 @@ def publish(
         if not mine or _overtaken(folder, previous):
             return None
         listed = manifests(folder)
-        draft = _draft(folder, previous, blocks, drop)
-        lists, recall = _lists(draft, previous, clean, flat_bytes)
-        files = [
-            put(folder, "keys", lambda take: take(draft.keys.astype("<i8").tobytes())),
-            put(folder, "faiss", lambda take: faiss_index.write_index(draft.index, take)),
-        ]
-        if lists is not None:
-            files.append(put(folder, "lists", lambda take: faiss_index.write_lists(lists, take)))
+        records, dimension = _write_segments(folder, previous, blocks, drop, clean, flat_bytes)
         manifest = GenerationManifest(
             number=max(after, listed[0][0] if listed else 0) + 1,
             revision=revision,
             model_id=model_id,
-            dimension=draft.vectors.shape[1],
+            dimension=dimension,
             anchor=anchor(),
-            files=tuple(files),
-            recall=recall,
+            segments=records,
         )
         if not share(manifest):
             remove_unneeded(folder)
@@ -518,8 +483,28 @@ def publish(
         if previous is not None:  # known to be sound, whatever lies between
             listed = [each for each in listed if each[0] == previous.number]
         _clean(folder, {own, *(path for _, path in listed[: 0 if clean else 1])})
-        written = {name: (folder / name).stat().st_ino for name, _ in files}
-        return open_generation(folder, manifest, written=written)
+        before = {} if previous is None else previous.inodes
+        written = {name: _inode(folder / name) for name, _ in manifest.files if name not in before}
+        return open_generation(folder, manifest, previous, written)
+
+
+def _write_segments(
+    folder: Path, previous: Generation | None, blocks: Iterable[Block], drop: frozenset[int],
+    clean: bool, flat_bytes: int,
+) -> tuple[tuple[SegmentFiles, ...], int]:  # fmt: skip
+    """Write what is new and what it is merged with; all segments, and bytes of a signature."""
+    dimension = None if previous is None else previous.manifest.dimension
+    new_keys, stored = spool_blocks(folder, blocks, dimension)
+    if previous is None and len(new_keys) == 0:
+        raise ValueError("a generation of no frames that follows none")
+    sources = segment_sources(() if previous is None else previous.segments, new_keys, stored, drop)
+    most = list_threshold(sources, flat_bytes)
+    groups = merge_plan([len(each) for each in sources])
+    records = tuple(
+        write_segment(folder, [sources[at] for at in group], clean=clean, flat_bytes=most)
+        for group in reversed(groups)
+    )
+    return records, dimension or stored.shape[1]
 
 
 def clear(folder: Path, but: int | None = None) -> bool:
@@ -556,75 +541,6 @@ def _overtaken(folder: Path, previous: Generation | None) -> bool:
     return found is None or found.number != previous.number
 
 
-def _draft(
-    folder: Path, previous: Generation | None, blocks: Iterable[Block], drop: frozenset[int]
-) -> Draft:
-    """Merge what stays of the generation before with what is new."""
-    none = np.empty(0, np.int64)
-    dimension = None if previous is None else previous.manifest.dimension
-    new_keys, stored = _spooled(folder, blocks, dimension)
-    if previous is None and len(new_keys) == 0:
-        raise ValueError("a generation of no frames that follows none")
-    Places(new_keys)  # raises where a key is there twice
-    old_keys = none if previous is None else previous.keys
-    gone = np.fromiter(drop, np.int64, len(drop))
-    kept = np.flatnonzero(~np.isin(old_keys, np.concatenate([gone, new_keys])))
-    new = np.flatnonzero(~np.isin(new_keys, gone))
-    keys = np.concatenate([old_keys[kept], new_keys[new]])
-    order = np.argsort(keys)
-    before = np.concatenate([kept, np.full(len(new), -1)])[order]
-    spooled = np.concatenate([np.full(len(kept), -1), new])[order]
-    index, vectors = faiss_index.allocate(len(keys), stored.shape[1])
-    step = max(BLOCK_BYTES // stored.shape[1], 1)
-    for start in range(0, len(keys), step):
-        rows = slice(start, start + step)
-        is_new = before[rows] < 0
-        vectors[rows][is_new] = stored[spooled[rows][is_new]]
-        if previous is not None:
-            vectors[rows][~is_new] = previous.vectors[before[rows][~is_new]]
-    return Draft(keys[order], before, index, vectors)
-
-
-def _spooled(folder: Path, blocks: Iterable[Block], dimension: int | None) -> tuple[Keys, Bytes]:
-    """Keys (n,) and signatures (n, D) as they come: in a file without a name, not in memory."""
-    keys, path = [np.empty(0, np.int64)], unfinished(folder)
-    with os.fdopen(create_private(path), "w+b") as file:
-        path.unlink()
-        for own, signatures in blocks:
-            if dimension is not None and signatures.ndim == 2 and signatures.shape[1] != dimension:
-                lengths = sorted({dimension, signatures.shape[1]})
-                raise ValueError(f"signatures of {lengths} bytes in one map")
-            check_block(own, signatures, signatures.shape[-1])
-            dimension = signatures.shape[1]
-            file.write(np.ascontiguousarray(signatures).data)
-            keys.append(own)
-        file.flush()
-        found = np.concatenate(keys)
-        if len(found) == 0:
-            return found, np.empty((0, dimension or 1), np.uint8)
-        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    return found, np.frombuffer(data, np.uint8).reshape(len(found), -1)
-
-
-def _lists(
-    draft: Draft, previous: Generation | None, clean: bool, flat_bytes: int
-) -> tuple[faiss_index.Lists | None, Recall]:
-    """The inverted file, where the signatures are so many, and what a search finds by it."""
-    n = len(draft.keys)
-    if draft.vectors.nbytes <= flat_bytes:
-        return None, Recall(1.0, faiss_index.NEAR, 0, 0, n)
-    known = None if previous is None else previous.lists
-    if previous is None or known is None or n >= faiss_index.GROWTH * known.trained_on:
-        return faiss_index.measure_lists(faiss_index.train_lists(draft.vectors), draft.vectors)
-    lists = faiss_index.extend_lists(known, draft.vectors, draft.before)
-    if clean or np.count_nonzero(draft.before >= 0) < len(previous):
-        # the centroid of a list of one frame is that frame: none may outlive what is deleted
-        lists = faiss_index.centre_lists(lists, draft.vectors)
-    if not clean and faiss_index.still_holds(previous.manifest.recall, n):
-        return replace(lists, probes=known.probes), previous.manifest.recall
-    return faiss_index.measure_lists(lists, draft.vectors)
-
-
 def _clean(folder: Path, kept: set[Path]) -> None:
     """Remove all manifests but some, and every file that none of these needs."""
     needed = {name for path in kept for name, _ in _files(path)}
@@ -641,34 +557,3 @@ def _files(path: Path) -> tuple[tuple[str, int], ...]:
         return read_manifest(path).files
     except DamagedIndex:  # it was not sound, and nothing will be read by it
         return ()
-
-
-class Places:
-    """The places of keys in a list, found by bisection.
-
-    Parameters
-    ----------
-    keys : (n,) in their order; a rising list is not copied
-
-    Raises
-    ------
-    ValueError : a key is there twice.
-    """
-
-    def __init__(self, keys: Keys) -> None:
-        self._order: NDArray[np.intp] | None = None
-        self._rising = keys
-        if (keys[1:] <= keys[:-1]).any():
-            self._order = np.argsort(keys)
-            self._rising = keys[self._order]
-            again = self._rising[1:] == self._rising[:-1]
-            if again.any():
-                raise ValueError(f"the keys {self._rising[1:][again][:5].tolist()} are there twice")
-
-    def of(self, keys: Keys) -> NDArray[np.int64]:
-        """Places (m,) of keys (m,); -1 for a key that is not there."""
-        if len(self._rising) == 0:
-            return np.full(len(keys), -1, np.int64)
-        at = np.minimum(np.searchsorted(self._rising, keys), len(self._rising) - 1)
-        places = at if self._order is None else self._order[at]
-        return np.where(self._rising[at] == keys, places, -1)

@@ -1,5 +1,5 @@
 """Files of a cache folder, each named by the SHA-256 of what it holds, the folder's lock, and the
-manifests that say what a generation consists of.
+manifests that say which segments a generation consists of, and each segment of which files.
 
 A name that is the checksum needs no second place to keep it: a manifest that lists names lists
 checksums, a file that two generations share is one file, and no file ever changes.
@@ -34,15 +34,13 @@ from sceneprint.atomic_files import (
 from sceneprint.errors import DamagedIndex
 from sceneprint.types import Bytes
 
-#: What the keys, the FAISS index and the inverted file of a generation are called.
-KINDS = ("keys", "faiss", "lists")
+#: What the keys, the FAISS index, the inverted file and the deleted keys of a segment are called.
+KINDS = ("keys", "faiss", "lists", "gone")
 #: Bytes that are read at once where a file is checked.
 BLOCK_BYTES = 8 << 20
 _NAME = re.compile(rf"[0-9a-f]{{64}}\.({'|'.join(KINDS)})")
-#: What version 0.1 left, manifests too, and what a killed builder left.
-_LEFT = re.compile(
-    r"[0-9a-f]{64}\.(segment|rows|code)|\d{10}-[0-9a-f]{32}\.json|\.[0-9a-f]{12}\.part"
-)
+#: What a killed builder left.
+_LEFT = re.compile(r"\.[0-9a-f]{12}\.part")
 
 
 def is_name(name: str, kind: str) -> bool:
@@ -204,18 +202,19 @@ def draw(n: int, limit: int, seed: int) -> NDArray[np.int64]:
 # Manifests: what a generation consists of. It exists from the moment its manifest has its name.
 #
 # A manifest is JSON, called by the number of the generation, the SHA-256 of its own bytes, and its
-# schema: those of another schema are nobody's, and the next builder removes them.
+# schema. Each schema has folders of its own, here and in an object store: two versions of the
+# product beside each other neither read nor remove what the other made.
 
 #: Of the files of a generation and of what they mean. Raise it when either changes.
-SCHEMA_VERSION = 2
-#: A manifest names three files at most; a larger file is refused unread.
+SCHEMA_VERSION = 3
+#: A manifest names four files of each segment at most; a larger file is refused unread.
 MAXIMUM_BYTES = 1 << 16
 _MANIFEST = re.compile(rf"(\d{{10}})-([0-9a-f]{{32}})\.{SCHEMA_VERSION}\.json")
 
 
 @dataclass(frozen=True)
 class Recall:
-    """What a search of a generation finds.
+    """What a search of a segment, or of a generation, finds.
 
     Parameters
     ----------
@@ -224,7 +223,7 @@ class Recall:
     sample : frames that were looked up, each without itself; 0 where a search compares every
         frame, so that there is nothing to miss
     probes : lists of the inverted file that a search compares; 0 where there is none
-    frames : of the generation that was measured, which may be an earlier one
+    frames : of the segment that was measured, which may be an earlier one
     """
 
     share: float
@@ -232,6 +231,31 @@ class Recall:
     sample: int
     probes: int
     frames: int
+
+
+@dataclass(frozen=True)
+class SegmentFiles:
+    """What a segment consists of.
+
+    Parameters
+    ----------
+    files : (name, bytes) of its keys, of the FAISS index of their signatures, of their inverted
+        file, if there is one, and of the keys that count no longer, if there are any
+    recall : as measured when it, or one that it grew from and that was about as large, was written
+    """
+
+    files: tuple[tuple[str, int], ...]
+    recall: Recall
+
+    @property
+    def frames(self) -> int:
+        """How many of its frames count."""
+        sizes = {kind: 0 if (one := self.file(kind)) is None else one[1] for kind in KINDS}
+        return (sizes["keys"] - sizes["gone"]) // 8
+
+    def file(self, kind: str) -> tuple[str, int] | None:
+        """The file of a kind, by name and bytes; None where there is none."""
+        return next((each for each in self.files if is_name(each[0], kind)), None)
 
 
 @dataclass(frozen=True)
@@ -245,8 +269,7 @@ class GenerationManifest:
     model_id : of the model that signed them
     dimension : D, bytes of a signature
     anchor : what whoever published it will know the state of the database by
-    files : (name, bytes) of every file; a name is a checksum
-    recall : as measured when it, or one before it that had about as many frames, was published
+    segments : that together hold each frame once; a frame counts in one of them only
     """
 
     number: int
@@ -254,18 +277,39 @@ class GenerationManifest:
     model_id: str
     dimension: int
     anchor: str
-    files: tuple[tuple[str, int], ...]
-    recall: Recall
+    segments: tuple[SegmentFiles, ...]
+
+    @property
+    def files(self) -> tuple[tuple[str, int], ...]:
+        """(name, bytes) of every file, each once; a name is a checksum."""
+        return tuple(dict.fromkeys(each for one in self.segments for each in one.files))
 
     @property
     def frames(self) -> int:
         """How many it holds."""
-        found = self.file("keys")
-        return 0 if found is None else found[1] // 8
+        return sum(one.frames for one in self.segments)
 
-    def file(self, kind: str) -> tuple[str, int] | None:
-        """The file of a kind, by name and bytes; None where there is none."""
-        return next((each for each in self.files if is_name(each[0], kind)), None)
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Names of the files of the keys, of those too that count no longer."""
+        return tuple(name for name, _ in self.files if is_name(name, "keys"))
+
+    @property
+    def worn_keys(self) -> tuple[str, ...]:
+        """Names of the files of the keys of those segments of which some frames are gone."""
+        return tuple(one.files[0][0] for one in self.segments if one.file("gone") is not None)
+
+    @property
+    def recall(self) -> Recall:
+        """What a search finds: the least of its segments."""
+        each = [one.recall for one in self.segments]
+        return Recall(
+            share=min((one.share for one in each), default=1.0),
+            near=max((one.near for one in each), default=0),
+            sample=sum(one.sample for one in each),
+            probes=sum(one.probes for one in each),
+            frames=sum(one.frames for one in each),
+        )
 
 
 def manifests(folder: Path) -> list[tuple[int, Path]]:
@@ -339,15 +383,19 @@ def decode_manifest(path: Path, data: bytes) -> GenerationManifest:
         record: dict[str, Any] = json.loads(data)
         if record.pop("schema_version") != SCHEMA_VERSION:
             raise DamagedIndex(f"{path}: of another schema than {SCHEMA_VERSION}.")
-        record["files"] = tuple((str(name), int(size)) for name, size in record["files"])
-        record["recall"] = Recall(**record["recall"])
+        record["segments"] = tuple(_decode_segment(**each) for each in record["segments"])
         manifest = GenerationManifest(**record)
     except (ValueError, TypeError, KeyError) as error:
         raise DamagedIndex(f"{path}: no manifest ({error}).") from error
-    kinds = [kind for kind in KINDS if manifest.file(kind) is not None]
-    if len(kinds) != len(manifest.files) or kinds[:2] != ["keys", "faiss"]:
-        raise DamagedIndex(f"{path}: names files that no generation has.")
+    for one in manifest.segments:
+        kinds = [kind for kind in KINDS if one.file(kind) is not None]
+        if len(kinds) != len(one.files) or kinds[:2] != ["keys", "faiss"]:
+            raise DamagedIndex(f"{path}: names files that no segment has.")
     return manifest
+
+
+def _decode_segment(files: list[list[Any]], recall: dict[str, Any]) -> SegmentFiles:
+    return SegmentFiles(tuple((str(name), int(size)) for name, size in files), Recall(**recall))
 
 
 def scrub(folder: Path) -> Iterator[Path | None]:

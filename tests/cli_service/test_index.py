@@ -93,10 +93,11 @@ def test_recall_counts_what_an_inverted_file_misses(
     with Engine(Settings(data_dir=data)) as engine:
         stats = indexes.describe_index(engine, "hall", 20, seed=3)
     generation, none, hits = generation_of(data), Tail.empty(LENGTH), 0
+    vectors = generation.vectors_of(generation.keys)
     for i in draw(N, 20, 3):
-        row, own = generation.vectors[i], frozenset([int(generation.keys[i])])
+        row, own = vectors[i], frozenset([int(generation.keys[i])])
         near = search(row, generation, none, 10, metric="l2", dead=own)
-        exact = ((generation.vectors.astype(int) - row) ** 2).sum(1)
+        exact = ((vectors.astype(int) - row) ** 2).sum(1)
         limit = np.sort(np.delete(exact, i))[9]
         hits += int((near.distances <= limit).sum())
     assert stats.recall == hits / 200

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 from sqlalchemy import select
@@ -17,14 +21,15 @@ from sqlalchemy import select
 from benchmarks.fleet.s3 import ObjectServer
 from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index, shared_index
-from sceneprint.engine.search.local_index import index_folder
+from sceneprint.engine.search.local_index import earlier_folder, index_folder
 from sceneprint.engine.search.shared_index import IN_USE_S, SharedIndexes
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import BusyIndex, DamagedIndex, UnusableStore
-from sceneprint.index import manifests
+from sceneprint.index import Generation, clear, manifests, newest, publish
 from sceneprint.index.generation_files import building
 from sceneprint.settings import Settings
 from sceneprint.store.blobs.object_client import Objects, open_objects
+from sceneprint.store.events import anchor_of_now
 from sceneprint.store.maps import find_map
 from sceneprint.store.postgres.connection import index_turn
 from sceneprint.store.tables import MapRow, frames, signatures
@@ -157,6 +162,185 @@ def test_a_host_goes_on_from_what_another_built(
     head = shared(built).head(row_of(built))
     assert head is not None
     assert (head.number, head.frames) == (2, 8)
+
+
+@pytest.fixture
+def append(place: str) -> Callable[..., Generation]:
+    """Publish and share signatures that no frame has, as the next generation of map "hall"."""
+
+    def run(engine: Engine, n: int, drop: frozenset[int] = frozenset(), **more: Any) -> Generation:
+        row, folder = row_of(engine), folder_of(engine)
+        previous = newest(folder, row.model_id, 448)
+        first = 0 if previous is None else int(previous.keys[-1]) + 1
+        rows = np.random.default_rng(first).integers(0, 256, (n, 448), np.uint8)
+        made = publish(
+            folder, model_id=row.model_id, revision=row.revision, previous=previous, drop=drop,
+            blocks=[(np.arange(first, first + n), rows)], after=shared(engine).newest_number(row),
+            anchor=partial(anchor_of_now, engine.store.database, "hall"),
+            share=lambda manifest: shared(engine).share(folder, manifest), **more,
+        )  # fmt: skip
+        assert made is not None
+        return made
+
+    return run
+
+
+def test_an_append_puts_and_fetches_what_is_new(
+    make_engine: Make, append: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Counted by the server: a sixteenth more is two files and a manifest, and a sixteenth more."""
+    with ObjectServer(log=tmp_path / "log") as server:
+        for name, value in server.env.items():
+            monkeypatch.setenv(name, value)
+        given: dict[str, Any] = {
+            "database_url": f"sqlite:///{tmp_path}/own.db", "blob_url": f"file://{tmp_path}/common",
+            "index_url": f"{server.bucket('segments')}/fleet",
+        }  # fmt: skip
+        (tmp_path / "common" / "blobs").mkdir(parents=True)
+        one, two = (make_engine(tmp_path / name, **given) for name in ("one", "two"))
+        one.create_map(NewMap(name="hall", model="depth"))
+        row, objects = row_of(one), open_objects(given["index_url"])
+
+        def stored() -> dict[str, int]:
+            return {each.key: each.size for each in objects.list("index/")}
+
+        def asked(do: Callable[[], object]) -> Counter[str]:
+            before = server.requests()
+            do()
+            return server.requests() - before
+
+        for n in (1600, 400):
+            append(one, n)
+        shared(two).sync(row)
+        before = stored()
+        puts = asked(lambda: append(one, 125))
+        new = {key: size for key, size in stored().items() if key not in before}
+        assert puts["PUT"] == 3
+        assert sorted(key.rpartition(".")[2] for key in new) == ["faiss", "json", "keys"]
+        assert sum(new.values()) / sum(before.values()) == pytest.approx(1 / 17, abs=0.01)
+        gets = asked(lambda: shared(two).sync(row))
+        assert (gets["GET"], gets["PUT"]) == (4, 0)  # the folder is listed
+        assert numbers(two) == [3]
+        found = newest(folder_of(two), row.model_id, 448)
+        assert found is not None
+        assert [len(each) for each in found.segments] == [1600, 400, 125]
+        puts = asked(lambda: append(one, 0, frozenset([3])))
+        assert puts["PUT"] == 2  # what is gone, and the manifest
+
+
+def test_files_of_a_generation_stay_while_somebody_may_fetch_it(
+    built: Engine, append: Any, place: str, host: Callable[..., Engine],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Also old ones, that the next generation has merged."""
+    built.create_map(NewMap(name="other", model="depth"))
+    row, objects, other = row_of(built), open_objects(place), host("two")
+    shared(built).withdraw(row)
+    clear(folder_of(built))
+    first = append(built, 100)
+    second = append(built, 20)
+    shared(built).tidy(row)
+    head = shared(built).head(row)
+    third = append(built, 31)
+    assert [len(each.segments) for each in (first, second, third)] == [1, 2, 1]
+    files = [{name for name, _ in each.manifest.files} for each in (first, second, third)]
+    # all is an hour old but the newest, which has just come
+    listed = objects.list
+
+    def aged(prefix: str) -> list[Any]:
+        newest_name = f"{third.number:010d}.json"
+        return [
+            one if one.key.endswith(newest_name) else replace(one, changed_at=one.changed_at - 3600)
+            for one in listed(prefix)
+        ]
+
+    monkeypatch.setattr(shared(built)._objects, "list", aged)
+    shared(built).tidy(row)
+    left = set(keys(objects))
+    assert left >= files[1] | files[2] | {f"{n.number:010d}.json" for n in (second, third)}
+    assert f"{first.number:010d}.json" not in left
+    assert head is not None
+    for name, size in head.files:  # who began before goes on
+        shared(other)._get(folder_of(built), name, size)
+    shared(built).tidy(row, clean=True)
+    assert set(keys(objects)) == files[2] | {f"{third.number:010d}.json"}
+
+
+def test_the_version_before_neither_sees_nor_loses_anything(
+    built: Engine, host: Callable[..., Engine], ids: Any, uploads: Any, place: str
+) -> None:
+    """It runs beside this one while a fleet is upgraded: each has folders of its own."""
+    objects, name = open_objects(place), folder_of(built).name
+    before = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}-\d+-[0-9a-f]+(-[0-9a-f]{12})?")
+    assert not before.fullmatch(name)  # it removes nothing that it does not know
+    theirs = earlier_folder(built.settings.indexes, row_of(built))
+    assert before.fullmatch(theirs.name)
+    assert not name.startswith(f"{theirs.name}/")
+    left = {f"{'a' * 64}.faiss", f"{'b' * 64}.keys", "0000000009.json"}
+    for file in left:
+        objects.put(f"index/{theirs.name}/{file}", b"of schema 2")
+    theirs.mkdir()
+    (theirs / f"0000000009-{'c' * 32}.2.json").write_bytes(b"of schema 2")
+    (theirs / f"{'a' * 64}.faiss").write_bytes(b"signatures")
+    other = host("two")
+    ask(other, uploads)
+    shared(other).finish()
+    assert numbers(other) == [1]
+    assert (built.publish_due(), other.publish_due()) == (0, 0)
+    assert len(list(theirs.iterdir())) == 2
+    assert {one.key.rpartition("/")[2] for one in objects.list(f"index/{theirs.name}/")} == left
+    # of what is deleted nothing may be left, whoever made it
+    built.delete_frame("hall", ids(built)[0])
+    assert built.purging.now().indexes == 1
+    assert not theirs.exists()
+    assert list(objects.list(f"index/{theirs.name}/")) == []
+    assert numbers(built) == [2]
+
+
+def test_a_purge_writes_the_segment_that_held_the_frame(
+    host: Callable[..., Engine], fill: Any, ids: Any, uploads: Any, place: str
+) -> None:
+    """Two segments, of nine frames and of three; one of the three is deleted."""
+    engine, objects = host("one"), open_objects(place)
+    engine.create_map(NewMap(name="hall", model="depth"))
+    names = fill(engine, range(9))
+    assert engine.publish_due() == 1
+    names += fill(engine, range(9, 12))
+    assert engine.publish_due() == 1
+    secret, before = signature(engine, names[10]), set(keys(objects))
+    head = shared(engine).head(row_of(engine))
+    assert head is not None
+    assert [one.frames for one in head.segments] == [9, 3]
+    engine.delete_frame("hall", names[10])
+    assert engine.purging.now().indexes == 1
+    head = shared(engine).head(row_of(engine))
+    assert head is not None
+    assert [one.frames for one in head.segments] == [9, 2]
+    assert {name for name, _ in head.segments[0].files} <= before
+    assert all(secret not in objects.get(one.key) for one in objects.list("index/"))
+    assert engine.purging.now().indexes == 0
+
+
+def test_a_service_drops_segments_of_which_frames_have_been_gone_for_long(
+    host: Callable[..., Engine], append: Any
+) -> None:
+    """The generation is another each time, and the segment the same."""
+    one, service = host("one"), host("two", purge_s=1)
+    one.create_map(NewMap(name="hall", model="depth"))
+    append(one, 100)
+    left = []
+    for drop in ({5}, {6}):
+        append(one, 0, frozenset(drop))
+        service._purged = time.monotonic() - 1
+        shared(service).sync(row_of(one))
+        service.forget_gone()
+        left.append(numbers(service))
+    assert left == [[2], []]
+    append(one, 0, clean=True)
+    shared(service).sync(row_of(one))
+    service._purged = time.monotonic() - 1
+    service.forget_gone()
+    assert numbers(service) == [4]
 
 
 def test_while_one_host_builds_no_other_does(host: Callable[..., Engine], fill: Any) -> None:

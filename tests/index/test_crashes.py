@@ -72,7 +72,7 @@ def is_whole(generation: Generation) -> bool:
     """Whether a generation holds the first `revision` frames, and nothing else."""
     n = generation.revision
     np.testing.assert_array_equal(generation.keys, np.arange(n))
-    assert len(generation.vectors) == n
+    assert len(generation) == n
     keys = np.arange(0, n, 7)
     stored = signatures_of(keys, generation, Tail.empty(LENGTH))
     np.testing.assert_array_equal(stored, signatures_at(keys))
@@ -200,4 +200,4 @@ def test_readers_go_on_while_generations_pass(
     assert min(counts) >= 3
     assert generation.number == 31
     left = {path.name for path in folder.iterdir()}
-    assert old & left == {".lock"}
+    assert old & left == {".lock"}  # the first segment has been merged

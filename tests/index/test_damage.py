@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index import Generation, generation_files, newest, newest_number, scrub
+from sceneprint.index import Generation, generation_files, newest, scrub
 from sceneprint.index.faiss_index import map_index, map_lists
 from sceneprint.index.generation_files import GenerationManifest, manifests, read_manifest
 from sceneprint.types import Bytes
@@ -23,6 +23,7 @@ LENGTH = 32
 
 
 KINDS = ["json", "keys", "faiss", "lists"]
+RECALL = {"share": 1.0, "near": 10, "sample": 0, "probes": 0, "frames": 0}
 
 
 @pytest.fixture
@@ -154,12 +155,14 @@ def test_a_damaged_file_is_written_again_when_its_content_is(
 @pytest.mark.parametrize(
     "change",
     [
-        {"schema_version": 3},
-        {"files": []},
-        {"files": [["../../etc/passwd", 1]]},
+        {"schema_version": 2},
+        {"segments": [{"files": [], "recall": RECALL}]},
+        {"segments": [{"files": [["../../etc/passwd", 1]], "recall": RECALL}]},
+        {"segments": [{"files": [[f"{'0' * 64}.keys", 8]], "recall": RECALL}]},
+        {"segments": [{"files": [], "recall": None}]},
+        {"segments": 3},
+        {"segments": None},
         {"number": None, "unknown": 1},
-        {"files": 3},
-        {"recall": None},
     ],
 )
 def test_a_manifest_that_means_something_else_is_refused(
@@ -170,28 +173,11 @@ def test_a_manifest_that_means_something_else_is_refused(
 
     path = own_files(folder)["json"]
     data = json.dumps(json.loads(path.read_bytes()) | change).encode()
-    other = path.with_name(f"0000000009-{hashlib.sha256(data).hexdigest()[:32]}.2.json")
+    other = path.with_name(f"0000000009-{hashlib.sha256(data).hexdigest()[:32]}.3.json")
     other.write_bytes(data)
     with pytest.raises(DamagedIndex):
         read_manifest(other)
     assert number_of(folder) == 2
-
-
-def test_what_version_0_1_left_is_no_damage(
-    folder: Path, walk: Walk, published: Publish, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Its manifests and files are passed over in silence, and the next builder removes them."""
-    old = [folder / f"0000000009-{'a' * 32}.json"]
-    old += [folder / f"{'b' * 64}.{kind}" for kind in ("segment", "rows", "code", "faiss")]
-    for path in old:
-        path.write_bytes(b'{"schema_version": 1}')
-    found = newest(folder, "model", LENGTH)
-    assert found is not None
-    assert (found.number, newest_number(folder)) == (2, 2)
-    assert [path for path in scrub(folder) if path is not None] == []
-    assert caplog.record_tuples == []
-    assert published(np.arange(45, 50), walk(50, LENGTH)[45:], found).number == 3
-    assert not any(path.exists() for path in old)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.index import Generation, Tail, faiss_index, newest, search
+from sceneprint.index import Generation, Tail, faiss_index, newest, search, segment
 from sceneprint.index.faiss_index import Lists, centre_lists, grouped, train_lists
 from sceneprint.index.generation_files import draw
+from sceneprint.index.segment import Segment
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -22,17 +23,25 @@ EMPTY = Tail.empty(LENGTH)
 search_l2 = partial(search, metric="l2")
 
 
-def lists_of(generation: Generation | None) -> Lists:
+def only(generation: Generation | None) -> Segment:
+    """The segment of a generation that has one."""
     assert generation is not None
-    assert generation.lists is not None
-    return generation.lists
+    (found,) = generation.segments
+    return found
+
+
+def lists_of(generation: Generation | None) -> Lists:
+    found = only(generation).lists
+    assert found is not None
+    return found
 
 
 def is_partition(generation: Generation) -> bool:
     """Whether each row is in the one list whose centroid is nearest."""
     own = lists_of(generation)
     assert sorted(own.rows.tolist()) == list(range(len(generation)))
-    squares = ((generation.vectors[:, None].astype(float) - own.centroids) ** 2).sum(axis=2)
+    vectors = only(generation).vectors
+    squares = ((vectors[:, None].astype(float) - own.centroids) ** 2).sum(axis=2)
     chosen = squares[np.arange(len(generation)), own.assignment()]
     np.testing.assert_allclose(chosen, squares.min(axis=1), rtol=1e-4, atol=0.5)
     return True
@@ -44,7 +53,7 @@ def test_a_map_that_is_too_large_has_lists(
     signatures = walk(3000, LENGTH, walks=20)
     keys = np.arange(3000) * 2
     flat = published(keys, signatures, flat_bytes=3000 * LENGTH)
-    assert flat.lists is None
+    assert only(flat).lists is None
     recall = flat.manifest.recall
     assert (recall.share, recall.sample, recall.probes) == (1, 0, 0)
     made = published(keys, signatures, flat_bytes=3000 * LENGTH - 1)
@@ -71,7 +80,7 @@ def test_a_map_that_is_too_large_has_lists(
 
 
 def test_no_centroid_outlives_the_only_frame_of_its_list(walk: Walk, published: Publish) -> None:
-    """Deleting is for good: an ordinary publication leaves nothing of a frame that is gone."""
+    """Deleting is for good: nothing of it is left once its segment is written anew."""
     signatures = walk(500, LENGTH, walks=5)
     signatures[77] = 255 - signatures[77]  # far from all others
     made = published(np.arange(500), signatures, flat_bytes=0)
@@ -79,6 +88,8 @@ def test_no_centroid_outlives_the_only_frame_of_its_list(walk: Walk, published: 
     assert (np.abs(alone.centroids - signatures[77]).max(axis=1) < 0.5).sum() == 1
     none = np.empty(0, np.int64), np.empty((0, LENGTH), np.uint8)
     after = published(*none, previous=made, drop=frozenset([77]), flat_bytes=0)
+    assert only(after).record.file("lists") == only(made).record.file("lists")
+    after = published(*none, previous=after, flat_bytes=0, clean=True)
     left = lists_of(after)
     assert len(after) == 499
     assert (np.abs(left.centroids - signatures[77]).max(axis=1) < 0.5).sum() == 0
@@ -149,11 +160,12 @@ def test_as_many_come_back_as_there_are(walk: Walk, published: Publish, nearest:
 
 
 def test_centroids_stay_until_the_map_has_doubled(
-    walk: Walk, published: Publish, tmp_path: Path
+    walk: Walk, published: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     signatures = walk(1000, LENGTH, walks=10)
     made = published(np.arange(400), signatures[:400], flat_bytes=0)
     first = lists_of(made)
+    monkeypatch.setattr(segment, "RATIO", 100)  # so that all is merged each time
     for start, end in ((400, 420), (420, 799)):
         made = published(
             np.arange(start, end), signatures[start:end], made, drop=frozenset([start]),
@@ -170,7 +182,7 @@ def test_centroids_stay_until_the_map_has_doubled(
     assert lists_of(made).trained_on == len(made) == 998
     assert is_partition(made)
     again = published(np.arange(0), signatures[:0], made, flat_bytes=1 << 30)
-    assert again.lists is None  # it is small enough
+    assert only(again).lists is None  # it is small enough
 
 
 def test_nothing_of_a_frame_that_is_gone_is_in_a_centroid(walk: Walk, published: Publish) -> None:
@@ -185,7 +197,7 @@ def test_nothing_of_a_frame_that_is_gone_is_in_a_centroid(walk: Walk, published:
     assert sorted(own.rows.tolist()) == list(range(199))
     assert (np.diff(own.ends, prepend=0) > 0).all()
     for i, centroid in enumerate(own.centroids):
-        members = made.vectors[own.assignment() == i]
+        members = only(made).vectors[own.assignment() == i]
         np.testing.assert_allclose(centroid, members.mean(axis=0), rtol=1e-5)
 
 

@@ -35,10 +35,12 @@ def holds(generation: Generation | None, frames: dict[int, Bytes]) -> bool:
     assert generation is not None
     keys = np.array(sorted(frames), np.int64)
     assert generation.keys.tolist() == keys.tolist()
-    assert len(generation) == len(generation.vectors) == generation.index.ntotal
+    assert len(generation) == generation.manifest.frames == len(keys)
     expected = np.array([frames[int(key)] for key in keys], np.uint8).reshape(-1, LENGTH)
-    np.testing.assert_array_equal(generation.vectors, expected)
     np.testing.assert_array_equal(generation.vectors_of(keys[::-1]), expected[::-1])
+    assert generation.has(keys).all()
+    for segment in generation.segments:
+        assert len(segment.keys) == len(segment.vectors) == segment.index.ntotal
     return True
 
 
@@ -62,7 +64,8 @@ def test_what_is_published_is_what_is_opened(
         assert (generation.number, generation.revision, generation.model_id) == (1, 41, "model")
         assert (generation.manifest.dimension, len(generation)) == (LENGTH, 300)
         assert generation.manifest.anchor == "an event"
-        assert not generation.vectors.flags.writeable
+        (segment,) = generation.segments
+        assert not segment.vectors.flags.writeable
         with pytest.raises(ValueError, match="no frames"):
             generation.vectors_of(np.array([keys[0], 3]))
 
@@ -99,7 +102,7 @@ def test_appending_gives_the_bytes_of_publishing_at_once(
     walk: Walk, published: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
 ) -> None:
     """Whatever came when, in blocks of whatever size."""
-    monkeypatch.setattr("sceneprint.index.generation.BLOCK_BYTES", step * LENGTH)
+    monkeypatch.setattr("sceneprint.index.segment.BLOCK_BYTES", step * LENGTH)
     signatures, again = walk(120), walk(30, seed=5)
     first = published(np.arange(99, -1, -1), signatures[99::-1])
     keys = np.concatenate([np.arange(10, 40), np.arange(100, 120)])
@@ -120,7 +123,9 @@ def test_appending_gives_the_bytes_of_publishing_at_once(
         np.array(sorted(expected)), np.stack([expected[key] for key in sorted(expected)]),
         folder=tmp_path / "once",
     )  # fmt: skip
-    assert once.manifest.files == second.manifest.files  # names are checksums
+    # what is written again without anything of what is gone, is written as at once
+    clean = published(np.arange(0), signatures[:0], third, clean=True)
+    assert once.manifest.files == clean.manifest.files  # names are checksums
 
 
 def test_all_frames_may_go(walk: Walk, published: Publish, tmp_path: Path) -> None:
@@ -130,7 +135,8 @@ def test_all_frames_may_go(walk: Walk, published: Publish, tmp_path: Path) -> No
     opened = newest(tmp_path / "map", "model", LENGTH)
     for generation in (last, opened):
         assert generation is not None
-        assert (len(generation), generation.vectors.shape) == (0, (0, LENGTH))
+        assert (len(generation), generation.manifest.files) == (0, ())
+        assert generation.manifest.dimension == LENGTH
     anew = published(np.arange(3), signatures[:3], opened)
     assert holds(anew, frames_of(np.arange(3), signatures[:3]))
 
@@ -140,9 +146,8 @@ def test_two_generations_are_kept_and_only_our_files_removed(
 ) -> None:
     folder, signatures = tmp_path / "map", walk(160)
     generation = published(np.arange(100), signatures[:100])
-    left = [".0123456789ab.part", f"{'0' * 64}.faiss", f"0000000007-{'0' * 32}.json"]
-    left += [f"{'0' * 64}.{kind}" for kind in ("segment", "rows", "code")]
-    for name in left:  # of a killed builder, of no manifest, and of version 0.1
+    left = [".0123456789ab.part", *(f"{'0' * 64}.{kind}" for kind in ("keys", "faiss", "gone"))]
+    for name in left:  # of a killed builder, of no manifest
         (folder / name).write_bytes(b"left")
     (folder / "notes.txt").write_text("of somebody else")
     for key in range(100, 105):
@@ -150,7 +155,8 @@ def test_two_generations_are_kept_and_only_our_files_removed(
     names = files(folder)
     assert {".lock", "notes.txt"} <= names
     kinds = sorted(name.rpartition(".")[2] for name in names - {".lock", "notes.txt"})
-    assert kinds == ["faiss", "faiss", "json", "json", "keys", "keys"]
+    # of 100 and of 5 frames; of 100, of 3 and of 1
+    assert kinds == ["faiss"] * 4 + ["json"] * 2 + ["keys"] * 4
     assert newest_number(folder) == 6
     (folder / left[2]).write_bytes(b"left")
     assert clear(folder, but=5)
@@ -186,7 +192,10 @@ def test_what_is_open_is_taken_from_there(
     found = newest(folder, "model", LENGTH, known=first)
     assert found is not None
     assert holds(found, frames_of(np.arange(150), signatures))
-    assert read == [name for name, _ in second.manifest.files]
+    assert read == [name for name, _ in second.manifest.files if name not in first.inodes]
+    read.clear()
+    assert newest(folder, "model", LENGTH, sound=second.inodes) is not None
+    assert read == []
     read.clear()
     published(np.arange(0), signatures[:0], second, revision=3)  # the same files
     again = newest(folder, "model", LENGTH, known=newest(folder, "model", LENGTH, known=second))
@@ -209,11 +218,10 @@ publish(folder, model_id="m", revision=1, blocks=[(np.arange(n), rows)], previou
 found = newest(folder, "m", 256)
 for path in folder.iterdir():
     path.unlink()
-vectors = found.vectors
+vectors = found.segments[0].vectors
 hits = search(rows[777], found, Tail.empty(256), 3, metric="l2")
 assert hits.keys[0] == 777 and hits.distances[0] == 0
-assert (found.vectors == rows).all()
-assert (found.vectors[5] == rows[5]).all()
+assert (vectors == rows).all()
 where = next(line for line in open("/proc/self/smaps") if ".faiss" in line)
 del found, hits
 assert (vectors == rows).all()  # keeps the mapping alive by itself
@@ -297,16 +305,21 @@ def test_mistakes_leave_the_generation_before(
     assert holds(newest(folder, "model", LENGTH), frames_of(np.arange(20), signatures))
 
 
+@pytest.mark.parametrize("n", [10, 60])
 def test_a_failure_at_any_step_leaves_the_old_or_the_new(
-    walk: Walk, published: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    walk: Walk, published: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n: int
 ) -> None:
-    """A disk that fills, at each of the calls that give a file its name or make it durable."""
-    signatures, real = walk(60), {"replace": os.replace, "fsync": os.fsync}
+    """A disk that fills, at each of the calls that give a file its name or make it durable.
+
+    Of a publication that appends and deletes, and of one that merges.
+    """
+    signatures, real = walk(100), {"replace": os.replace, "fsync": os.fsync}
     seen = set()
     for call in ("replace", "fsync"):
         for step in range(100):
             folder = tmp_path / f"{call}-{step}"
             first = published(np.arange(40), signatures[:40], folder=folder)
+            keys, gone = np.arange(40, 40 + n), frozenset([3])
             left = step
 
             def failing(*arguments: object, call: str = call) -> None:
@@ -319,13 +332,14 @@ def test_a_failure_at_any_step_leaves_the_old_or_the_new(
             with monkeypatch.context() as patch:
                 patch.setattr(os, call, failing)
                 with contextlib.suppress(OSError):
-                    published(
-                        np.arange(40, 60), signatures[40:], first, folder=folder, flat_bytes=0
-                    )
+                    published(keys, signatures[keys], first, folder=folder, drop=gone, flat_bytes=0)
             found = newest(folder, "model", LENGTH)
             assert found is not None
-            n = {1: 40, 2: 60}[found.number]
-            assert holds(found, frames_of(np.arange(n), signatures[:n]))
+            last = {1: 40, 2: 40 + n}[found.number]
+            frames = frames_of(np.arange(last), signatures[:last])
+            if found.number == 2:
+                del frames[3]
+            assert holds(found, frames)
             assert not list(folder.glob(".*.part"))
             seen.add((call, found.number))
             if left >= 0:
@@ -345,7 +359,7 @@ def test_a_disk_that_is_full_is_said_as_it_was(
         def refuse(data: bytes) -> None:
             raise OSError(28, "No space left on device")
 
-        write(first.index, refuse)
+        write(first.segments[0].index, refuse)
 
     write = faiss_index.write_index
     monkeypatch.setattr(faiss_index, "write_index", full)

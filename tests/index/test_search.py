@@ -12,7 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneprint.geometry.retrieval import ranking
-from sceneprint.index import Generation, SearchHits, Tail, publish, search, signatures_of
+from sceneprint.index import (
+    Generation,
+    SearchHits,
+    Tail,
+    publish,
+    search,
+    segment,
+    signatures_of,
+)
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -142,9 +150,9 @@ def test_rows_that_may_not_be_found_are_not_read(
         read.append(len(rows))
         return ranking.distances(query, stored, metric, rows=rows)
 
-    names = search.__globals__
-    monkeypatch.setitem(names, "distances", counted)
-    monkeypatch.delitem(names, "nearest")  # FAISS reads all rows, whatever may be found
+    monkeypatch.setitem(search.__globals__, "distances", counted)
+    monkeypatch.setattr(segment, "distances", counted)
+    monkeypatch.delattr(segment, "nearest")  # FAISS reads all rows, whatever may be found
     among = keys_of(12, 15, 369)
     hits = search_l2(tail.signatures[0], generation, tail, 5, dead=dead, among=among)
     assert sorted(hits.keys.tolist()) == [12, 15, 369]
@@ -192,7 +200,7 @@ def test_distances_that_floats_cannot_hold_are_exact(published: Publish, nearest
         assert hits.distances[0] > 1 << 24
         assert answer(hits) == nearest(query, frames_of(keys, signatures), size)
     np.testing.assert_array_equal(
-        ranking.distances(query, generation.vectors, "l2"),
+        generation.distances_to(query, keys),
         (signatures.astype(np.int64) ** 2).sum(axis=1),
     )
 

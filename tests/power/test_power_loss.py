@@ -215,8 +215,9 @@ def read(folder: Path) -> Generation | None:
     if found is not None:
         number = found.revision // 10
         assert found.keys.tolist() == expected(number)
-        np.testing.assert_array_equal(found.vectors, signatures_at(found.keys))
-        assert (found.lists is None) == (STEPS[number - 1][2] > 0)
+        np.testing.assert_array_equal(found.vectors_of(found.keys), signatures_at(found.keys))
+        for one in found.segments:
+            assert (one.lists is None) == (STEPS[number - 1][2] > 0)
     return found
 
 

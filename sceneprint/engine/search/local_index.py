@@ -37,7 +37,7 @@ from sceneprint.index import (
     search,
     signatures_of,
 )
-from sceneprint.index.generation_files import GenerationManifest, Keys
+from sceneprint.index.generation_files import SCHEMA_VERSION, GenerationManifest, Keys
 from sceneprint.models import Model
 from sceneprint.store import require_primary
 from sceneprint.store.events import holds_anchor
@@ -151,7 +151,7 @@ class IndexView(MapView):
         """See MapView."""
         known = self.tail.places.of(keys) >= 0
         if self.generation is not None:
-            known |= self.generation.places.of(keys) >= 0
+            known |= self.generation.has(keys)
         alive: NDArray[np.bool_] = known & ~np.isin(keys, list(self.dead))
         return alive
 
@@ -283,15 +283,26 @@ _LOOK_S, _AGAIN_S = 1.0, 60.0
 def index_folder(indexes: Path, row: MapRow) -> Path:
     """Where the index of a map is: never that of another map, which may have had its name.
 
-    And never that of another model, whose signatures are not comparable.
+    And never that of another model, whose signatures are not comparable, nor of another schema: a
+    version of the product that runs beside this one has a folder of its own.
     """
+    return indexes / f"{earlier_folder(indexes, row).name}.{SCHEMA_VERSION}"
+
+
+def earlier_folder(indexes: Path, row: MapRow) -> Path:
+    """Where versions before schema 3 have the index of a map."""
     made = f"{row.number}-{round(1e6 * row.created_at):x}"
     return indexes / f"{row.name}-{made}-{row.model_id[:12]}"
 
 
+_FOLDER_NAME = re.compile(
+    rf"[a-z0-9][a-z0-9_-]{{0,62}}-\d+-[0-9a-f]+(-[0-9a-f]{{12}}(\.{SCHEMA_VERSION})?)?"
+)
+
+
 def is_index_folder(name: str) -> bool:
-    """Whether a folder is called as `index_folder` calls them."""
-    return re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,62}-\d+-[0-9a-f]+(-[0-9a-f]{12})?", name) is not None
+    """Whether a folder is called as `index_folder` calls them, or `earlier_folder`."""
+    return _FOLDER_NAME.fullmatch(name) is not None
 
 
 #: A generation, or its manifest alone.
@@ -452,8 +463,8 @@ class Reader:
         deleted = np.fromiter(self._dead, np.int64, len(self._dead))
         held = np.isin(deleted, tail.keys)
         if generation is not None:
-            held |= generation.places.of(deleted) >= 0
-            both = int((generation.places.of(tail.keys) >= 0).sum())  # signed anew since
+            held |= generation.has(deleted)
+            both = int(generation.has(tail.keys).sum())  # signed anew since
         dead = frozenset(deleted[held].tolist())
         size = len(generation or ()) + len(tail) - both - len(dead)
         model, damaged = self._model, frozenset(self._damaged)

@@ -6,6 +6,7 @@
 
 builder  --share-->  object store  --sync-->  the folder that all other code reads
 
+Most files of a generation are those of the one before: what is there is neither put nor fetched.
 A manifest without bytes stands for a generation that was withdrawn: its number is not used again.
 What is fetched is verified as it is written, data first and the manifest last. Nobody needs the
 store to answer a query: whoever cannot reach it goes on with what is here.
@@ -21,6 +22,7 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -62,9 +64,6 @@ LOOK_S = 30.0
 GRACE_S = 600.0
 #: Seconds after its last query for which the index of a map is not removed to make room.
 IN_USE_S = 600.0
-#: A map is published when so large a share of it is new, or deleted: to publish writes all of it,
-#: so that what is written in all stays proportional to the map.
-SHARE = 1 / 16
 
 
 class SharedIndexes:
@@ -89,7 +88,7 @@ class SharedIndexes:
         self._looked: dict[str, float] = {}
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._stale: dict[str, int] = {}
+        self._stale: dict[str, frozenset[str]] = {}
 
     def close(self) -> None:
         """End fetching, within a part of a file."""
@@ -115,13 +114,12 @@ class SharedIndexes:
         return 0 if listed is None else listed[1]
 
     def keys(self, row: MapRow, manifest: GenerationManifest) -> Keys:
-        """Keys of the frames of a generation; none where its file is gone."""
-        name, _ = manifest.files[0]
-        try:
-            data = self._objects.get(f"{_FOLDER}{index_folder(self._indexes, row).name}/{name}")
-        except FileNotFoundError:
-            return np.empty(0, np.int64)
-        return np.frombuffer(data, "<i8")
+        """Keys of the frames in the files of a generation; none of a file that is gone."""
+        folder, found = index_folder(self._indexes, row).name, [np.empty(0, np.int64)]
+        for name in manifest.keys:
+            with suppress(FileNotFoundError):
+                found.append(np.frombuffer(self._objects.get(f"{_FOLDER}{folder}/{name}"), "<i8"))
+        return np.concatenate(found)
 
     @contextmanager
     def turn(self, row: MapRow) -> Iterator[Callable[[], None] | None]:
@@ -142,10 +140,10 @@ class SharedIndexes:
         done : False where another has that number
         """
         self._claim()
-        there = {one.key for one in self._objects.list(f"{_FOLDER}{folder.name}/")}
-        for name, _ in manifest.files:
+        there = {one.key: one.size for one in self._objects.list(f"{_FOLDER}{folder.name}/")}
+        for name, size in manifest.files:
             key = f"{_FOLDER}{folder.name}/{name}"
-            if key not in there:
+            if there.get(key) != size:
                 self._objects.put_file(key, folder / name)
         data = encode_manifest(manifest)
         key = f"{_FOLDER}{folder.name}/{manifest.number:010d}.json"
@@ -153,23 +151,30 @@ class SharedIndexes:
         return self._objects.put(key, data, create=True) or self._objects.get(key) == data
 
     def tidy(self, row: MapRow, *, clean: bool = False) -> None:
-        """Remove what the newest generation of a map does not need; in its turn alone.
+        """Remove what no generation needs that somebody may be fetching; in its turn alone.
 
         Parameters
         ----------
         row : of the map
-        clean : at once, and not after some time
+        clean : all but the newest at once, and not after some time
         """
         name = index_folder(self._indexes, row).name
         listed = sorted(self._objects.list(f"{_FOLDER}{name}/"), key=lambda one: one.key)
         numbered = [one for one in listed if _NUMBER.fullmatch(one.key.rpartition("/")[2])]
         if not numbered:
             return
-        found = self._read(name, int(numbered[-1].key[-15:-5]), numbered[-1].size)
-        needed = set() if found is None else {each for each, _ in found.files}
         now = max(one.changed_at for one in listed)  # by the clock of the store
+        kept = [
+            one for one, after in pairwise(numbered)  # replaced a moment ago
+            if not clean and after.changed_at >= now - GRACE_S
+        ]  # fmt: skip
+        needed = set[str]()
+        for one in (*kept, numbered[-1]):
+            found = self._read(name, int(one.key[-15:-5]), one.size)
+            needed |= {one.key.rpartition("/")[2]}
+            needed |= set() if found is None else {each for each, _ in found.files}
         old = [
-            one.key for one in (*numbered[:-1], *(o for o in listed if o not in numbered))
+            one.key for one in sorted(listed, key=lambda one: one not in numbered)
             if one.key.rpartition("/")[2] not in needed
             and (clean or one.changed_at < now - GRACE_S)
         ]  # fmt: skip
@@ -219,13 +224,13 @@ class SharedIndexes:
         generation : that is used here
         """
         folder = index_folder(self._indexes, row)
-        since, frames = (0, 0) if generation is None else (generation.revision, len(generation))
+        since = 0 if generation is None else generation.revision
         with self._lock:
             if time.monotonic() - self._looked.get(folder.name, -LOOK_S) < LOOK_S:
                 return
             self._looked[folder.name] = time.monotonic()
             _mark_used(folder)
-            if row.revision - since <= max(self._tail_frames, int(SHARE * frames)):
+            if row.revision - since <= self._tail_frames:
                 return  # nobody has published a newer one
             self._wanted[folder.name] = row
             if self._thread is None or not self._thread.is_alive():
@@ -277,8 +282,9 @@ class SharedIndexes:
             if not mine:
                 return None  # somebody fetches or builds it
             try:
-                for name, size in lacking:
-                    self._get(folder, name, size)
+                for name, size in found.files:
+                    if not _is_here(folder, name, size):
+                        self._get(folder, name, size)
             except UnusableStore:
                 remove_unneeded(folder)  # a part of an index is nobody's, and nobody would purge it
                 raise
@@ -323,15 +329,18 @@ class SharedIndexes:
         number, path = manifests(folder)[0]
         found = read_manifest(path)
         with self._database.read() as connection:
-            gone = deleted_since(connection, row.number, found.revision)
-        held = np.frombuffer(mapped(folder / found.files[0][0]), "<i8")
+            gone = np.fromiter(deleted_since(connection, row.number, found.revision), np.int64)
         # of what one that old has too much, no row tells any more
-        stale = found.revision < row.pruned_revision or bool(
-            np.isin(held, np.fromiter(gone, np.int64)).any()
-        )
-        if (stale and self._stale.get(folder.name) == number) or len(manifests(folder)) > 1:
+        pruned = found.revision < row.pruned_revision
+        # by the files of their keys: a segment of which more is gone since is the same
+        stale = frozenset(
+            name for name in found.keys
+            if pruned or name in found.worn_keys
+            or np.isin(np.frombuffer(mapped(folder / name), "<i8"), gone).any()
+        )  # fmt: skip
+        if stale & self._stale.get(folder.name, frozenset()) or len(manifests(folder)) > 1:
             clear(folder, but=None if stale else number)
-        self._stale[folder.name] = number if stale else 0
+        self._stale[folder.name] = stale
 
     def _make_room(self, size: int, keep: Path) -> bool:
         """Remove indexes that were not used for long, the longest first; whether there is room."""

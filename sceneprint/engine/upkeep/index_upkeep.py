@@ -7,7 +7,7 @@ import os
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -20,9 +20,15 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from sceneprint.atomic_files import PRIVATE_FILE, make_folder
-from sceneprint.engine.search.local_index import READ_MOST, index_folder, is_index_folder, trusted
+from sceneprint.engine.search.local_index import (
+    READ_MOST,
+    earlier_folder,
+    index_folder,
+    is_index_folder,
+    trusted,
+)
 from sceneprint.engine.search.retrieval import Setting
-from sceneprint.engine.search.shared_index import SHARE, SharedIndexes
+from sceneprint.engine.search.shared_index import SharedIndexes
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import (
@@ -135,9 +141,9 @@ class Upkeep:
     ----------
     store, signers : see there
     settings : `indexes` is the folder of all indexes; a generation may lack `tail_frames` frames,
-        and hold as many deleted ones, of a large map SHARE of its frames; after `scrub_s` seconds
-        all files are read again, to see that they are sound; an index that lacks a
-        deletion of `deleted_rows_days` ago cannot be brought up to date
+        and as many deletions; after `scrub_s` seconds all files are read again, to see that they
+        are sound; an index that lacks a deletion of `deleted_rows_days` ago cannot be brought up
+        to date
     shared : indexes of the fleet; None where each host builds its own
     """
 
@@ -147,8 +153,11 @@ class Upkeep:
         self._store, self._signers, self._shared = store, signers, shared
         self._indexes, self._tail_frames = settings.indexes, settings.tail_frames
         self._elsewhere: dict[int, float] = {}  # by map, when it may be looked at again
-        # map and model: number of their index, revision, frames
-        self._published: dict[tuple[int, str], tuple[int, int, int]] = {}
+        # map and model: number of their index, and revision
+        self._published: dict[tuple[int, str], tuple[int, int]] = {}
+        # map and model: files of their index that this process has verified, by name and inode; to
+        # read all of them for each thousand frames would take longer than to write
+        self._verified: dict[tuple[int, str], Mapping[str, int]] = {}
         self._metrics: dict[str, Metric | None] = {}
         self._scrubber = Scrubber(settings.indexes, settings.scrub_s)
         self._rows_s = DAY_S * settings.deleted_rows_days
@@ -258,25 +267,24 @@ class Upkeep:
         return self._metrics[model_id]
 
     def _due(self, connection: Connection, row: MapRow) -> bool:
-        number, since, frames = self._published.get((row.number, row.model_id), (None, 0, 0))
+        number, since = self._published.get((row.number, row.model_id), (None, 0))
         here = newest_number(index_folder(self._indexes, row))
         if self._shared is None and here != number:
-            since = frames = 0  # published by another process, or removed: to be looked at
-        return self._is_long(connection, row, since, frames)
+            since = 0  # published by another process, or removed: to be looked at
+        return self._is_long(connection, row, since)
 
-    def _is_long(self, connection: Connection, row: MapRow, since: int, frames: int) -> bool:
-        """Whether a generation of that revision and size lacks, or holds too much, too many; or
-        will soon be too old to be brought up to date.
+    def _is_long(self, connection: Connection, row: MapRow, since: int) -> bool:
+        """Whether a generation of that revision lacks too many frames, or deletions; or will soon
+        be too old to be brought up to date.
         """
         if since < row.pruned_revision:
-            since = frames = 0
+            since = 0
         if since and self._is_aging(connection, row, since):
             return True
-        most = max(self._tail_frames, int(SHARE * frames))
-        if row.revision - since <= most:  # spares the counting
+        if row.revision - since <= self._tail_frames:  # spares the counting
             return False
-        return count_indexed(connection, row.number, since) > most or (
-            count_gone(connection, row.number, since) > most
+        return count_indexed(connection, row.number, since) > self._tail_frames or (
+            count_gone(connection, row.number, since) > self._tail_frames
         )
 
     def _is_aging(self, connection: Connection, row: MapRow, since: int) -> bool:
@@ -295,25 +303,34 @@ class Upkeep:
         """Leave no byte of a deleted frame in the index of a map, be it here or shared; whether
         anything was done.
 
+        Also removed is the index of an earlier schema. Another version of the product that still
+        runs here makes it again, and searches meanwhile what it has open.
+
         Raises
         ------
         UnknownMap : the map is gone, and with it soon its index.
         BusyIndex : another process is building it, and may not know of the latest deletions.
         OSError, UnusableStore : it cannot be written; what was there stays.
         """
-        if self._shared is not None and self._metric(row.model_id) == "l2":
-            return self._purge_shared(row, self._shared)
-        folder = index_folder(self._indexes, row)
-        if self._metric(row.model_id) == "l1":  # version 0.1 may have left one
-            left = any(folder.glob("*.json"))
-            shutil.rmtree(folder, ignore_errors=True)
+        metric, earlier = self._metric(row.model_id), earlier_folder(self._indexes, row)
+        if metric is None:  # of another version's model, which says so where there is an index
+            return self._purge_own(row)
+        left = any(earlier.glob("*.json"))
+        shutil.rmtree(earlier, ignore_errors=True)
+        if metric == "l1":  # it has no other
             return left
+        own = self._purge_own if self._shared is None else self._purge_shared
+        return own(row) or left
+
+    def _purge_own(self, row: MapRow) -> bool:
+        """As `purge`: of what is here alone."""
+        folder = index_folder(self._indexes, row)
         listed = manifests(folder)
         if not listed:
             return False
         model = self._signers(row.model_id).model
         # before a connection waits for it
-        found = newest(folder, row.model_id, model.signature_bytes)
+        found = self._newest(row, folder, model.signature_bytes)
         with self._store.database.read() as connection:
             allow(connection, 0)
             now = find_map(connection, row.name)
@@ -330,7 +347,7 @@ class Upkeep:
         elif found is None:
             return False
         else:
-            if (found.places.of(np.fromiter(gone, np.int64)) >= 0).any():
+            if found.holds_any(np.fromiter(gone, np.int64)):
                 done = self._publish(row, anyway=True, clean=True) is not None
             elif older:
                 done = clear(folder, but=found.number)
@@ -343,8 +360,10 @@ class Upkeep:
             )
         return True
 
-    def _purge_shared(self, row: MapRow, shared: SharedIndexes) -> bool:
+    def _purge_shared(self, row: MapRow) -> bool:
         """As `purge`: of what the fleet shares, and then of what is here of it."""
+        shared = self._shared
+        assert shared is not None
         head, folder = shared.head(row), index_folder(self._indexes, row)
         with self._store.database.read() as connection:
             allow(connection, 0)
@@ -358,6 +377,7 @@ class Upkeep:
         done = done_here = True
         stale = head is not None and (
             head.revision < now.pruned_revision  # of what it has too much, no row tells any more
+            or bool(head.worn_keys)
             or bool(np.isin(gone, shared.keys(row, head)).any())
         )
         if stale and not empty:
@@ -441,11 +461,10 @@ class Upkeep:
         with self._store.database.read() as connection:
             now = replace(find_map(connection, row.name), model_id=row.model_id)
             found = trusted(connection, now, head)
-            since, frames = (0, 0) if found is None else (found.revision, found.frames)
+            since = 0 if found is None else found.revision
             if found is not None:
-                own = (found.number, since, frames)
-                self._published[row.number, row.model_id] = own
-            return not self._is_long(connection, now, since, frames)
+                self._published[row.number, row.model_id] = found.number, since
+            return not self._is_long(connection, now, since)
 
     def _build(
         self, row: MapRow, *, anyway: bool = False, anew: bool = False, clean: bool = False,
@@ -464,11 +483,11 @@ class Upkeep:
             length = signer.model.signature_bytes
             previous = None
             if not anew:
-                previous = trusted(connection, now, newest(folder, now.model_id, length))
+                previous = trusted(connection, now, self._newest(now, folder, length))
             since = 0 if previous is None else previous.revision
             if previous is not None:
                 self._note(now, previous)
-            if not anyway and not self._is_long(connection, now, since, len(previous or ())):
+            if not anyway and not self._is_long(connection, now, since):
                 return None  # another worker was first
             if previous is None and count_indexed(connection, now.number, 0) == 0:
                 if anew:
@@ -499,26 +518,33 @@ class Upkeep:
         return generation
 
     def _note(self, row: MapRow, found: Generation) -> None:
-        own = (found.number, found.revision, len(found))
-        self._published[row.number, row.model_id] = own
+        self._published[row.number, row.model_id] = found.number, found.revision
+        self._verified[row.number, row.model_id] = found.inodes
+
+    def _newest(self, row: MapRow, folder: Path, length: int) -> Generation | None:
+        """The newest sound generation here; what this process has verified is not read again."""
+        sound = self._verified.get((row.number, row.model_id))
+        return newest(folder, row.model_id, length, sound=sound)
 
     def _clean(self, rows: Sequence[MapRow]) -> None:
         """Remove the indexes of maps that are no more, of models that they had, and of psi."""
         if not self._indexes.is_dir():
             return
-        kept = self._known_folders(rows)
+        kept = self._known_folders(rows, earlier_folder) | self._known_folders(rows)
         for folder in self._indexes.iterdir():
             if is_index_folder(folder.name) and folder.name not in kept:
                 shutil.rmtree(folder, ignore_errors=True)
                 log.info("index removed", extra={"folder": folder.name})
 
-    def _known_folders(self, rows: Sequence[MapRow]) -> set[str]:
+    def _known_folders(
+        self, rows: Sequence[MapRow], folder_of: Callable[[Path, MapRow], Path] = index_folder
+    ) -> set[str]:
         """Names of the folders of indexes of these maps, and of those that there are now."""
         with self._store.database.read() as connection:  # a map may have been made since
             known = [*rows, *list_maps(connection)]
         known += [_coming(row) for row in known if row.next_model_id is not None]
         known = [row for row in known if self._metric(row.model_id) != "l1"]
-        return {index_folder(self._indexes, row).name for row in known}
+        return {folder_of(self._indexes, row).name for row in known}
 
 
 def _coming(row: MapRow) -> MapRow:

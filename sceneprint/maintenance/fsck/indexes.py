@@ -17,7 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import select
 
-from sceneprint.engine.search.local_index import index_folder, is_index_folder, trusted
+from sceneprint.engine.search.local_index import (
+    earlier_folder,
+    index_folder,
+    is_index_folder,
+    trusted,
+)
 from sceneprint.errors import DamagedIndex, StoreError
 from sceneprint.index import Generation, newest, signatures_of
 from sceneprint.index.generation_files import (
@@ -363,7 +368,7 @@ def _differences(folder: Folder, row: MapRow, generation: Generation) -> list[st
             return wrong
         after = block[-1].number
         keys = np.array([each.number for each in block], np.int64)
-        held = generation.places.of(keys) >= 0
+        held = generation.has(keys)
         rows = generation.vectors_of(keys[held])
         indexed = dict(zip(keys[held].tolist(), rows, strict=True))
         for number, frame_id in block:
@@ -394,9 +399,10 @@ def _of_no_map(folder: Folder) -> Iterator[Finding]:
         rows = list_maps(connection)
     models = {row.number: (row.model_id, row.next_model_id or row.model_id) for row in rows}
     own = {
-        index_folder(place, replace(row, model_id=model_id)).name
+        folder_of(place, replace(row, model_id=model_id)).name
         for row in rows
         for model_id in models[row.number]
+        for folder_of in (index_folder, earlier_folder)  # workers remove what is of before
     }
     for path in found:
         if path.is_dir() and is_index_folder(path.name) and path.name not in own:

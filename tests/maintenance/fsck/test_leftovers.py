@@ -32,7 +32,7 @@ def test_old_leftovers_are_removed_and_young_ones_are_not(house: Any) -> None:
     names = {
         folder / DIGEST: "unreferenced-blob",
         folder / f".{'0' * 12}.part": "unfinished-file",
-        index / f"{'cd' * 32}.rows": "unneeded-file",
+        index / f"{'cd' * 32}.keys": "unneeded-file",
         index / f".{'1' * 12}.part": "unneeded-file",
         house.place / "cache" / f".{'2' * 12}.part": "unfinished-file",
     }

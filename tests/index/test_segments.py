@@ -1,0 +1,358 @@
+"""Segments: appended and merged, never all written anew; searched as one, whatever they hold."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sceneprint.errors import DamagedIndex
+from sceneprint.index import Generation, Tail, newest, publish, search, signatures_of
+from sceneprint.index.generation_files import GenerationManifest, Recall, SegmentFiles
+from sceneprint.index.segment import (
+    GONE_SHARE,
+    MOST_SEGMENTS,
+    RATIO,
+    merge_plan,
+    open_segment,
+)
+from sceneprint.types import Bytes
+
+Walk = Callable[..., Bytes]
+Publish = Callable[..., Generation]
+Nearest = Callable[..., tuple[list[int], list[int]]]
+LENGTH = 24
+RECALL = Recall(1.0, 10, 0, 0, 10)
+NONE = np.empty(0, np.int64), np.empty((0, LENGTH), np.uint8)
+
+
+def bits(n: int, seed: int) -> Bytes:
+    """Signatures of 0 and 1 alone, so that many distances are equal."""
+    return np.random.default_rng(seed).integers(0, 2, (n, LENGTH), np.uint8)
+
+
+def sizes(generation: Generation) -> list[int]:
+    return [len(one) for one in generation.segments]
+
+
+def names(generation: Generation) -> set[str]:
+    return {name for name, _ in generation.manifest.files}
+
+
+def written(before: Generation | None, after: Generation) -> int:
+    """Bytes of the files that a generation has and the one before has not."""
+    known = set() if before is None else names(before)
+    return sum(size for name, size in after.manifest.files if name not in known)
+
+
+@given(st.lists(st.integers(1, 100_000), min_size=1, max_size=40))
+def test_each_segment_is_thrice_as_large_as_the_next(given_sizes: list[int]) -> None:
+    groups = merge_plan(given_sizes)
+    assert sorted(at for group in groups for at in group) == list(range(len(given_sizes)))
+    totals = [sum(given_sizes[at] for at in group) for group in groups]
+    assert 1 <= len(groups) <= MOST_SEGMENTS
+    first = 1 if len(groups) == MOST_SEGMENTS else 0  # the smallest may be several
+    assert all(b >= RATIO * a for a, b in zip(totals[first:], totals[first + 1 :], strict=False))
+
+
+def test_merges_by_hand() -> None:
+    assert merge_plan([100, 10]) == [[1], [0]]
+    assert merge_plan([99, 33]) == [[1], [0]]
+    assert merge_plan([98, 33]) == [[1, 0]]
+    assert merge_plan([47, 10, 6]) == [[2, 1, 0]]  # what is merged may merge more
+    assert merge_plan([3**i for i in range(10)]) == [[0, 1, 2], *([i] for i in range(3, 10))]
+
+
+@pytest.mark.parametrize("step", [1, 16])
+def test_all_writing_together_is_in_n_log_n(walk: Walk, published: Publish, step: int) -> None:
+    """From nothing to n in equal steps: each frame is written once, and at each merge again."""
+    n, length = 128 * step, 64
+    signatures, made, total, most = walk(n, length), None, 0, 0
+    for start in range(0, n, step):
+        keys = np.arange(start, start + step)
+        before, made = made, published(keys, signatures[keys], made, revision=start)
+        total += written(before, made)
+        most = max(most, len(made.segments))
+        assert len(made) == start + step
+        assert made.manifest.frames == start + step
+    head = 200  # of FAISS, in each file
+    # signature and key of each frame 5.4 times on average; all anew each time would be 64 times
+    assert n * (length + 8) <= total <= 5.4 * n * (length + 8) + 2 * 128 * head
+    assert most == 4
+
+
+def test_an_append_of_a_sixteenth_writes_a_sixteenth(walk: Walk, published: Publish) -> None:
+    signatures = walk(3400, 64)
+    first = published(np.arange(3200), signatures[:3200])
+    second = published(np.arange(3200, 3400), signatures[3200:], first, drop=frozenset([7, 9]))
+    assert sizes(second) == [3198, 200]
+    assert written(None, first) == pytest.approx(3200 * 72, rel=0.01)
+    assert written(first, second) == pytest.approx(200 * 72 + 2 * 8, rel=0.02)
+    assert second.segments[0].gone.tolist() == [7, 9]
+    assert second.segments[0].vectors.shape == (3200, 64)
+
+
+def test_what_is_open_stays_open(walk: Walk, published: Publish, tmp_path: Path) -> None:
+    """A reader that follows maps only what is new."""
+    signatures = walk(130)
+    first = published(np.arange(100), signatures[:100])
+    second = published(np.arange(100, 110), signatures[100:110], first)
+    found = newest(tmp_path / "map", "model", 256, known=first)
+    assert found is not None
+    assert [one is first.segments[0] for one in found.segments] == [True, False]
+    assert second.segments[0] is first.segments[0]
+    third = published(*([part[:0] for part in (np.arange(0), signatures)]), second,
+                      drop=frozenset([5]))  # fmt: skip
+    assert third.segments[0] is not first.segments[0]
+    assert third.segments[1] is second.segments[1]
+    assert (len(first.segments[0]), len(third.segments[0])) == (100, 99)
+
+
+@settings(max_examples=80, deadline=None)
+@given(data=st.data(), flat=st.sampled_from([0, 1 << 30]), seed=st.integers(0, 999))
+def test_any_history_is_searched_as_one_map(
+    tmp_path_factory: pytest.TempPathFactory, nearest: Nearest, data: Any, flat: int, seed: int
+) -> None:
+    """New, signed anew, deleted and indexed again, in any order, against a dict of all frames."""
+    folder, rng = tmp_path_factory.mktemp("map"), np.random.default_rng(seed)
+    frames: dict[int, Bytes] = {}
+    made: Generation | None = None
+    for step in range(data.draw(st.integers(1, 7))):
+        new = data.draw(st.sets(st.integers(0, 150), min_size=int(made is None), max_size=70))
+        drop = data.draw(st.sets(st.integers(0, 150), max_size=12)) if made is not None else set()
+        keys = rng.permutation(np.array(sorted(new), np.int64))
+        own = rng.integers(0, 2, (len(keys), LENGTH), np.uint8)
+        clean = data.draw(st.booleans())
+        made = publish(
+            folder, model_id="model", revision=step, blocks=[(keys, own)], previous=made,
+            drop=frozenset(drop), clean=clean, flat_bytes=flat,
+        )  # fmt: skip
+        assert made is not None
+        frames |= dict(zip(keys.tolist(), own, strict=True))
+        frames = {key: row for key, row in frames.items() if key not in drop}
+        assert not (clean and made.manifest.worn_keys)
+        for one in made.segments:
+            assert len(one.gone) <= GONE_SHARE * len(one.keys)
+    opened = newest(folder, "model", LENGTH)
+    assert made is not None
+    assert opened is not None
+    tail_keys = np.array(sorted(data.draw(st.sets(st.integers(100, 200), max_size=9))), np.int64)
+    tail = Tail(tail_keys, bits(len(tail_keys), seed + 1))
+    dead = frozenset(data.draw(st.sets(st.integers(0, 200), max_size=30)))
+    among = data.draw(st.none() | st.sets(st.integers(0, 220), max_size=120))
+    given_keys = None if among is None else rng.permutation(np.array([*among], np.int64))
+    everything = frames | dict(zip(tail_keys.tolist(), tail.signatures, strict=True))
+    allowed = {
+        key: row for key, row in everything.items()
+        if key not in dead and (among is None or key in among)
+    }  # fmt: skip
+    query = bits(1, seed + 2)[0]
+    for generation in (made, opened):
+        assert generation.keys.tolist() == sorted(frames)
+        assert (len(generation), generation.manifest.frames) == (len(frames), len(frames))
+        asked = np.arange(-3, 210)
+        assert generation.has(asked).tolist() == [int(key) in frames for key in asked]
+        for size in (1, 10, 300):
+            hits = search(
+                query, generation, tail, size, metric="l2", dead=dead, among=given_keys, exact=True
+            )
+            assert (hits.keys.tolist(), hits.distances.tolist()) == nearest(query, allowed, size)
+            assert (hits.exact, hits.compared) == (True, len(allowed))
+        held = np.array(list(everything), np.int64)
+        np.testing.assert_array_equal(
+            signatures_of(held, generation, tail), [everything[key] for key in held.tolist()]
+        )
+        own_keys = np.array(list(frames), np.int64)
+        distant = [int(((frames[k].astype(int) - query) ** 2).sum()) for k in own_keys.tolist()]
+        assert generation.distances_to(query, own_keys).tolist() == distant
+
+
+def test_what_is_gone_counts_in_no_segment(published: Publish) -> None:
+    rows = bits(140, 1)
+    made = published(np.arange(100), rows[:100])
+    made = published(np.arange(95, 110), rows[110:125], made, drop=frozenset([1, 96]))
+    assert sizes(made) == [94, 14]
+    assert made.segments[0].gone.tolist() == [1, 95, 96, 97, 98, 99]
+    # deleted where it is now, indexed once more, and replaced a second time
+    made = published(np.array([1, 97]), rows[130:132], made, drop=frozenset([98]))
+    assert made.keys.tolist() == [0, *range(1, 96), 97, *range(99, 110)]
+    np.testing.assert_array_equal(made.vectors_of(np.array([1, 97, 99])), rows[[130, 131, 114]])
+    with pytest.raises(ValueError, match=r"no frames \[98\]"):
+        made.vectors_of(np.array([98, 97]))
+    with pytest.raises(ValueError, match=r"no frames \[96\]"):
+        made.distances_to(rows[0], np.array([97, 96]))
+    assert made.holds_any(np.array([5000]))  # as some of it is gone
+    clean = published(*NONE, made, clean=True)
+    assert not clean.holds_any(np.array([5000, 98]))
+    assert clean.holds_any(np.array([5000, 97]))
+
+
+def test_a_segment_of_which_too_much_is_gone_is_written_again(published: Publish) -> None:
+    rows = bits(500, 2)
+    made = published(np.arange(400), rows[:400])
+    made = published(np.arange(400, 440), rows[400:440], made)
+    before = made.segments
+    made = published(*NONE, made, drop=frozenset(range(100)))  # a quarter
+    assert [len(one.keys) for one in made.segments] == [400, 40]
+    made = published(*NONE, made, drop=frozenset([100]))
+    assert [len(one.keys) for one in made.segments] == [299, 40]
+    assert made.segments[1] is before[1]
+    made = published(*NONE, made, drop=frozenset(range(400, 440)))  # nothing stays of it
+    assert [len(one.keys) for one in made.segments] == [299]
+
+
+def test_cleaning_writes_only_segments_that_something_is_gone_of(
+    walk: Walk, published: Publish, tmp_path: Path
+) -> None:
+    signatures = walk(207, LENGTH)
+    made = published(np.arange(150), signatures[:150])
+    for start, end in ((150, 190), (190, 203), (203, 207)):
+        made = published(np.arange(start, end), signatures[start:end], made)
+    made = published(*NONE, made, drop=frozenset([160]))
+    assert sizes(made) == [150, 39, 13, 4]
+    content = b"".join(path.read_bytes() for path in (tmp_path / "map").iterdir())
+    assert signatures[160].tobytes() in content
+    clean = published(*NONE, made, clean=True)
+    content = b"".join(path.read_bytes() for path in (tmp_path / "map").iterdir())
+    assert signatures[160].tobytes() not in content
+    assert signatures[161].tobytes() in content
+    assert [a is b for a, b in zip(made.segments, clean.segments, strict=True)] == [
+        True, False, True, True,
+    ]  # fmt: skip
+    assert written(made, clean) < 40 * (LENGTH + 8) + 200
+    assert clean.manifest.worn_keys == ()
+
+
+def test_a_map_that_becomes_large_gets_lists_for_what_it_has(
+    walk: Walk, published: Publish, tmp_path: Path
+) -> None:
+    length = 64
+    signatures = walk(3000, length, walks=20)
+    flat = 2500 * length
+    made = published(np.arange(2000), signatures[:2000], flat_bytes=flat)
+    made = published(np.arange(2000, 2500), signatures[2000:2500], made, flat_bytes=flat)
+    assert [one.lists for one in made.segments] == [None, None]
+    assert made.manifest.recall.sample == 0
+    known = made.segments
+    made = published(np.arange(2500, 2530), signatures[2500:2530], made, flat_bytes=flat)
+    assert sizes(made) == [2000, 500, 30]
+    # a small segment is compared whole
+    assert [one.lists is None for one in made.segments] == [False, False, True]
+    for one, before in zip(made.segments, known, strict=False):
+        assert one.record.file("faiss") == before.record.file("faiss")
+        assert one.record.recall.frames == len(one)
+    opened = newest(tmp_path / "map", "model", length)
+    assert opened is not None
+    each = [one.lists.probes for one in opened.segments if one.lists is not None]
+    recall = opened.manifest.recall
+    assert recall.probes == sum(each)
+    assert recall.share == min(one.record.recall.share for one in opened.segments) < 1.001
+    assert recall.sample == sum(one.record.recall.sample for one in opened.segments) > 0
+    hits = search(signatures[2999], opened, Tail.empty(length), 10, metric="l2")
+    assert not hits.exact
+    assert 30 + 10 <= hits.compared < 2530
+    less = published(*[part[:0] for part in (np.arange(0), signatures)], made,
+                     drop=frozenset(range(2500, 2530)), flat_bytes=flat)  # fmt: skip
+    assert [one.lists for one in less.segments] == [None, None]
+    assert less.manifest.recall.probes == 0
+
+
+def test_segments_find_as_much_as_one_file(walk: Walk, published: Publish, tmp_path: Path) -> None:
+    """Recall of the ten nearest, of frames of the map and of queries from elsewhere."""
+    length, n = 64, 5916
+    signatures = walk(n, length, walks=40)
+    one = published(np.arange(n), signatures, folder=tmp_path / "one", flat_bytes=0)
+    order, made = np.random.default_rng(3).permutation(n), None
+    for start, end in ((0, 4000), (4000, 5300), (5300, 5730), (5730, 5870), (5870, n)):
+        keys = order[start:end]
+        made = published(keys, signatures[keys], made, flat_bytes=0)
+    assert made is not None
+    assert len(made.segments) == 5
+    noise = np.random.default_rng(7).normal(0, 6, (80, length))
+    queries = np.clip(signatures[40::70][:80] + noise, 0, 255).astype(np.uint8)
+    empty, kept = Tail.empty(length), {"one": 0.0, "several": 0.0}
+    for query in queries:
+        right = search(query, one, empty, 10, metric="l2", exact=True)
+        for name, generation in (("one", one), ("several", made)):
+            found = search(query, generation, empty, 10, metric="l2")
+            kept[name] += np.isin(right.keys, found.keys).mean() / len(queries)
+    assert kept["several"] >= kept["one"] - 0.005
+    assert kept["several"] >= 0.97
+
+
+@pytest.fixture
+def worn(walk: Walk, published: Publish, tmp_path: Path) -> tuple[Path, Path]:
+    """Two generations of one segment, of which a frame is gone in the second; and what says so."""
+    signatures = walk(40, LENGTH)
+    first = published(np.arange(40), signatures)
+    published(*NONE, first, drop=frozenset([7]))
+    (path,) = (tmp_path / "map").glob("*.gone")
+    assert path.read_bytes() == np.array([7], "<i8").tobytes()
+    return tmp_path / "map", path
+
+
+def test_a_list_of_what_is_gone_that_is_damaged_is_passed_over(worn: tuple[Path, Path]) -> None:
+    folder, path = worn
+    found = newest(folder, "model", LENGTH)
+    assert found is not None
+    assert (found.number, len(found)) == (2, 39)
+    for data in (b"", bytes(7), bytes(8), path.read_bytes() + bytes(8), None):
+        path.unlink()
+        if data is not None:
+            path.write_bytes(data)
+        found = newest(folder, "model", LENGTH)
+        assert found is not None
+        assert (found.number, len(found)) == (1, 40)  # readers know of the deletion themselves
+
+
+@pytest.mark.parametrize(("gone", "why"), [([7, 40], "has not"), ([9, 7], "not in order")])
+def test_a_list_of_other_frames_is_refused(
+    worn: tuple[Path, Path], gone: list[int], why: str
+) -> None:
+    """Sound bytes, of somebody's own making."""
+    folder, _ = worn
+    found = newest(folder, "model", LENGTH)
+    assert found is not None
+    data = np.array(gone, "<i8").tobytes()
+    name = f"{hashlib.sha256(data).hexdigest()}.gone"
+    (folder / name).write_bytes(data)
+    record = found.segments[0].record
+    other = SegmentFiles((*record.files[:2], (name, len(data))), record.recall)
+    with pytest.raises(DamagedIndex, match=why):
+        open_segment(folder, other, LENGTH)
+
+
+def test_where_a_file_of_both_generations_is_damaged_there_is_none(
+    walk: Walk, published: Publish, tmp_path: Path
+) -> None:
+    """The database makes it again."""
+    signatures = walk(110, LENGTH)
+    first = published(np.arange(100), signatures[:100])
+    second = published(np.arange(100, 110), signatures[100:], first)
+    own, common = names(second) - names(first), names(second) & names(first)
+    assert (len(own), len(common)) == (2, 2)
+    (tmp_path / "map" / max(own)).write_bytes(b"x")
+    found = newest(tmp_path / "map", "model", LENGTH)
+    assert found is not None
+    assert found.number == 1
+    (tmp_path / "map" / max(common)).write_bytes(b"x")
+    assert newest(tmp_path / "map", "model", LENGTH) is None
+
+
+def test_a_manifest_names_a_file_once() -> None:
+    """Of two segments that lack the same frames there is one list of these."""
+    gone = ("0" * 64 + ".gone", 8)
+    each = [
+        SegmentFiles(((c * 64 + ".keys", 80), (c * 64 + ".faiss", 900), gone), RECALL)
+        for c in "ab"
+    ]  # fmt: skip
+    manifest = GenerationManifest(1, 2, "model", 9, "", tuple(each))
+    assert len(manifest.files) == 5
+    assert manifest.frames == 2 * 9
+    assert manifest.keys == manifest.worn_keys == ("a" * 64 + ".keys", "b" * 64 + ".keys")
