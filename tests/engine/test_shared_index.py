@@ -228,6 +228,45 @@ def test_an_append_puts_and_fetches_what_is_new(
         assert puts["PUT"] == 2  # what is gone, and the manifest
 
 
+def test_a_builder_that_dies_at_any_step_leaves_what_was_shared(
+    built: Engine, append: Any, place: str, host: Callable[..., Engine],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Of a merge: files first, and the manifest last; the next builder goes on from what is put."""
+    built.create_map(NewMap(name="other", model="depth"))
+    row, objects, other = row_of(built), open_objects(place), host("two")
+    shared(built).withdraw(row)
+    clear(folder_of(built))
+    append(built, 100)
+    before, store = shared(built).head(row), shared(built)._objects
+    for kind in (".keys", ".faiss", ".json"):
+
+        def dying(put: Callable[..., Any], kind: str = kind) -> Callable[..., Any]:
+            def run(key: str, *arguments: Any, **more: Any) -> Any:
+                if key.endswith(kind):
+                    raise UnusableStore("gone")
+                return put(key, *arguments, **more)
+
+            return run
+
+        with monkeypatch.context() as patch:
+            patch.setattr(store, "put_file", dying(store.put_file))
+            patch.setattr(store, "put", dying(store.put))
+            with pytest.raises(UnusableStore, match="gone"):
+                append(built, 60)
+        assert shared(built).head(row) == before
+        assert len(numbers(built)) == 1
+        assert shared(other).sync(row) == before
+    assert len([key for key in keys(objects) if key.endswith(".faiss")]) == 2
+    made = append(built, 60)
+    assert len(made.segments) == 1
+    assert shared(other).sync(row) == made.manifest
+    shared(built).tidy(row, clean=True)
+    assert set(keys(objects)) == {
+        f"{made.number:010d}.json", *(name for name, _ in made.manifest.files)
+    }  # fmt: skip
+
+
 def test_files_of_a_generation_stay_while_somebody_may_fetch_it(
     built: Engine, append: Any, place: str, host: Callable[..., Engine],
     monkeypatch: pytest.MonkeyPatch,

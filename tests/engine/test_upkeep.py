@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from sceneprint.engine import Engine
 from sceneprint.engine import engine as administration
 from sceneprint.engine.search import local_index, retrieval
 from sceneprint.errors import InvalidRequest, UnreadableModel
+from sceneprint.index import generation_files
+from sceneprint.index.generation_files import check
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import models
 from sceneprint_client.api import JobState, NewMap, Query
@@ -147,6 +149,57 @@ def test_an_index_is_published_by_what_it_lacks_however_large(
     assert due == [(0, 0), (1, 0), (0, 0), (1, 0)]
     answer = engine.queries.upload(["hall"], uploads[11].data, uploads[11].meta, ALL)
     assert (answer.counts.map, answer.index_generation) == (8, 3)
+
+
+def test_a_worker_reads_a_file_of_an_index_once(
+    make_engine: Make, uploads: Any, work_off: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To read a large index for each of many small publications would cost more than to write."""
+    engine, read = make_engine(tail_frames=1), list[str]()
+    engine.create_map(NewMap(name="hall", model="depth"))
+
+    def noted(folder: Path, name: str, size: int) -> Iterator[None]:
+        read.append(name)
+        return check(folder, name, size)
+
+    fill(engine, uploads, work_off, range(6))
+    assert engine.publish_due() == 1
+    assert engine.publish_due() == 0  # and all has been scrubbed
+    monkeypatch.setattr(generation_files, "check", noted)
+    fill(engine, uploads, work_off, range(6, 8))
+    assert engine.publish_due() == 1
+    assert read == []
+    other = make_engine(tail_frames=1)
+    fill(other, uploads, work_off, range(8, 11))
+    assert other.publish_due() == 1
+    assert sorted(name.rpartition(".")[2] for name in read) == ["faiss", "faiss", "keys", "keys"]
+    (number, _), *_ = generation_files.manifests(next(engine.settings.indexes.glob("hall*")))
+    assert number == 3
+
+
+def test_purging_removes_what_a_publication_had_only_marked(
+    make_engine: Make, uploads: Any, work_off: Any
+) -> None:
+    engine = make_engine(tail_frames=1, undo_s=0)
+    engine.create_map(NewMap(name="hall", model="depth"))
+    names = fill(engine, uploads, work_off, range(12))
+    assert engine.publish_due() == 1
+    (folder,) = engine.settings.indexes.glob("hall*")
+    generation = engine.view("hall")[2].generation
+    row = generation.vectors_of(generation.keys[2:3]).tobytes()
+    for name in (names[2], names[3]):
+        engine.delete_frame("hall", name)
+    assert engine.publish_due() == 1
+    ((_, newest), _) = generation_files.manifests(folder)
+    found = generation_files.read_manifest(newest)
+    assert (found.frames, len(found.worn_keys)) == (10, 1)
+    assert any(row in one.read_bytes() for one in folder.iterdir())
+    assert engine.purging.now().indexes == 1
+    assert all(row not in one.read_bytes() for one in folder.iterdir())
+    assert engine.purging.now().indexes == 0
+    fresh = make_engine(tail_frames=1)
+    answer = fresh.queries.upload(["hall"], uploads[5].data, uploads[5].meta, ALL)
+    assert (answer.counts.map, answer.index_generation) == (10, 3)
 
 
 def test_maps_of_whole_fisher_vectors_have_no_index(
