@@ -208,7 +208,9 @@ def too_many_requests(most: int) -> RateLimited:
 QUERY_COST, ROWS_PER_COST = 5.0, 50
 #: Rows of a list that is asked for without a limit.
 _USUAL_ROWS = 100
-_QUERIES = re.compile(r"/(queries|queries/records|localize|localize/sequence|similarity)$")
+_QUERIES = re.compile(
+    r"/(queries|queries/records|localize|localize/sequence|similarity|signatures)$"
+)
 
 
 @dataclass(frozen=True)

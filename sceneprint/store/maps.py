@@ -40,6 +40,7 @@ from sceneprint.store.events import events_table, inherited, record_event
 from sceneprint.store.tables import (
     FRAME_COLUMNS,
     MAP_COLUMNS,
+    PACKAGE,
     STATEMENT_TIME,
     TEXT,
     WHOLE,
@@ -51,6 +52,7 @@ from sceneprint.store.tables import (
     frame_rows,
     frame_tags,
     frames,
+    job_files,
     job_values,
     jobs,
     map_row,
@@ -181,7 +183,8 @@ def model_names(connection: Connection) -> dict[str, str]:
 # What a map holds and may hold: frames, and bytes of their uploads.
 #
 # Counted are frames that are neither deleted nor redundant, whatever else became of them, and their
-# uploads as they were sent. Not counted is what we make of them: signatures, artifacts, indexes.
+# uploads as they were sent, with what robots made of them while that waits. Not counted is what we
+# make of them: signatures, artifacts, indexes.
 # Two columns of the map count on in the transaction that changes it; writers take turns, so that a
 # quota holds to the frame whoever sends at once.
 
@@ -218,7 +221,12 @@ def counted_usage(connection: Connection, map_number: int) -> MapUsage:
         frames.c.map_number == map_number, frames.c.state.not_in(ROOMLESS)
     )
     n, size = connection.execute(asked).one()
-    return MapUsage(int(n), int(size))
+    sent = (
+        select(func.coalesce(func.sum(job_files.c.bytes), 0))
+        .join(jobs, jobs.c.number == job_files.c.job_number)
+        .where(job_files.c.name == PACKAGE, jobs.c.map_number == map_number)
+    )
+    return MapUsage(int(n), int(size) + int(connection.execute(sent).scalar_one()))
 
 
 def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> None:
@@ -297,8 +305,9 @@ def _received(
 
 
 def receive_frame(
-    connection: Connection, row: MapRow, values: dict[str, Any], priority: int
-) -> tuple[str, str] | None:
+    connection: Connection, row: MapRow, values: dict[str, Any], priority: int,
+    data: dict[str, Any] | None = None, more_bytes: int = 0,
+) -> tuple[str, str] | None:  # fmt: skip
     """Take a frame whose content its map lacks, and queue its signing: all that most uploads are.
 
     Others wait for this, so it is one statement on PostgreSQL, whose answer takes a round trip, and
@@ -309,18 +318,19 @@ def receive_frame(
     connection : of a writing transaction
     row : of the map, as it was when somebody looked
     values : see `add_frame`
-    priority : of the job
+    priority, data : of the job
+    more_bytes : that its map counts beside the upload
 
     Returns
     -------
     ids : of the frame and of its job; None, and nothing was written, where the map is gone, has no
         room or has the content: `add_frame` and what is asked before it say which
     """
-    frame_id, job = uuid.uuid4().hex, job_values(connection, "sign", priority)
+    frame_id, job = uuid.uuid4().hex, job_values(connection, "sign", priority, None, data)
     frame = _received(connection, row.number, frame_id, values)
     job["map_number"] = row.number
     told = event_values("frame.received", row.name, frame_id, job["id"], {})
-    room = {"map_number": row.number, "map_name": row.name, "size": values["bytes"],
+    room = {"map_number": row.number, "map_name": row.name, "size": values["bytes"] + more_bytes,
             "content": values["content_id"]}  # fmt: skip
     tags = sorted(set(values["tags"]))
     if connection.dialect.name == "sqlite":

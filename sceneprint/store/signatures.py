@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 from zlib import crc32
 
 from sqlalchemy import (
@@ -53,6 +54,7 @@ class StoredSignature:
     vector : the signature's bytes
     geometry : blob of the artifact
     n_patches, n_pairs : of each level
+    sender : id of the key that sent it with the frame; None: it was made here
     """
 
     model_id: str
@@ -60,6 +62,7 @@ class StoredSignature:
     geometry: str
     n_patches: Sequence[int]
     n_pairs: Sequence[int]
+    sender: str | None = None
 
 
 @dataclass(frozen=True)
@@ -91,8 +94,9 @@ def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) 
 
 
 def index_claimed_frame(
-    connection: Connection, job: JobRow, frame: FrameRow, map_name: str, made: StoredSignature
-) -> bool:
+    connection: Connection, job: JobRow, frame: FrameRow, map_name: str, made: StoredSignature,
+    result: dict[str, Any] | None = None,
+) -> bool:  # fmt: skip
     """End a job and index its frame in one statement, as most signatures are on PostgreSQL: the
     map's other writers wait for each round trip.
 
@@ -102,6 +106,7 @@ def index_claimed_frame(
     job : as it was claimed, of that frame
     frame, made : see `index_frame`
     map_name : of the frame's map
+    result : of the job
 
     Returns
     -------
@@ -117,6 +122,7 @@ def index_claimed_frame(
         "checksum": crc32(made.vector), "geometry": made.geometry,
         "n_patches": json.dumps(list(made.n_patches)), "n_pairs": json.dumps(list(made.n_pairs)),
         "vectors": vectors.table_of(len(made.vector)), "indexed_at": time.time(), **told,
+        "sender": made.sender, "result": None if result is None else json.dumps(result),
         "data": json.dumps(told["data"]),
     }  # fmt: skip
     found = connection.execute(_index_claimed(events_table(connection).name), values).first()
@@ -133,7 +139,8 @@ def _index_claimed(events_name: str) -> TextClause:
         f"""
         WITH ended AS (
             UPDATE jobs SET state = '{JobState.SUCCEEDED}', error = NULL, traceback = NULL,
-                leased_until = NULL, finished_at = extract(epoch FROM statement_timestamp())
+                leased_until = NULL, finished_at = extract(epoch FROM statement_timestamp()),
+                result = cast(:result AS json)
             WHERE number = :job AND token = :token AND worker = :worker
                 AND state = '{JobState.RUNNING}' AND EXISTS (
                     SELECT FROM maps WHERE number = :map_number AND model_id = :model
@@ -144,12 +151,13 @@ def _index_claimed(events_name: str) -> TextClause:
             WHERE number = :map_number AND EXISTS (SELECT FROM ended) RETURNING revision
         ), signed AS (
             INSERT INTO signatures (frame_number, model_id, vector, checksum, geometry, n_patches,
-                n_pairs)
+                n_pairs, sender)
             SELECT :frame, :model, :vector, :checksum, :geometry, cast(:n_patches AS json),
-                cast(:n_pairs AS json) FROM revised
+                cast(:n_pairs AS json), :sender FROM revised
             ON CONFLICT (frame_number, model_id) DO UPDATE SET vector = EXCLUDED.vector,
                 checksum = EXCLUDED.checksum, geometry = EXCLUDED.geometry,
-                n_patches = EXCLUDED.n_patches, n_pairs = EXCLUDED.n_pairs
+                n_patches = EXCLUDED.n_patches, n_pairs = EXCLUDED.n_pairs,
+                sender = EXCLUDED.sender
         ), edited AS (
             UPDATE surface_frames SET changed = true FROM revised WHERE frame_number = :frame
         ), found AS (
@@ -202,7 +210,7 @@ def _write_signature(connection: Connection, frame: FrameRow, made: StoredSignat
         insert(signatures).values(
             frame_number=frame.number, model_id=made.model_id, vector=made.vector,
             checksum=crc32(made.vector), geometry=made.geometry,
-            n_patches=list(made.n_patches), n_pairs=list(made.n_pairs),
+            n_patches=list(made.n_patches), n_pairs=list(made.n_pairs), sender=made.sender,
         )
     )  # fmt: skip
     vectors.put(connection, frame.number, made.model_id, len(made.vector))

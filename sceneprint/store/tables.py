@@ -194,7 +194,25 @@ signatures = Table(
     Column("geometry", _string(64), nullable=False),  # blob of the artifact
     Column("n_patches", JSON, nullable=False),
     Column("n_pairs", JSON, nullable=False),
+    Column("sender", _string(32)),  # id of the key that sent it with the frame; null: made here
     Index(None, "geometry"),
+)
+#: Signatures that were sent, by who sent them.
+_SENT: ColumnElement[bool] = signatures.c.sender.is_not(None)
+Index(
+    "ix_signatures_sender", signatures.c.sender, signatures.c.frame_number,
+    sqlite_where=_SENT, postgresql_where=_SENT,
+)  # fmt: skip
+
+#: Keys that sent signatures with their frames.
+signature_senders = Table(
+    "signature_senders",
+    metadata,
+    Column("key_id", _string(32), primary_key=True),  # the key may be revoked since
+    Column("verified", WHOLE, nullable=False),  # signatures that were made here as well, and agree
+    Column("distrusted_at", Float),  # since one did not agree; null: it is trusted
+    Column("map", _string(63)),  # of the frame for which it did not
+    Column("frame_id", _string(64)),
 )
 
 jobs = Table(
@@ -257,6 +275,9 @@ job_files = Table(
     Column("media_type", _string(64), nullable=False),
     Index(None, "blob"),
 )
+
+#: Name of the file of a job that is what a robot made of its frame, until it is signed.
+PACKAGE = "signed"
 
 keys = Table(
     "keys",
@@ -839,15 +860,23 @@ def job_values(
 ) -> dict[str, Any]:  # fmt: skip
     """Columns of a job that is queued now, but for what it is about: see `enqueue`."""
     made = now(connection)
-    if data is None and request_id() is not None:
-        data = {"request_id": request_id()}  # whose log its worker's lines belong to
-        if (parent := traceparent()) is not None:
-            data["traceparent"] = parent
+    if data is None:
+        data = request_data()
     return {
         "id": uuid.uuid4().hex, "kind": kind, "model_id": model_id, "data": data,
         "state": JobState.QUEUED, "priority": priority, "attempts": 0, "failures": 0, "token": 0,
         "run_after": made, "created_at": made, "tenant": current_tenant(),
     }  # fmt: skip
+
+
+def request_data() -> dict[str, Any] | None:
+    """What a job keeps of the request that queues it; None outside of one."""
+    if request_id() is None:
+        return None
+    data: dict[str, Any] = {"request_id": request_id()}  # whose log its worker's lines belong to
+    if (parent := traceparent()) is not None:
+        data["traceparent"] = parent
+    return data
 
 
 def event_values(

@@ -56,6 +56,11 @@ class Key(ApiRecord):
     last_used_at: datetime | None = Field(
         default=None, description="To about an hour; null: it was never used."
     )
+    signatures_distrusted_at: datetime | None = Field(
+        default=None,
+        description="Since when signatures that it sends with frames are not used, as one was "
+        "wrong; null: none was.",
+    )
 
 
 class MadeKey(Key):
@@ -362,7 +367,9 @@ class Job(ApiRecord):
         default=None, description="Of a long job, which is done in parts; null until it has begun."
     )
     result: dict[str, Any] | None = Field(
-        default=None, description="What a long job came to, in short, when it has succeeded."
+        default=None,
+        description="What a long job came to, in short, when it has succeeded. Of `sign`, where a "
+        "signature came with the frame: `signed_by`, and in `sent` what became of it.",
     )
     followed_by: str | None = Field(
         default=None,
@@ -424,6 +431,10 @@ KINDS = {
     "key.created": "A key was made; of no map.",
     "key.rotated": "A key has a new secret; the one before ends soon. Of no map.",
     "key.revoked": "A key opens nothing any more; of no map.",
+    "key.distrusted": (
+        "A signature that came with a frame was wrong, so that none of the key is used any more; "
+        "of no map. `data` has `name`, `map`, `frame_id` and `reason`."
+    ),
 }
 #: Stands in a stream where events are not there any more; kept by nobody.
 MISSED = "events.missed"

@@ -22,6 +22,8 @@ from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upload
 from sceneprint.engine.upkeep import garbage_collection, repair
 from sceneprint.errors import SceneprintError, UnusableStore
+from sceneprint.formats.signature_package import read_package
+from sceneprint.signing import SIGNING_VERSION
 from sceneprint.store import Store
 from sceneprint.store.database import Database
 from sceneprint.store.events import record_event
@@ -37,10 +39,16 @@ from sceneprint.store.maps import (
 )
 from sceneprint.store.postgres.connection import has_turn
 from sceneprint.store.queue import enqueue, job_ids_of
-from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
+from sceneprint.store.sender_rows import add_package, find_sender
+from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames, request_data
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Added, FrameMeta, FrameState
-from sceneprint_client.api.frames import BatchItem, check_frame_id, problem_of
+from sceneprint_client.api.frames import (
+    BatchItem,
+    SentSignature,
+    check_frame_id,
+    problem_of,
+)
 
 # Who an upload is: the frame that is there, a frame of its own, or a contradiction.
 
@@ -187,14 +195,18 @@ def replayed(
         frame = connection.execute(asked).mappings().first()
         if frame is None:
             return None
-        found.append(UploadResult(upload_response(connection, frame_row(frame)), one["new"]))
+        there = upload_response(connection, frame_row(frame))
+        there = there.model_copy(update={"signed": one.get("signed")})
+        found.append(UploadResult(there, one["new"]))
     return found
 
 
 def _stored_outcome(outcome: UploadResult) -> dict[str, Any]:
     """What came of an upload, as JSON that is remembered."""
     if outcome.added is not None:
-        return {"frame_id": outcome.added.frame_id, "new": outcome.new}
+        told = {"frame_id": outcome.added.frame_id, "new": outcome.new}
+        signed = outcome.added.signed
+        return told if signed is None else {**told, "signed": signed}
     error = outcome.error
     fields = error.fields if isinstance(error, errors.InvalidRequest) else ()
     return {"error": type(error).__name__, "detail": str(error), "fields": fields}
@@ -220,6 +232,8 @@ class Upload:
         of unrelated frames; None to keep it anyway. Of one that is not signed yet, the weaker
         condition counts
     frame_id : that it is to have; None: one of ours, and none where the map has its content
+    signed : what a robot made of it; see `sceneprint.formats.signature_package`
+    sender : id of the key that was shown; None: none was
     """
 
     data: bytes
@@ -227,6 +241,8 @@ class Upload:
     priority: int = 0
     if_novel: float | None = None
     frame_id: str | None = None
+    signed: bytes | None = None
+    sender: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,6 +253,33 @@ class _Prepared:
     blob: str
     content: str
     known: dict[str, Any]
+    signed: SentSignature | None = None
+
+    @property
+    def package(self) -> tuple[str, bytes] | None:
+        """Blob and bytes of what a robot made of it, where that is kept."""
+        data = self.upload.signed
+        if data is None or self.signed != "kept":
+            return None
+        return hashlib.sha256(data).hexdigest(), data
+
+    @property
+    def blobs(self) -> dict[str, bytes]:
+        """What has to be durable before a row refers to it."""
+        package = self.package
+        return {self.blob: self.upload.data} | ({} if package is None else dict([package]))
+
+    @property
+    def size(self) -> int:
+        """Bytes that its map counts for it."""
+        return sum(map(len, self.blobs.values()))
+
+    @property
+    def of_job(self) -> dict[str, Any] | None:
+        """What its job keeps of how it was sent; None: nothing but what any job does."""
+        if self.package is None:
+            return None
+        return {**(request_data() or {}), "sender": self.upload.sender}
 
     @property
     def of_blob(self) -> dict[str, Any]:
@@ -256,10 +299,11 @@ class Uploads:
     Parameters
     ----------
     store, bell : see there
+    trusts : whether what robots made of their frames is kept for workers to use
     """
 
-    def __init__(self, store: Store, bell: Wakeup) -> None:
-        self._store, self._bell = store, bell
+    def __init__(self, store: Store, bell: Wakeup, *, trusts: bool = False) -> None:
+        self._store, self._bell, self._trusts = store, bell, trusts
         # of each map that is written to, as long as somebody writes to it
         self._writes = WeakValueDictionary[int | None, Grouping]()
         self._guard = threading.Lock()
@@ -281,7 +325,8 @@ class Uploads:
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : a frame id that is none; or see `read_upload`.
+        InvalidRequest : a frame id that is none; `signed` is of another frame or model, or
+            damaged; or see `read_upload`.
         FrameError : see `read_upload`.
         FrameConflict : the frame is there with other content or metadata.
         QuotaExceeded : the map's quota has no room for one more; nothing was taken.
@@ -318,7 +363,7 @@ class Uploads:
         ready: dict[int, _Prepared] = {}
         for i, upload in enumerate(uploads):
             try:
-                ready[i] = self._prepared(upload)
+                ready[i] = self._prepared(row, upload)
             except errors.StoreError:
                 raise
             except errors.SceneprintError as error:
@@ -336,14 +381,48 @@ class Uploads:
             self._bell.ring()
         return [one for one in outcomes if one is not None], again
 
-    def _prepared(self, upload: Upload) -> _Prepared:
+    def _prepared(self, row: MapRow, upload: Upload) -> _Prepared:
         if upload.frame_id is not None:
             check_frame_id(upload.frame_id)
         read = read_upload(upload.data, upload.meta, self._store.decoders)
         content = content_id(read)
         blob = hashlib.sha256(upload.data).hexdigest()
         known = {**columns(upload.meta, read.frame.pose, read.base), "cloud": read.cloud}
-        return _Prepared(upload, blob, content, known)
+        return _Prepared(upload, blob, content, known, self._sent(row, upload, content))
+
+    def _sent(self, row: MapRow, upload: Upload, content: str) -> SentSignature | None:
+        """What becomes of what a robot made of its frame, unless the map has the frame already.
+
+        Raises
+        ------
+        InvalidRequest : it is no package, or is of another frame or another model.
+        """
+        if upload.signed is None:
+            return None
+        if not self._trusts:
+            return "off"
+        if upload.sender is None:
+            return "keyless"
+        package = read_package(upload.signed)
+        if package.content_id != content:
+            raise errors.InvalidRequest(
+                f"The part `signed` is of content {package.content_id[:12]}, and the frame has "
+                f"{content[:12]}: samples, camera or viewpoint differ. Send both as they were "
+                "when the frame was signed.",
+                (("signed", "of another frame"),),
+            )
+        if package.model_id != row.model_id:
+            raise errors.InvalidRequest(
+                f"The part `signed` was made with model {package.model_id[:12]}, and map "
+                f"{row.name!r} has {row.model_id[:12]}. Sign the frame with the map's model, or "
+                "send it without that part.",
+                (("signed", "of another model"),),
+            )
+        if package.signing_version != SIGNING_VERSION:
+            return "other_version"
+        with self._store.database.read() as connection:
+            distrusted = find_sender(connection, upload.sender).distrusted_at is not None
+        return "distrusted" if distrusted else "kept"
 
     def _settled(self, map_name: str, ready: _Prepared) -> UploadResult | None:
         """What comes of an upload for which nothing has to be written; None: it has to be."""
@@ -354,7 +433,7 @@ class Uploads:
                     connection, row, ready.content, ready.known, ready.upload.frame_id
                 )
                 if frame is None:  # what has no room is not even written to the disk
-                    require_room(connection, row, len(ready.upload.data))
+                    require_room(connection, row, ready.size)
                 if frame is None or is_retried(frame.state):
                     return None
                 waits = frame.state in (FrameState.RECEIVED, FrameState.SIGNING)
@@ -371,7 +450,8 @@ class Uploads:
         left = repair.take_upload(self._store, map_name, there.frame_id, ready.upload.data)
         if left:
             garbage_collection.collect_blobs(self._store, left)
-        return UploadResult(there.model_copy(update={"reason": repair.without_loss(there.reason)}))
+        told = {"reason": repair.without_loss(there.reason), "signed": _known(ready)}
+        return UploadResult(there.model_copy(update=told))
 
     def _write(
         self, row: MapRow, ready: dict[int, _Prepared], known: list[UploadResult | None],
@@ -391,7 +471,7 @@ class Uploads:
         """
         self._store.database.require_writable()  # before a blob to which nothing could refer
         todo = {i: one for i, one in ready.items() if known[i] is None}
-        blobs = {one.blob: one.upload.data for one in todo.values()}
+        blobs = {blob: data for one in todo.values() for blob, data in one.blobs.items()}
         left = list[str]()  # blobs that may be of no use
 
         def do(connection: Connection) -> tuple[list[UploadResult | None], bool] | None:
@@ -472,11 +552,25 @@ def _taken(connection: Connection, row: MapRow, ready: _Prepared) -> UploadResul
     """An upload of a new frame; None where it is none, or was not taken: see `_stored`."""
     if ready.upload.frame_id is not None:
         return None
-    ids = receive_frame(connection, row, ready.columns, ready.upload.priority)
+    package = ready.package
+    more = 0 if package is None else len(package[1])
+    ids = receive_frame(
+        connection, row, ready.columns, ready.upload.priority, ready.of_job, more
+    )  # fmt: skip
     if ids is None:
         return None
-    added = Added(frame_id=ids[0], job_id=ids[1], state=FrameState.RECEIVED, reason=None)
-    return UploadResult(added, new=True)
+    if package is not None:
+        add_package(connection, row.number, ids[1], package[0], more, counted=True)
+    return UploadResult(_added(ids[0], ids[1], FrameState.RECEIVED, ready), new=True)
+
+
+def _added(frame_id: str, job_id: str, state: FrameState, ready: _Prepared) -> Added:
+    return Added(frame_id=frame_id, job_id=job_id, state=state, reason=None, signed=ready.signed)
+
+
+def _known(ready: _Prepared) -> SentSignature | None:
+    """What became of what a robot made of a frame that is there already."""
+    return None if ready.signed is None else "known"
 
 
 def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[str]) -> UploadResult:
@@ -485,20 +579,21 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
     try:  # once more: another upload may have been first
         frame = find_duplicate(connection, row, ready.content, ready.known, upload.frame_id)
     except errors.FrameConflict as error:
-        left.append(ready.blob)
+        left.extend(ready.blobs)
         return UploadResult(None, error=error)
     if frame is not None and not is_retried(frame.state):
         loosen(connection, frame.number, upload.if_novel)
         frame = write_frame(connection, row, frame, _missing_labels(frame, ready.known))
-        left.append(ready.blob)
-        return UploadResult(upload_response(connection, frame))
+        left.extend(ready.blobs)
+        there = upload_response(connection, frame)
+        return UploadResult(there.model_copy(update={"signed": _known(ready)}))
     new = frame is None or frame.state == FrameState.REDUNDANT
     # a failed one is counted already, and may come packed otherwise
     held = 0 if frame is None or new else frame.bytes
     try:
-        require_room(connection, row, len(upload.data) - held, new=new)
+        require_room(connection, row, ready.size - held, new=new)
     except errors.QuotaExceeded as error:
-        left.append(ready.blob)
+        left.extend(ready.blobs)
         return UploadResult(None, error=error)
     if frame is None:
         frame = add_frame(connection, row.number, ready.columns, upload.frame_id)
@@ -506,10 +601,12 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
         left.append(frame.blob)  # it was packed otherwise
         labels = _missing_labels(frame, ready.known)
         frame = renew_frame(connection, frame.number, {**ready.of_blob, **labels})
-    job = enqueue(connection, "sign", frame.number, upload.priority)
+    job = enqueue(connection, "sign", frame.number, upload.priority, data=ready.of_job)
+    if ready.package is not None:
+        blob, data = ready.package
+        add_package(connection, row.number, job.id, blob, len(data))
     record_event(connection, "frame.received", row.name, frame.id, job.id)
-    added = Added(frame_id=frame.id, job_id=job.id, state=frame.state, reason=None)
-    return UploadResult(added, new=True)
+    return UploadResult(_added(frame.id, job.id, frame.state, ready), new=True)
 
 
 # Writers that come while another one writes are written together in the next transaction: a commit

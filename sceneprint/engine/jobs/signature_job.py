@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection
@@ -14,6 +15,7 @@ from sqlalchemy import Connection
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_stored
 from sceneprint.engine.jobs import lifecycle
+from sceneprint.engine.jobs.robot_signatures import RobotSignatures, SentSignature
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.search.retrieval import Readers
 from sceneprint.engine.signers import Signers
@@ -21,12 +23,13 @@ from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.formats.artifact import write_geometry
 from sceneprint.geometry.retrieval.ranking import Metric, distance_share, distances
 from sceneprint.models import Model
-from sceneprint.pipeline import prepare
+from sceneprint.pipeline import Signature, Signer, prepare
 from sceneprint.process import span
 from sceneprint.store import Database, Store, queue
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import find_map, frame_of, geometry_blobs, map_of
 from sceneprint.store.reencoding_rows import REENCODE, enqueue_all, models_of
+from sceneprint.store.sender_rows import find_sender, remove_packages
 from sceneprint.store.signatures import (
     StoredSignature,
     changes_since,
@@ -35,7 +38,7 @@ from sceneprint.store.signatures import (
     replace_signature,
 )
 from sceneprint.store.tables import FrameRow, MapRow
-from sceneprint.types import Bytes
+from sceneprint.types import Bytes, Geometry
 from sceneprint_client.api import FrameState, JobState
 
 log = logging.getLogger(__name__)
@@ -72,15 +75,30 @@ def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob
         return lifecycle.Work(held, frame, map_of(connection, frame.map_number))
 
 
-def run(
-    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, lease_s: float,
-    longest_s: float, broke: Callable[[], None] | None = None,
-) -> JobState | None:  # fmt: skip
-    """Sign a claimed frame.
+@dataclass(frozen=True)
+class Made:
+    """What came of a frame, and how.
 
     Parameters
     ----------
-    store, signers, readers : see there
+    signature : to be stored
+    result : of the job, where a robot sent what it had made; None: it sent nothing
+    """
+
+    signature: StoredSignature
+    result: dict[str, Any] | None
+
+
+def run(
+    store: Store, signers: Signers, readers: Readers, robots: RobotSignatures,
+    work: lifecycle.Work, lease_s: float, longest_s: float,
+    broke: Callable[[], None] | None = None,
+) -> JobState | None:  # fmt: skip
+    """Sign a claimed frame, or take what a robot made of it.
+
+    Parameters
+    ----------
+    store, signers, readers, robots : see there
     work : of `claim`
     lease_s : seconds for which each renewal holds
     longest_s : seconds after which it is renewed no more: what takes so long does not end
@@ -94,11 +112,11 @@ def run(
     """
     start = time.perf_counter()
     state: JobState | None
-    made: StoredSignature | None = None
+    made: Made | None = None
     gone: list[str] = []
     try:
         with lifecycle.renewed(store, work.job, lease_s, longest_s):
-            made = _sign(store, signers, work)
+            made = _make(store, signers, robots, work)
             gone = _store_patiently(store, signers, readers, work, made)
         state = JobState.SUCCEEDED
     except errors.LostLease as error:
@@ -113,30 +131,77 @@ def run(
             # others go before it: it may be its own folder of blobs alone that cannot be written
             lifecycle.put_back(store, work, lifecycle.LEFT_S)
             if made is not None:
-                collect_blobs(store, [made.geometry])
+                collect_blobs(store, [made.signature.geometry])
         raise
     except Exception as error:
         state = lifecycle.break_down(store, work, error)
         if broke is not None and not isinstance(error, errors.SceneprintError):
             broke()
     if made is not None and state != JobState.SUCCEEDED:
-        gone = [made.geometry]  # nothing came to refer to it
+        gone = [made.signature.geometry]  # nothing came to refer to it
     if gone:
         collect_blobs(store, gone)
     if state is None:
         return None
     milliseconds = round(1e3 * (time.perf_counter() - start), 1)
-    log.info("job %s", state, extra=lifecycle.about(work, state=state, milliseconds=milliseconds))
+    how = {} if made is None or made.result is None else made.result
+    told = {"state": state, "milliseconds": milliseconds, **how}
+    log.info("job %s", state, extra=lifecycle.about(work, **told))
     return state
 
 
-def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> StoredSignature:
+def _make(store: Store, signers: Signers, robots: RobotSignatures, work: lifecycle.Work) -> Made:
+    """Take what a robot made of a frame, or sign it."""
     if work.model_id not in models_of(work.map):
         raise lifecycle.Outdated
+    signer = signers(work.model_id)
+    with span("package"):
+        sent, note = robots.open(work, signer.model)
+    if sent is None:
+        made = _sign(store, signer, work)
+        return Made(made, None if note is None else {"signed_by": "service", "sent": note})
+    if robots.is_sampled(work, sent):
+        return _verify(store, signer, robots, work, sent)
+    with span("artifact"):
+        blob = store.blobs.put(sent.package.artifact)
+    taken = StoredSignature(
+        model_id=sent.package.model_id,
+        vector=sent.package.vector,
+        geometry=blob,
+        n_patches=sent.package.n_patches,
+        n_pairs=sent.package.n_pairs,
+        sender=sent.sender,
+    )
+    return Made(taken, {"signed_by": "robot", "sent": "taken"})
+
+
+def _verify(
+    store: Store, signer: Signer, robots: RobotSignatures, work: lifecycle.Work,
+    sent: SentSignature,
+) -> Made:  # fmt: skip
+    """Sign a frame, and compare what a robot made of it; what is made here is stored."""
+    try:
+        signature, geometry = _prepared(store, signer, work)
+    except errors.FrameError:
+        robots.verify(work, sent, None, None, signer.model)
+        raise
+    agrees = robots.verify(work, sent, signature, geometry, signer.model)
+    note = "verified" if agrees else "wrong: the key is trusted no more"
+    return Made(_put(store, signature, geometry), {"signed_by": "service", "sent": note})
+
+
+def _sign(store: Store, signer: Signer, work: lifecycle.Work) -> StoredSignature:
+    return _put(store, *_prepared(store, signer, work))
+
+
+def _prepared(store: Store, signer: Signer, work: lifecycle.Work) -> tuple[Signature, Geometry]:
     with span("decode"):
         frame = read_stored(store.blobs.get(work.frame.blob), work.frame, store.decoders)
     with span("sign"):
-        signature, geometry = prepare(frame, signers(work.model_id))
+        return prepare(frame, signer)
+
+
+def _put(store: Store, signature: Signature, geometry: Geometry) -> StoredSignature:
     with span("artifact"):
         blob = store.blobs.put(write_geometry(geometry))
     return StoredSignature(
@@ -149,7 +214,7 @@ def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> StoredSignatu
 
 
 def _store_patiently(
-    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, made: StoredSignature
+    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, made: Made
 ) -> list[str]:
     """As `_store`, while another server takes the place of one that fell.
 
@@ -167,14 +232,16 @@ def _store_patiently(
 
 
 def _store(
-    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, made: StoredSignature
+    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, result: Made
 ) -> list[str]:
     """Signature, artifact, state and end of the job in one commit.
 
     Returns
     -------
-    blobs : that a frame refers to no more which was not to be kept: its map has the place
+    blobs : that nothing refers to any more: of the package of a robot, and of a frame that was not
+        to be kept, as its map has the place
     """
+    made = result.signature
     if work.again:
         return _replace_signature(store, work, made)
     while True:
@@ -187,13 +254,16 @@ def _store(
             store.database.write(map_number=number, pending=True) as connection,
         ):
             is_indexed = is_kept and index_claimed_frame(
-                connection, work.job, work.frame, work.map.name, made
+                connection, work.job, work.frame, work.map.name, made, result.result
             )
             if not is_indexed:
-                queue.finish(connection, work.job, JobState.SUCCEEDED)
-            is_held = store.blobs.holds(made.geometry)  # in its turn nobody removes a blob
+                queue.finish(connection, work.job, JobState.SUCCEEDED, result=result.result)
+            # in its turn nobody trusts a sender no more, nor removes a blob
+            if made.sender is not None and find_sender(connection, made.sender).distrusted_at:
+                raise lifecycle.Outdated  # found to be wrong meanwhile: it is signed here
+            is_held = store.blobs.holds(made.geometry)
             if is_indexed and is_held:
-                return []
+                return _remove_package(connection, work, result)
             row = map_of(connection, number)
             if row.model_id != made.model_id:
                 raise lifecycle.Outdated
@@ -203,7 +273,8 @@ def _store(
             if reason is not None:
                 set_state(connection, work.frame.number, FrameState.REDUNDANT, reason)
                 lifecycle.record_job_event(connection, "frame.redundant", work)
-                return [work.frame.blob, made.geometry]
+                package = _remove_package(connection, work, result)
+                return [work.frame.blob, made.geometry, *package]
             if not is_held:  # nothing referred to it until now
                 raise errors.DamagedBlob(
                     "A deletion elsewhere swept the artifact: it must be made again."
@@ -212,7 +283,12 @@ def _store(
             if row.next_model_id is not None:
                 enqueue_all(connection, row, [work.frame.number])
             lifecycle.record_job_event(connection, "frame.indexed", work)
-            return []
+            return _remove_package(connection, work, result)
+
+
+def _remove_package(connection: Connection, work: lifecycle.Work, made: Made) -> list[str]:
+    """Forget what a robot sent with a frame that is signed now; returns the blob that it was."""
+    return [] if made.result is None else remove_packages(connection, [work.job.number])
 
 
 def _replace_signature(store: Store, work: lifecycle.Work, made: StoredSignature) -> list[str]:
