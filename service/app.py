@@ -53,6 +53,7 @@ from service.metrics import Metrics, housekeeping
 from service.middleware import RequestMiddleware
 from service.routes import (
     admin,
+    copies,
     coverage,
     differences,
     frame_data,
@@ -122,7 +123,7 @@ log = logging.getLogger(__name__)
 #: In the order in which the document lists them.
 ROUTERS = (
     maps.router, frames.router, selections.router, frame_data.router, frame_data.points_router,
-    maps.edits_router,
+    maps.edits_router, copies.router,
     sessions.router, frames.imports_router, frames.signatures_router, queries.router,
     results.history_router, results.offline_router,
     results.router,

@@ -12,6 +12,7 @@ from pydantic_core import to_json
 
 from sceneprint_client.api import Frame, FrameState, Map, NewMap, Page
 from sceneprint_client.api.base import checked
+from sceneprint_client.api.copies import MOST_LISTED, FrameRowRecord, FrameRows, MapListing
 from sceneprint_client.api.listing import (
     Clock,
     FrameDeletion,
@@ -513,6 +514,28 @@ class MapMethods(ServiceConnection):
         NotIndexed : it was not kept.
         """
         return self._bytes(f"{frame_path(map_name, frame_id)}/upload")
+
+    # a copy of a map, row by row
+
+    def map_listing(
+        self, map_name: str, cursor: str | None = None, limit: int = MOST_LISTED
+    ) -> MapListing:
+        """A map, and a part of the list of its indexed frames; UnknownMap if there is none."""
+        params = given(cursor=cursor, limit=limit)
+        return self._ask(MapListing, "GET", f"{map_path(map_name)}/copy", params=params)
+
+    def copied_rows(self, map_name: str, frame_ids: Sequence[str]) -> list[FrameRowRecord]:
+        """All that the service knows of at most 50 indexed frames, but for their uploads."""
+        path = f"{map_path(map_name)}/copy/frames"
+        return self._ask(FrameRows, "GET", path, params={"frame_id": list(frame_ids)}).items
+
+    def copied_artifact(self, map_name: str, digest: str) -> bytes:
+        """What validation compares of a frame; NotFound if no indexed frame has it."""
+        return self._bytes(f"{map_path(map_name)}/copy/artifacts/{digest}")
+
+    def copied_model(self, map_name: str) -> bytes:
+        """The file of a map's model; UnknownMap if there is no such map."""
+        return self._bytes(f"{map_path(map_name)}/copy/model")
 
 
 def _listed(names: Sequence[str] | None) -> list[str] | None:

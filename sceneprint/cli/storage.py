@@ -660,7 +660,12 @@ def add_pull(commands: Any) -> None:
         "the data folder, all or nothing; without a newer one, nothing is downloaded. It replaces "
         "the copy pulled before, which is moved aside only if frames were added to it, and "
         "nothing else. Stop every process that uses the folder first. The key must be an "
-        "administrator's. The copy holds all frames and the hashes of keys: protect it.",
+        "administrator's. The copy holds all frames and the hashes of keys: protect it. With "
+        "--map, only these maps, without uploads and keys: only what is new is downloaded, a key "
+        "that may read them suffices, and programs may use the folder meanwhile.",
+    )
+    command.add_argument(
+        "--map", action="append", metavar="NAME", help="only this map; may be repeated"
     )
     add_data_option(command)
     add_service_options(command)
@@ -680,6 +685,8 @@ def run_pull(options: argparse.Namespace) -> int:
             "folder. Unset them."
         )
     folder = settings.data_dir.absolute()
+    if options.map:
+        return _pull_maps(options, settings, folder)
     held = snapshot_of_copy(folder)
     with ended_by_signals(), open_client(options) as client:
         newest = next(iter(client.snapshots()), None)
@@ -705,6 +712,35 @@ def run_pull(options: argparse.Namespace) -> int:
     if aside is not None:
         print(f"frames were added to the copy before: {one_line(str(aside))}", file=sys.stderr)
     return 1 if name_damaged(snapshot, "They cannot be found by queries of the copy.") else 0
+
+
+def _pull_maps(options: argparse.Namespace, settings: Settings, folder: Path) -> int:
+    """Bring maps of a robot's store to what the service has now."""
+    from sceneprint.engine.maps.map_copy import claim_folder, pull_map
+    from sceneprint.store import open_store
+
+    claim_folder(folder)
+    with ended_by_signals(), open_client(options) as client:
+        store = open_store(settings.database, settings.blobs)
+        try:
+            for name in dict.fromkeys(options.map):
+                start = time.perf_counter()
+                with tqdm(desc=name, unit="frame", disable=None) as bar:
+
+                    def progress(done: int, total: int, bar: Any = bar) -> None:
+                        bar.total = total
+                        bar.update(done - bar.n)
+
+                    found = pull_map(client, store, name, progress)
+                print(
+                    f"{one_line(str(folder))} has map {name} of revision {found.revision}: "
+                    f"{found.frames} frames, {found.written} new or changed, {found.removed} "
+                    f"removed; {found.artifacts} artifacts, {found.bytes / 1e6:.1f} MB fetched in "
+                    f"{time.perf_counter() - start:.1f} s"
+                )
+        finally:
+            store.close()
+    return 0
 
 
 # `sceneprint thin`: which frames a map can lose, and losing them.

@@ -21,6 +21,7 @@ from sceneprint.engine.jobs.lifecycle import Work, put_back
 from sceneprint.engine.jobs.robot_signatures import RobotSignatures, make_package
 from sceneprint.engine.jobs.tasks import LongJob, Tasks
 from sceneprint.engine.maps import map_lifecycle
+from sceneprint.engine.maps.map_copy import MapCopies
 from sceneprint.engine.maps.map_coverage import COVERAGE, CoverageHandler, CoverageJobs
 from sceneprint.engine.maps.map_frames import FrameFiles, list_frames
 from sceneprint.engine.maps.map_lifecycle import Reencodings
@@ -150,6 +151,7 @@ class Engine:
         self.audit = Audit(self.store, settings.audit_kept_days)
         self.key_uses = stored_keys.KeyUses()
         self.outputs = FrameFiles(self.store, self.signers)
+        self.copies = MapCopies(self.store)
         self.points = PointClouds(self.store, self.signers, self.inspection.pairs, self.kept)
         self.reconstructions = ReconstructionJobs(self.store, self.tasks)
         self.retiring = Retention(self.store, settings.deleted_rows_days)

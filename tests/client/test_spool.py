@@ -690,7 +690,7 @@ def test_records_wait_for_a_service_that_takes_them(
 
 
 def test_a_clock_that_is_set_back_costs_no_record(
-    copy: Client, map_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    remote: Client, copy: Client, map_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now, path = time.time(), tmp_path / "spool"
     with Spool(path) as spool:
@@ -700,9 +700,12 @@ def test_a_clock_that_is_set_back_costs_no_record(
             assert spool.add_queries(copy) == 2
         late = ask(copy, map_name, 2)
         assert [spool.add_queries(copy) for _ in range(2)] == [2, 0]
+        assert sorted(held(path)) == sorted(early + late)
+        assert spool.sync(remote, map_name).queries == 4
+        assert spool.add_queries(copy) == 0  # what went is not taken again
         late += ask(copy, map_name, 1)
         assert spool.add_queries(copy) == 1
-    assert sorted(held(path)) == sorted(early + late)
+        assert held(path) == late[-1:]
 
 
 def test_kills_and_a_full_disk_lose_and_double_no_record(
@@ -761,7 +764,7 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
         first += len(numbers)  # one more may be durable: it is added again
     for _ in range(12):
         with child("queries", path, folder, chance.randrange(1200)) as process:
-            process.communicate()
+            process.communicate(timeout=120)
         assert process.returncode == -signal.SIGKILL
     with Client.embedded(folder) as copy, Spool(path) as spool:
         spool.add_queries(copy)

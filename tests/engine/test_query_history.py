@@ -396,7 +396,7 @@ def test_what_the_service_answered_itself_is_known_when_it_comes_back(aged):
     assert add(aged.history, back) == (0, 1, 0, {})
     assert [one.offline for one in aged.history.page(EVERY, None, None, 9).items] == [False]
     # what a robot sends under the id of another's query is never taken for that query's record
-    forged = sent(1, at=datetime.fromtimestamp(online.at.timestamp() + 1, UTC).isoformat())
+    forged = sent(1, at=datetime.fromtimestamp(online.at.timestamp() - 1, UTC).isoformat())
     add(aged.history, forged)
     with aged.store.database.read() as connection:
         number = find_map(connection, "hall").number

@@ -68,6 +68,10 @@ OF_A_MAP = {
     "GET /v1/maps/{map_name}/frames/{frame_id}/signature": Case(),
     "GET /v1/maps/{map_name}/frames/{frame_id}/upload": Case(),
     "GET /v1/maps/{map_name}/frames/{frame_id}/points": Case(),
+    "GET /v1/maps/{map_name}/copy": Case(),
+    "GET /v1/maps/{map_name}/copy/frames": Case(query={"frame_id": "{frame}"}),
+    "GET /v1/maps/{map_name}/copy/artifacts/{digest}": Case(),
+    "GET /v1/maps/{map_name}/copy/model": Case(),
     "GET /v1/maps/{map_name}/sessions": Case(),
     "PATCH /v1/maps/{map_name}/sessions": Case(
         "write", body={"add_tags": ["x"]}, query={"session": "{session}"}
@@ -190,6 +194,7 @@ class There:
     difference: str
     tile: str
     session: str
+    artifact: str
 
     def of(self, operation: str, what: str) -> str:
         """The id that a part of a path stands for."""
@@ -201,7 +206,7 @@ class There:
         return {
             "map_name": self.map, "frame_id": self.frame, "query_id": self.query,
             "job_id": (jobs or [self.job])[0], "key_name": "keeper", "snapshot_id": self.job,
-            "digest": self.tile,
+            "digest": self.artifact if "/artifacts/" in operation else self.tile,
         }[what]  # fmt: skip
 
     def fill(self, text: str) -> str:
@@ -222,6 +227,7 @@ class There:
             self.coverage,
             self.difference,
             self.tile,
+            self.artifact,
         ]
 
 
@@ -269,10 +275,15 @@ def there(walled, small_shots, until) -> dict[str, There]:
         jobs = [
             one.headers["location"].rpartition("/")[2] for one in (begun, fused, measured, compared)
         ]
+        alone = sent[0 if name == OWN else 2]["frame_id"]  # the other map has not its content
+        rows = walled.ask(
+            "boss", "GET", f"/v1/maps/{name}/copy/frames", params={"frame_id": alone}
+        ).json()["items"]
         found[name] = There(
-            name, frame, query, sent[0]["job_id"], *jobs, tiles[0]["digest"], session
-        )
-    found[NONE] = There(NONE, *[NO_ID] * 8, f"run-of-{NONE}")
+            name, frame, query, sent[0]["job_id"], *jobs, tiles[0]["digest"], session,
+            rows[0]["geometry"],
+        )  # fmt: skip
+    found[NONE] = There(NONE, *[NO_ID] * 8, f"run-of-{NONE}", "0" * 64)
     return found
 
 
@@ -366,7 +377,7 @@ def test_lists_have_nothing_of_another_map(walled, there, operations):
               f"/v1/maps/{OWN}/associations", f"/v1/maps/{OWN}/coverage",
               f"/v1/maps/{OWN}/differences",
               f"/v1/maps/{OWN}/surface", f"/v1/maps/{OWN}/surface/tiles",
-              f"/v1/maps/{OWN}/sessions"]  # fmt: skip
+              f"/v1/maps/{OWN}/sessions", f"/v1/maps/{OWN}/copy"]  # fmt: skip
     for path in listed:
         for key in ("admin", "reader"):
             answer = walled.ask(key, "GET", path)
@@ -456,7 +467,7 @@ def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
 def unseen(walled: Any, method: str, path: str, id_: str) -> None:
     """See that an id is to the key as one that nothing has."""
     answers = [
-        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"-------"))
+        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"--------"))
         for one in (id_, NO_ID)
     ]
     assert told(*answers[0]) == told(*answers[1])

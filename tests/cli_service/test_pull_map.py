@@ -1,0 +1,37 @@
+"""`sceneprint pull --map`: maps of a running service in a robot's folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sceneprint_client import Client
+
+
+@pytest.mark.sqlite_only("a copy of a map is in a folder with SQLite")
+def test_a_map_is_pulled_and_renewed(
+    sceneprint: Callable[..., Any], service_url: str, rooms: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy"
+    with Client(service_url) as client:
+        client.create_map("pulled", model="depth")
+        client.create_map("pulled-too", model="depth")
+        sceneprint("upload", "pulled", rooms / "room-0")
+        said = sceneprint("pull", "--map", "pulled", "--map", "pulled-too", "--data", copy)
+        told = said.stdout.splitlines()
+        assert told[0].startswith(
+            f"{copy} has map pulled of revision 3: 3 frames, 3 new or changed"
+        )
+        assert told[1].startswith(f"{copy} has map pulled-too of revision 0: 0 frames, 0 new")
+        said = sceneprint("pull", "--map", "pulled", "--data", copy)
+        assert ", 0 new or changed, 0 removed; 0 artifacts, 0.0 MB fetched" in said.stdout
+        online = sorted(one.frame_id for one in client.frames("pulled"))
+    with Client.embedded(copy) as robot:
+        assert sorted(one.frame_id for one in robot.frames("pulled")) == online
+    said = sceneprint("pull", "--map", "nowhere", "--data", copy, expect=2)
+    assert "nowhere" in said.stderr
+    said = sceneprint("pull", "--map", "pulled", "--data", rooms, expect=2)
+    assert "is not empty" in said.stderr

@@ -1,0 +1,279 @@
+"""One map pulled into a robot's store: the same answers, only what is new, and after kills."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.engine.maps import map_copy
+from sceneprint.engine.maps.map_copy import PulledMap, pull_map
+from sceneprint.errors import Conflict, DamagedBlob, InvalidRequest, UnknownMap
+from sceneprint.lab.synth import synthesise_room
+from sceneprint.store import open_store
+from sceneprint.types import DepthFrame
+from sceneprint_client import Client
+from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose
+
+MAP = "hall"
+#: What tells one query from another, and says nothing of the answer.
+OF_THE_QUERY = ("query_id", "milliseconds")
+
+
+@pytest.fixture(scope="module")
+def walk() -> tuple[DepthFrame, ...]:
+    return synthesise_room(5, 1, 16, along_path=True).frames
+
+
+def camera_of(view: DepthFrame) -> CameraIntrinsics:
+    k = view.intrinsics
+    return CameraIntrinsics(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
+
+
+def upload(client: Client, views: tuple[DepthFrame, ...], name: str = MAP) -> list[str]:
+    ids = []
+    for number, view in enumerate(views):
+        pose = GivenPose(parent_frame="room", matrix=np.array(view.pose).tolist())
+        meta = FrameMeta(
+            intrinsics=camera_of(view), session="s", robot="cart", pose=pose, sequence=number,
+            captured_at="2026-11-16T09:30:00.125Z", up=(0.0, -1.0, 0.0), tags=["lit", "door"],
+            name=f"a/{number}.png",
+        )  # fmt: skip
+        added = client.upload(name, view.depth, meta, wait_s=400)
+        assert added.state == "indexed"
+        ids.append(added.frame_id)
+    return ids
+
+
+def answers(client: Client, views: tuple[DepthFrame, ...]) -> list[dict[str, Any]]:
+    """All that is answered to each view, and what is told of the map's frames."""
+    asked = [client.query(MAP, one.depth, camera_of(one), explain=True) for one in views]
+    told = [one.model_dump(mode="json") for one in asked]
+    frames = [
+        one.model_dump(mode="json", exclude={"job_id"}) for one in client.frames(MAP)
+        if one.state == "indexed"  # of those that are gone, the copy need not have known
+    ]  # fmt: skip
+    return [
+        *({name: one[name] for name in one if name not in OF_THE_QUERY} for one in told), *frames
+    ]  # fmt: skip
+
+
+@dataclass
+class Robot:
+    """A robot's folder, and the service that it pulls from."""
+
+    service: Client
+    folder: Path
+
+    def pull(self, name: str = MAP) -> PulledMap:
+        database = f"sqlite:///{self.folder}/sceneprint.db"
+        with closing(open_store(database, self.folder / "blobs")) as store:
+            return pull_map(self.service, store, name)
+
+    def answers(self, views: tuple[DepthFrame, ...]) -> list[dict[str, Any]]:
+        with Client.embedded(self.folder) as client:
+            return answers(client, views)
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Iterator[Robot]:
+    with ExitStack() as stack:
+        service = stack.enter_context(Client.embedded(tmp_path / "service"))
+        (tmp_path / "robot").mkdir()
+        yield Robot(service, tmp_path / "robot")
+
+
+def test_a_pulled_map_answers_as_the_service_and_follows_it(
+    robot: Robot, walk: tuple[DepthFrame, ...]
+) -> None:
+    service, asked = robot.service, walk[1:8:3]
+    with pytest.raises(UnknownMap):
+        robot.pull()
+    service.create_map(MAP, title="The hall", model="depth")
+    service.create_map("other", model="depth")
+    ids = upload(service, walk[:10:2])
+    first = robot.pull()
+    assert (first.frames, first.written, first.removed, first.artifacts) == (5, 5, 0, 5)
+    online = answers(service, asked)
+    assert [one["status"] for one in online[:3]].count("found") >= 2
+    assert robot.answers(asked) == online
+    with Client.embedded(robot.folder) as client:
+        assert [one.name for one in client.maps()] == [MAP]
+        told = client.map(MAP)
+        assert (told.title, told.created_at) == ("The hall", service.map(MAP).created_at)
+    again = robot.pull()
+    assert (again.written, again.removed, again.artifacts, again.bytes) == (0, 0, 0, 0)
+
+    # one is new, one is gone, one edited, and one uploaded again under its id
+    upload(service, walk[10:11])
+    service.delete_frame(MAP, ids[1])
+    service.edit_frame(MAP, ids[2], {"tags": ["dark"], "pose": None})
+    service.delete_frame(MAP, ids[3])
+    view = walk[12]
+    service.put_frame(MAP, ids[3], view.depth, FrameMeta(intrinsics=camera_of(view)), wait_s=400)
+    second = robot.pull()
+    assert (second.frames, second.written, second.removed, second.artifacts) == (5, 3, 1, 2)
+    assert robot.answers(asked) == answers(service, asked)
+    assert robot.pull().written == 0
+
+    # the map is deleted and created again
+    service.delete_map(MAP)
+    service.create_map(MAP, model="depth")
+    upload(service, walk[:2])
+    third = robot.pull()
+    assert (third.frames, third.written, third.artifacts) == (2, 2, 1)
+    assert robot.answers(asked) == answers(service, asked)
+
+
+def test_what_was_uploaded_into_the_copy_is_not_lost(
+    robot: Robot, walk: tuple[DepthFrame, ...]
+) -> None:
+    robot.service.create_map(MAP, model="depth")
+    robot.pull()
+    with Client.embedded(robot.folder) as client:
+        [own] = upload(client, walk[:1])
+    with pytest.raises(Conflict, match=own):
+        robot.pull()
+    robot.service.delete_map(MAP)
+    robot.service.create_map(MAP, model="depth")
+    with pytest.raises(Conflict, match="uploaded into the copy"):
+        robot.pull()
+    with Client.embedded(robot.folder) as client:
+        assert [one.frame_id for one in client.frames(MAP)] == [own]
+
+
+#: Pulls in a process that is killed: after so many artifacts, or in the middle of the transaction.
+CHILD = """
+import os, signal, sys
+from contextlib import closing
+from pathlib import Path
+from sceneprint.engine.maps import map_copy
+from sceneprint.store import open_store
+from sceneprint_client import Client
+service, folder, what, count = sys.argv[1:]
+seen = []
+def counted(do):
+    def done(*given):
+        seen.append(given)
+        if len(seen) > int(count):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return do(*given)
+    return done
+store = open_store(f"sqlite:///{folder}/sceneprint.db", Path(folder) / "blobs")
+with Client.embedded(service) as client, closing(store):
+    if what == "artifacts":
+        client.copied_artifact = counted(client.copied_artifact)
+    else:
+        map_copy.put_copied = counted(map_copy.put_copied)
+    map_copy.pull_map(client, store, "hall")
+"""
+
+
+def test_a_killed_pull_leaves_the_copy_and_goes_on(
+    robot: Robot, walk: tuple[DepthFrame, ...], tmp_path: Path
+) -> None:
+    service, asked = robot.service, walk[1:4:2]
+    service.create_map(MAP, model="depth")
+    upload(service, walk[:2])
+    robot.pull()
+    before = robot.answers(asked)
+    upload(service, walk[2:6])
+
+    def kill(what: str, count: int) -> None:
+        given = [tmp_path / "service", robot.folder, what, str(count)]
+        ran = subprocess.run([sys.executable, "-c", CHILD, *given], check=False)
+        assert ran.returncode == -signal.SIGKILL
+        assert robot.answers(asked) == before
+
+    kill("artifacts", 2)
+    kill("rows", 3)  # all four artifacts are there by then
+    found = robot.pull()
+    assert (found.frames, found.written, found.artifacts, found.bytes) == (6, 4, 0, 0)
+    assert robot.answers(asked) == answers(service, asked)
+
+
+@pytest.mark.parametrize("rounds", [1, 10])
+def test_a_map_that_changes_is_listed_until_it_is_quiet(
+    robot: Robot, walk: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch, rounds: int
+) -> None:
+    """But not for ever: then what was gone by the end is in the copy until the next pull."""
+    service = robot.service
+    service.create_map(MAP, model="depth")
+    ids = upload(service, walk[:4])
+    monkeypatch.setattr(map_copy, "ROUNDS", rounds)
+    monkeypatch.setattr(map_copy, "MOST_LISTED", 2)
+    monkeypatch.setattr(map_copy, "MOST_ROWS", 1)
+    read, changes = service.map_listing, iter([ids[0], ids[3]])
+
+    def changing(*given: Any, **how: Any) -> Any:
+        part = read(*given, **how)
+        if part.next_cursor is not None and (gone := next(changes, None)) is not None:
+            service.delete_frame(MAP, gone)
+        return part
+
+    monkeypatch.setattr(service, "map_listing", changing)
+    found = robot.pull()
+    if rounds == 1:
+        assert (found.frames, found.written, found.revision) == (3, 3, 4)
+        monkeypatch.undo()
+        service.delete_frame(MAP, ids[3])
+        found = robot.pull()
+        assert (found.frames, found.written, found.removed) == (2, 0, 1)
+    else:
+        assert (found.frames, found.written) == (2, 2)
+    assert found.revision == service.map(MAP).revision
+    with Client.embedded(robot.folder) as client:
+        living = [one for one in client.frames(MAP) if one.state == "indexed"]
+        assert {one.frame_id for one in living} == set(ids[1:3])
+
+
+def test_a_frame_that_goes_before_its_artifact_is_passed_over(
+    robot: Robot, walk: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = robot.service
+    service.create_map(MAP, model="depth")
+    ids = upload(service, walk[:2])
+    read = service.copied_artifact
+
+    def gone(*given: Any) -> bytes:
+        if service.frame(MAP, ids[0]).state == "indexed":
+            service.delete_frame(MAP, ids[0])
+        return read(*given)
+
+    monkeypatch.setattr(service, "copied_artifact", gone)
+    found = robot.pull()
+    assert (found.frames, found.written, found.revision) == (1, 1, 3)
+
+
+def test_other_bytes_than_were_named_are_refused(
+    robot: Robot, walk: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot.service.create_map(MAP, model="depth")
+    upload(robot.service, walk[:1])
+    monkeypatch.setattr(robot.service, "copied_artifact", lambda *_: b"other")
+    with pytest.raises(DamagedBlob, match="other bytes"):
+        robot.pull()
+    with Client.embedded(robot.folder) as client:
+        assert list(client.maps()) == []
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    map_copy.claim_folder(tmp_path / "new")
+    (tmp_path / "new" / "sceneprint.db").touch()
+    map_copy.claim_folder(tmp_path / "new")  # which is one already
+    (tmp_path / "data").mkdir()
+    map_copy.claim_folder(tmp_path / "data")
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "sceneprint.db").touch()
+    for folder in (other, other / "sceneprint.db"):
+        with pytest.raises(InvalidRequest, match="not empty"):
+            map_copy.claim_folder(folder)
