@@ -263,6 +263,25 @@ def test_a_map_that_becomes_large_gets_lists_for_what_it_has(
     assert less.manifest.recall.probes == 0
 
 
+def test_a_merge_goes_on_with_the_centroids_of_the_largest(walk: Walk, published: Publish) -> None:
+    signatures, made = walk(1420, 64, walks=9), None
+    for start, end in ((0, 1000), (1000, 1300), (1300, 1360)):
+        made = published(np.arange(start, end), signatures[start:end], made, flat_bytes=0)
+        assert made.segments[-1].record.recall.frames == end - start  # each is trained by itself
+    assert made is not None
+    before = made.segments[0].lists
+    made = published(np.arange(1360, 1420), signatures[1360:], made, flat_bytes=0)
+    assert sizes(made) == [1420]
+    after = made.segments[0].lists
+    assert before is not None
+    assert after is not None
+    assert after.trained_on == 1000
+    np.testing.assert_array_equal(after.centroids, before.centroids)
+    squares = ((signatures[:, None].astype(float) - after.centroids) ** 2).sum(axis=2)
+    chosen = squares[np.arange(1420), after.assignment()]
+    np.testing.assert_allclose(chosen, squares.min(axis=1), rtol=1e-4, atol=0.5)
+
+
 def test_segments_find_as_much_as_one_file(walk: Walk, published: Publish, tmp_path: Path) -> None:
     """Recall of the ten nearest, of frames of the map and of queries from elsewhere."""
     length, n = 64, 5916

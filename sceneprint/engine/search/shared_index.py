@@ -282,7 +282,8 @@ class SharedIndexes:
             if not mine:
                 return None  # somebody fetches or builds it
             try:
-                for name, size in found.files:
+                # small ones first: they are merged soon, and then removed from the store
+                for name, size in sorted(found.files, key=lambda each: each[1]):
                     if not _is_here(folder, name, size):
                         self._get(folder, name, size)
             except UnusableStore:
