@@ -207,19 +207,15 @@ def open_generation(
         if inodes[name] != verified.get(name, -1):
             for _ in generation_files.check(folder, name, size):
                 pass
-    # what is open already has its rows by key, and its pages, at hand
+    # what is open has its rows by key, and its pages, at hand; a name is a checksum
     open_ones = {} if known is None else {one.record: one for one in known.segments}
     segments = tuple(
         open_ones[record]
-        if record in open_ones and known is not None and _same(known.inodes, inodes, record)
+        if record in open_ones
         else open_segment(folder, record, manifest.dimension)
         for record in manifest.segments
     )
     return Generation(manifest, segments, inodes)
-
-
-def _same(known: Mapping[str, int], inodes: Mapping[str, int], record: SegmentFiles) -> bool:
-    return all(known[name] == inodes[name] for name, _ in record.files)
 
 
 def _inode(path: Path) -> int:
@@ -483,9 +479,9 @@ def publish(
         if previous is not None:  # known to be sound, whatever lies between
             listed = [each for each in listed if each[0] == previous.number]
         _clean(folder, {own, *(path for _, path in listed[: 0 if clean else 1])})
-        before = {} if previous is None else previous.inodes
-        written = {name: _inode(folder / name) for name, _ in manifest.files if name not in before}
-        return open_generation(folder, manifest, previous, written)
+        # what was there was verified when it was opened, and what is new as it was written
+        sound = {name: _inode(folder / name) for name, _ in manifest.files}
+        return open_generation(folder, manifest, previous, sound)
 
 
 def _write_segments(
