@@ -20,6 +20,9 @@ from benchmarks.fleet.failover_client import FailoverClient, RequestLog, Unreach
 from benchmarks.fleet.faults import PRIMARY, Kill, Promotion, schedule
 from benchmarks.fleet.paper import Costs, paper
 from benchmarks.fleet.postgres import NoServer, binaries
+from benchmarks.fleet.qdrant_search import Compared, Searched
+from benchmarks.fleet.qdrant_search import measure as measure_qdrant
+from benchmarks.fleet.qdrant_search import table as qdrant_table
 from benchmarks.fleet.recordings import GRIDS, walks
 from benchmarks.fleet.resource_usage import Work
 from benchmarks.fleet.robots import Kept, Listener
@@ -287,3 +290,25 @@ def test_what_is_on_paper_is_multiplied_right() -> None:
     assert told["| linking all of them anew, one processor"] == "1.4 h |"
     assert told["| of one that asks all maps"] == "160 MB, 128.1 GB |"
     assert tenfold["| reading all blobs, at 100 MB/s"] == "69 h |"
+
+
+def test_figures_of_qdrant_beside_our_own_search() -> None:
+    own, other = Searched(0.0, 1234.5, 14.04, 0.0), Searched(12.34, 987.0, 58.06, 250_180.4)
+    told = qdrant_table([Compared("paper", 3000, 125_000, (own, other), 4.14)])
+    assert told[0] == "| | 3,000 x 125,000 B, own | 3,000 x 125,000 B, Qdrant |"
+    assert told[2:6] == [
+        "| publish the index, CPU s | none | 12.3 |",
+        "| first query after a start, CPU ms | 1,234 | 987 |",
+        "| later queries, median, CPU ms | 14.0 | 58.1 |",
+        "| index on the disk, bytes a frame | 0 | 250,180 |",
+    ]
+    assert "4.1 times as long by the clock" in told[7]
+
+
+@pytest.mark.thorough
+def test_our_own_search_and_qdrant_are_measured(tmp_path: Path) -> None:
+    """It ends with an error where their answers differ."""
+    told = measure_qdrant("depth", 600, tmp_path)
+    assert [one.publish_s > 0 for one in told.nodes] == [True, True]
+    assert told.nodes[1].bytes_per_frame > told.nodes[0].bytes_per_frame > told.signature_bytes
+    assert told.ratio > 0

@@ -29,6 +29,7 @@ from sceneprint.index.generation_files import (
     is_ours,
     manifests,
     read_manifest,
+    remove,
     write_manifest,
 )
 from sceneprint.index.segment import (
@@ -117,8 +118,8 @@ class Generation:
             result[at] = one.vectors[rows]
         return result
 
-    def distances_to(self, query: Bytes, keys: Keys) -> NDArray[np.int64]:
-        """Exact distances (r,) of a signature (D,) to some frames.
+    def distances_to(self, query: Bytes, keys: Keys, metric: Metric) -> NDArray[np.int64]:
+        """Exact distances (r,) of a signature (D,) to some frames, by the metric of their model.
 
         Raises
         ------
@@ -126,7 +127,7 @@ class Generation:
         """
         result = np.empty(len(keys), np.int64)
         for one, at, rows in self._located(keys):
-            result[at] = distances(query, one.vectors, "l2", rows)
+            result[at] = distances(query, one.vectors, metric, rows)
         return result
 
     def _located(self, keys: Keys) -> list[tuple[Segment, NDArray[np.intp], NDArray[np.int64]]]:
@@ -149,6 +150,7 @@ def newest(
     *,
     known: Generation | None = None,
     sound: Mapping[str, int] | None = None,
+    qdrant: Metric | None = None,
 ) -> Generation | None:
     """Open the newest sound generation of a folder.
 
@@ -162,6 +164,8 @@ def newest(
     known : a generation of this folder that is open: files that it has are not verified again,
         and where it is the newest it is returned itself
     sound : inodes, by name, of files that this process has verified before
+    qdrant : the metric of the signatures, where shards of Qdrant are to be searched, as far as
+        there are any that its engine can open; None where they are left alone
 
     Returns
     -------
@@ -173,7 +177,7 @@ def newest(
             try:
                 manifest = generation_files.read_manifest(path)
                 if (manifest.model_id, manifest.dimension) == (model_id, dimension):
-                    found = open_generation(folder, manifest, known, sound)
+                    found = open_generation(folder, manifest, known, sound, qdrant)
                     break
             except DamagedIndex as error:
                 errors.append(error)
@@ -186,14 +190,14 @@ def newest(
 
 def open_generation(
     folder: Path, manifest: GenerationManifest, known: Generation | None = None,
-    sound: Mapping[str, int] | None = None,
+    sound: Mapping[str, int] | None = None, qdrant: Metric | None = None,
 ) -> Generation:  # fmt: skip
     """Open the files of a generation.
 
     Parameters
     ----------
     folder, manifest : of the generation
-    known, sound : see `newest`
+    known, sound, qdrant : see `newest`
 
     Raises
     ------
@@ -212,7 +216,7 @@ def open_generation(
     segments = tuple(
         open_ones[record]
         if record in open_ones
-        else open_segment(folder, record, manifest.dimension)
+        else open_segment(folder, record, manifest.dimension, qdrant)
         for record in manifest.segments
     )
     return Generation(manifest, segments, inodes)
@@ -362,14 +366,14 @@ def search(
     generation : or None where there is none
     tail : frames newer than that; where a frame is in both, this one counts
     size : of the answer; all frames where there are fewer
-    metric : of the model of the map; a generation is of "l2"
+    metric : of the model of the map
     dead : keys of frames that were deleted since
     among : keys of the frames that may be found, where not all may; others are no matter
     exact : compare every frame, of those that may be found
 
     Raises
     ------
-    ValueError : no signature of that length, a negative size, or a generation under "l1".
+    ValueError : no signature of that length, or a negative size.
     """
     if query.ndim != 1 or query.dtype != np.uint8 or size < 0:
         raise ValueError(f"{size} for a query {query.dtype} {query.shape}")
@@ -380,11 +384,11 @@ def search(
     keys, whole, compared = [tail.keys[alive]], True, len(alive)
     found = [distances(query, tail.signatures, metric, alive)]
     if generation is not None and len(generation):
-        if metric != "l2":
-            raise ValueError(f"an index of metric 'l2' searched by {metric!r}")
         gone = np.sort(np.concatenate([gone, tail.keys]))
         for one in generation.segments:
-            (own, distant), all_of_it, count = one.nearest(query, size, gone, among, exact=exact)
+            (own, distant), all_of_it, count = one.nearest(
+                query, size, gone, among, metric=metric, exact=exact
+            )
             keys.append(own)
             found.append(distant)
             whole, compared = whole and all_of_it, compared + count
@@ -420,6 +424,7 @@ def publish(
     flat_bytes: int = FLAT_BYTES,
     after: int = 0,
     share: Callable[[GenerationManifest], bool] = lambda _: True,
+    qdrant: Metric | None = None,
 ) -> Generation | None:
     """Publish the generation that follows `previous`.
 
@@ -431,7 +436,7 @@ def publish(
     Parameters
     ----------
     folder : of the map; made if need be
-    model_id : of the model that signed the frames, whose metric is "l2"
+    model_id : of the model that signed the frames
     revision : of the map, up to which `blocks` and `previous` hold its frames
     blocks : keys (n,) int64 and signatures (n, D) uint8 of the frames that are not in `previous`;
         a key that is there replaces the signature there. It is read once, and block by block.
@@ -445,6 +450,8 @@ def publish(
     after : its number is larger than that
     share : called with the manifest once all files are there and before it is: False where another
         generation was published by that number elsewhere, so that this one is not published
+    qdrant : the metric of the signatures, where shards of Qdrant are to choose what is compared;
+        None where FAISS does, and the metric is "l2"
 
     Returns
     -------
@@ -463,7 +470,9 @@ def publish(
         if not mine or _overtaken(folder, previous):
             return None
         listed = manifests(folder)
-        records, dimension = _write_segments(folder, previous, blocks, drop, clean, flat_bytes)
+        records, dimension = _write_segments(
+            folder, previous, blocks, drop, clean, flat_bytes, qdrant
+        )
         manifest = GenerationManifest(
             number=max(after, listed[0][0] if listed else 0) + 1,
             revision=revision,
@@ -481,12 +490,12 @@ def publish(
         _clean(folder, {own, *(path for _, path in listed[: 0 if clean else 1])})
         # what was there was verified when it was opened, and what is new as it was written
         sound = {name: _inode(folder / name) for name, _ in manifest.files}
-        return open_generation(folder, manifest, previous, sound)
+        return open_generation(folder, manifest, previous, sound, qdrant)
 
 
 def _write_segments(
     folder: Path, previous: Generation | None, blocks: Iterable[Block], drop: frozenset[int],
-    clean: bool, flat_bytes: int,
+    clean: bool, flat_bytes: int, qdrant: Metric | None,
 ) -> tuple[tuple[SegmentFiles, ...], int]:  # fmt: skip
     """Write what is new and what it is merged with; all segments, and bytes of a signature."""
     dimension = None if previous is None else previous.manifest.dimension
@@ -494,10 +503,12 @@ def _write_segments(
     if previous is None and len(new_keys) == 0:
         raise ValueError("a generation of no frames that follows none")
     sources = segment_sources(() if previous is None else previous.segments, new_keys, stored, drop)
-    most = list_threshold(sources, flat_bytes)
+    most = list_threshold(sources, flat_bytes) if qdrant is None else np.inf
     groups = merge_plan([len(each) for each in sources])
     records = tuple(
-        write_segment(folder, [sources[at] for at in group], clean=clean, flat_bytes=most)
+        write_segment(
+            folder, [sources[at] for at in group], clean=clean, flat_bytes=most, qdrant=qdrant
+        )
         for group in reversed(groups)
     )
     return records, dimension or stored.shape[1]
@@ -545,7 +556,7 @@ def _clean(folder: Path, kept: set[Path]) -> None:
             path.unlink(missing_ok=True)
     for path in folder.iterdir():
         if is_ours(path.name) and path.name not in needed:
-            path.unlink(missing_ok=True)
+            remove(path)
 
 
 def _files(path: Path) -> tuple[tuple[str, int], ...]:

@@ -13,6 +13,7 @@ again.
 
 from __future__ import annotations
 
+import logging
 import mmap
 import os
 from collections.abc import Iterable, Sequence
@@ -26,11 +27,12 @@ from numpy.typing import NDArray
 
 from sceneprint.atomic_files import create_private
 from sceneprint.errors import DamagedIndex
-from sceneprint.geometry.retrieval.ranking import distances
+from sceneprint.geometry.retrieval.ranking import Metric, distances
 from sceneprint.index import faiss_index
 from sceneprint.index.faiss_index import Lists, codes_of, map_index, map_lists, nearest
 from sceneprint.index.generation_files import (
     BLOCK_BYTES,
+    FOLDER_KIND,
     Block,
     Keys,
     Recall,
@@ -38,12 +40,16 @@ from sceneprint.index.generation_files import (
     check_block,
     mapped,
     put,
+    put_folder,
     unfinished,
 )
+from sceneprint.index.qdrant_shard import Shard, open_shard, write_shard
 from sceneprint.types import Bytes
 
 if TYPE_CHECKING:
     from faiss import IndexScalarQuantizer
+
+log = logging.getLogger(__name__)
 
 #: A segment has at least this many times the frames of the next smaller one. By 2 a map of 100,000
 #: frames has up to 7 segments, a search takes a fifth longer, and a fifth less is written.
@@ -62,6 +68,10 @@ FLAT_SHARE = 1 / 64
 FEW = 8
 #: Longest answer that FAISS gives: of a longer one, ordering costs more than comparing.
 LONGEST = 2048
+
+#: Rows that Qdrant is asked for beyond those that are wanted: of the last ones, distances may be
+#: rounded alike.
+SPARE = 16
 
 #: Rows or keys of frames, and their distances.
 Found = tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -122,6 +132,7 @@ class Segment:
     lists : the inverted file; None where all of it is compared
     gone : (g,) int64, rising, of the frames that do not count: deleted since, or signed anew and
         in another segment
+    shard : of Qdrant, which chooses what is compared; None where it has none, or it is not used
     """
 
     record: SegmentFiles
@@ -129,6 +140,7 @@ class Segment:
     index: IndexScalarQuantizer
     lists: Lists | None
     gone: Keys
+    shard: Shard | None = None
 
     def __len__(self) -> int:
         return len(self.keys) - len(self.gone)
@@ -164,8 +176,9 @@ class Segment:
         return np.delete(np.arange(len(self.keys)), self.places.found(gone))
 
     def nearest(
-        self, query: Bytes, size: int, gone: Keys, among: Keys | None, *, exact: bool
-    ) -> tuple[Found, bool, int]:
+        self, query: Bytes, size: int, gone: Keys, among: Keys | None, *, metric: Metric,
+        exact: bool,
+    ) -> tuple[Found, bool, int]:  # fmt: skip
         """The nearest frames of those that may be found.
 
         Parameters
@@ -174,6 +187,7 @@ class Segment:
         size : of the answer
         gone : (g,) rising, of frames that may not be found
         among : (a,) rising, of those that may; None: all others
+        metric : of their model
         exact : compare every frame that may be found
 
         Returns
@@ -184,7 +198,7 @@ class Segment:
         free = self._free_rows(gone, among)
         count = len(self.keys) if free is None else int(np.count_nonzero(free))
         own, whole = self._candidates(query, free, count, size, exact)
-        rows, distant = self._compared(query, free, count, size, own)
+        rows, distant = self._compared(query, metric, free, count, size, own)
         return (self.keys[rows], distant), whole, count if own is None else len(own)
 
     def _free_rows(self, gone: Keys, among: Keys | None) -> NDArray[np.bool_] | None:
@@ -210,21 +224,53 @@ class Segment:
         return rows, len(rows) == count
 
     def _compared(
-        self, query: Bytes, free: NDArray[np.bool_] | None, count: int, size: int,
+        self, query: Bytes, metric: Metric, free: NDArray[np.bool_] | None, count: int, size: int,
         rows: NDArray[np.int64] | None,
     ) -> Found:  # fmt: skip
         """Rows among which the nearest are, and their distances."""
+        found = None
         if rows is None and size <= LONGEST:
-            found = nearest(self.index, query, min(size, count), free)
-            if found is not None:
-                return found
+            if self.shard is not None:
+                found = self._by_shard(self.shard, query, free, count, size)
+            elif metric == "l2":
+                found = nearest(self.index, query, min(size, count), free)
+        if found is not None:
+            return found
         if rows is None:
             rows = np.arange(len(self.keys)) if free is None else np.flatnonzero(free)
-        return rows, distances(query, self.vectors, "l2", rows)
+        return rows, distances(query, self.vectors, metric, rows)
+
+    def _by_shard(
+        self, shard: Shard, query: Bytes, free: NDArray[np.bool_] | None, count: int, size: int
+    ) -> Found | None:
+        """As `_compared`, of rows that Qdrant chose; None where all have to be compared here.
+
+        More are asked for until none that it left out can be among the nearest, whatever it
+        rounded.
+        """
+        asked = size + SPARE
+        while 0 < size < count and 2 * asked <= count:
+            try:
+                rows, limit = shard.nearest(query, asked, free)
+            except DamagedIndex as error:
+                log.warning("Qdrant failed; all signatures are compared: %s", error)
+                return None
+            found = distances(query, self.vectors, shard.metric, rows)
+            if np.partition(found, size - 1)[size - 1] < limit:
+                return rows, found
+            asked *= 4
+        return None
 
 
-def open_segment(folder: Path, record: SegmentFiles, dimension: int) -> Segment:
+def open_segment(
+    folder: Path, record: SegmentFiles, dimension: int, qdrant: Metric | None = None
+) -> Segment:
     """Map the files of a segment, whose checksums the caller has checked.
+
+    Parameters
+    ----------
+    folder, record, dimension : of the map, the segment, its signatures
+    qdrant : their metric, where Qdrant's shard is to be searched, if there is one
 
     Raises
     ------
@@ -240,7 +286,13 @@ def open_segment(folder: Path, record: SegmentFiles, dimension: int) -> Segment:
         gone = _rising_keys(names["gone"])
         if not np.isin(gone, keys).all():
             raise DamagedIndex(f"{names['gone']}: names frames that its segment has not.")
-    return Segment(record, keys, index, lists, gone)
+    shard = None
+    if qdrant is not None and FOLDER_KIND in names:
+        try:
+            shard = open_shard(names[FOLDER_KIND], len(keys), dimension, qdrant)
+        except DamagedIndex as error:  # its files are sound, as they were checked
+            log.warning("Qdrant not used; all signatures are compared: %s", error)
+    return Segment(record, keys, index, lists, gone, shard)
 
 
 def _rising_keys(path: Path) -> Keys:
@@ -344,8 +396,9 @@ def spool_blocks(
 
 
 def write_segment(
-    folder: Path, sources: Sequence[SegmentSource], *, clean: bool, flat_bytes: float
-) -> SegmentFiles:
+    folder: Path, sources: Sequence[SegmentSource], *, clean: bool, flat_bytes: float,
+    qdrant: Metric | None = None,
+) -> SegmentFiles:  # fmt: skip
     """Write the frames of some sources as one segment, in the order of their keys.
 
     A segment that is not to change is not read, and its files are named again.
@@ -356,14 +409,15 @@ def write_segment(
     sources : of which at least one has frames
     clean : leave nothing of frames that are gone
     flat_bytes : of signatures, above which there is an inverted file
+    qdrant : the metric, where it is to have a shard of Qdrant
 
     Raises
     ------
-    OSError : a file cannot be written.
+    OSError, UnusableStore : a file cannot be written.
     """
     only = sources[0]
     if len(sources) == 1 and only.segment is not None and not only.is_worn(clean):
-        return _renamed(folder, only.segment, only.gone, flat_bytes)
+        return _renamed(folder, only.segment, only.gone, flat_bytes, qdrant)
     keys, order = _merged_keys(sources)
     index, vectors = faiss_index.allocate(len(keys), only.vectors.shape[1])
     step, start = max(BLOCK_BYTES // vectors.shape[1], 1), 0
@@ -382,7 +436,13 @@ def write_segment(
     ]
     if lists is not None:
         files.append(put(folder, "lists", lambda take: faiss_index.write_lists(lists, take)))
+    if qdrant is not None:
+        files.append(_put_shard(folder, vectors, qdrant))
     return SegmentFiles(tuple(files), recall)
+
+
+def _put_shard(folder: Path, vectors: Bytes, metric: Metric) -> tuple[str, int]:
+    return put_folder(folder, FOLDER_KIND, lambda path: write_shard(path, vectors, metric))
 
 
 def _merged_keys(sources: Sequence[SegmentSource]) -> tuple[Keys, NDArray[np.int64]]:
@@ -398,8 +458,11 @@ def _flat_recall(frames: int) -> Recall:
     return Recall(1.0, faiss_index.NEAR, 0, 0, frames)
 
 
-def _renamed(folder: Path, segment: Segment, gone: Keys, flat_bytes: float) -> SegmentFiles:
-    """The files of a segment that stays, with other frames gone, and an inverted file if need be.
+def _renamed(
+    folder: Path, segment: Segment, gone: Keys, flat_bytes: float, qdrant: Metric | None
+) -> SegmentFiles:
+    """The files of a segment that stays, with other frames gone, and an inverted file or a shard if
+    need be.
 
     Of a map that has become large its older segments get one, which no search had needed before.
     """
@@ -419,6 +482,11 @@ def _renamed(folder: Path, segment: Segment, gone: Keys, flat_bytes: float) -> S
         files.append(before)
     elif len(gone):
         files.append(put(folder, "gone", lambda take: take(gone.astype("<i8").tobytes())))
+    held = segment.record.file(FOLDER_KIND)
+    if qdrant is not None and (segment.shard is None or held is None):
+        files.append(_put_shard(folder, segment.vectors, qdrant))
+    elif qdrant is not None and held is not None:
+        files.append(held)
     return SegmentFiles(tuple(files), recall)
 
 

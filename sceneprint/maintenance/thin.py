@@ -217,7 +217,7 @@ def _distances_to_all(view: IndexView, keys: Keys, index: int) -> Ints64:
     rows, found = in_tail[in_tail >= 0], np.empty(len(keys), np.int64)
     found[in_tail >= 0] = distances(query, view.tail.signatures, view.metric, rows)
     if view.generation is not None:
-        found[in_tail < 0] = view.generation.distances_to(query, keys[in_tail < 0])
+        found[in_tail < 0] = view.generation.distances_to(query, keys[in_tail < 0], view.metric)
     return found
 
 

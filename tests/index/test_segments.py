@@ -170,7 +170,7 @@ def test_any_history_is_searched_as_one_map(
         )
         own_keys = np.array(list(frames), np.int64)
         distant = [int(((frames[k].astype(int) - query) ** 2).sum()) for k in own_keys.tolist()]
-        assert generation.distances_to(query, own_keys).tolist() == distant
+        assert generation.distances_to(query, own_keys, "l2").tolist() == distant
 
 
 def test_what_is_gone_counts_in_no_segment(published: Publish) -> None:
@@ -186,7 +186,7 @@ def test_what_is_gone_counts_in_no_segment(published: Publish) -> None:
     with pytest.raises(ValueError, match=r"no frames \[98\]"):
         made.vectors_of(np.array([98, 97]))
     with pytest.raises(ValueError, match=r"no frames \[96\]"):
-        made.distances_to(rows[0], np.array([97, 96]))
+        made.distances_to(rows[0], np.array([97, 96]), "l2")
     assert made.holds_any(np.array([5000]))  # as some of it is gone
     clean = published(*NONE, made, clean=True)
     assert not clean.holds_any(np.array([5000, 98]))

@@ -22,7 +22,12 @@ from sqlalchemy import Connection, func, select
 from sceneprint.engine.search.local_index import index_folder, is_index_folder
 from sceneprint.engine.serializers import when
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
-from sceneprint.index.generation_files import GenerationManifest, manifests, read_manifest
+from sceneprint.index.generation_files import (
+    GenerationManifest,
+    allocated,
+    manifests,
+    read_manifest,
+)
 from sceneprint.process import merged, quantile
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database, FolderBlobs, Store, frame_queries, store_counts
@@ -185,10 +190,11 @@ def _of_blobs(folder: Path) -> int:
 
 
 def _files_of(folder: Path, *, deep: bool = False) -> Iterator[int]:
+    """Bytes of the files of a folder; with `deep`, what those of an index take of the disk."""
     try:
         for one in os.scandir(folder):
             if one.is_file(follow_symlinks=False):
-                yield _size(one)
+                yield allocated(one) if deep else _size(one)
             elif deep and one.is_dir(follow_symlinks=False):
                 yield from _files_of(Path(one.path), deep=True)
     except OSError:

@@ -25,6 +25,7 @@ from sceneprint.engine.search.local_index import (
     earlier_folder,
     index_folder,
     is_index_folder,
+    qdrant_metric,
     trusted,
 )
 from sceneprint.engine.search.retrieval import Setting
@@ -42,7 +43,8 @@ from sceneprint.errors import (
 )
 from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.index import Generation, clear, manifests, newest, newest_number, publish, scrub
-from sceneprint.index.generation_files import GenerationManifest
+from sceneprint.index.generation_files import GenerationManifest, remove
+from sceneprint.models import Model
 from sceneprint.settings import Settings
 from sceneprint.store import Store
 from sceneprint.store.deletion import DAY_S, newest_deletion
@@ -102,7 +104,7 @@ class Scrubber:
                 return None
             if damaged is not None:
                 log.error("damaged index file removed", extra={"path": str(damaged)})
-                damaged.unlink(missing_ok=True)  # what names it is passed over from now on
+                remove(damaged)  # what names it is passed over from now on
                 return damaged.parent
         return None
 
@@ -143,7 +145,7 @@ class Upkeep:
     settings : `indexes` is the folder of all indexes; a generation may lack `tail_frames` frames,
         and as many deletions; after `scrub_s` seconds all files are read again, to see that they
         are sound; an index that lacks a deletion of `deleted_rows_days` ago cannot be brought up
-        to date
+        to date; `search` says whether indexes have shards of Qdrant
     shared : indexes of the fleet; None where each host builds its own
     """
 
@@ -158,7 +160,8 @@ class Upkeep:
         # map and model: files of their index that this process has verified, by name and inode; to
         # read all of them for each thousand frames would take longer than to write
         self._verified: dict[tuple[int, str], Mapping[str, int]] = {}
-        self._metrics: dict[str, Metric | None] = {}
+        self._models: dict[str, Model | None] = {}
+        self._qdrant = settings.search == "qdrant"
         self._scrubber = Scrubber(settings.indexes, settings.scrub_s)
         self._rows_s = DAY_S * settings.deleted_rows_days
         # map and model: when it is looked next for deletions that the index should know of by now
@@ -172,7 +175,7 @@ class Upkeep:
         """
         with self._store.database.read() as connection:
             listed = list_maps(connection)
-        rows = [row for row in listed if self._metric(row.model_id) == "l2"]
+        rows = [row for row in listed if self._has_index(row.model_id)]
         with self._store.database.read() as connection:
             due = [row for row in rows if self._due(connection, row)]
         published = sum(self._tried(row) for row in due if self._is_ours(row))
@@ -193,7 +196,7 @@ class Upkeep:
         BusyIndex : another process is building it.
         OSError : it cannot be written; what was there stays.
         """
-        if self._signers(row.model_id).model.metric != "l2":
+        if not self._is_indexed(self._signers(row.model_id).model):
             raise InvalidRequest(
                 f"Map {row.name!r} has no index to rebuild: its model stores full Fisher "
                 "vectors, and queries compare all of them. If the map is too large for that, "
@@ -221,7 +224,7 @@ class Upkeep:
         BusyIndex : another process is building it.
         """
         coming = _coming(row)
-        if self._signers(coming.model_id).model.metric != "l2":
+        if not self._is_indexed(self._signers(coming.model_id).model):
             return None
         try:
             if self._publish(coming) is None:
@@ -257,14 +260,23 @@ class Upkeep:
                 self._elsewhere[row.number] = time.monotonic() + ELSEWHERE_S
             return False
 
-    def _metric(self, model_id: str) -> Metric | None:
-        """Of a model's signatures; None where another version made it, which looks after it."""
-        if model_id not in self._metrics:
+    def _model(self, model_id: str) -> Model | None:
+        """A model; None where another version made it, which looks after it."""
+        if model_id not in self._models:
             try:
-                self._metrics[model_id] = self._signers(model_id).model.metric
+                self._models[model_id] = self._signers(model_id).model
             except SceneprintError:
-                self._metrics[model_id] = None
-        return self._metrics[model_id]
+                self._models[model_id] = None
+        return self._models[model_id]
+
+    def _has_index(self, model_id: str) -> bool:
+        """Whether maps of a model have an index that is ours to look after."""
+        model = self._model(model_id)
+        return model is not None and self._is_indexed(model)
+
+    def _is_indexed(self, model: Model) -> bool:
+        """Whether maps of a model have an index: those of L1 where Qdrant searches it alone."""
+        return model.metric == "l2" or qdrant_metric(model, self._qdrant) is not None
 
     def _due(self, connection: Connection, row: MapRow) -> bool:
         number, since = self._published.get((row.number, row.model_id), (None, 0))
@@ -312,12 +324,15 @@ class Upkeep:
         BusyIndex : another process is building it, and may not know of the latest deletions.
         OSError, UnusableStore : it cannot be written; what was there stays.
         """
-        metric, earlier = self._metric(row.model_id), earlier_folder(self._indexes, row)
-        if metric is None:  # of another version's model, which says so where there is an index
+        model, earlier = self._model(row.model_id), earlier_folder(self._indexes, row)
+        if model is None:  # of another version's model, which says so where there is an index
             return self._purge_own(row)
         left = any(earlier.glob("*.json"))
         shutil.rmtree(earlier, ignore_errors=True)
-        if metric == "l1":  # it has no other
+        if not self._is_indexed(model):  # Qdrant may have searched it before
+            folder = index_folder(self._indexes, row)
+            left |= any(folder.glob("*.json"))
+            shutil.rmtree(folder, ignore_errors=True)
             return left
         own = self._purge_own if self._shared is None else self._purge_shared
         return own(row) or left
@@ -481,13 +496,14 @@ class Upkeep:
                 return None  # made anew, or signed anew, in the meantime; next time
             folder = index_folder(self._indexes, now)
             length = signer.model.signature_bytes
-            previous = None
+            metric, previous = qdrant_metric(signer.model, self._qdrant), None
             if not anew:
                 previous = trusted(connection, now, self._newest(now, folder, length))
             since = 0 if previous is None else previous.revision
             if previous is not None:
                 self._note(now, previous)
-            if not anyway and not self._is_long(connection, now, since):
+            wanted = anyway or _lacks_shard(previous, metric)
+            if not wanted and not self._is_long(connection, now, since):
                 return None  # another worker was first
             if previous is None and count_indexed(connection, now.number, 0) == 0:
                 if anew:
@@ -506,6 +522,7 @@ class Upkeep:
                 clean=clean,
                 after=after,
                 share=share,
+                qdrant=metric,
             )
         resign_frames(self._store, now, damaged, now.model_id)
         if generation is None:
@@ -524,7 +541,8 @@ class Upkeep:
     def _newest(self, row: MapRow, folder: Path, length: int) -> Generation | None:
         """The newest sound generation here; what this process has verified is not read again."""
         sound = self._verified.get((row.number, row.model_id))
-        return newest(folder, row.model_id, length, sound=sound)
+        metric = qdrant_metric(self._signers(row.model_id).model, self._qdrant)
+        return newest(folder, row.model_id, length, sound=sound, qdrant=metric)
 
     def _clean(self, rows: Sequence[MapRow]) -> None:
         """Remove the indexes of maps that are no more, of models that they had, and of psi."""
@@ -543,8 +561,18 @@ class Upkeep:
         with self._store.database.read() as connection:  # a map may have been made since
             known = [*rows, *list_maps(connection)]
         known += [_coming(row) for row in known if row.next_model_id is not None]
-        known = [row for row in known if self._metric(row.model_id) != "l1"]
+        # a model of another version is another's concern
+        known = [r for r in known if self._model(r.model_id) is None or self._has_index(r.model_id)]
         return {folder_of(self._indexes, row).name for row in known}
+
+
+def _lacks_shard(previous: Generation | None, metric: Metric | None) -> bool:
+    """Whether a generation was published before Qdrant was to search, or by another engine."""
+    return (
+        metric is not None
+        and previous is not None
+        and any(one.shard is None for one in previous.segments)
+    )
 
 
 def _coming(row: MapRow) -> MapRow:
@@ -584,7 +612,7 @@ class VectorTables:
     Parameters
     ----------
     signers : that know the models, and the database
-    setting : with `local` there are none; with `auto` none that no node would ask
+    setting : with `local` and `qdrant` there are none; with `auto` none that no node would ask
     """
 
     def __init__(self, signers: Signers, setting: Setting) -> None:
@@ -594,7 +622,7 @@ class VectorTables:
     def run(self) -> bool:
         """Do a little of what is due; returns whether there is more to do at once."""
         database = self._database
-        if database.is_sqlite or database.read_only or self._setting == "local":
+        if database.is_sqlite or database.read_only or self._setting in ("local", "qdrant"):
             return False
         if time.monotonic() < self._not_before:
             return False

@@ -27,12 +27,14 @@ from sceneprint.errors import DamagedIndex, StoreError
 from sceneprint.index import Generation, newest, signatures_of
 from sceneprint.index.generation_files import (
     GenerationManifest,
+    allocated,
     building,
     check,
     draw,
     is_ours,
     manifests,
     read_manifest,
+    remove,
 )
 from sceneprint.maintenance.fsck.blobs import WRITING_S, changed_at
 from sceneprint.maintenance.fsck.findings import Finding, Folder
@@ -118,7 +120,7 @@ def describe_index(
     with engine.store.database.read() as connection:
         sizes = _sizes(connection, engine, row, seed)
         lag_s = _lag_s(connection, row, view)
-    on_disk = sum(path.stat().st_size for path in folder.glob("*")) if folder.is_dir() else 0
+    on_disk = sum(allocated(path) for path in folder.rglob("*"))
     generation = view.generation
     recall, spread, looked_up = _recall(view, sample, seed, progress)
     return IndexStats(
@@ -292,7 +294,7 @@ def _remove_file(file: Path) -> str:
             raise StoreError("a worker is building this index; run it again when that is done")
         needing = [path for _, path in manifests(file.parent) if _needs(path, file.name)]
         for path in (*needing, file):  # manifests first: none should promise what is gone
-            path.unlink(missing_ok=True)
+            remove(path)
     return f"removed, and {len(needing)} generations that need it" if needing else "removed"
 
 
@@ -388,7 +390,7 @@ def _remove_generations(place: Path) -> str:
             path.unlink(missing_ok=True)
         for path in place.iterdir():
             if is_ours(path.name):
-                path.unlink(missing_ok=True)
+                remove(path)
     return f"{len(listed)} generations removed"
 
 
