@@ -360,6 +360,25 @@ def test_a_purge_writes_the_segment_that_held_the_frame(
     assert engine.purging.now().indexes == 0
 
 
+def test_a_purge_removes_what_a_shared_index_had_only_marked(
+    host: Callable[..., Engine], fill: Any, place: str
+) -> None:
+    engine, objects = host("one", tail_frames=1), open_objects(place)
+    engine.create_map(NewMap(name="hall", model="depth"))
+    names = fill(engine, range(12))
+    assert engine.publish_due() == 1
+    secret = signature(engine, names[2])
+    for name in names[2:4]:
+        engine.delete_frame("hall", name)
+    assert engine.publish_due() == 1
+    head = shared(engine).head(row_of(engine))
+    assert head is not None
+    assert (head.frames, len(head.worn_keys)) == (10, 1)
+    assert any(secret in objects.get(one.key) for one in objects.list("index/"))
+    assert engine.purging.now().indexes == 1
+    assert all(secret not in objects.get(one.key) for one in objects.list("index/"))
+
+
 def test_a_service_drops_segments_of_which_frames_have_been_gone_for_long(
     host: Callable[..., Engine], append: Any
 ) -> None:
