@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import time
+import uuid
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select, update
 
 from sceneprint.store.frames import write_frame
-from sceneprint.store.maps import add_frame, find_map
-from sceneprint.store.signatures import StoredSignature, index_frame, replace_signature
+from sceneprint.store.maps import count_on, find_map, free_id, next_revision, position
+from sceneprint.store.signatures import StoredSignature, put_signatures, replace_signature
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
     blocks,
     frame_row,
+    frame_tags,
     frames,
     job_values,
     jobs,
@@ -97,38 +100,69 @@ def date_map(connection: Connection, row: MapRow, created_at: float) -> MapRow:
     return find_map(connection, row.name)
 
 
-def put_copied(
-    connection: Connection, row: MapRow, there: FrameRow | None, frame_id: str,
-    values: Mapping[str, Any], made: StoredSignature,
-) -> None:  # fmt: skip
-    """Write a frame as it is elsewhere, found by queries at once.
+@dataclass(frozen=True, eq=False)
+class CopiedFrame:
+    """A frame as it is elsewhere.
+
+    Parameters
+    ----------
+    id : of the frame
+    values : by column of COPIED
+    made : its signature
+    """
+
+    id: str
+    values: Mapping[str, Any]
+    made: StoredSignature
+
+
+def add_copied(connection: Connection, row: MapRow, found: Sequence[CopiedFrame]) -> None:
+    """Add frames, found by queries at once: a few statements for some hundred of them.
 
     Parameters
     ----------
     connection : of a writing transaction
     row : of the map
-    there : the frame of that id and content, as it is here; None: it is new
-    frame_id : its id
-    values : by column of COPIED
-    made : its signature
+    found : of which the map has none that is not deleted
     """
-    if there is None:
-        frame = add_frame(connection, row.number, dict(values), frame_id)
-        done = {
-            "frame_number": frame.number, "map_number": row.number,
-            "state": JobState.SUCCEEDED, "attempts": 1,
-        }  # fmt: skip
-        times = dict.fromkeys(("started_at", "finished_at"), time.time())
-        connection.execute(
-            insert(jobs).values(**(job_values(connection, "sign", 0) | done | times))
-        )
-        index_frame(connection, frame, made)
-    else:
-        frame = there
-        write_frame(connection, row, there, values)
-        replace_signature(connection, there, made)
-    own = update(frames).where(frames.c.number == frame.number)
-    connection.execute(own.values(indexed_at=values["indexed_at"]))
+    gone = select(frames.c.id).where(
+        frames.c.map_number == row.number, frames.c.id.in_([one.id for one in found])
+    )
+    for frame_id in connection.execute(gone).scalars().all():
+        free_id(connection, row.number, frame_id)
+    last = next_revision(connection, row.number, len(found))
+    rows = [
+        {
+            **one.values, **position(one.values["pose"]), "id": one.id, "map_number": row.number,
+            "state": FrameState.INDEXED, "revision": last - len(found) + i,
+        }
+        for i, one in enumerate(found, 1)
+    ]  # fmt: skip
+    added = insert(frames).returning(frames.c.number, sort_by_parameter_order=True)
+    numbers = connection.execute(added, rows).scalars().all()
+    count_on(connection, row.number, len(found), sum(one.values["bytes"] for one in found))
+    tags = [
+        {"frame_number": number, "tag": tag}
+        for number, one in zip(numbers, found, strict=True)
+        for tag in sorted(set(one.values["tags"]))
+    ]
+    if tags:
+        connection.execute(insert(frame_tags), tags)
+    put_signatures(connection, list(zip(numbers, [one.made for one in found], strict=True)))
+    job, at = job_values(connection, "sign", 0), time.time()
+    job |= {"map_number": row.number, "state": JobState.SUCCEEDED, "attempts": 1}
+    job |= dict.fromkeys(("created_at", "run_after", "started_at", "finished_at"), at)
+    ids = [uuid.uuid4().hex for _ in numbers]
+    done = [
+        job | {"id": one, "frame_number": number} for one, number in zip(ids, numbers, strict=True)
+    ]
+    connection.execute(insert(jobs), done)
+
+
+def edit_copied(connection: Connection, row: MapRow, there: FrameRow, now: CopiedFrame) -> None:
+    """Bring a frame to what it is elsewhere, where its content is the same."""
+    write_frame(connection, row, there, now.values)
+    replace_signature(connection, there, now.made)
 
 
 def numbers_in_blocks(found: Sequence[FrameRow]) -> list[list[int]]:

@@ -286,7 +286,7 @@ def add_frame(
     if frame_id is None:
         frame_id = uuid.uuid4().hex
     else:
-        _free(connection, map_number, frame_id)
+        free_id(connection, map_number, frame_id)
     made = insert(frames).values(_received(connection, map_number, frame_id, values))
     row = frame_row(connection.execute(made.returning(frames)).mappings().one())
     count_on(connection, map_number, 1, values["bytes"])
@@ -297,11 +297,15 @@ def add_frame(
 def _received(
     connection: Connection, map_number: int, frame_id: str, values: dict[str, Any]
 ) -> dict[str, Any]:
-    pose = values["pose"]
-    place = {} if pose is None else {f"pose_{axis}": pose[i][3] for i, axis in enumerate("xyz")}
+    place = {} if values["pose"] is None else position(values["pose"])
     state, at = FrameState.RECEIVED, now(connection)
     own = {"id": frame_id, "map_number": map_number, "state": state, "received_at": at}
     return {**own, **values, **place}
+
+
+def position(pose: Sequence[Sequence[float]] | None) -> dict[str, float | None]:
+    """Columns of a frame's position, to be searched for."""
+    return {f"pose_{axis}": None if pose is None else pose[i][3] for i, axis in enumerate("xyz")}
 
 
 def receive_frame(
@@ -472,7 +476,7 @@ def _frames_of_numbers(dialect: str) -> Select[Any]:
     return select(*FRAME_COLUMNS).where(frames.c.state != FrameState.DELETED, among)
 
 
-def _free(connection: Connection, map_number: int, frame_id: str) -> None:
+def free_id(connection: Connection, map_number: int, frame_id: str) -> None:
     """Let a deleted frame give its id up: its row stays, as readers learn of it by its number."""
     deleted = frames.c.state == FrameState.DELETED
     own = update(frames).where(frames.c.map_number == map_number, frames.c.id == frame_id, deleted)

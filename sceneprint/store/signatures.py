@@ -206,14 +206,22 @@ def _write_signature(connection: Connection, frame: FrameRow, made: StoredSignat
     """Store a signature and its vector in place of those that the model made before."""
     own = (signatures.c.frame_number == frame.number) & (signatures.c.model_id == made.model_id)
     connection.execute(delete(signatures).where(own))
-    connection.execute(
-        insert(signatures).values(
-            frame_number=frame.number, model_id=made.model_id, vector=made.vector,
-            checksum=crc32(made.vector), geometry=made.geometry,
-            n_patches=list(made.n_patches), n_pairs=list(made.n_pairs), sender=made.sender,
-        )
-    )  # fmt: skip
-    vectors.put(connection, frame.number, made.model_id, len(made.vector))
+    put_signatures(connection, [(frame.number, made)])
+
+
+def put_signatures(connection: Connection, made: Sequence[tuple[int, StoredSignature]]) -> None:
+    """Store signatures of frames, by their numbers, that have none of these models."""
+    rows = [
+        {
+            "frame_number": number, "model_id": one.model_id, "vector": one.vector,
+            "checksum": crc32(one.vector), "geometry": one.geometry,
+            "n_patches": list(one.n_patches), "n_pairs": list(one.n_pairs), "sender": one.sender,
+        }
+        for number, one in made
+    ]  # fmt: skip
+    connection.execute(insert(signatures), rows)
+    for number, one in made:
+        vectors.put(connection, number, one.model_id, len(one.vector))
 
 
 def changes_since(

@@ -172,7 +172,7 @@ with Client.embedded(service) as client, closing(store):
     if what == "artifacts":
         client.copied_artifact = counted(client.copied_artifact)
     else:
-        map_copy.put_copied = counted(map_copy.put_copied)
+        map_copy.BLOCK, map_copy.add_copied = 1, counted(map_copy.add_copied)
     map_copy.pull_map(client, store, "hall")
 """
 

@@ -27,17 +27,19 @@ from sceneprint.models import parse_model
 from sceneprint.store import Store
 from sceneprint.store.copy_rows import (
     COPIED,
+    CopiedFrame,
+    add_copied,
     copied_values,
     date_map,
+    edit_copied,
     has_artifact,
     indexed_rows,
     living_rows,
     model_of,
     numbers_in_blocks,
-    put_copied,
     rows_of_ids,
 )
-from sceneprint.store.deletion import delete_frames, remove_map
+from sceneprint.store.deletion import BLOCK, delete_frames, remove_map
 from sceneprint.store.frames import write_map
 from sceneprint.store.maps import add_map, find_map, keep_model, list_maps
 from sceneprint.store.signatures import StoredSignature
@@ -333,15 +335,19 @@ def _write(
                 raise DamagedBlob(
                     f"The artifact {one.geometry[:12]} was removed meanwhile. Pull again."
                 )
-            values = row_values(one)
-            made = StoredSignature(
-                listing.model_id, one.vector, one.geometry, one.n_patches, one.n_pairs
-            )
-            before = there[one.frame_id] if one.frame_id in kept else None
-            own = {name: values[name] for name in COPIED}
-            put_copied(connection, row, before, one.frame_id, own, made)
+            if one.frame_id in kept:
+                edit_copied(connection, row, there[one.frame_id], _copied(one, listing))
+        new = [_copied(one, listing) for one in written if one.frame_id not in kept]
+        for first in range(0, len(new), BLOCK):
+            add_copied(connection, row, new[first : first + BLOCK])
     collect_deleted_blobs(store, blobs)
     return len(written), len(gone)
+
+
+def _copied(one: FrameRowRecord, listing: MapListing) -> CopiedFrame:
+    values = row_values(one)
+    made = StoredSignature(listing.model_id, one.vector, one.geometry, one.n_patches, one.n_pairs)
+    return CopiedFrame(one.frame_id, {name: values[name] for name in COPIED}, made)
 
 
 def _prepared(
