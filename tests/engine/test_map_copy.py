@@ -277,3 +277,14 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     for folder in (other, other / "sceneprint.db"):
         with pytest.raises(InvalidRequest, match="not empty"):
             map_copy.claim_folder(folder)
+
+
+def test_edits_of_the_map_follow(robot: Robot) -> None:
+    robot.service.create_map(MAP, model="depth")
+    robot.pull()
+    robot.service.edit_map(MAP, {"title": "The hall", "up": [0.0, 0.0, 1.0]})
+    robot.pull()
+    with Client.embedded(robot.folder) as client:
+        told = client.map(MAP)
+        assert (told.title, told.up) == ("The hall", robot.service.map(MAP).up)
+        assert told.up is not None
