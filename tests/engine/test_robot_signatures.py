@@ -17,7 +17,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import list_keys
 from sceneprint.engine.ingest.frame_decoder import content_id, read_upload
 from sceneprint.engine.ingest.uploads import Upload
-from sceneprint.engine.jobs import signature_job
+from sceneprint.engine.jobs import robot_signatures, signature_job
 from sceneprint.engine.jobs.lifecycle import cancel
 from sceneprint.engine.jobs.robot_signatures import (
     EVERY_S,
@@ -347,6 +347,16 @@ def test_what_is_of_no_use_is_signed_by_the_worker(
     assert packages(trusting) == []
     with trusting.store.database.read() as connection:  # nothing bad was taken
         assert find_sender(connection, key_id(trusting)).distrusted_at is None
+
+
+def test_a_worker_with_other_signing_code_signs_itself(
+    trusting: Engine, uploads: Any, work_off: WorkOff, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    added = add(trusting, uploads[0], package_of(trusting, uploads[0]))
+    monkeypatch.setattr(robot_signatures, "SIGNING_VERSION", 2)  # upgraded meanwhile
+    assert work_off(trusting) == [JobState.SUCCEEDED]
+    assert job(trusting, added).result["sent"].endswith("other signing code made it")
+    assert signed_by(trusting, added) == "service"
 
 
 def test_a_package_that_was_lost_costs_nothing(
