@@ -211,15 +211,20 @@ def open_generation(
         if inodes[name] != verified.get(name, -1):
             for _ in generation_files.check(folder, name, size):
                 pass
-    # what is open has its rows by key, and its pages, at hand; a name is a checksum
+    # what is open has its rows by key, and its pages, at hand; but where a damaged file was made
+    # anew under its name, what is mapped is the damaged one
     open_ones = {} if known is None else {one.record: one for one in known.segments}
     segments = tuple(
         open_ones[record]
-        if record in open_ones
+        if record in open_ones and known is not None and _same(known.inodes, inodes, record)
         else open_segment(folder, record, manifest.dimension, qdrant)
         for record in manifest.segments
     )
     return Generation(manifest, segments, inodes)
+
+
+def _same(known: Mapping[str, int], inodes: Mapping[str, int], record: SegmentFiles) -> bool:
+    return all(known[name] == inodes[name] for name, _ in record.files)
 
 
 def _inode(path: Path) -> int:
@@ -488,9 +493,9 @@ def publish(
         if previous is not None:  # known to be sound, whatever lies between
             listed = [each for each in listed if each[0] == previous.number]
         _clean(folder, {own, *(path for _, path in listed[: 0 if clean else 1])})
-        # what was there was verified when it was opened, and what is new as it was written
-        sound = {name: _inode(folder / name) for name, _ in manifest.files}
-        return open_generation(folder, manifest, previous, sound, qdrant)
+        before = {} if previous is None else previous.inodes
+        written = {name: _inode(folder / name) for name, _ in manifest.files if name not in before}
+        return open_generation(folder, manifest, previous, written, qdrant)
 
 
 def _write_segments(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import runpy
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -121,6 +122,9 @@ def test_records_of_a_copys_queries_are_spooled_and_sent(
         for frame in (b"no depth image", b"nor this"):
             with pytest.raises(FrameError):
                 robot.query("offline-records", frame, FrameMeta(robot="cart", intrinsics=CAMERA))
+        end = time.monotonic() + 90.0
+        while len(list(robot.queries("offline-records"))) < 2:  # they are written in a moment
+            assert time.monotonic() < end
         added = sceneprint("spool", "add-queries", spool, "--data", copy)
         assert added.stdout == "2 query records added; 2 wait\n"
         added = sceneprint("spool", "add-queries", spool, "--data", copy)

@@ -75,7 +75,7 @@ GIVEN: dict[str, Any] = {
     "since": ID, "snapshot_id": ID, "session": "s",
     "changes": {"title": "x"},
     "model": "depth", "grants": {"*": "read"}, "query": ID, "job_ids": [ID],
-    "digest": ID,
+    "digest": ID, "records": [{}], "frame_ids": [ID],
     "a": ("hall", ID), "b": ("hall", ID),
 }  # fmt: skip
 #: Answered without a key, or of no service.

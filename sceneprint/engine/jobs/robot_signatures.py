@@ -29,6 +29,7 @@ from sceneprint.geometry.retrieval.ranking import distance_share, distances
 from sceneprint.geometry.surface.depth_image import halved, halvings
 from sceneprint.models import Model
 from sceneprint.pipeline import prepare
+from sceneprint.process import span
 from sceneprint.settings import Settings
 from sceneprint.signing import SIGNING_VERSION, Signature
 from sceneprint.store import Store, sender_rows
@@ -105,6 +106,13 @@ class RobotSignatures:
             return None, None
         if not self._trusts:
             return None, "signatures of robots are not trusted"
+        with span("package"):
+            return self._read(work, model, sender)
+
+    def _read(
+        self, work: Work, model: Model, sender: str
+    ) -> tuple[SentSignature | None, str | None]:
+        """See `open`."""
         with self._store.database.read() as connection:
             blob = sender_rows.package_of(connection, work.job.number)
             known = sender_rows.find_sender(connection, sender)

@@ -155,8 +155,7 @@ def _make(store: Store, signers: Signers, robots: RobotSignatures, work: lifecyc
     if work.model_id not in models_of(work.map):
         raise lifecycle.Outdated
     signer = signers(work.model_id)
-    with span("package"):
-        sent, note = robots.open(work, signer.model)
+    sent, note = robots.open(work, signer.model)
     if sent is None:
         made = _sign(store, signer, work)
         return Made(made, None if note is None else {"signed_by": "service", "sent": note})
