@@ -110,6 +110,7 @@ siege: $(STAMP)
 fleet: $(STAMP) kernels
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --asynchronous
+	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --objects --delays --freezes 2
 
 models: $(STAMP)
 	$(BIN)/sceneprint train --preset depth --out sceneprint/presets/depth.safetensors
