@@ -166,7 +166,8 @@ def test_any_history_is_searched_as_one_map(
             assert (hits.exact, hits.compared) == (True, len(allowed))
         held = np.array(list(everything), np.int64)
         np.testing.assert_array_equal(
-            signatures_of(held, generation, tail), [everything[key] for key in held.tolist()]
+            signatures_of(held, generation, tail),
+            np.reshape([everything[key] for key in held.tolist()], (-1, LENGTH)),
         )
         own_keys = np.array(list(frames), np.int64)
         distant = [int(((frames[k].astype(int) - query) ** 2).sum()) for k in own_keys.tolist()]
