@@ -31,10 +31,10 @@ from sceneprint.pipeline import open_signer
 from sceneprint.types import DepthFrame
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Frames of the maps that are searched, and whether by inverted lists.
+#: Frames of the maps that are searched, and whether by sketches.
 SEARCHED = (
     (10_000, search.FLAT), (100_000, search.FLAT), (1_000_000, search.FLAT),
-    (100_000, search.LISTS),
+    (100_000, search.SKETCHES), (1_000_000, search.SKETCHES),
 )  # fmt: skip
 BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
 

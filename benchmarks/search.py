@@ -1,5 +1,5 @@
-"""What a search costs by the number of frames in a map: all compared, and by inverted lists; and
-what it costs to keep its index while the map grows.
+"""What a search costs by the number of frames in a map: all compared, and by sketches; and what
+it costs to keep its index while the map grows.
 
 `python -m benchmarks.search`
 
@@ -33,8 +33,8 @@ SIZE = 200
 PLACE, BLOCK = 50, 1 << 16
 #: Equal steps in which a map grows: after them it has as many segments as it ever has.
 STEPS = 127
-#: Bytes of a map from which inverted lists are made: never, and always.
-FLAT, LISTS = 1 << 62, 0
+#: Bytes of a map from which sketches are made: never, and always.
+FLAT, SKETCHES = 1 << 62, 0
 
 #: Opens an index in a process of its own, searches, and prints milliseconds and bytes.
 _PROBE = """
@@ -64,10 +64,10 @@ class SearchFigures:
     """Of one query against a map of `frames`, medians over all runs; milliseconds and megabytes.
 
     `search` is as a service searches; `exact` compares every frame. `ratio` is the time of the one
-    over that of the other within one run. `probes` is 0 where there are no lists; then `recall` is
-    1 without being measured. `publish`, `append` (of a thousand frames) and `open` (all files read
-    and verified) are of one run. `held` is memory of the process alone, `shared` what processes
-    have in common.
+    over that of the other within one run. `probes` is 0 where there are no sketches; then `recall`
+    is 1 without being measured. `publish`, `append` (of a thousand frames) and `open` (all
+    files read and verified) are of one run. `held` is memory of the process alone, `shared` what
+    processes have in common.
     """
 
     frames: int
@@ -136,7 +136,7 @@ def measure(
     ----------
     frames : of the map
     length : bytes of a signature; default: of the default preset
-    flat_bytes : see `publish`; FLAT or LISTS
+    flat_bytes : see `publish`; FLAT or SKETCHES
     runs : queries, of which none is in the map
     """
     length = read_model(PRESETS[0]).signature_bytes if length is None else length
@@ -293,14 +293,14 @@ def table(figures: list[SearchFigures]) -> list[str]:
         "|--:|--:|---|--:|--:|--:|--:|--:|--:|--:|--:|",
         *(
             f"| {f.frames:,} | {f.signature_bytes} "
-            f"| {f'{f.probes} lists' if f.probes else 'all'} | {f.search:.2f} | {f.exact:.2f} "
+            f"| {'by sketches' if f.probes else 'all'} | {f.search:.2f} | {f.exact:.2f} "
             f"| {f.ratio:.2f} | {f.recall:.4f} | {f.publish / 1e3:.1f} | {f.append / 1e3:.1f} "
             f"| {f.open / 1e3:.2f} | {f.held:.0f}, {f.shared:.0f} |"
             for f in figures
         ),
         "",
-        "A service compares all frames of a map up to 1 GiB of signatures, and uses inverted lists "
-        "beyond. Rows with lists below that size are for comparison.",
+        "A service compares all frames of a map up to 16 MiB of signatures, and selects frames by "
+        "sketches beyond.",
         "",
     ]
 
@@ -329,12 +329,12 @@ def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, nargs="+", default=[10_000, 100_000, 1_000_000])
-    parser.add_argument("--lists", action="store_true", help="by inverted lists as well")
+    parser.add_argument("--sketches", action="store_true", help="by sketches as well")
     parser.add_argument("--growth", action="store_true", help="only what a growing index costs")
     parser.add_argument("--runs", type=int, default=15)
     options = parser.parse_args()
     pin_to_one_processor()
-    kinds = (FLAT, LISTS) if options.lists else (FLAT,)
+    kinds = (FLAT, SKETCHES) if options.sketches else (FLAT,)
     sizes = [(n, kind) for kind in kinds for n in options.frames]
     if options.growth:
         grown = [measure_growth(n, flat_bytes=kind, runs=options.runs) for n, kind in sizes]

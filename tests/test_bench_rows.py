@@ -216,7 +216,7 @@ def test_page_and_json_hold_every_row() -> None:
         "8 clients are answered **1.80** times as often as one.",
         "| **HTTP / library** | **1.05** |",
         "| /healthz while 4 clients query and a worker signs: p50, p99 | 9.0, 30.0 |",
-        "| 1,000 | 384 | 16 lists | 1.50 | 3.00 | 0.50 | 0.9960 | 5.0 | 0.9 | 0.02 | 7, 384 |",
+        "| 1,000 | 384 | by sketches | 1.50 | 3.00 | 0.50 | 0.9960 | 5.0 | 0.9 | 0.02 | 7, 384 |",
         "| 384 | 1,500 | 76,000 | 174,000 |",
         "### Signing, `paper`",
         "### Exact scan of 500 signatures of 125,000 bytes (62.5 MB)",
@@ -322,22 +322,22 @@ def test_a_load_that_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("flat_bytes", [search.FLAT, search.LISTS])
+@pytest.mark.parametrize("flat_bytes", [search.FLAT, search.SKETCHES])
 def test_a_search_is_compared_with_the_scan_of_all(flat_bytes: int) -> None:
     found = search.measure(frames=1000, length=64, flat_bytes=flat_bytes, runs=2)
     assert (found.frames, found.signature_bytes) == (980, 64)  # one of each place is asked for
     assert min(found.publish, found.append, found.open, found.exact, found.search) > 0
     assert found.ratio > 0
-    assert (found.probes > 0) == (flat_bytes == search.LISTS)
+    assert (found.probes > 0) == (flat_bytes == search.SKETCHES)
     assert found.recall >= 0.995
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("flat_bytes", [search.FLAT, search.LISTS])
+@pytest.mark.parametrize("flat_bytes", [search.FLAT, search.SKETCHES])
 def test_a_map_that_grew_is_compared_with_one_published_at_once(flat_bytes: int) -> None:
     found = search.measure_growth(frames=1300, length=64, flat_bytes=flat_bytes, runs=3)
     assert (found.frames, found.segments) == (127 * (1300 * 49 // 50 // 127), 4)
-    assert 4 < found.written < 12  # lists are written too
+    assert 4 < found.written < 12  # sketches are written too
     assert 0 < found.share < 0.2
     assert found.append_ratio == found.append / found.whole > 0
     assert min(found.largest, found.search, found.one, found.search_ratio) > 0

@@ -294,7 +294,7 @@ def _stats(engine: Engine, name: str, options: argparse.Namespace) -> int:
 def _lines(s: IndexStats) -> list[str]:
     index = "no index" if s.generation == 0 else f"generation {s.generation}"
     recall = "1 (queries compare every frame)" if s.recall is None else f"{s.recall:.3f}"
-    lists = f", {s.probes} lists compared" if s.probes else ""
+    compared = f", {s.probes} frames compared" if s.probes else ""
     spread = "" if s.spread is None else f"; 100th neighbour at {s.spread:.2f} of the 10th"
     return [
         f"map {s.map}, {s.model}",
@@ -303,7 +303,7 @@ def _lines(s: IndexStats) -> list[str]:
         f"  bytes       {s.bytes_beyond_upload} per frame besides its upload of "
         f"{s.upload_bytes}: signature {s.signature_bytes}, artifact {s.artifact_bytes}, index "
         f"{s.index_bytes}",
-        f"  recall@10   {recall}{lists} ({s.sample} frames){spread}",
+        f"  recall@10   {recall}{compared} ({s.sample} frames){spread}",
     ]
 
 

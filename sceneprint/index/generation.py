@@ -36,10 +36,10 @@ from sceneprint.index.segment import (
     FLAT_BYTES,
     Places,
     Segment,
-    list_threshold,
     merge_plan,
     open_segment,
     segment_sources,
+    sketch_threshold,
     spool_blocks,
     write_segment,
 )
@@ -237,8 +237,8 @@ def _inode(path: Path) -> int:
 
 # Search: the nearest frames of a map by exact distance of signatures, Sec. III-C.
 #
-# The tail is compared whole, and so is each segment; of one with an inverted file only the lists
-# that are nearest to the query. What they miss is missed, and measured when it is published.
+# The tail is compared whole, and so is each segment; of one with sketches only the frames whose
+# sketches are nearest to that of the query. What they miss is measured when it is published.
 
 # Tails: frames newer than a generation, held in memory and always compared exactly.
 
@@ -451,7 +451,7 @@ def publish(
         kept as it is, for whoever opens the generation to check
     clean : leave no file that has a byte of a frame that is no longer there: the generation
         before is not kept
-    flat_bytes : of signatures, above which there is an inverted file
+    flat_bytes : of signatures, above which there are sketches
     after : its number is larger than that
     share : called with the manifest once all files are there and before it is: False where another
         generation was published by that number elsewhere, so that this one is not published
@@ -508,7 +508,7 @@ def _write_segments(
     if previous is None and len(new_keys) == 0:
         raise ValueError("a generation of no frames that follows none")
     sources = segment_sources(() if previous is None else previous.segments, new_keys, stored, drop)
-    most = list_threshold(sources, flat_bytes) if qdrant is None else np.inf
+    most = sketch_threshold(sources, flat_bytes) if qdrant is None else np.inf
     groups = merge_plan([len(each) for each in sources])
     records = tuple(
         write_segment(

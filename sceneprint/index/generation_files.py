@@ -37,9 +37,9 @@ from sceneprint.atomic_files import (
 from sceneprint.errors import DamagedIndex
 from sceneprint.types import Bytes
 
-#: What the keys, the FAISS index, the inverted file, the deleted keys and the shard of Qdrant of a
+#: What the keys, the FAISS index, the sketches, the deleted keys and the shard of Qdrant of a
 #: segment are called.
-KINDS = ("keys", "faiss", "lists", "gone", "qdrant")
+KINDS = ("keys", "faiss", "sketches", "gone", "qdrant")
 #: Of these the one that is a folder, and what in it names its files.
 FOLDER_KIND, CONTENTS = "qdrant", "contents.json"
 #: Of that list, at most: a larger one is refused unread. It takes 200 bytes a file.
@@ -349,7 +349,7 @@ def draw(n: int, limit: int, seed: int) -> NDArray[np.int64]:
 # product beside each other neither read nor remove what the other made.
 
 #: Of the files of a generation and of what they mean. Raise it when either changes.
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 #: A manifest names five files of each segment at most; a larger file is refused unread.
 MAXIMUM_BYTES = 1 << 16
 _MANIFEST = re.compile(rf"(\d{{10}})-([0-9a-f]{{32}})\.{SCHEMA_VERSION}\.json")
@@ -365,8 +365,9 @@ class Recall:
     near : neighbours that were looked for
     sample : frames that were looked up, each without itself; 0 where a search compares every
         frame, so that there is nothing to miss
-    probes : lists of the inverted file that a search compares; 0 where there is none
-    frames : of the segment that was measured, which may be an earlier one
+    probes : frames that a search compares at least, selected by their sketches; 0 where there are
+        no sketches
+    frames : that were measured
     """
 
     share: float
@@ -382,9 +383,9 @@ class SegmentFiles:
 
     Parameters
     ----------
-    files : (name, bytes) of its keys, of the FAISS index of their signatures, of their inverted
-        file, if there is one, and of the keys that count no longer, if there are any
-    recall : as measured when it, or one that it grew from and that was about as large, was written
+    files : (name, bytes) of its keys, of the FAISS index of their signatures, of their sketches,
+        if there are any, and of the keys that count no longer, if there are any
+    recall : as measured when it was written
     """
 
     files: tuple[tuple[str, int], ...]

@@ -17,7 +17,7 @@ import logging
 import mmap
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,7 +29,7 @@ from sceneprint.atomic_files import create_private
 from sceneprint.errors import DamagedIndex
 from sceneprint.geometry.retrieval.ranking import Metric, distances
 from sceneprint.index import faiss_index
-from sceneprint.index.faiss_index import Lists, codes_of, map_index, map_lists, nearest
+from sceneprint.index.faiss_index import codes_of, map_index, nearest
 from sceneprint.index.generation_files import (
     BLOCK_BYTES,
     FOLDER_KIND,
@@ -44,6 +44,14 @@ from sceneprint.index.generation_files import (
     unfinished,
 )
 from sceneprint.index.qdrant_shard import Shard, open_shard, write_shard
+from sceneprint.index.sketches import (
+    NEAR,
+    Sketches,
+    make_sketches,
+    map_sketches,
+    measure_sketches,
+    write_sketches,
+)
 from sceneprint.types import Bytes
 
 if TYPE_CHECKING:
@@ -58,11 +66,10 @@ RATIO = 3
 MOST_SEGMENTS = 8
 #: Share of a segment's frames that may be gone before it is written again without them.
 GONE_SHARE = 0.25
-#: Bytes of signatures up to which a map has no inverted file: comparing all takes a fifth of a
-#: second.
-FLAT_BYTES = 1 << 30
+#: Bytes of signatures up to which a map has no sketches: comparing all takes 3 ms.
+FLAT_BYTES = 1 << 24
 #: Of a larger map, segments of at most this share of FLAT_BYTES have none.
-FLAT_SHARE = 1 / 64
+FLAT_SHARE = 1 / 8
 #: Where fewer than one in this many frames may be found, they are compared one by one: FAISS reads
 #: all of them.
 FEW = 8
@@ -129,7 +136,7 @@ class Segment:
     record : of its files
     keys : (N,) int64, rising, of all frames in its files
     index : of FAISS, over their signatures in the same order
-    lists : the inverted file; None where all of it is compared
+    sketches : of its frames; None where all of them are compared
     gone : (g,) int64, rising, of the frames that do not count: deleted since, or signed anew and
         in another segment
     shard : of Qdrant, which chooses what is compared; None where it has none, or it is not used
@@ -138,7 +145,7 @@ class Segment:
     record: SegmentFiles
     keys: Keys
     index: IndexScalarQuantizer
-    lists: Lists | None
+    sketches: Sketches | None
     gone: Keys
     shard: Shard | None = None
 
@@ -218,9 +225,9 @@ class Segment:
         """Rows that are compared one by one, None for all that are free; whether they are all."""
         if free is not None and count < len(free) // FEW:
             return np.flatnonzero(free), True
-        if self.lists is None or exact:
+        if self.sketches is None or exact:
             return None, True
-        rows = self.lists.candidates(query, min(size, count), free)
+        rows = self.sketches.candidates(query, min(size, count), free)
         return rows, len(rows) == count
 
     def _compared(
@@ -277,10 +284,10 @@ def open_segment(
     DamagedIndex : one of them is missing, or not what its kind is.
     """
     names = {name.rpartition(".")[2]: folder / name for name, _ in record.files}
-    keys, lists = _rising_keys(names["keys"]), None
+    keys, sketches = _rising_keys(names["keys"]), None
     index = map_index(names["faiss"], len(keys), dimension)
-    if "lists" in names:
-        lists = map_lists(names["lists"], len(keys), dimension, record.recall.probes)
+    if "sketches" in names:
+        sketches = map_sketches(names["sketches"], len(keys), dimension, record.recall.probes)
     gone = np.empty(0, np.int64)
     if "gone" in names:
         gone = _rising_keys(names["gone"])
@@ -292,7 +299,7 @@ def open_segment(
             shard = open_shard(names[FOLDER_KIND], len(keys), dimension, qdrant)
         except DamagedIndex as error:  # its files are sound, as they were checked
             log.warning("Qdrant not used; all signatures are compared: %s", error)
-    return Segment(record, keys, index, lists, gone, shard)
+    return Segment(record, keys, index, sketches, gone, shard)
 
 
 def _rising_keys(path: Path) -> Keys:
@@ -408,7 +415,7 @@ def write_segment(
     folder : of the map
     sources : of which at least one has frames
     clean : leave nothing of frames that are gone
-    flat_bytes : of signatures, above which there is an inverted file
+    flat_bytes : of signatures, above which there are sketches
     qdrant : the metric, where it is to have a shard of Qdrant
 
     Raises
@@ -427,18 +434,22 @@ def write_segment(
         for first in range(0, len(each), step):
             some = slice(first, first + step)
             vectors[places[some]] = each.vectors[each.rows[some]]
-    lists, recall = None, _flat_recall(len(keys))
-    if vectors.nbytes > flat_bytes:
-        lists, recall = _grown_lists(sources, order, vectors, clean)
+    recall = _flat_recall(len(keys))
     files = [
         put(folder, "keys", lambda take: take(keys.astype("<i8").tobytes())),
         put(folder, "faiss", lambda take: faiss_index.write_index(index, take)),
     ]
-    if lists is not None:
-        files.append(put(folder, "lists", lambda take: faiss_index.write_lists(lists, take)))
+    if vectors.nbytes > flat_bytes:
+        made, recall = _put_sketches(folder, vectors)
+        files.append(made)
     if qdrant is not None:
         files.append(_put_shard(folder, vectors, qdrant))
     return SegmentFiles(tuple(files), recall)
+
+
+def _put_sketches(folder: Path, vectors: Bytes) -> tuple[tuple[str, int], Recall]:
+    made, recall = measure_sketches(make_sketches(vectors), vectors)
+    return put(folder, "sketches", lambda take: write_sketches(made, take)), recall
 
 
 def _put_shard(folder: Path, vectors: Bytes, metric: Metric) -> tuple[str, int]:
@@ -455,28 +466,25 @@ def _merged_keys(sources: Sequence[SegmentSource]) -> tuple[Keys, NDArray[np.int
 
 
 def _flat_recall(frames: int) -> Recall:
-    return Recall(1.0, faiss_index.NEAR, 0, 0, frames)
+    return Recall(1.0, NEAR, 0, 0, frames)
 
 
 def _renamed(
     folder: Path, segment: Segment, gone: Keys, flat_bytes: float, qdrant: Metric | None
 ) -> SegmentFiles:
-    """The files of a segment that stays, with other frames gone, and an inverted file or a shard if
-    need be.
+    """The files of a segment that stays, with other frames gone; sketches or a shard if need be.
 
-    Of a map that has become large its older segments get one, which no search had needed before.
+    Of a map that has become large its older segments get sketches, which no search needed before.
     """
     files = [one for one in segment.record.files if one[0].endswith((".keys", ".faiss"))]
-    recall, lists = segment.record.recall, segment.record.file("lists")
+    recall, sketches = segment.record.recall, segment.record.file("sketches")
     if segment.vectors.nbytes <= flat_bytes:
         recall = _flat_recall(len(segment.keys))
-    elif lists is not None:
-        files.append(lists)
+    elif sketches is not None:
+        files.append(sketches)
     else:
-        made, recall = faiss_index.measure_lists(
-            faiss_index.train_lists(segment.vectors), segment.vectors
-        )
-        files.append(put(folder, "lists", lambda take: faiss_index.write_lists(made, take)))
+        made, recall = _put_sketches(folder, segment.vectors)
+        files.append(made)
     before = segment.record.file("gone")
     if before is not None and len(gone) == len(segment.gone):
         files.append(before)
@@ -490,32 +498,7 @@ def _renamed(
     return SegmentFiles(tuple(files), recall)
 
 
-def _grown_lists(
-    sources: Sequence[SegmentSource], order: NDArray[np.int64], vectors: Bytes, clean: bool
-) -> tuple[Lists, Recall]:
-    """The inverted file of a merged segment, from that of the largest source that has one."""
-    n, start = len(vectors), 0
-    base, before = None, np.full(n, -1)
-    for each in sources:
-        places = order[start : start + len(each)]
-        start += len(each)
-        known = None if each.segment is None else each.segment.lists
-        if known is not None and (base is None or len(each) > len(base)):
-            base, before = each, np.full(n, -1)
-            before[places] = each.rows
-    held = None if base is None else base.segment
-    if held is None or held.lists is None or n >= faiss_index.GROWTH * held.lists.trained_on:
-        return faiss_index.measure_lists(faiss_index.train_lists(vectors), vectors)
-    lists = faiss_index.extend_lists(held.lists, vectors, before)
-    if clean or np.count_nonzero(before >= 0) < len(held.keys):
-        # the centroid of a list of one frame is that frame: none may outlive what is deleted
-        lists = faiss_index.centre_lists(lists, vectors)
-    if not clean and faiss_index.still_holds(held.record.recall, n):
-        return replace(lists, probes=held.lists.probes), held.record.recall
-    return faiss_index.measure_lists(lists, vectors)
-
-
-def list_threshold(sources: Sequence[SegmentSource], flat_bytes: int) -> float:
-    """Bytes of signatures of one segment above which it has an inverted file."""
+def sketch_threshold(sources: Sequence[SegmentSource], flat_bytes: int) -> float:
+    """Bytes of signatures of one segment above which it has sketches."""
     total = sum(len(each) * each.vectors.shape[1] for each in sources)
     return FLAT_SHARE * flat_bytes if total > flat_bytes else np.inf

@@ -12,7 +12,7 @@ from sqlalchemy import update
 
 from sceneprint.cli import main
 from sceneprint.engine import Engine
-from sceneprint.index import Generation, Tail, faiss_index, newest, publish, search
+from sceneprint.index import Generation, Tail, newest, publish, search, sketches
 from sceneprint.index.generation_files import draw
 from sceneprint.maintenance.fsck import indexes
 from sceneprint.settings import Settings
@@ -83,12 +83,13 @@ def test_rebuild_stats_and_verify(data: Path, capsys: pytest.CaptureFixture[str]
     assert "generation 1" in out
 
 
-def test_recall_counts_what_an_inverted_file_misses(
+def test_recall_counts_what_sketches_miss(
     data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(publish, "__kwdefaults__",
                         publish.__kwdefaults__ | {"flat_bytes": 0})  # fmt: skip
-    monkeypatch.setattr(faiss_index, "ENOUGH", 0.1)  # so that it does miss some
+    for name, value in (("ENOUGH", 0.1), ("LEAST_SELECTED", 4), ("TIMES_WANTED", 1)):
+        monkeypatch.setattr(sketches, name, value)  # so that it does miss some
     told(capsys, "rebuild", "hall", "--data", data)
     with Engine(Settings(data_dir=data)) as engine:
         stats = indexes.describe_index(engine, "hall", 20, seed=3)
@@ -104,7 +105,7 @@ def test_recall_counts_what_an_inverted_file_misses(
     assert 0 < stats.recall < 1
     assert stats.probes == generation.manifest.recall.probes > 0
     _, out = told(capsys, "stats", "hall", "--data", data)
-    assert f", {stats.probes} lists compared (60 frames)" in out
+    assert f", {stats.probes} frames compared (60 frames)" in out
 
 
 @pytest.mark.parametrize("what", ["signature", "database"])

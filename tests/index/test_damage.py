@@ -13,8 +13,9 @@ import pytest
 
 from sceneprint.errors import DamagedIndex
 from sceneprint.index import Generation, generation_files, newest, scrub
-from sceneprint.index.faiss_index import map_index, map_lists
+from sceneprint.index.faiss_index import map_index
 from sceneprint.index.generation_files import GenerationManifest, manifests, read_manifest
+from sceneprint.index.sketches import map_sketches
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -22,7 +23,7 @@ Publish = Callable[..., Generation]
 LENGTH = 32
 
 
-KINDS = ["json", "keys", "faiss", "lists"]
+KINDS = ["json", "keys", "faiss", "sketches"]
 RECALL = {"share": 1.0, "near": 10, "sample": 0, "probes": 0, "frames": 0}
 
 
@@ -144,7 +145,7 @@ def test_a_damaged_file_is_written_again_when_its_content_is(
 ) -> None:
     """Names come from content, so that a name may be there already, with other bytes."""
     for path in folder.iterdir():
-        if path.suffix in {".faiss", ".keys", ".lists"}:
+        if path.suffix in {".faiss", ".keys", ".sketches"}:
             path.write_bytes(b"damaged")
     signatures = walk(45, LENGTH)
     # the very bytes of the first generation
@@ -155,7 +156,7 @@ def test_a_damaged_file_is_written_again_when_its_content_is(
 @pytest.mark.parametrize(
     "change",
     [
-        {"schema_version": 2},
+        {"schema_version": 3},
         {"segments": [{"files": [], "recall": RECALL}]},
         {"segments": [{"files": [["../../etc/passwd", 1]], "recall": RECALL}]},
         {"segments": [{"files": [[f"{'0' * 64}.keys", 8]], "recall": RECALL}]},
@@ -173,7 +174,7 @@ def test_a_manifest_that_means_something_else_is_refused(
 
     path = own_files(folder)["json"]
     data = json.dumps(json.loads(path.read_bytes()) | change).encode()
-    other = path.with_name(f"0000000009-{hashlib.sha256(data).hexdigest()[:32]}.3.json")
+    other = path.with_name(f"0000000009-{hashlib.sha256(data).hexdigest()[:32]}.4.json")
     other.write_bytes(data)
     with pytest.raises(DamagedIndex):
         read_manifest(other)
@@ -222,14 +223,14 @@ def test_another_kind_of_faiss_index_is_refused(
         map_index(tmp_path / "other", 45, LENGTH)
 
 
-def test_lists_of_other_signatures_are_refused(folder: Path) -> None:
-    path = own_files(folder)["lists"]
-    assert len(map_lists(path, 45, LENGTH, 1)) > 1
+def test_sketches_of_other_signatures_are_refused(folder: Path) -> None:
+    path = own_files(folder)["sketches"]
+    assert len(map_sketches(path, 45, LENGTH, 1)) == 45
     for n, dimension in ((44, LENGTH), (45, LENGTH + 1)):
-        with pytest.raises(DamagedIndex, match="no lists of"):
-            map_lists(path, n, dimension, 1)
+        with pytest.raises(DamagedIndex, match="no sketches of"):
+            map_sketches(path, n, dimension, 1)
     data = path.read_bytes()
     for wrong in (b"", data[:20], data[:-1], b"X" + data[1:], data[:6] + b"\x09" + data[7:]):
         path.write_bytes(wrong)
-        with pytest.raises(DamagedIndex, match="no lists of"):
-            map_lists(path, 45, LENGTH, 1)
+        with pytest.raises(DamagedIndex, match="no sketches of"):
+            map_sketches(path, 45, LENGTH, 1)

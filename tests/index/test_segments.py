@@ -22,6 +22,7 @@ from sceneprint.index.segment import (
     merge_plan,
     open_segment,
 )
+from sceneprint.index.sketches import make_sketches
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -230,7 +231,7 @@ def test_cleaning_writes_only_segments_that_something_is_gone_of(
     assert clean.manifest.worn_keys == ()
 
 
-def test_a_map_that_becomes_large_gets_lists_for_what_it_has(
+def test_a_map_that_becomes_large_gets_sketches_for_what_it_has(
     walk: Walk, published: Publish, tmp_path: Path
 ) -> None:
     length = 64
@@ -238,19 +239,19 @@ def test_a_map_that_becomes_large_gets_lists_for_what_it_has(
     flat = 2500 * length
     made = published(np.arange(2000), signatures[:2000], flat_bytes=flat)
     made = published(np.arange(2000, 2500), signatures[2000:2500], made, flat_bytes=flat)
-    assert [one.lists for one in made.segments] == [None, None]
+    assert [one.sketches for one in made.segments] == [None, None]
     assert made.manifest.recall.sample == 0
     known = made.segments
     made = published(np.arange(2500, 2530), signatures[2500:2530], made, flat_bytes=flat)
     assert sizes(made) == [2000, 500, 30]
     # a small segment is compared whole
-    assert [one.lists is None for one in made.segments] == [False, False, True]
+    assert [one.sketches is None for one in made.segments] == [False, False, True]
     for one, before in zip(made.segments, known, strict=False):
         assert one.record.file("faiss") == before.record.file("faiss")
         assert one.record.recall.frames == len(one)
     opened = newest(tmp_path / "map", "model", length)
     assert opened is not None
-    each = [one.lists.probes for one in opened.segments if one.lists is not None]
+    each = [one.sketches.probes for one in opened.segments if one.sketches is not None]
     recall = opened.manifest.recall
     assert recall.probes == sum(each)
     assert recall.share == min(one.record.recall.share for one in opened.segments) < 1.001
@@ -260,27 +261,27 @@ def test_a_map_that_becomes_large_gets_lists_for_what_it_has(
     assert 30 + 10 <= hits.compared < 2530
     less = published(*[part[:0] for part in (np.arange(0), signatures)], made,
                      drop=frozenset(range(2500, 2530)), flat_bytes=flat)  # fmt: skip
-    assert [one.lists for one in less.segments] == [None, None]
+    assert [one.sketches for one in less.segments] == [None, None]
     assert less.manifest.recall.probes == 0
 
 
-def test_a_merge_goes_on_with_the_centroids_of_the_largest(walk: Walk, published: Publish) -> None:
+def test_a_segment_is_measured_when_it_is_written(walk: Walk, published: Publish) -> None:
     signatures, made = walk(1420, 64, walks=9), None
     for start, end in ((0, 1000), (1000, 1300), (1300, 1360)):
         made = published(np.arange(start, end), signatures[start:end], made, flat_bytes=0)
-        assert made.segments[-1].record.recall.frames == end - start  # each is trained by itself
+        assert made.segments[-1].record.recall.frames == end - start
     assert made is not None
-    before = made.segments[0].lists
+    before = made.segments[0].record
+    made = published(*[part[:0] for part in (np.arange(0), signatures)], made,
+                     drop=frozenset([1001]), flat_bytes=0)  # fmt: skip
+    assert made.segments[0].record == before
     made = published(np.arange(1360, 1420), signatures[1360:], made, flat_bytes=0)
-    assert sizes(made) == [1420]
-    after = made.segments[0].lists
-    assert before is not None
-    assert after is not None
-    assert after.trained_on == 1000
-    np.testing.assert_array_equal(after.centroids, before.centroids)
-    squares = ((signatures[:, None].astype(float) - after.centroids) ** 2).sum(axis=2)
-    chosen = squares[np.arange(1420), after.assignment()]
-    np.testing.assert_allclose(chosen, squares.min(axis=1), rtol=1e-4, atol=0.5)
+    assert sizes(made) == [1419]
+    (one,) = made.segments
+    assert one.record.recall.frames == 1419
+    assert one.sketches is not None
+    alone = make_sketches(np.delete(signatures, 1001, axis=0))
+    np.testing.assert_array_equal(one.sketches.words, alone.words)
 
 
 def test_segments_find_as_much_as_one_file(walk: Walk, published: Publish, tmp_path: Path) -> None:

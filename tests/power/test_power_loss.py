@@ -179,8 +179,8 @@ def signatures_at(keys: NDArray[np.int64]) -> Bytes:
     return np.stack([np.random.default_rng(k).integers(0, 256, LENGTH, np.uint8) for k in keys])
 
 
-#: Keys that each generation adds, those it drops, and bytes up to which it has no inverted file:
-#: a first, an appended, one in lists, one of deletions with fewer lists, one without.
+#: Keys that each generation adds, those it drops, and bytes up to which it has no sketches:
+#: a first, an appended, one with sketches, one of deletions with sketches, one without.
 STEPS = (
     (range(20), frozenset[int](), 1 << 30),
     (range(20, 26), frozenset({3}), 1 << 30),
@@ -217,7 +217,7 @@ def read(folder: Path) -> Generation | None:
         assert found.keys.tolist() == expected(number)
         np.testing.assert_array_equal(found.vectors_of(found.keys), signatures_at(found.keys))
         for one in found.segments:
-            assert (one.lists is None) == (STEPS[number - 1][2] > 0)
+            assert (one.sketches is None) == (STEPS[number - 1][2] > 0)
     return found
 
 

@@ -148,12 +148,12 @@ class IndexRecall(ApiRecord):
         "where a query compares every frame, so that there is nothing to measure."
     )
     probes: int = Field(
-        description="Inverted lists that a query compares, of a very large map; 0 where it "
-        "compares every frame."
+        description="Frames that a query compares at least, of a large map: those whose sketches "
+        "(a bit for each byte of a signature) are nearest to its own. 0 where it compares every "
+        "frame."
     )
     frames: int = Field(
-        description="Frames that the index had when this was measured: it is measured anew when "
-        "they have changed by a tenth."
+        description="Frames of the index that were there to be found when this was measured."
     )
 
 

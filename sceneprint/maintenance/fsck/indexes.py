@@ -69,7 +69,7 @@ class IndexStats:
     deleted : frames that are in the index and not in the map any more
     upload_bytes, signature_bytes, artifact_bytes, index_bytes : per frame
     sample : frames that were looked up
-    probes : lists of the inverted file that a query compares; 0 where it compares every frame
+    probes : frames that a query compares at least; 0 where it compares every frame
     recall : share of the 10 nearest by the exact scan that a query finds; None where it compares
         every frame
     spread : distance of the 100th neighbour over that of the 10th, median: near 1 is hard

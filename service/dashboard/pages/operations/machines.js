@@ -23,7 +23,7 @@ export function indexes() {
   return {
     element: h("section", { class: "card", "aria-labelledby": "indexes" }, h("h2", { id: "indexes" }, "Search indexes"), none,
       h("div", { class: "scroll" }, table),
-      h("p", { class: "note muted" }, "A query compares every frame, except in very large maps. For these, recall is measured when a generation is published, on a sample of its frames.")),
+      h("p", { class: "note muted" }, "A query compares every frame, except in large maps. For these, recall is measured when a generation is published, on a sample of its frames.")),
     update({ indexes: found }) {
       none.hidden = found.length > 0;
       table.hidden = found.length === 0;
@@ -35,7 +35,7 @@ export function indexes() {
 /** The share of the nearest frames that a query finds, in words where it compares every frame. */
 function recall({ recall: found }) {
   if (found === null || found.sample === 0) return h("span", { class: "muted", title: "A query compares every frame of this map" }, "exact search");
-  return h("span", { title: `Measured with ${count(found.sample)} frames; a query compares ${count(found.probes)} inverted lists` }, percent(found.share));
+  return h("span", { title: `Measured with ${count(found.sample)} frames; a query compares at least ${count(found.probes)} frames, those whose sketches are nearest` }, percent(found.share));
 }
 
 /**

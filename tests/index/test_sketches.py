@@ -1,0 +1,231 @@
+"""The sketches of a large map: exact where it says so, and what they miss is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sceneprint.index import Generation, Tail, newest, search, sketches
+from sceneprint.index.generation_files import draw
+from sceneprint.index.segment import Segment
+from sceneprint.index.sketches import LEAST_SELECTED, Sketches, make_sketches, neighbours
+from sceneprint.types import Bytes
+
+Walk = Callable[..., Bytes]
+Publish = Callable[..., Generation]
+Nearest = Callable[..., tuple[list[int], list[int]]]
+LENGTH = 64
+EMPTY = Tail.empty(LENGTH)
+search_l2 = partial(search, metric="l2")
+
+
+def only(generation: Generation | None) -> Segment:
+    """The segment of a generation that has one."""
+    assert generation is not None
+    (found,) = generation.segments
+    return found
+
+
+def sketches_of(generation: Generation | None) -> Sketches:
+    found = only(generation).sketches
+    assert found is not None
+    return found
+
+
+def differing_bits(query: Bytes, vectors: Bytes, means: Bytes) -> list[int]:
+    """The oracle: bits in which sketches differ, one by one."""
+    return [int(((row > means) != (query > means)).sum()) for row in vectors]
+
+
+def test_a_map_that_is_large_has_sketches(
+    walk: Walk, published: Publish, nearest: Nearest, tmp_path: Path
+) -> None:
+    signatures = walk(3000, LENGTH, walks=20)
+    keys = np.arange(3000) * 2
+    flat = published(keys, signatures, flat_bytes=3000 * LENGTH)
+    assert only(flat).sketches is None
+    recall = flat.manifest.recall
+    assert (recall.share, recall.sample, recall.probes) == (1, 0, 0)
+    made = published(keys, signatures, flat_bytes=3000 * LENGTH - 1)
+    opened = newest(tmp_path / "map", "model", LENGTH)
+    assert opened is not None
+    frames = dict(zip(keys.tolist(), signatures, strict=True))
+    query = walk(31, LENGTH, seed=8)[30]
+    for generation in (made, opened):
+        own = sketches_of(generation)
+        assert (len(own), own.probes) == (3000, generation.manifest.recall.probes)
+        np.testing.assert_array_equal(own.means, signatures.mean(axis=0).astype(np.uint8))
+        bits, rows = own.differing(query, None)
+        assert bits.tolist() == differing_bits(query, signatures, own.means)
+        assert rows.tolist() == np.bincount(bits, minlength=LENGTH + 1).tolist()
+        hits = search_l2(query, generation, EMPTY, 10)
+        assert not hits.exact
+        assert LEAST_SELECTED <= hits.compared < 1500
+        assert (hits.keys.tolist(), hits.distances.tolist()) == nearest(query, frames, 10)
+        whole = search_l2(query, generation, EMPTY, 10, exact=True)
+        assert (whole.keys.tolist(), whole.distances.tolist()) == nearest(query, frames, 10)
+        assert (whole.exact, whole.compared) == (True, 3000)
+
+
+def test_nothing_of_a_deleted_frame_is_in_sketches(walk: Walk, published: Publish) -> None:
+    """Those of a segment that is written anew are as if it had never been there."""
+    signatures = walk(50, LENGTH, walks=5)
+    signatures[7] = 255  # it moves every mean
+    made = published(np.arange(50), signatures, flat_bytes=0)
+    none = np.empty(0, np.int64), np.empty((0, LENGTH), np.uint8)
+    after = published(*none, previous=made, drop=frozenset([7]), flat_bytes=0)
+    assert only(after).record.file("sketches") == only(made).record.file("sketches")
+    after = published(*none, previous=after, flat_bytes=0, clean=True)
+    left, alone = sketches_of(after), make_sketches(np.delete(signatures, 7, axis=0))
+    np.testing.assert_array_equal(left.means, alone.means)
+    np.testing.assert_array_equal(left.words, alone.words)
+    assert (left.means < sketches_of(made).means).any()
+
+
+def test_recall_is_what_searches_find(
+    walk: Walk, published: Publish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By searches of the frames that were drawn, each without itself, against the exact scan."""
+    for name, value in (("LEAST_SELECTED", 10), ("TIMES_WANTED", 1), ("ENOUGH", 0.5)):
+        monkeypatch.setattr(sketches, name, value)  # so that some are missed
+    signatures = walk(4000, LENGTH, walks=30)
+    generation = published(np.arange(4000), signatures, flat_bytes=0)
+    recall, found = generation.manifest.recall, 0
+    assert (recall.near, recall.sample, recall.frames) == (10, sketches.MOST, 4000)
+    for row in draw(4000, recall.sample, 0).tolist():
+        itself = frozenset([row])
+        right = search_l2(signatures[row], generation, EMPTY, 10, dead=itself, exact=True)
+        hits = search_l2(signatures[row], generation, EMPTY, 10, dead=itself)
+        found += int((hits.distances <= right.distances[-1]).sum())
+    assert recall.share == pytest.approx(found / (10 * recall.sample))
+    assert 0.5 <= recall.share < 1
+
+
+def test_no_more_frames_are_selected_than_are_needed(
+    walk: Walk, published: Publish, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    signatures = walk(4000, LENGTH, walks=30)
+    probes = []
+    monkeypatch.setattr(sketches, "LEAST_SELECTED", 4)
+    for enough in (0.0, 0.5, 0.9, 1.0):
+        monkeypatch.setattr(sketches, "ENOUGH", enough)
+        folder = tmp_path / str(enough)
+        recall = published(np.arange(4000), signatures, folder=folder, flat_bytes=0).manifest.recall
+        assert recall.share >= enough
+        probes.append(recall.probes)
+    assert probes[0] == 4
+    assert probes == sorted(probes)
+    assert probes[-1] > probes[1] > 4
+
+
+def test_what_queries_from_elsewhere_find(walk: Walk, published: Publish) -> None:
+    """Places of the map with other noise: recall of the ten nearest."""
+    signatures = walk(6000, LENGTH, walks=12)
+    generation = published(np.arange(6000), signatures, flat_bytes=0)
+    noise = np.random.default_rng(7).normal(0, 4, (60, LENGTH))
+    kept = []
+    for query in np.clip(signatures[70::100][:60] + noise, 0, 255).astype(np.uint8):
+        right = search_l2(query, generation, EMPTY, 10, exact=True)
+        found = search_l2(query, generation, EMPTY, 10)
+        kept.append(np.isin(right.keys, found.keys).mean())
+    assert np.mean(kept) >= 0.97
+
+
+def test_as_many_come_back_as_there_are(walk: Walk, published: Publish, nearest: Nearest) -> None:
+    """Sketches of frames that may not be found take no place of others."""
+    signatures, keys = walk(2000, LENGTH, walks=10), np.arange(2000)
+    generation = published(keys, signatures, flat_bytes=0)
+    query = signatures[1234]
+    near = search_l2(query, generation, EMPTY, 900, exact=True).keys
+    dead = frozenset(near.tolist())
+    hits = search_l2(query, generation, EMPTY, 300, dead=dead)
+    assert len(hits) == 300
+    assert not dead & set(hits.keys.tolist())
+    assert len(search_l2(query, generation, EMPTY, 5000, dead=dead)) == 1100
+    # few among many are compared one by one
+    among = np.sort(near[-100:])
+    few = search_l2(query, generation, EMPTY, 10, among=among)
+    assert (few.exact, few.compared) == (True, 100)
+    frames = {int(k): signatures[k] for k in among}
+    assert (few.keys.tolist(), few.distances.tolist()) == nearest(query, frames, 10)
+
+
+def test_sketches_by_hand() -> None:
+    vectors = np.array([[0, 0, 9], [9, 9, 9], [0, 8, 0], [9, 9, 0]], np.uint8)
+    own = make_sketches(vectors)
+    assert own.means.tolist() == [4, 6, 4]
+    assert own.words.tolist() == [[0b100], [0b111], [0b010], [0b011]]
+    own = replace(own, probes=1)
+    query = np.array([5, 9, 4], np.uint8)  # 0b011
+    bits, rows = own.differing(query, None)
+    assert (bits.tolist(), rows.tolist()) == ([3, 1, 1, 0], [1, 2, 0, 1])
+    assert own.candidates(query, 0, None).tolist() == [3]
+    assert replace(own, probes=2).candidates(query, 0, None).tolist() == [1, 2, 3]
+    assert own.candidates(query, 1, None).tolist() == [0, 1, 2, 3]  # four times as many
+    free = np.array([True, True, False, False])
+    bits, rows = own.differing(query, free)
+    assert (bits.tolist(), rows.tolist()) == ([3, 1, 4, 4], [0, 1, 0, 1])
+    assert own.candidates(query, 0, free).tolist() == [1]
+    assert own.candidates(query, 9, free).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("length", [1, 63, 64, 65, 448])
+def test_bits_are_counted_whatever_the_length(length: int) -> None:
+    rows = np.random.default_rng(length).integers(0, 256, (300, length), np.uint8)
+    own = make_sketches(rows)
+    assert own.words.shape == (300, -(-length // 64))
+    bits, counts = own.differing(rows[5], None)
+    assert bits.tolist() == differing_bits(rows[5], rows, own.means)
+    assert counts.tolist() == np.bincount(bits, minlength=length + 1).tolist()
+
+
+def test_means_are_of_a_sample_and_blocks_make_no_difference(
+    walk: Walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    signatures = walk(500, LENGTH)
+    whole = make_sketches(signatures)
+    monkeypatch.setattr(sketches, "BLOCK_BYTES", 7 * LENGTH)
+    np.testing.assert_array_equal(make_sketches(signatures.copy()).words, whole.words)
+    monkeypatch.setattr(sketches, "MEASURED", 90)
+    means = signatures[draw(500, 90, 0)].mean(axis=0).astype(np.uint8)
+    np.testing.assert_array_equal(make_sketches(signatures).means, means)
+
+
+@pytest.mark.parametrize("most", [1, 20, 299, 400])
+def test_neighbours_are_the_nearest_by_exact_distance(
+    walk: Walk, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    signatures, chosen = walk(300, LENGTH, walks=3), np.array([0, 6, 7, 150, 299])
+    for block in (7 * LENGTH, 1 << 20):
+        monkeypatch.setattr(sketches, "BLOCK_BYTES", block)
+        found = list(neighbours(signatures, chosen, most))
+        assert [row for row, _ in found] == chosen.tolist()
+        for row, others in found:
+            exact = ((signatures.astype(int) - signatures[row]) ** 2).sum(axis=1)
+            assert len(set(others.tolist())) == len(others) == min(most, 299)
+            assert row not in others
+            right = np.sort(np.delete(exact, row))[:most]
+            assert np.sort(exact[others]).tolist() == right.tolist()
+
+
+def test_one_frame_and_equal_frames_have_lists_too(published: Publish, tmp_path: Path) -> None:
+    for n in (1, 2, 50):
+        same = np.full((n, LENGTH), 7, np.uint8)
+        made = published(np.arange(n), same, folder=tmp_path / str(n), flat_bytes=0)
+        hits = search_l2(same[0], made, EMPTY, 5)
+        assert hits.keys.tolist() == list(range(min(n, 5)))
+        assert made.manifest.recall.share == 1
+
+
+@pytest.mark.parametrize(("n", "limit"), [(5, 5), (5, 9), (100, 7), (1000, 999)])
+def test_a_draw_is_one_of_each_stretch(n: int, limit: int) -> None:
+    rows = draw(n, limit, 4)
+    assert len(rows) == min(n, limit)
+    assert (np.diff(rows) > 0).all()
+    assert 0 <= rows[0] <= rows[-1] < n
+    assert rows.tolist() == draw(n, limit, 4).tolist()
