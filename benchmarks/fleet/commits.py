@@ -145,7 +145,7 @@ def _maps(database: Database, n: int) -> list[MapRow]:
 
 def _upload(database: Database, work: tuple[MapRow, int]) -> None:
     row, number = work
-    with database.write(map_number=row.number, pending=True) as connection:
+    with database.write(map_number=row.number, single=True) as connection:
         if receive_frame(connection, row, {**KNOWN, "content_id": f"{number:064x}"}, 0) is None:
             raise RuntimeError("an upload was not taken")
 
@@ -160,7 +160,7 @@ def _claim(database: Database) -> tuple[JobRow, FrameRow]:
 
 def _index(database: Database, work: tuple[JobRow, FrameRow]) -> None:
     held, frame = work
-    with database.write(map_number=frame.map_number, pending=True) as connection:
+    with database.write(map_number=frame.map_number, single=True) as connection:
         if not index_claimed_frame(connection, held, frame, "map", MADE):
             raise RuntimeError("a frame was not indexed")
 
