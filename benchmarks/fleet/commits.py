@@ -2,9 +2,8 @@
 
 `python -m benchmarks.fleet.commits [--maps N] [--clients N] [--delay-ms X] [--commits N]`: uploads,
 then the index commits of the same frames, as services and workers make them. Each client has a
-database of its own, as each is a process of a fleet; they are threads here, so that the
-interpreter's lock counts too. A reader follows the events meanwhile, as services do for those who
-listen: what it misses, or sees out of a map's order, and how late it is.
+database of its own, and a few of them share a process. A reader follows the events meanwhile, as
+services do for those who listen: what it misses, or sees out of a map's order, and how late it is.
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection as Pipe
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -38,6 +37,10 @@ T = TypeVar("T")
 
 #: Seconds between two looks for events, and events of one, as in `service/event_stream.py`.
 POLL_S, MOST = 0.1, 500
+#: Processes that clients share, each with a network of its own.
+PROCESSES = 8
+#: Commits of each client before those that are timed.
+WARM = 10
 MODEL, LEASE_S = "ab" * 32, 3600.0
 MADE = StoredSignature(MODEL, bytes(400), "00" * 32, [1], [1])
 #: What is known of each frame beside its content.
@@ -76,45 +79,57 @@ def measure(
     delay_ms : that each message takes, in either direction
     commits : of each kind
     """
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         server = Server(Path(folder) / "server", durable=True)
         server.start()
-        try:
-            server.create("commits")
-            near = open_database(server.url("commits"))
-            rows = _maps(near, n_maps)
-            proxy = DelayProxy(server.port, delay_ms / 1e3)
-            far = server.url("commits").replace(f":{server.port}/", f":{proxy.port}/")
-            clients = [open_database(far) for _ in range(n_clients)]
-            reader, own = _reader(far, commits)
-            try:
-                uploads = [(rows[i % n_maps], i) for i in range(commits)]
-                uploaded = _timed(clients, uploads, _upload)
-                ended = _timed(clients, [_claim(near) for _ in range(commits)], _index)
-                own.send("over")
-                feed: Feed = own.recv()
-            finally:
-                reader.kill()
-                reader.join()
-                for one in (*clients, near):
-                    one.close()
-                proxy.end()
-        finally:
-            server.kill()
+        stack.callback(server.kill)
+        server.create("commits")
+        near = open_database(server.url("commits"))
+        stack.callback(near.close)
+        rows = make_maps(near, n_maps)
+        urls = [_far(stack, server, delay_ms) for _ in range(min(PROCESSES, n_clients))]
+        reader = stack.enter_context(_process(_follow, urls[0], WARM * n_clients + commits))
+        shares = [n_clients // len(urls) + (i < n_clients % len(urls)) for i in range(len(urls))]
+        clients = [
+            stack.enter_context(_process(_write, url, n))
+            for url, n in zip(urls, shares, strict=True)
+        ]
+        # a connection prepares what it has executed some times
+        warm, all_ = WARM * n_clients, WARM * n_clients + commits
+        uploads = [(rows[i % n_maps], i) for i in range(all_)]
+        _timed(clients, upload, uploads[:warm])
+        uploaded = _timed(clients, upload, uploads[warm:])
+        claimed = [claim(near) for _ in range(all_)]
+        _timed(clients, index, claimed[:warm])
+        ended = _timed(clients, index, claimed[warm:])
+        reader.send("over")
+        feed: Feed = reader.recv()
     return commits / uploaded, commits / ended, feed
 
 
-def _reader(url: str, commits: int) -> tuple[BaseProcess, Pipe]:
-    """A process of its own that follows the events, as a service does, and how to end it."""
+def _far(stack: ExitStack, server: Server, delay_ms: float) -> str:
+    """The URL of a server behind a network of its own."""
+    proxy = DelayProxy(server.port, delay_ms / 1e3)
+    stack.callback(proxy.end)
+    return server.url("commits").replace(f":{server.port}/", f":{proxy.port}/")
+
+
+@contextmanager
+def _process(do: Callable[..., None], *given: object) -> Iterator[Pipe]:
+    """A process of its own that begins by saying so, and is killed in the end."""
     context = get_context("spawn")
     own, its = context.Pipe()
-    process = context.Process(target=_follow, args=(its, url, commits), daemon=True)
+    process = context.Process(target=do, args=(its, *given), daemon=True)
     process.start()
-    own.recv()
-    return process, own
+    try:
+        own.recv()
+        yield own
+    finally:
+        process.kill()
+        process.join()
 
 
-def _follow(pipe: Pipe, url: str, commits: int) -> None:
+def _follow(pipe: Pipe, url: str, n: int) -> None:
     database = open_database(url)
     feed, place, seen = Feed(), 0, dict[str | None, set[str]]()
     pipe.send("begun")
@@ -132,25 +147,28 @@ def _follow(pipe: Pipe, url: str, commits: int) -> None:
                 pause_s = POLL_S / 2
             if len(part.found) < MOST:
                 break
-    feed.missed = 2 * commits - sum(map(len, seen.values()))
+    feed.missed = 2 * n - sum(map(len, seen.values()))
     pipe.send(feed)
     database.close()
 
 
-def _maps(database: Database, n: int) -> list[MapRow]:
+def make_maps(database: Database, n: int) -> list[MapRow]:
+    """Maps without frames."""
     with database.write() as connection:
         keep_model(connection, MODEL, "toy", b"the file of a model")
         return [add_map(connection, f"map-{i}", None, MODEL) for i in range(n)]
 
 
-def _upload(database: Database, work: tuple[MapRow, int]) -> None:
+def upload(database: Database, work: tuple[MapRow, int]) -> None:
+    """Write a frame to a map, as a service does."""
     row, number = work
-    with database.write(map_number=row.number, pending=True) as connection:
+    with database.write(map_number=row.number, single=True) as connection:
         if receive_frame(connection, row, {**KNOWN, "content_id": f"{number:064x}"}, 0) is None:
             raise RuntimeError("an upload was not taken")
 
 
-def _claim(database: Database) -> tuple[JobRow, FrameRow]:
+def claim(database: Database) -> tuple[JobRow, FrameRow]:
+    """Claim a job, as a worker does."""
     with database.write(turn=False) as connection:
         held = queue.claim(connection, "commits", LEASE_S)
         if held is None:
@@ -158,40 +176,64 @@ def _claim(database: Database) -> tuple[JobRow, FrameRow]:
         return held, frame_of(connection, held.frame)
 
 
-def _index(database: Database, work: tuple[JobRow, FrameRow]) -> None:
+def index(database: Database, work: tuple[JobRow, FrameRow]) -> None:
+    """Write the signature of a claimed frame, as a worker does."""
     held, frame = work
-    with database.write(map_number=frame.map_number, pending=True) as connection:
-        if not index_claimed_frame(connection, held, frame, "map", MADE):
+    with database.write(map_number=frame.map_number, single=True) as connection:
+        if not index_claimed_frame(connection, held, frame, "map", MADE, single=True):
             raise RuntimeError("a frame was not indexed")
 
 
-def _timed(clients: list[Database], works: list[T], do: Callable[[Database, T], None]) -> float:
+def _timed(clients: list[Pipe], do: Callable[[Database, T], None], works: list[T]) -> float:
     """Seconds until all is done by the clients at once."""
-    waiting, errors = SimpleQueue[T](), list[Exception]()
-    for work in works:
-        waiting.put(work)
-
-    def run(database: Database) -> None:
-        try:
-            while True:
-                do(database, waiting.get_nowait())
-        except Empty:
-            return
-        except Exception as error:
-            errors.append(error)
-
-    for client in clients:  # a first connection costs more than a commit
-        with client.read():
-            pass
-    threads = [threading.Thread(target=run, args=[one]) for one in clients]
+    for i, client in enumerate(clients):
+        client.send((do, works[i :: len(clients)]))
+    for client in clients:
+        client.recv()  # they have connected
     begun = time.perf_counter()
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    if errors:
-        raise errors[0]
+    for client in clients:
+        client.send("begin")
+    errors = [client.recv() for client in clients]
+    for error in filter(None, errors):
+        raise error
     return time.perf_counter() - begun
+
+
+def _write(pipe: Pipe, url: str, n_clients: int) -> None:
+    """Some clients, which do what they are told as fast as they can."""
+    databases = [open_database(url) for _ in range(n_clients)]
+    pipe.send("begun")
+    while True:
+        do, works = pipe.recv()
+        waiting, errors = SimpleQueue[Any](), list[Exception]()
+        for work in works:
+            waiting.put(work)
+        for one in databases:  # a first connection costs more than a commit
+            with one.read():
+                pass
+        threads = [
+            threading.Thread(target=_work, args=(one, do, waiting, errors)) for one in databases
+        ]
+        pipe.send("ready")
+        pipe.recv()
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        pipe.send(errors[0] if errors else None)
+
+
+def _work(
+    database: Database, do: Callable[[Database, Any], None], waiting: SimpleQueue[Any],
+    errors: list[Exception],
+) -> None:  # fmt: skip
+    try:
+        while True:
+            do(database, waiting.get_nowait())
+    except Empty:
+        return
+    except Exception as error:
+        errors.append(error)
 
 
 def main(arguments: list[str] | None = None) -> int:

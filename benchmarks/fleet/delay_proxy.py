@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import select
 import socket
 import threading
 import time
+from collections import deque
 from contextlib import suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection as Pipe
@@ -57,9 +59,19 @@ def _join(near: socket.socket, far: socket.socket, delay_s: float) -> None:
 
 
 def _pump(source: socket.socket, to: socket.socket, delay_s: float) -> None:
+    """Hand on what comes, each message for itself: one that follows closely comes as closely."""
+    coming, is_open = deque[tuple[float, bytes]](), True
     with suppress(OSError):
-        while data := source.recv(1 << 16):
-            time.sleep(delay_s)
-            to.sendall(data)
+        while is_open or coming:
+            wait_s = max(coming[0][0] - time.monotonic(), 0.0) if coming else None
+            # of `select` alone the time is not counted in whole milliseconds
+            if is_open and select.select([source], [], [], wait_s)[0]:
+                data = source.recv(1 << 16)
+                is_open = bool(data)
+                coming.append((time.monotonic() + delay_s, data))
+            elif not is_open and wait_s:
+                time.sleep(wait_s)
+            while coming and coming[0][0] <= time.monotonic():
+                to.sendall(coming.popleft()[1])
     with suppress(OSError):
         to.shutdown(socket.SHUT_WR)

@@ -128,10 +128,6 @@ def schema_range_of(connection: Connection) -> SchemaRange | None:
     return SchemaRange(revision, connection.execute(select(schema_range)).scalar())
 
 
-#: What each writer asks, in its transaction.
-_RANGE = "SELECT version_num, (SELECT max(least_revision) FROM schema_range) FROM alembic_version"
-
-
 def require_schema(connection: Connection) -> None:
     """See that a store has not been brought beyond what this process may write.
 
@@ -139,7 +135,7 @@ def require_schema(connection: Connection) -> None:
     ------
     NewerSchema : it has, since this process opened it; nothing may be written.
     """
-    row = connection.exec_driver_sql(_RANGE).one()
+    row = connection.exec_driver_sql(postgres.SCHEMA).one()
     _allow_schema(connection.engine, SchemaRange(*row))
 
 
@@ -315,6 +311,7 @@ class Database:
         self._held = False  # by another process, for longer than anybody should wait
         self._history: str | None = None
         self._guarded = False
+        self._schema = postgres.KnownSchema(self._check_schema)
         if not self.is_sqlite:
             event.listen(engine, "connect", self._note_history)
 
@@ -394,7 +391,7 @@ class Database:
     @contextmanager
     def write(
         self, *, unchecked: bool = False, turn: bool = True, map_number: int | None = None,
-        pending: bool = False,
+        single: bool = False,
     ) -> Iterator[Connection]:  # fmt: skip
         """A transaction that is committed at the end, or leaves no trace where it raises.
 
@@ -408,8 +405,9 @@ class Database:
         map_number : of the only map that is written to. On PostgreSQL writers of other maps do not
             wait then, so that no row may be touched that is of several maps, but for inserting one;
             `record_event` is the way to tell an event
-        pending : whether its turn comes with its first statement, which saves a round trip; before
-            it nothing is held against others. It has no say on SQLite, nor for several maps
+        single : whether it is of one statement, which PostgreSQL then takes in its turn, executes
+            and commits in one round trip: it is committed when it has an answer. It has no say on
+            SQLite, nor for several maps
 
         Raises
         ------
@@ -422,20 +420,48 @@ class Database:
         """
         self.require_writable()
         if not turn and not self.is_sqlite:
-            # a migration begins once what holds its row is over
-            asked = (f"{_RANGE} FOR KEY SHARE",) if self._guarded else ()
-            with self.explained(), self._writers.begin() as connection:
-                row = postgres.begin(connection, *asked)
-                if row is not None:
-                    self._check_schema(row)
+            with self._write_out_of_turn() as connection:
                 yield connection
             return
-        held_s = HELD_S if self.is_sqlite else postgres.HELD_S
-        wait_s = held_s if self._held else BUSY_S
-        if unchecked and not self.is_sqlite:
-            wait_s = postgres.MIGRATION_S
         if self.is_sqlite:
             map_number = None
+        wait_s = (HELD_S if self.is_sqlite else postgres.HELD_S) if self._held else BUSY_S
+        if unchecked and not self.is_sqlite:
+            wait_s = postgres.MIGRATION_S
+        with (
+            self._threads_turn(map_number, wait_s),
+            self.explained(),
+            self._writers.connect() as connection,
+        ):
+            if single and map_number is not None:
+                known = self._schema if self._guarded else None
+                only = postgres.SingleStatement(map_number, wait_s, known)
+                writing = connection.execution_options(
+                    **{MAP_OPTION: map_number, postgres.SINGLE: only}
+                )
+                postgres.forget_warnings(writing)
+                yield writing
+                self._held = False
+            else:
+                with self._begun(connection, wait_s, map_number, unchecked) as writing:
+                    yield writing
+            if not self.is_sqlite:
+                postgres.require_synchronous(writing)
+
+    @contextmanager
+    def _write_out_of_turn(self) -> Iterator[Connection]:
+        """As `write`, for which nobody waits; PostgreSQL."""
+        # a migration begins once what holds its row is over
+        asked = (f"{postgres.SCHEMA} FOR KEY SHARE",) if self._guarded else ()
+        with self.explained(), self._writers.begin() as connection:
+            row = postgres.begin(connection, *asked)
+            if row is not None:
+                self._check_schema(row)
+            yield connection
+
+    @contextmanager
+    def _threads_turn(self, map_number: int | None, wait_s: float) -> Iterator[None]:
+        """The turn among the threads of this process."""
         turns = self._turns if map_number is None else self._map_turns
         tenant = current_tenant()
         if not turns.acquire(tenant, wait_s):
@@ -444,30 +470,31 @@ class Database:
                 "nothing was stored. Come back later."
             )
         try:
-            with self.explained(), self._writers.connect() as connection:
-                options: dict[str, Any] = {
-                    "sceneprint_write": wait_s,
-                    "sceneprint_line": self._line,
-                    MAP_OPTION: map_number,
-                }
-                if unchecked and self.is_sqlite:
-                    options["sceneprint_unchecked"] = True
-                    connection.detach()  # nobody else gets a connection that does not look
-                if pending and map_number is not None and wait_s == BUSY_S:
-                    options[postgres.PENDING_TURN] = self._pending_turn(map_number)
-                writing = connection.execution_options(**options)
-                with writing.begin():
-                    if postgres.PENDING_TURN not in options:
-                        checked = self._guarded and not unchecked
-                        self._begin_writing(writing, wait_s, map_number, checked=checked)
-                    yield writing
-                if not self.is_sqlite:
-                    postgres.require_synchronous(writing)
+            yield
         except StoreLocked:
             self._held = True
             raise
         finally:
             turns.release(tenant)
+
+    @contextmanager
+    def _begun(
+        self, connection: Connection, wait_s: float, map_number: int | None, unchecked: bool
+    ) -> Iterator[Connection]:
+        """A transaction in its turn, committed at the end."""
+        options: dict[str, Any] = {
+            "sceneprint_write": wait_s,
+            "sceneprint_line": self._line,
+            MAP_OPTION: map_number,
+        }
+        if unchecked and self.is_sqlite:
+            options["sceneprint_unchecked"] = True
+            connection.detach()  # nobody else gets a connection that does not look
+        writing = connection.execution_options(**options)
+        with writing.begin():
+            checked = self._guarded and not unchecked
+            self._begin_writing(writing, wait_s, map_number, checked=checked)
+            yield writing
 
     def _begin_writing(
         self, writing: Connection, wait_s: float, map_number: int | None, *, checked: bool
@@ -475,16 +502,14 @@ class Database:
         """Have the turn, which SQLite gave with the transaction, and see that it may be used."""
         row = None
         if not self.is_sqlite:
-            row = postgres.take_turn(writing, wait_s, _RANGE if checked else None, map_number)
+            row = postgres.take_turn(
+                writing, wait_s, postgres.SCHEMA if checked else None, map_number
+            )
         self._held = False
         if row is not None:
             self._check_schema(row)
         elif checked:
             require_schema(writing)
-
-    def _pending_turn(self, map_number: int) -> postgres.PendingTurn:
-        asked = _RANGE if self._guarded else None
-        return postgres.PendingTurn(map_number, asked, self._check_schema)
 
     def _check_schema(self, row: Any) -> None:
         _allow_schema(self._engine, SchemaRange(*row))

@@ -95,7 +95,7 @@ def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) 
 
 def index_claimed_frame(
     connection: Connection, job: JobRow, frame: FrameRow, map_name: str, made: StoredSignature,
-    result: dict[str, Any] | None = None,
+    result: dict[str, Any] | None = None, *, single: bool = False,
 ) -> bool:  # fmt: skip
     """End a job and index its frame in one statement, as most signatures are on PostgreSQL: the
     map's other writers wait for each round trip.
@@ -107,11 +107,13 @@ def index_claimed_frame(
     frame, made : see `index_frame`
     map_name : of the frame's map
     result : of the job
+    single : whether the transaction has no room for another statement
 
     Returns
     -------
-    done : False, and nothing was written, on SQLite; where the job is not held any more; and where
-        the map has another model, or is to have one: then what else has to be done must be found
+    done : False, and nothing was written, on SQLite; where the job is not held any more; where
+        the map has another model, or is to have one: then what else has to be done must be found;
+        and where another statement would be needed, as pgvector searches the map
     """
     if connection.dialect.name == "sqlite":
         return False
@@ -123,7 +125,7 @@ def index_claimed_frame(
         "n_patches": json.dumps(list(made.n_patches)), "n_pairs": json.dumps(list(made.n_pairs)),
         "vectors": vectors.table_of(len(made.vector)), "indexed_at": time.time(), **told,
         "sender": made.sender, "result": None if result is None else json.dumps(result),
-        "data": json.dumps(told["data"]),
+        "data": json.dumps(told["data"]), "single": single,
     }  # fmt: skip
     found = connection.execute(_index_claimed(events_table(connection).name), values).first()
     if found is None:
@@ -142,7 +144,8 @@ def _index_claimed(events_name: str) -> TextClause:
                 leased_until = NULL, finished_at = extract(epoch FROM statement_timestamp()),
                 result = cast(:result AS json)
             WHERE number = :job AND token = :token AND worker = :worker
-                AND state = '{JobState.RUNNING}' AND EXISTS (
+                AND state = '{JobState.RUNNING}'
+                AND NOT (:single AND to_regclass(:vectors) IS NOT NULL) AND EXISTS (
                     SELECT FROM maps WHERE number = :map_number AND model_id = :model
                         AND next_model_id IS NULL)
             RETURNING number

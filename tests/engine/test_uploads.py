@@ -12,7 +12,7 @@ from PIL import Image
 from sqlalchemy import Connection, event, update
 
 from sceneprint.engine import Engine
-from sceneprint.engine.ingest.uploads import Grouping
+from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.engine.upkeep import garbage_collection
 from sceneprint.errors import (
     FrameConflict,
@@ -97,11 +97,14 @@ def test_a_signature_whose_artifact_is_swept_before_its_commit_is_made_again(
     claimed = empty.claim("w")
     assert claimed is not None
     sweep_before(empty, "INSERT INTO signatures", lambda: [b for b in blobs(empty) if b != upload])
-    assert empty.run(claimed) == JobState.QUEUED
-    assert empty.get_frame("hall", added.frame_id).state == FrameState.RECEIVED
-    with empty.store.database.write() as connection:
-        connection.execute(update(jobs).values(run_after=0.0))
-    assert work_off(empty) == [JobState.SUCCEEDED]
+    if empty.store.database.is_sqlite:
+        assert empty.run(claimed) == JobState.QUEUED
+        assert empty.get_frame("hall", added.frame_id).state == FrameState.RECEIVED
+        with empty.store.database.write() as connection:
+            connection.execute(update(jobs).values(run_after=0.0))
+        assert work_off(empty) == [JobState.SUCCEEDED]
+    else:  # it was committed with its only statement, and is put again
+        assert empty.run(claimed) == JobState.SUCCEEDED
     assert empty.get_frame("hall", added.frame_id).state == FrameState.INDEXED
     assert len(blobs(empty)) == 2
 
@@ -113,7 +116,7 @@ def test_while_others_wait_a_new_frame_takes_one_statement_or_one_for_each_table
     database, said = empty.store.database, list[str]()
 
     def note(connection: Any, _cursor: Any, statement: str, *_: Any) -> None:
-        if "sceneprint_write" in connection.get_execution_options():
+        if {"sceneprint_write", "sceneprint_single"} & connection.get_execution_options().keys():
             said.append(statement)
 
     event.listen(database._engine, "before_cursor_execute", note)

@@ -15,7 +15,7 @@ import pytest
 from sqlalchemy import Connection, insert, select, text
 
 from sceneprint.engine.admin.operations import next_events
-from sceneprint.engine.ingest.uploads import Grouping
+from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.errors import IdempotencyConflict, StoreLocked
 from sceneprint.store import Store, open_store
 from sceneprint.store.events import (

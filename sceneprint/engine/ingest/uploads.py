@@ -11,21 +11,20 @@ import hashlib
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from contextvars import copy_context
-from dataclasses import dataclass
-from typing import Any, TypeVar, cast
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any
 from weakref import WeakValueDictionary
 
 from sqlalchemy import Connection, select
 
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upload
+from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.engine.upkeep import garbage_collection, repair
-from sceneprint.errors import SceneprintError, UnusableStore
 from sceneprint.formats.signature_package import read_package
 from sceneprint.signing import SIGNING_VERSION
 from sceneprint.store import Store
-from sceneprint.store.database import Database
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import loosen, renew_frame, write_frame
 from sceneprint.store.keys import IdempotentRequest, Overtaken
@@ -37,7 +36,6 @@ from sceneprint.store.maps import (
     receive_frame,
     require_room,
 )
-from sceneprint.store.postgres.connection import has_turn
 from sceneprint.store.queue import enqueue, job_ids_of
 from sceneprint.store.sender_rows import add_package, find_sender
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames, request_data
@@ -293,6 +291,35 @@ class _Prepared:
         return {"content_id": self.content, **self.of_blob, **self.known}
 
 
+@dataclass(frozen=True, eq=False)
+class _Request:
+    """Uploads that are stored together.
+
+    Parameters
+    ----------
+    todo : those of which it is not known yet what comes of them, by their place
+    known, once, fence : see `Uploads.add_all`
+    left : blobs that may be of no use, of the last try
+    """
+
+    todo: dict[int, _Prepared]
+    known: list[UploadResult | None]
+    once: IdempotentRequest | None
+    fence: Callable[[Connection], None] | None
+    left: list[str] = field(default_factory=list)
+
+    @cached_property
+    def blobs(self) -> dict[str, bytes]:
+        """What has to be durable first."""
+        return {blob: data for one in self.todo.values() for blob, data in one.blobs.items()}
+
+    @property
+    def is_single(self) -> bool:
+        """Whether it is one upload, of which nothing but the frame is to be written."""
+        alone = len(self.known) == len(self.todo) == 1
+        return alone and self.once is None and self.fence is None and len(self.blobs) == 1
+
+
 class Uploads:
     """Takes frames into maps; safe to share between threads.
 
@@ -471,45 +498,16 @@ class Uploads:
         """
         self._store.database.require_writable()  # before a blob to which nothing could refer
         todo = {i: one for i, one in ready.items() if known[i] is None}
-        blobs = {blob: data for one in todo.values() for blob, data in one.blobs.items()}
-        left = list[str]()  # blobs that may be of no use
-
-        def do(connection: Connection) -> tuple[list[UploadResult | None], bool] | None:
-            if fence is not None:
-                fence(connection)
-            if once is not None:
-                now = find_map(connection, row.name)
-                if now.number != row.number:
-                    return None
-                before = _before(connection, now, once)
-                if before is not None:
-                    left[:] = blobs
-                    return list(before), True
-            is_held = has_turn(connection)  # then nobody removes a blob any more
-            if is_held and not all(map(self._store.blobs.holds, blobs)):
-                return None  # a deletion has removed one
-            left.clear()
-            written = {}
-            for i, one in todo.items():
-                came_of = _taken(connection, row, one)
-                if came_of is None:
-                    now = find_map(connection, row.name)
-                    if now.number != row.number:
-                        return None
-                    came_of = _stored(connection, now, one, left)
-                written[i] = came_of
-            if not is_held and not all(map(self._store.blobs.holds, blobs)):
-                raise Overtaken
-            outcomes = [written.get(i, one) for i, one in enumerate(known)]
-            if once is not None:
-                _keep(connection, once, [one for one in outcomes if one is not None])
-            return outcomes, False
-
+        request = _Request(todo, known, once, fence)
+        blobs = request.blobs
         while True:
             try:
                 for data in blobs.values():
                     self._store.blobs.put(data)
-                found = self._grouping(row).run(do)
+                came_of = self._received(row, request) if request.is_single else None
+                if came_of is not None:
+                    return [came_of], False
+                found = self._grouping(row).run(partial(self._store_all, row, request))
                 if found is None:
                     with self._store.database.read() as connection:
                         row = find_map(connection, row.name)
@@ -520,9 +518,53 @@ class Uploads:
                     garbage_collection.collect_blobs(self._store, list(blobs))
                 raise
             if found is not None:
-                if left:
-                    garbage_collection.collect_deleted_blobs(self._store, left)
+                if request.left:
+                    garbage_collection.collect_deleted_blobs(self._store, request.left)
                 return found
+
+    def _received(self, row: MapRow, request: _Request) -> UploadResult | None:
+        """Take one new frame, as most uploads are, in one round trip to PostgreSQL.
+
+        None where more has to be found out or written, and where others of this process write.
+        """
+        [one] = request.todo.values()
+        came_of = self._grouping(row).run_single(lambda connection: _taken(connection, row, one))
+        if came_of is not None and not self._store.blobs.holds(one.blob):
+            # a deletion removed it before the commit, and from now on none does; a worker that
+            # missed it meanwhile tries again
+            self._store.blobs.put(one.upload.data)
+        return came_of
+
+    def _store_all(
+        self, row: MapRow, request: _Request, connection: Connection
+    ) -> tuple[list[UploadResult | None], bool] | None:
+        """As `_write`, in a transaction; None where a blob or the map is gone."""
+        if request.fence is not None:
+            request.fence(connection)
+        if request.once is not None:
+            now = find_map(connection, row.name)
+            if now.number != row.number:
+                return None
+            before = _before(connection, now, request.once)
+            if before is not None:
+                request.left[:] = request.blobs
+                return list(before), True
+        if not all(map(self._store.blobs.holds, request.blobs)):
+            return None  # a deletion has removed one
+        request.left.clear()
+        written = {}
+        for i, one in request.todo.items():
+            came_of = _taken(connection, row, one)
+            if came_of is None:
+                now = find_map(connection, row.name)
+                if now.number != row.number:
+                    return None
+                came_of = _stored(connection, now, one, request.left)
+            written[i] = came_of
+        outcomes = [written.get(i, one) for i, one in enumerate(request.known)]
+        if request.once is not None:
+            _keep(connection, request.once, [one for one in outcomes if one is not None])
+        return outcomes, False
 
     def _grouping(self, row: MapRow) -> Grouping:
         """Where uploads wait that may be committed together: of a map, in SQLite of all."""
@@ -607,123 +649,3 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
         add_package(connection, row.number, job.id, blob, len(data))
     record_event(connection, "frame.received", row.name, frame.id, job.id)
     return UploadResult(_added(frame.id, job.id, frame.state, ready), new=True)
-
-
-# Writers that come while another one writes are written together in the next transaction: a commit
-# waits for the disk, whatever is in it, and eight clients need not wait eight times.
-#
-#     run(a), run(b), run(c)  --Grouping.run, in one commit-->  each gets its own result
-
-T = TypeVar("T")
-
-#: Pieces of work in one transaction: other writers wait meanwhile.
-MOST_TOGETHER = 32
-
-
-class _Waiting:
-    """A piece of work, and what came of it."""
-
-    def __init__(self, do: Callable[[Connection], Any]) -> None:
-        own = copy_context()  # another thread may do it: what it says of a request is of this one
-        self.do: Callable[[Connection], Any] = lambda connection: own.run(do, connection)
-        self.done = False
-        self.result: Any = None
-        self.error: Exception | None = None
-
-
-class Grouping:
-    """Writes of many threads to one database; safe to share between them.
-
-    Parameters
-    ----------
-    database, map_number : see `Database.write`
-    """
-
-    def __init__(self, database: Database, map_number: int | None = None) -> None:
-        self._database, self._map_number = database, map_number
-        self._waiting: list[_Waiting] = []
-        self._list = threading.Lock()
-        self._writing = threading.Lock()
-
-    def run(self, do: Callable[[Connection], T]) -> T:
-        """Do it in a writing transaction; when this returns it is committed.
-
-        Parameters
-        ----------
-        do : whatever it raises of `SceneprintError`, beside `UnusableStore`, it raises before it
-            writes: others of the transaction go on. It may be called more than once
-
-        Raises
-        ------
-        what `do` raises, and what `Database.write` does.
-        """
-        mine = _Waiting(do)
-        with self._list:
-            self._waiting.append(mine)
-        try:
-            with self._writing:  # meanwhile somebody may have written mine with his own
-                while not mine.done:  # there may be more before it than are written at once
-                    self._write()
-        except BaseException:  # such as Ctrl-C
-            with self._list:
-                if mine in self._waiting:
-                    self._waiting.remove(mine)
-            raise
-        if mine.error is not None:
-            raise mine.error
-        return cast(T, mine.result)
-
-    def _write(self) -> None:
-        """Write what waits, from the first on."""
-        taken: list[_Waiting] = []
-        try:
-            self._write_together(taken)
-        except BaseException:  # Ctrl-C is the caller's alone: the others write themselves
-            with self._list:
-                self._waiting = [one for one in taken if not one.done] + self._waiting
-            raise
-
-    def _write_together(self, taken: list[_Waiting]) -> None:
-        """Write what waits in one transaction, or each alone; `taken` is filled with it."""
-        with self._list:  # of one alone, the turn comes with its first statement
-            pending = len(self._waiting) == 1
-        try:
-            with self._database.write(map_number=self._map_number, pending=pending) as connection:
-                with self._list:  # not before it is our turn: more have come since
-                    taken[:], self._waiting = (
-                        self._waiting[:MOST_TOGETHER],
-                        self._waiting[MOST_TOGETHER:],
-                    )
-                for one in taken:
-                    _do(one, connection)
-        except Exception as error:
-            if not taken:  # it was never our turn: who waits has waited as long
-                with self._list:
-                    taken[:], self._waiting = self._waiting, []
-            if len(taken) == 1 or isinstance(error, UnusableStore):
-                for one in taken:
-                    one.result, one.error = None, error
-            else:
-                for one in taken:  # one of them broke the transaction of all
-                    self._write_alone(one)
-                    one.done = True
-        for one in taken:
-            one.done = True
-
-    def _write_alone(self, one: _Waiting) -> None:
-        one.result = one.error = None
-        try:
-            with self._database.write(map_number=self._map_number) as connection:
-                _do(one, connection)
-        except Exception as error:
-            one.result, one.error = None, error
-
-
-def _do(one: _Waiting, connection: Connection) -> None:
-    one.result = one.error = None
-    try:
-        one.result = one.do(connection)
-    except UnusableStore:
-        raise
-    except SceneprintError as error:
-        one.error = error

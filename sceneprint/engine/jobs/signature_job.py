@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -82,11 +82,13 @@ class Made:
     Parameters
     ----------
     signature : to be stored
+    artifact : that it refers to, and that was put
     result : of the job, where a robot sent what it had made; None: it sent nothing
     """
 
     signature: StoredSignature
-    result: dict[str, Any] | None
+    artifact: bytes
+    result: dict[str, Any] | None = None
 
 
 def run(
@@ -157,8 +159,10 @@ def _make(store: Store, signers: Signers, robots: RobotSignatures, work: lifecyc
     signer = signers(work.model_id)
     sent, note = robots.open(work, signer.model)
     if sent is None:
-        made = _sign(store, signer, work)
-        return Made(made, None if note is None else {"signed_by": "service", "sent": note})
+        made = _put(store, *_prepared(store, signer, work))
+        if note is None:
+            return made
+        return replace(made, result={"signed_by": "service", "sent": note})
     if robots.is_sampled(work, sent):
         return _verify(store, signer, robots, work, sent)
     with span("artifact"):
@@ -171,7 +175,7 @@ def _make(store: Store, signers: Signers, robots: RobotSignatures, work: lifecyc
         n_pairs=sent.package.n_pairs,
         sender=sent.sender,
     )
-    return Made(taken, {"signed_by": "robot", "sent": "taken"})
+    return Made(taken, sent.package.artifact, {"signed_by": "robot", "sent": "taken"})
 
 
 def _verify(
@@ -186,11 +190,8 @@ def _verify(
         raise
     agrees = robots.verify(work, sent, signature, geometry, signer.model)
     note = "verified" if agrees else "wrong: the key is trusted no more"
-    return Made(_put(store, signature, geometry), {"signed_by": "service", "sent": note})
-
-
-def _sign(store: Store, signer: Signer, work: lifecycle.Work) -> StoredSignature:
-    return _put(store, *_prepared(store, signer, work))
+    made = _put(store, signature, geometry)
+    return replace(made, result={"signed_by": "service", "sent": note})
 
 
 def _prepared(store: Store, signer: Signer, work: lifecycle.Work) -> tuple[Signature, Geometry]:
@@ -200,16 +201,18 @@ def _prepared(store: Store, signer: Signer, work: lifecycle.Work) -> tuple[Signa
         return prepare(frame, signer)
 
 
-def _put(store: Store, signature: Signature, geometry: Geometry) -> StoredSignature:
+def _put(store: Store, signature: Signature, geometry: Geometry) -> Made:
+    artifact = write_geometry(geometry)
     with span("artifact"):
-        blob = store.blobs.put(write_geometry(geometry))
-    return StoredSignature(
+        blob = store.blobs.put(artifact)
+    stored = StoredSignature(
         model_id=signature.model_id,
         vector=signature.vector.tobytes(),
         geometry=blob,
         n_patches=signature.n_patches,
         n_pairs=signature.n_pairs,
     )
+    return Made(stored, artifact)
 
 
 def _store_patiently(
@@ -243,6 +246,8 @@ def _store(
     made = result.signature
     if work.again:
         return _replace_signature(store, work, made)
+    if _index_alone(store, work, result):
+        return []
     while True:
         seen, is_kept = None, work.frame.novelty is None
         if not is_kept:
@@ -250,7 +255,7 @@ def _store(
         number = work.frame.map_number
         with (
             suppress(Stale),
-            store.database.write(map_number=number, pending=True) as connection,
+            store.database.write(map_number=number) as connection,
         ):
             is_indexed = is_kept and index_claimed_frame(
                 connection, work.job, work.frame, work.map.name, made, result.result
@@ -283,6 +288,23 @@ def _store(
                 enqueue_all(connection, row, [work.frame.number])
             lifecycle.record_job_event(connection, "frame.indexed", work)
             return _remove_package(connection, work, result)
+
+
+def _index_alone(store: Store, work: lifecycle.Work, result: Made) -> bool:
+    """Index a frame as most are, in one round trip to PostgreSQL; False, and nothing was written,
+    where more has to be found out or written.
+    """
+    made = result.signature
+    if store.database.is_sqlite or work.frame.novelty is not None or result.result is not None:
+        return False
+    with store.database.write(map_number=work.frame.map_number, single=True) as connection:
+        is_indexed = index_claimed_frame(
+            connection, work.job, work.frame, work.map.name, made, single=True
+        )
+    if is_indexed and not store.blobs.holds(made.geometry):
+        # a deletion removed it before the commit: from now on none does
+        store.blobs.put(result.artifact)
+    return is_indexed
 
 
 def _remove_package(connection: Connection, work: lifecycle.Work, made: Made) -> list[str]:

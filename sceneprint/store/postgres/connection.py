@@ -78,8 +78,8 @@ _CONNECT = {
 #: Oldest version that is known to do.
 _OLDEST = 14
 _WARNED, _USED = "sceneprint_warned", "sceneprint_used"
-#: Option of a connection: the turn that its first statement brings along.
-PENDING_TURN = "sceneprint_turn"
+#: Option of a connection: its only statement is a transaction of its own.
+SINGLE = "sceneprint_single"
 #: Option of a statement: it is several, of which the last one has the answer.
 _MESSAGE = "sceneprint_message"
 
@@ -100,9 +100,9 @@ def open_postgres(url: URL) -> Engine:
     event.listen(engine, "checkin", _note_use)
     event.listen(engine, "checkout", partial(_require_alive, engine.dialect))
     event.listen(engine, "do_execute", _execute)
-    event.listen(engine, "do_execute_no_params", _require_turn)
-    event.listen(engine, "do_executemany", _require_turn)
-    event.listen(engine, "commit", _forget_warnings)
+    event.listen(engine, "do_execute_no_params", _refuse_single)
+    event.listen(engine, "do_executemany", _refuse_single)
+    event.listen(engine, "commit", forget_warnings)
     event.listen(engine, "handle_error", _leave_behind)
     return engine
 
@@ -201,73 +201,118 @@ def begin(connection: Connection, *statements: str) -> Any:
 
 
 @dataclass(eq=False)
-class PendingTurn:
-    """A turn that comes with the first statement of a transaction, in one round trip.
+class SingleStatement:
+    """A transaction of one statement: it takes its turn, is executed and committed in one round
+    trip. Others of its map wait for that long, wherever the client is.
 
-    Each sees what was committed before it, so that the statement is executed in the turn; what was
-    read before it was not. It is waited for `BUSY_S`.
+    It sees what was committed before its turn.
 
     Parameters
     ----------
     map_number : of the only map that is written to
-    asked : a query of one row, answered when it is its turn; None: nothing is
-    check : called with that row; whatever it raises ends the transaction
-    taken : whether it has come
+    wait_s : seconds to wait for the turn
+    schema : what this process knows of the schema; None: that is not looked at
+    executed : whether it was sent
     """
 
     map_number: int
-    asked: str | None
-    check: Callable[[Any], None]
-    taken: bool = False
+    wait_s: float
+    schema: KnownSchema | None
+    executed: bool = False
 
     def execute(self, cursor: Any, statement: str, parameters: Any) -> None:
-        """Execute the first statement on a cursor of psycopg."""
-        self.taken, connection, answer = True, cursor.connection, None
+        """Execute it on a cursor of psycopg that commits each statement.
+
+        Raises
+        ------
+        NewerSchema : another version has brought the store beyond what this one may write.
+        ValueError : it is the second.
+        """
+        import psycopg
+
+        if self.executed:
+            raise ValueError("a transaction of a single statement has a second one")
+        self.executed = True
+        if self.schema is not None and self.schema.found is None:
+            self.schema.look(cursor.connection)
         try:
-            with connection.pipeline():
-                connection.execute("BEGIN")
-                # a COMMIT that waits for its standby would be cut off by the limit of statements,
-                # and be acknowledged although the standby may lack it
-                connection.execute(
-                    "SELECT set_config('statement_timeout', '0', true),"
-                    " pg_advisory_xact_lock_shared(%s, %s), pg_advisory_xact_lock(%s, %s)",
-                    (LOCKS, TURN, MAP_LOCKS, self.map_number & _LOCK_BITS),
-                )
-                if self.asked is not None:
-                    answer = connection.execute(self.asked)
-                cursor.execute(statement, parameters)
-        finally:  # a statement may have failed because of what is found
-            if answer is not None and answer.description is not None:
-                self.check(answer.fetchone())
+            self._send(cursor, statement, parameters)
+        except psycopg.errors.DivisionByZero:  # nothing was written
+            if self.schema is None or not self.schema.look(cursor.connection):
+                raise
+            self._send(cursor, statement, parameters)
+
+    def _send(self, cursor: Any, statement: str, parameters: Any) -> None:
+        connection = cursor.connection
+        # without a BEGIN, all up to the end of the pipeline is one transaction
+        with connection.pipeline():
+            # a commit that waits for its standby would be cut off by the limit of statements,
+            # and be acknowledged although the standby may lack it
+            connection.execute(
+                "SELECT set_config('statement_timeout', '0', true),"
+                " set_config('lock_timeout', %s, true),"
+                " pg_advisory_xact_lock_shared(%s, %s), pg_advisory_xact_lock(%s, %s)",
+                (_milliseconds(self.wait_s), LOCKS, TURN, MAP_LOCKS, self.map_number & _LOCK_BITS),
+            )
+            if self.schema is not None:
+                connection.execute(_SAME_SCHEMA, self.schema.found)
+            cursor.execute(statement, parameters)
 
 
-def has_turn(connection: Connection) -> bool:
-    """Whether nobody else writes to what a transaction may write to."""
-    turn = connection.get_execution_options().get(PENDING_TURN)
-    return turn is None or turn.taken
+#: The schema that a process may write to, as it found it last.
+SCHEMA = "SELECT version_num, (SELECT max(least_revision) FROM schema_range) FROM alembic_version"
+#: Fails where it is another one, so that what follows in the transaction is not executed.
+_SAME_SCHEMA = (
+    "SELECT 1 / cast(version_num = %s AND (SELECT max(least_revision) FROM schema_range)"
+    " IS NOT DISTINCT FROM %s AS integer) FROM alembic_version"
+)
+
+
+class KnownSchema:
+    """The schema of a store, as a process found it last, and may write to it.
+
+    Parameters
+    ----------
+    check : raises where it may not write to the one that was found
+    """
+
+    def __init__(self, check: Callable[[Any], None]) -> None:
+        self._check = check
+        self.found: tuple[str, str | None] | None = None
+
+    def look(self, connection: Any) -> bool:
+        """Find it again, by a connection of psycopg; whether it is another one than before.
+
+        Raises
+        ------
+        Exception : of `check`
+        """
+        before, found = self.found, connection.execute(SCHEMA).fetchone()
+        self._check(found)
+        self.found = found
+        return bool(found != before)
 
 
 def _execute(cursor: Any, statement: str, parameters: Any, context: Any) -> bool:
-    """Execute what is several statements, and go to the answer of the last one; or what brings a
-    turn along. Any other statement is SQLAlchemy's.
+    """Execute what is several statements, and go to the answer of the last one; or what is a
+    transaction of its own. Any other statement is SQLAlchemy's.
     """
     if _MESSAGE in context.execution_options:
         cursor.execute(statement)
         while cursor.nextset():
             pass
         return True
-    turn = context.execution_options.get(PENDING_TURN)
-    if turn is None or turn.taken:
+    single = context.execution_options.get(SINGLE)
+    if single is None:
         return False
-    turn.execute(cursor, statement, parameters)
+    single.execute(cursor, statement, parameters)
     return True
 
 
-def _require_turn(_cursor: Any, _statement: str, *others: Any) -> None:
-    """See that what cannot bring a turn along does not come before it."""
-    turn = others[-1].execution_options.get(PENDING_TURN)
-    if turn is not None and not turn.taken:
-        raise ValueError("a transaction whose turn is pending begins with a single statement")
+def _refuse_single(_cursor: Any, _statement: str, *others: Any) -> None:
+    """See that what is no single statement with parameters is not sent as one."""
+    if others[-1].execution_options.get(SINGLE) is not None:
+        raise ValueError("a transaction of a single statement has one with parameters")
 
 
 def take_turn(
@@ -289,7 +334,7 @@ def take_turn(
     -------
     row : of `asked`
     """
-    message = ["SET LOCAL statement_timeout = 0"]  # see PendingTurn
+    message = ["SET LOCAL statement_timeout = 0"]  # see SingleStatement
     turn = f"SELECT pg_advisory_xact_lock({LOCKS}, {TURN})"
     if map_number is not None:
         turn = (
@@ -364,7 +409,7 @@ def _watch_commits(connection: Any, record: Any) -> None:
     connection.add_notice_handler(warned)
 
 
-def _forget_warnings(connection: Connection) -> None:
+def forget_warnings(connection: Connection) -> None:
     """Before a COMMIT, those of the statements before it."""
     connection.info.pop(_WARNED, None)
 

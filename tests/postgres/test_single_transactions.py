@@ -1,4 +1,4 @@
-"""A turn that comes with the first statement of a transaction: what it costs, and what it holds."""
+"""A transaction of one statement: one round trip, in its turn, and all of it or nothing."""
 
 from __future__ import annotations
 
@@ -6,18 +6,23 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import func, insert, select, text, update
+from sqlalchemy import func, insert, literal_column, select, text, update
 
+from sceneprint.engine import Engine
+from sceneprint.engine.ingest.write_groups import Grouping
+from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import NewerSchema, StoreLocked
+from sceneprint.settings import Settings
 from sceneprint.store import Database, Store, open_database, queue
 from sceneprint.store.maps import add_map, frame_of, keep_model, receive_frame
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.postgres.connection import has_turn
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame
-from sceneprint.store.tables import FrameRow, JobRow, MapRow, frames, maps, pending_events
+from sceneprint.store.tables import FrameRow, JobRow, MapRow, frames, jobs, maps, pending_events
+from sceneprint_client.api import JobState, NewMap
 
 Until = Callable[[Callable[[], Any]], Any]
 MODEL = "ab" * 32
@@ -88,7 +93,7 @@ def counted(server_store: Store, row: MapRow) -> Iterator[tuple[Database, TripCo
 
 
 def upload(database: Database, row: MapRow, number: int) -> None:
-    with database.write(map_number=row.number, pending=True) as connection:
+    with database.write(map_number=row.number, single=True) as connection:
         values = {**KNOWN, "content_id": f"{number:064x}"}
         assert receive_frame(connection, row, values, 0) is not None
 
@@ -102,12 +107,12 @@ def claimed(database: Database) -> tuple[JobRow, FrameRow]:
 
 def sign(database: Database, job: JobRow, frame: FrameRow) -> None:
     made = StoredSignature(MODEL, bytes(400), "00" * 32, [1], [1])
-    with database.write(map_number=frame.map_number, pending=True) as connection:
-        assert index_claimed_frame(connection, job, frame, "hall", made)
+    with database.write(map_number=frame.map_number, single=True) as connection:
+        assert index_claimed_frame(connection, job, frame, "hall", made, single=True)
 
 
-def edit(database: Database, row: MapRow, note: str, *, pending: bool = True) -> None:
-    with database.write(map_number=row.number, pending=pending) as connection:
+def edit(database: Database, row: MapRow, note: str, *, single: bool = True) -> None:
+    with database.write(map_number=row.number, single=single) as connection:
         connection.execute(update(maps).where(maps.c.number == row.number).values(name=note))
 
 
@@ -129,7 +134,7 @@ def held(store: Store, row: MapRow) -> Iterator[Any]:
         yield other
 
 
-def test_an_upload_and_a_signature_take_two_round_trips_each(
+def test_an_upload_and_a_signature_take_one_round_trip_each(
     counted: tuple[Database, TripCounter], row: MapRow
 ) -> None:
     database, counter = counted
@@ -138,41 +143,48 @@ def test_an_upload_and_a_signature_take_two_round_trips_each(
         sign(database, *claimed(database))
     begun = counter.trips
     upload(database, row, 90)
-    assert counter.trips - begun == 2
+    assert counter.trips - begun == 1
     work = claimed(database)
     begun = counter.trips
     sign(database, *work)
-    assert counter.trips - begun == 2
+    assert counter.trips - begun == 1
     begun = counter.trips
-    edit(database, row, "later", pending=False)
+    edit(database, row, "later", single=False)
     assert counter.trips - begun == 3  # the turn takes its own
     with database.read() as connection:
         counts = select(frames.c.state, func.count()).group_by(frames.c.state)
         assert [tuple(one) for one in connection.execute(counts)] == [("indexed", 9)]
 
 
-def test_the_turn_is_there_from_the_first_statement_on(server_store: Store, row: MapRow) -> None:
+def test_it_is_committed_with_its_answer_and_keeps_no_turn(
+    server_store: Store, row: MapRow
+) -> None:
     database = server_store.database
-    with database.write(map_number=row.number, pending=True) as connection:
-        assert not has_turn(connection)
+    asked = text(f"{LOCKS_HELD} AND pid = pg_backend_pid()")
+    with database.write(map_number=row.number, single=True) as connection:
+        assert connection.execute(asked).scalar_one() == 2  # it had its turn
         assert locks(server_store) == 0
-        connection.execute(select(maps)).all()
-        assert has_turn(connection)
-        assert locks(server_store) == 2
-        limits = connection.exec_driver_sql("SHOW statement_timeout")
-        assert limits.scalar_one() == "0"  # or a COMMIT that waits for a standby is cut off
-    assert locks(server_store) == 0
-    with database.write(map_number=row.number) as connection:
-        assert has_turn(connection)
+    with database.write(map_number=row.number, single=True) as connection:
+        connection.execute(update(maps).values(name="at once"))
+        assert named(server_store) == "at once"
 
 
-def test_the_first_statement_sees_what_was_committed_while_its_turn_was_waited_for(
+def test_nothing_cuts_its_commit_off(server_store: Store, row: MapRow) -> None:
+    """A commit may wait for a standby for longer than any statement may take."""
+    asked = text("SELECT current_setting('statement_timeout'), current_setting('lock_timeout')")
+    with server_store.database.write(map_number=row.number, single=True) as connection:
+        assert tuple(connection.execute(asked).one()) == ("0", "10s")
+    with server_store.database.read() as connection:  # and it is of that transaction alone
+        assert connection.exec_driver_sql("SHOW statement_timeout").scalar_one() == "1min"
+
+
+def test_it_sees_what_was_committed_while_its_turn_was_waited_for(
     server_store: Store, row: MapRow, until: Until
 ) -> None:
     found = list[str]()
 
     def late() -> None:
-        with server_store.database.write(map_number=row.number, pending=True) as connection:
+        with server_store.database.write(map_number=row.number, single=True) as connection:
             found.append(connection.execute(select(maps.c.name)).scalar_one())
 
     writer = threading.Thread(target=late)
@@ -206,63 +218,65 @@ def test_who_waited_for_a_migration_writes_nothing(
     assert [str(one).partition("schema ")[2][:4] for one in raised] == ["9999"]
 
 
+def test_a_schema_that_went_on_and_may_be_written_to_is_noted(
+    server_store: Store, row: MapRow
+) -> None:
+    database = server_store.database
+    edit(database, row, "before")
+    with database.write() as connection:
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+    for name in ("after", "later"):
+        edit(database, row, name)
+        assert named(server_store) == name
+    with database.write() as connection:
+        connection.exec_driver_sql("UPDATE schema_range SET least_revision = '9998'")
+    with pytest.raises(NewerSchema, match="Nothing was stored"):
+        edit(database, row, "too late")
+    assert named(server_store) == "later"
+
+
 def test_a_turn_that_does_not_come_in_time_is_said(
     server_store: Store, row: MapRow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    engine = server_store.database._engine
-    with engine.connect() as connection:  # of all, the one that is used next
-        connection.exec_driver_sql("SET lock_timeout = 100")
-        connection.commit()
-        other = open_database(engine.url.render_as_string(hide_password=False))
-        with other._writers.begin() as writer:
-            postgres.take_turn(writer, 10.0, None, row.number)
-            connection.close()
-            with pytest.raises(StoreLocked):
-                edit(server_store.database, row, "late")
-        other.close()
+    monkeypatch.setattr("sceneprint.store.database.BUSY_S", 0.1)
+    with held(server_store, row), pytest.raises(StoreLocked):
+        edit(server_store.database, row, "late")
     assert named(server_store) == "hall"
-    edit(server_store.database, row, "later")  # that it waited in vain is not held against it
+    assert server_store.database._held  # who comes after that waits for less
+    edit(server_store.database, row, "later")
     assert named(server_store) == "later"
-    edit(server_store.database, row, "last")
-    assert named(server_store) == "last"
+    assert not server_store.database._held
 
 
-def test_what_fails_with_its_turn_leaves_nothing(server_store: Store, row: MapRow) -> None:
+def test_what_fails_leaves_nothing(server_store: Store, row: MapRow) -> None:
     database = server_store.database
-    writing = database.write(map_number=row.number, pending=True)
-    with pytest.raises(Exception, match="division by zero"), writing as connection:
-        connection.exec_driver_sql("UPDATE maps SET revision = 1 / 0")
-
-    def fall() -> None:
-        with database.write(map_number=row.number, pending=True) as connection:
-            connection.execute(update(maps).values(name="half"))
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fall()
+    with (
+        pytest.raises(Exception, match="division by zero"),
+        database.write(map_number=row.number, single=True) as connection,
+    ):
+        connection.execute(update(maps).values(name="half", revision=literal_column("1 / 0")))
     assert named(server_store) == "hall"
     assert locks(server_store) == 0
-    with database.write(map_number=row.number, pending=True):
+    with database.write(map_number=row.number, single=True):
         pass  # nothing was asked: nothing has begun
     edit(database, row, "after")
     assert named(server_store) == "after"
 
 
-def test_many_rows_at_once_do_not_begin_a_transaction_whose_turn_is_pending(
-    server_store: Store, row: MapRow
-) -> None:
+def test_it_has_one_statement(server_store: Store, row: MapRow) -> None:
     rows = [{"at": 0.0, "kind": "late", "map": "hall", "data": {}}] * 2
-    many = insert(pending_events)
+    database, many = server_store.database, insert(pending_events)
     with (
         pytest.raises(ValueError, match="single statement"),
-        server_store.database.write(map_number=row.number, pending=True) as connection,
+        database.write(map_number=row.number, single=True) as connection,
     ):
         connection.execute(many, rows)
-    with server_store.database.write(map_number=row.number, pending=True) as connection:
-        connection.execute(select(maps.c.number)).all()
-        connection.execute(many, rows)
-    with server_store.database.read() as connection:
-        assert connection.execute(select(func.count()).select_from(pending_events)).scalar() == 2
+    with database.write(map_number=row.number, single=True) as connection:
+        connection.execute(many, rows[0])
+        with pytest.raises(ValueError, match="second"):
+            connection.execute(many, rows[0])
+    with database.read() as connection:
+        assert connection.execute(select(func.count()).select_from(pending_events)).scalar() == 1
 
 
 def test_a_connection_that_was_ended_a_moment_ago_is_not_used(
@@ -277,3 +291,65 @@ def test_a_connection_that_was_ended_a_moment_ago_is_not_used(
     other.close()
     edit(database, row, "after")
     assert named(server_store) == "after"
+
+
+@pytest.fixture
+def engine(postgres_url: str, tmp_path: Path) -> Iterator[Engine]:
+    (tmp_path / "blobs").mkdir()
+    given = {"database_url": postgres_url, "data_dir": tmp_path}
+    with Engine(Settings.model_validate(given)) as opened:
+        opened.create_map(NewMap(name="hall"))
+        yield opened
+
+
+def removed_before(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch, then: Callable[[], None]
+) -> None:
+    """Have a deletion remove an upload just before its commit, and something done after that."""
+    once = Grouping.run_single
+
+    def run(grouping: Grouping, do: Callable[[Any], Any]) -> Any:
+        monkeypatch.undo()
+        collect_blobs(engine.store, list(engine.store.blobs.digests()))
+        found = once(grouping, do)
+        assert list(engine.store.blobs.digests()) == []
+        then()
+        return found
+
+    monkeypatch.setattr(Grouping, "run_single", run)
+
+
+def test_an_upload_that_a_deletion_removed_before_its_commit_is_put_again(
+    engine: Engine, small: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    removed_before(engine, monkeypatch, lambda: None)
+    added, new = engine.add_frame("hall", *small[0])
+    assert new
+    work = engine.claim("w")
+    assert work is not None
+    assert work.job.id == added.job_id
+    assert engine.run(work) == JobState.SUCCEEDED
+    assert engine.get_map("hall").frames == {"indexed": 1}
+
+
+def test_a_worker_that_missed_an_upload_tries_again(
+    engine: Engine, small: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It had come between the commit and the upload's being put again."""
+    missed = list[str]()
+
+    def work_in_between() -> None:
+        work = engine.claim("w")
+        assert work is not None
+        assert engine.run(work) == JobState.QUEUED
+        missed.append(work.job.id)
+
+    removed_before(engine, monkeypatch, work_in_between)
+    added, new = engine.add_frame("hall", *small[0])
+    assert (new, missed) == (True, [added.job_id])
+    with engine.store.database.write() as connection:
+        connection.execute(update(jobs).values(run_after=0.0))
+    work = engine.claim("w")
+    assert work is not None
+    assert engine.run(work) == JobState.SUCCEEDED
+    assert engine.get_map("hall").frames == {"indexed": 1}

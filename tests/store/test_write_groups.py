@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, event, func, select
 
-from sceneprint.engine.ingest.uploads import MOST_TOGETHER, Grouping, _Waiting
+from sceneprint.engine.ingest.write_groups import MOST_TOGETHER, Grouping, _Waiting
 from sceneprint.errors import FrameConflict, LostLease, StoreFull
 from sceneprint.process import of_request, request_id
 from sceneprint.store import Database, Store
