@@ -23,6 +23,8 @@ from sceneprint.types import DepthFrame
 from sceneprint_client import Client
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose
 
+pytestmark = pytest.mark.sqlite_only("a robot's copy is a folder")
+
 MAP = "hall"
 #: What tells one query from another, and says nothing of the answer.
 OF_THE_QUERY = ("query_id", "milliseconds")
