@@ -66,6 +66,13 @@ class Feed:
     disordered: int = 0
     late_ms: list[float] = field(default_factory=list)
 
+    def __str__(self) -> str:
+        late = np.percentile(self.late_ms, [50, 99])
+        return (
+            f"{self.missed} missed, {self.disordered} out of order, {late[0]:.0f} ms late "
+            f"(p99 {late[1]:.0f} ms)"
+        )
+
 
 def measure(
     n_maps: int, n_clients: int, delay_ms: float, commits: int
@@ -88,10 +95,10 @@ def measure(
         stack.callback(near.close)
         rows = make_maps(near, n_maps)
         urls = [_far(stack, server, delay_ms) for _ in range(min(PROCESSES, n_clients))]
-        reader = stack.enter_context(_process(_follow, urls[0], WARM * n_clients + commits))
+        reader = stack.enter_context(in_process(follow, urls[0], 2 * (WARM * n_clients + commits)))
         shares = [n_clients // len(urls) + (i < n_clients % len(urls)) for i in range(len(urls))]
         clients = [
-            stack.enter_context(_process(_write, url, n))
+            stack.enter_context(in_process(_write, url, n))
             for url, n in zip(urls, shares, strict=True)
         ]
         # a connection prepares what it has executed some times
@@ -115,7 +122,7 @@ def _far(stack: ExitStack, server: Server, delay_ms: float) -> str:
 
 
 @contextmanager
-def _process(do: Callable[..., None], *given: object) -> Iterator[Pipe]:
+def in_process(do: Callable[..., None], *given: object) -> Iterator[Pipe]:
     """A process of its own that begins by saying so, and is killed in the end."""
     context = get_context("spawn")
     own, its = context.Pipe()
@@ -129,9 +136,11 @@ def _process(do: Callable[..., None], *given: object) -> Iterator[Pipe]:
         process.join()
 
 
-def _follow(pipe: Pipe, url: str, n: int) -> None:
+def follow(pipe: Pipe, url: str, n: int) -> None:
+    """Read events as a service does until told that it is over, and say what was seen of n."""
     database = open_database(url)
     feed, place, seen = Feed(), 0, dict[str | None, set[str]]()
+    begun = time.time()
     pipe.send("begun")
     is_last, pause_s = False, POLL_S
     while not is_last:
@@ -143,11 +152,12 @@ def _follow(pipe: Pipe, url: str, n: int) -> None:
                 of_frame = seen.setdefault(one.frame_id, set())
                 of_frame.add(one.kind)
                 feed.disordered += "frame.received" not in of_frame
-                feed.late_ms.append(1e3 * (now - one.at))
+                if one.at > begun:
+                    feed.late_ms.append(1e3 * (now - one.at))
                 pause_s = POLL_S / 2
             if len(part.found) < MOST:
                 break
-    feed.missed = 2 * n - sum(map(len, seen.values()))
+    feed.missed = n - sum(map(len, seen.values()))
     pipe.send(feed)
     database.close()
 
@@ -245,11 +255,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--commits", type=int, default=1000)
     asked = parser.parse_args(arguments)
     uploads, ends, feed = measure(asked.maps, asked.clients, asked.delay_ms, asked.commits)
-    late = np.percentile(feed.late_ms, [50, 99])
     print(
         f"{asked.maps} maps, {asked.clients} clients, {asked.delay_ms:g} ms: "
-        f"{uploads:.1f} uploads/s, {ends:.1f} index commits/s; events: {feed.missed} missed, "
-        f"{feed.disordered} out of order, {late[0]:.0f} ms late (p99 {late[1]:.0f} ms)"
+        f"{uploads:.1f} uploads/s, {ends:.1f} index commits/s; events: {feed}"
     )
     return 0
 

@@ -24,7 +24,15 @@ from pathlib import Path
 import psycopg
 from sqlalchemy import func, select, update
 
-from benchmarks.fleet.commits import claim, index, make_maps, upload
+from benchmarks.fleet.commits import (
+    Feed,
+    claim,
+    follow,
+    in_process,
+    index,
+    make_maps,
+    upload,
+)
 from benchmarks.fleet.postgres import Server, binaries
 from sceneprint.store import Database, open_database
 from sceneprint.store.tables import frames, jobs, maps, signatures
@@ -40,6 +48,7 @@ _COMMAND = re.compile(
     rf"LOG:  (?:statement|execute [^:]*): (.*?){_END}(?:[^\n]*DETAIL:  Parameters: (.*?){_END})?",
     re.DOTALL,
 )
+_NOW = "extract(epoch FROM clock_timestamp())"
 _PARAMETER = re.compile(r"\$(\d+) = (NULL|'(?:[^']|'')*')")
 
 
@@ -137,8 +146,12 @@ class Replay:
         return "\n".join(line.replace("\n", " ") for line in lines) + "\n"
 
 
-def measure(n_maps: int, n_clients: int, delay_ms: float, commits: int) -> dict[str, float]:
-    """Commits in a second, by what is committed; see `commits.measure`."""
+def measure(
+    n_maps: int, n_clients: int, delay_ms: float, commits: int
+) -> tuple[float, float, Feed]:
+    """Uploads and index commits in a second, and what a reader of the uploads' events saw; see
+    `commits.measure`.
+    """
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         server = Server(Path(folder) / "server", durable=True)
         server.start()
@@ -157,20 +170,25 @@ def measure(n_maps: int, n_clients: int, delay_ms: float, commits: int) -> dict[
         indexed = indexed[begins:]
         content, map_, map_name = f"'{WARM:064x}'", f"'{FIRST['maps']}'", "'map-0'"
         ids = dict.fromkeys(re.findall(r"'[0-9a-f]{32}'", " ".join(uploaded)))
+        times = dict.fromkeys(re.findall(r"'\d{10}\.\d+'", " ".join(uploaded)), _NOW)
         replaced = {
             content: "(md5('c' || :r) || md5('d' || :r))",
             map_: f"({FIRST['maps']} + :m)", map_name: "('map-' || :m)",
-            **{one: f"md5('{i}' || :r)" for i, one in enumerate(ids)},
+            **{one: f"md5('{i}' || :r)" for i, one in enumerate(ids)}, **times,
         }  # fmt: skip
         replay = Replay(server, Path(folder), n_maps, n_clients, delay_ms, commits)
-        found = {"uploads": replay.run(uploaded, replaced)}
+        written = commits // n_clients * n_clients + WARM + 1
+        with in_process(follow, server.url("commits"), written + WARM + 1) as reader:
+            uploads = replay.run(uploaded, replaced)
+            reader.send("over")
+            feed: Feed = reader.recv()
         with database.write() as connection:
             connection.execute(update(jobs).values(state="running", token=1, worker="commits"))
         last = FIRST["frames"] + WARM, FIRST["jobs"] + WARM
         taken = {f"'{one}'": f"({one + 1} + :n)" for one in last}
-        found["index commits"] = replay.run(indexed, {map_: replaced[map_], **taken})
-        _require_written(database, commits // n_clients * n_clients + WARM + 1)
-    return found
+        ends = replay.run(indexed, {map_: replaced[map_], **taken})
+        _require_written(database, written)
+    return uploads, ends, feed
 
 
 def _number_from(database: Database) -> None:
@@ -204,9 +222,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--delay-ms", type=float, default=0.5)
     parser.add_argument("--commits", type=int, default=6400)
     asked = parser.parse_args(arguments)
-    found = measure(asked.maps, asked.clients, asked.delay_ms, asked.commits)
-    told = ", ".join(f"{per_s:.0f} {what}/s" for what, per_s in found.items())
-    print(f"{asked.maps} maps, {asked.clients} clients, {asked.delay_ms:g} ms, replayed: {told}")
+    uploads, ends, feed = measure(asked.maps, asked.clients, asked.delay_ms, asked.commits)
+    print(
+        f"{asked.maps} maps, {asked.clients} clients, {asked.delay_ms:g} ms, replayed: "
+        f"{uploads:.0f} uploads/s, {ends:.0f} index commits/s; events of uploads: {feed}"
+    )
     return 0
 
 
