@@ -49,7 +49,7 @@ from sceneprint.store.database import (
 )
 from sceneprint.store.database_errors import unusable
 from sceneprint.store.opaque_ids import OpaqueIds
-from sceneprint.store.postgres.connection import SessionLocks
+from sceneprint.store.postgres.session_locks import SessionLocks
 from sceneprint.store.sqlite import is_read_only
 from sceneprint.types import Geometry
 

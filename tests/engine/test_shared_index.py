@@ -31,7 +31,7 @@ from sceneprint.settings import Settings
 from sceneprint.store.blobs.object_client import Objects, open_objects
 from sceneprint.store.events import anchor_of_now
 from sceneprint.store.maps import find_map
-from sceneprint.store.postgres.connection import index_turn
+from sceneprint.store.postgres.session_locks import index_turn
 from sceneprint.store.tables import MapRow, frames, signatures
 from sceneprint_client.api import Answer, NewMap, Query
 

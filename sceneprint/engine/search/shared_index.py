@@ -50,7 +50,7 @@ from sceneprint.store.blobs.object_client import Objects, open_objects
 from sceneprint.store.blobs.object_store import BucketOwner
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.opaque_ids import OpaqueIds
-from sceneprint.store.postgres.connection import index_turn
+from sceneprint.store.postgres.session_locks import index_turn
 from sceneprint.store.signatures import deleted_since
 from sceneprint.store.tables import MapRow
 

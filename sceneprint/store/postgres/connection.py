@@ -11,13 +11,9 @@ of the commits. Their events get no number before they are committed (see `event
 
 from __future__ import annotations
 
-import logging
 import select
-import threading
 import time
-import weakref
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
@@ -27,28 +23,23 @@ from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.exc import InvalidatePoolError
 
 from sceneprint.errors import StoreAway, UnusableStore
-from sceneprint.store.blobs.folder import Locks
 from sceneprint.store.database_errors import database_label, is_of_old_plan
 from sceneprint.store.sqlite import BUSY_S
 
 if TYPE_CHECKING:
-    import psycopg
-
-    from sceneprint.store.database import Database
+    pass
 
 
 #: Advisory locks are two numbers: this one, which is ours alone, and what is locked.
 LOCKS = 0x5CE7E
-#: Whose turn it is to write; uploads that are stored or removed (see `blobs/`).
-TURN, BLOBS = 1, 2
+#: Whose turn it is to write.
+TURN = 1
 #: Who links vectors (see `vectors`); who numbers events (see `events`).
 VECTORS, EVENTS = 7, 8
 #: The first number of locks of single maps; the second is that of the map.
 MAP_LOCKS = 0x5CE7F
 #: Of maps whose numbers have the same last bits, writers take turns.
-_LOCK_BITS = 0x7FFFFFFF
-#: That of who builds the index of a map for its fleet; the second is that of the map.
-INDEX_LOCKS = 0x5CE80
+LOCK_BITS = 0x7FFFFFFF
 #: Seconds for one statement, and for a transaction in which nothing is asked: a client that fell
 #: silent must not keep the turn from all others.
 STATEMENT_S, IDLE_S = 60.0, 30.0
@@ -252,7 +243,7 @@ class SingleStatement:
                 "SELECT set_config('statement_timeout', '0', true),"
                 " set_config('lock_timeout', %s, true),"
                 " pg_advisory_xact_lock_shared(%s, %s), pg_advisory_xact_lock(%s, %s)",
-                (_milliseconds(self.wait_s), LOCKS, TURN, MAP_LOCKS, self.map_number & _LOCK_BITS),
+                (_milliseconds(self.wait_s), LOCKS, TURN, MAP_LOCKS, self.map_number & LOCK_BITS),
             )
             if self.schema is not None:
                 connection.execute(_SAME_SCHEMA, self.schema.found)
@@ -339,7 +330,7 @@ def take_turn(
     if map_number is not None:
         turn = (
             f"SELECT pg_advisory_xact_lock_shared({LOCKS}, {TURN}); "
-            f"SELECT pg_advisory_xact_lock({MAP_LOCKS}, {map_number & _LOCK_BITS})"
+            f"SELECT pg_advisory_xact_lock({MAP_LOCKS}, {map_number & LOCK_BITS})"
         )
     if wait_s == BUSY_S:
         message.append(turn)
@@ -425,184 +416,3 @@ def _leave_behind(context: ExceptionContext) -> None:
 
 def _milliseconds(seconds: float) -> str:
     return str(int(1000 * seconds))
-
-
-# The lock of blobs that a fleet shares: advisory locks of sessions of PostgreSQL.
-
-log = logging.getLogger(__name__)
-
-#: Counts removals: odd while one is under way. No transaction takes it back, so it tells of those
-#: of removers that died, too.
-_COUNTER = "sceneprint_removals"
-_MAKE = f"CREATE SEQUENCE IF NOT EXISTS {_COUNTER}"
-_READ = f"SELECT CASE WHEN is_called THEN last_value ELSE 0 END FROM {_COUNTER}"
-_NEXT = f"SELECT nextval('{_COUNTER}')"
-_SHARE = "SELECT pg_advisory_lock_shared(%s, %s)"
-_TAKE = "SELECT pg_try_advisory_lock(%s, %s)"
-_GIVE = "SELECT pg_advisory_unlock(%s, %s)"
-
-
-class SessionLocks(Locks):
-    """Of all processes of all hosts that share a database of PostgreSQL.
-
-    A pooler that hands one connection to several clients takes them away: connect to the server
-    itself, or let the pooler keep whole sessions."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
-        self._alone = threading.Lock()  # of who removes in this process
-        self._removes, self._reads = _Line(database), _Line(database)
-
-    def close(self) -> None:
-        """Give back the connections."""
-        self._removes.drop()
-        self._reads.drop()
-
-    @contextmanager
-    def kept(self) -> Iterator[None]:
-        """See `Locks`; UnusableStore where it cannot be had, or was lost meanwhile."""
-        # of its own: a lock of the connection that removes would be no lock to that one
-        connection = self._database.driver_connection()
-        try:
-            with self._database.explained():
-                connection.execute(_SHARE, (LOCKS, BLOBS))
-            yield
-            self._require(connection)
-        finally:
-            connection.close()
-
-    def _require(self, connection: psycopg.Connection[Any]) -> None:
-        import psycopg
-
-        try:
-            connection.execute("SELECT 1")
-        except psycopg.Error as error:
-            raise UnusableStore(
-                f"{self._database.shown}: the connection was lost that kept blobs from being "
-                "removed, and some that were needed may be gone. Do it again."
-            ) from error
-
-    @contextmanager
-    def removing(self) -> Iterator[bool]:
-        """See `Locks`."""
-        if not self._alone.acquire(blocking=False):
-            yield False
-            return
-        try:
-            allowed = self._begin()
-            try:
-                yield allowed
-            finally:
-                if allowed:
-                    self._end()
-        finally:
-            self._alone.release()
-
-    def removals(self) -> int | None:
-        """A number that any removal changes; None where it cannot be told, or one is under way."""
-        number = self._reads.ask(_READ)
-        return number if number is not None and number % 2 == 0 else None
-
-    def _begin(self) -> bool:
-        if not self._removes.ask(_TAKE, LOCKS, BLOBS):
-            return False
-        # who puts a blob while it is removed must find out: without the counter, nothing goes
-        for _ in range(2):  # it is odd already after a remover that died
-            number = self._removes.ask(_NEXT)
-            if number is None:  # with the connection the lock is gone
-                break
-            if number % 2 == 1:
-                return True
-        self._removes.drop()
-        return False
-
-    def _end(self) -> None:
-        if self._removes.ask(_NEXT) is None or not self._removes.ask(_GIVE, LOCKS, BLOBS):
-            self._removes.drop()  # the lock goes with its connection
-
-
-@contextmanager
-def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], None] | None]:
-    """Have the turn to build a map's index for the fleet, as long as a connection lasts.
-
-    SQLite is of one machine, whose builders have the lock of the index's folder.
-
-    Yields
-    ------
-    what sees that the turn was not lost, and raises UnusableStore where it was; None where
-    somebody else has the turn
-
-    Raises
-    ------
-    UnusableStore : the database cannot be asked.
-    """
-    import psycopg
-
-    if database.is_sqlite:
-        yield lambda: None
-        return
-    connection = database.driver_connection()
-
-    def require() -> None:
-        try:
-            connection.execute("SELECT 1")
-        except psycopg.Error as error:
-            raise UnusableStore(
-                f"{database.shown}: the connection was lost that kept others from building the "
-                "same index. It is built again."
-            ) from error
-
-    try:
-        with database.explained():
-            values = (INDEX_LOCKS, map_number & _LOCK_BITS)
-            mine = bool(_one(connection, _TAKE, values))
-        yield require if mine else None
-    finally:
-        connection.close()
-
-
-class _Line:
-    """A connection that lasts, opened when it is needed and anew where it broke."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
-        self._lock = threading.Lock()
-        self._held: list[psycopg.Connection[Any]] = []  # at most one
-        # not by __del__: the driver warns of what is collected while it is open
-        weakref.finalize(self, _close, self._held)
-
-    def ask(self, statement: str, *values: int) -> Any:
-        """The value that answers; None where there is none, for whatever reason."""
-        import psycopg
-
-        with self._lock:
-            try:
-                if not self._held or self._held[0].closed:
-                    self._held[:] = [self._database.driver_connection()]
-                connection = self._held[0]
-                try:
-                    return _one(connection, statement, values)
-                except psycopg.errors.UndefinedTable:
-                    # another process may be making it
-                    with suppress(psycopg.errors.UniqueViolation, psycopg.errors.DuplicateTable):
-                        connection.execute(_MAKE)
-                    return _one(connection, statement, values)
-            except (psycopg.Error, UnusableStore) as error:
-                log.info("blob lock unavailable", extra={"error": str(error)})
-                _close(self._held)
-                return None
-
-    def drop(self) -> None:
-        """Close it; a lock that it holds is free."""
-        with self._lock:
-            _close(self._held)
-
-
-def _one(connection: psycopg.Connection[Any], statement: str, values: tuple[int, ...]) -> Any:
-    row = connection.execute(statement.encode(), values).fetchone()
-    return None if row is None else row[0]
-
-
-def _close(held: list[psycopg.Connection[Any]]) -> None:
-    while held:
-        held.pop().close()

@@ -1,0 +1,206 @@
+"""Locks that last as long as a connection: of a fleet's blobs, and of who builds an index.
+
+The server gives them back when a connection ends, however its process dies.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
+
+from sceneprint.errors import UnusableStore
+from sceneprint.store.blobs.folder import Locks
+from sceneprint.store.postgres.connection import LOCK_BITS, LOCKS
+
+if TYPE_CHECKING:
+    import psycopg
+
+    from sceneprint.store.database import Database
+
+#: What of `LOCKS` is locked: uploads that are stored or removed (see `blobs/`).
+BLOBS = 2
+#: First number of locks of who builds the index of a map for its fleet; the second is that of the
+#: map.
+INDEX_LOCKS = 0x5CE80
+
+log = logging.getLogger(__name__)
+
+#: Counts removals: odd while one is under way. No transaction takes it back, so it tells of those
+#: of removers that died, too.
+_COUNTER = "sceneprint_removals"
+_MAKE = f"CREATE SEQUENCE IF NOT EXISTS {_COUNTER}"
+_READ = f"SELECT CASE WHEN is_called THEN last_value ELSE 0 END FROM {_COUNTER}"
+_NEXT = f"SELECT nextval('{_COUNTER}')"
+_SHARE = "SELECT pg_advisory_lock_shared(%s, %s)"
+_TAKE = "SELECT pg_try_advisory_lock(%s, %s)"
+_GIVE = "SELECT pg_advisory_unlock(%s, %s)"
+
+
+class SessionLocks(Locks):
+    """Of all processes of all hosts that share a database of PostgreSQL.
+
+    A pooler that hands one connection to several clients takes them away: connect to the server
+    itself, or let the pooler keep whole sessions."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._alone = threading.Lock()  # of who removes in this process
+        self._removes, self._reads = _Line(database), _Line(database)
+
+    def close(self) -> None:
+        """Give back the connections."""
+        self._removes.drop()
+        self._reads.drop()
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """See `Locks`; UnusableStore where it cannot be had, or was lost meanwhile."""
+        # of its own: a lock of the connection that removes would be no lock to that one
+        connection = self._database.driver_connection()
+        try:
+            with self._database.explained():
+                connection.execute(_SHARE, (LOCKS, BLOBS))
+            yield
+            self._require(connection)
+        finally:
+            connection.close()
+
+    def _require(self, connection: psycopg.Connection[Any]) -> None:
+        import psycopg
+
+        try:
+            connection.execute("SELECT 1")
+        except psycopg.Error as error:
+            raise UnusableStore(
+                f"{self._database.shown}: the connection was lost that kept blobs from being "
+                "removed, and some that were needed may be gone. Do it again."
+            ) from error
+
+    @contextmanager
+    def removing(self) -> Iterator[bool]:
+        """See `Locks`."""
+        if not self._alone.acquire(blocking=False):
+            yield False
+            return
+        try:
+            allowed = self._begin()
+            try:
+                yield allowed
+            finally:
+                if allowed:
+                    self._end()
+        finally:
+            self._alone.release()
+
+    def removals(self) -> int | None:
+        """A number that any removal changes; None where it cannot be told, or one is under way."""
+        number = self._reads.ask(_READ)
+        return number if number is not None and number % 2 == 0 else None
+
+    def _begin(self) -> bool:
+        if not self._removes.ask(_TAKE, LOCKS, BLOBS):
+            return False
+        # who puts a blob while it is removed must find out: without the counter, nothing goes
+        for _ in range(2):  # it is odd already after a remover that died
+            number = self._removes.ask(_NEXT)
+            if number is None:  # with the connection the lock is gone
+                break
+            if number % 2 == 1:
+                return True
+        self._removes.drop()
+        return False
+
+    def _end(self) -> None:
+        if self._removes.ask(_NEXT) is None or not self._removes.ask(_GIVE, LOCKS, BLOBS):
+            self._removes.drop()  # the lock goes with its connection
+
+
+@contextmanager
+def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], None] | None]:
+    """Have the turn to build a map's index for the fleet, as long as a connection lasts.
+
+    SQLite is of one machine, whose builders have the lock of the index's folder.
+
+    Yields
+    ------
+    what sees that the turn was not lost, and raises UnusableStore where it was; None where
+    somebody else has the turn
+
+    Raises
+    ------
+    UnusableStore : the database cannot be asked.
+    """
+    import psycopg
+
+    if database.is_sqlite:
+        yield lambda: None
+        return
+    connection = database.driver_connection()
+
+    def require() -> None:
+        try:
+            connection.execute("SELECT 1")
+        except psycopg.Error as error:
+            raise UnusableStore(
+                f"{database.shown}: the connection was lost that kept others from building the "
+                "same index. It is built again."
+            ) from error
+
+    try:
+        with database.explained():
+            values = (INDEX_LOCKS, map_number & LOCK_BITS)
+            mine = bool(_one(connection, _TAKE, values))
+        yield require if mine else None
+    finally:
+        connection.close()
+
+
+class _Line:
+    """A connection that lasts, opened when it is needed and anew where it broke."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._lock = threading.Lock()
+        self._held: list[psycopg.Connection[Any]] = []  # at most one
+        # not by __del__: the driver warns of what is collected while it is open
+        weakref.finalize(self, _close, self._held)
+
+    def ask(self, statement: str, *values: int) -> Any:
+        """The value that answers; None where there is none, for whatever reason."""
+        import psycopg
+
+        with self._lock:
+            try:
+                if not self._held or self._held[0].closed:
+                    self._held[:] = [self._database.driver_connection()]
+                connection = self._held[0]
+                try:
+                    return _one(connection, statement, values)
+                except psycopg.errors.UndefinedTable:
+                    # another process may be making it
+                    with suppress(psycopg.errors.UniqueViolation, psycopg.errors.DuplicateTable):
+                        connection.execute(_MAKE)
+                    return _one(connection, statement, values)
+            except (psycopg.Error, UnusableStore) as error:
+                log.info("blob lock unavailable", extra={"error": str(error)})
+                _close(self._held)
+                return None
+
+    def drop(self) -> None:
+        """Close it; a lock that it holds is free."""
+        with self._lock:
+            _close(self._held)
+
+
+def _one(connection: psycopg.Connection[Any], statement: str, values: tuple[int, ...]) -> Any:
+    row = connection.execute(statement.encode(), values).fetchone()
+    return None if row is None else row[0]
+
+
+def _close(held: list[psycopg.Connection[Any]]) -> None:
+    while held:
+        held.pop().close()
