@@ -19,6 +19,7 @@ import numpy as np
 from sqlalchemy import insert, update
 
 from benchmarks.machine import memory_of
+from benchmarks.search import signatures as signatures_of
 from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import FrameReference, find_sequences
@@ -65,7 +66,7 @@ def measure(
     frame: FrameReference, to_sign: list[FrameReference], frames: int = 10_000,
     model: Preset = "depth",
 ) -> ReadinessFigures:  # fmt: skip
-    """Fill a map with random signatures, start a service on it, and ask; then let workers sign.
+    """Fill a map with signatures, start a service on it, and ask; then let workers sign.
 
     Parameters
     ----------
@@ -85,8 +86,9 @@ def measure(
 
 
 def fill_map(data: Path, frames: int, model: Preset) -> int:
-    """Make the map of frames with random signatures; returns the bytes of each."""
-    rng = np.random.default_rng(0)
+    """Make the map of frames, whose signatures are in groups as those of places are; returns the
+    bytes of each.
+    """
     with Engine(Settings(data_dir=data)) as engine:
         engine.create_map(NewMap(name=MAP, model=model))
         artifact = engine.store.blobs.put(b"none")
@@ -101,7 +103,7 @@ def fill_map(data: Path, frames: int, model: Preset) -> int:
         stored = {"model_id": row.model_id, "geometry": artifact, "n_patches": [1], "n_pairs": [1]}
         for start in range(1, frames + 1, _BLOCK):
             numbers = range(start, min(start + _BLOCK, frames + 1))
-            vectors = [rng.bytes(length) for _ in numbers]
+            vectors = [row.tobytes() for row in signatures_of(np.asarray(numbers), length)]
             with engine.store.database.write() as connection:
                 own = [{"number": n, "id": f"{n:032x}", "content_id": f"{n:064x}", "revision": n}
                        for n in numbers]  # fmt: skip
