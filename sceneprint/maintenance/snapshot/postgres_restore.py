@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
 from itertools import islice
@@ -267,8 +267,9 @@ _STAGING = ".restoring-"
 
 
 def restore_to_fleet(
-    archive: Path, settings: Settings, progress: Progress | None = None
-) -> Snapshot:
+    archive: Path, settings: Settings, progress: Progress | None = None,
+    since: Sequence[Path] = (),
+) -> Snapshot:  # fmt: skip
     """Put all of a snapshot into an empty database and where blobs are kept, or no row of it.
 
     Parameters
@@ -276,6 +277,7 @@ def restore_to_fleet(
     archive : of `take_snapshot`
     settings : whose database is PostgreSQL; its schema is made where there is none
     progress : told of bytes done and bytes in all; the archive is read twice
+    since : the archives that it was taken since
 
     Raises
     ------
@@ -294,7 +296,7 @@ def restore_to_fleet(
     make_folder(settings.data_dir)
     with full_disk_explained(settings.data_dir), staging(settings.data_dir, _STAGING) as made:
         snapshot = unpack(
-            archive, made, lambda done, total: tell(done, 2 * total), with_blobs=False
+            archive, made, lambda done, total: tell(done, 2 * total), with_blobs=False, since=since
         )
         path = made / DATABASE
         _bring_here(path)
@@ -306,7 +308,7 @@ def restore_to_fleet(
             try:
                 with _marked(settings, database, owner):
                     _fill(
-                        database, file, settings, snapshot,
+                        database, file, settings, snapshot, since,
                         lambda done, total: tell(total + done, 2 * total),
                     )  # fmt: skip
             finally:
@@ -376,7 +378,7 @@ def _marked(settings: Settings, database: Database, owner: str) -> Iterator[None
 
 def _fill(
     database: Database, file: sqlite3.Connection, settings: Settings, snapshot: Snapshot,
-    tell: Progress,
+    since: Sequence[Path], tell: Progress,
 ) -> None:  # fmt: skip
     with database.write() as connection:  # who keeps the blobs may ask whose they are
         check_empty(connection)
@@ -385,12 +387,14 @@ def _fill(
     with closing(blobs), blobs.kept():
         lost = {one.digest for one in snapshot.damaged}
         wanted = (digest for digest in referred(file) if digest not in lost)
-        _put_all(blobs, snapshot.path, wanted, tell)
+        _put_all(blobs, snapshot.path, since, wanted, tell)
         with database.write() as connection:
             copy_into(connection, file)
 
 
-def _put_all(blobs: Blobs, archive: Path, wanted: Iterable[str], tell: Progress) -> None:
+def _put_all(
+    blobs: Blobs, archive: Path, since: Sequence[Path], wanted: Iterable[str], tell: Progress
+) -> None:
     """Keep all blobs, a few at once: each waits for its disk, or for the network.
 
     The archive may have been changed, or be another one, since it was verified.
@@ -405,10 +409,8 @@ def _put_all(blobs: Blobs, archive: Path, wanted: Iterable[str], tell: Progress)
         for one in [*done]:
             require(one.result() == waiting.pop(one))
 
-    left = iter(wanted)
     with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="put") as pool:
-        for digest, size, chunks in blobs_of(archive, tell):
-            require(digest == next(left, None))
+        for digest, size, chunks in blobs_of(archive, since, wanted, tell):
             if size > _LARGE:
                 with blobs.incoming() as blob:
                     for chunk in chunks:
@@ -418,5 +420,4 @@ def _put_all(blobs: Blobs, archive: Path, wanted: Iterable[str], tell: Progress)
             waiting[pool.submit(blobs.put, b"".join(chunks))] = digest
             if len(waiting) >= 2 * _AT_ONCE:
                 kept(wait(waiting, return_when=FIRST_COMPLETED).done)
-        require(next(left, None) is None)
         kept(waiting)

@@ -283,7 +283,7 @@ def test_what_is_no_digest_names_no_file(archive, tmp_path, refused, name):
 
 def test_a_later_version(archive, refused):
     members = members_of(archive)
-    said = refused(rebuilt(members, version=2), "a snapshot of version 2", SnapshotError)
+    said = refused(rebuilt(members, version=3), "a snapshot of version 3", SnapshotError)
     assert "Restore it with the sceneprint that took it" in said
     refused(rebuilt(members, format="other"), "no snapshot of sceneprint")
     refused(rebuilt(members, more=1), "no snapshot of sceneprint, or its manifest is damaged")
