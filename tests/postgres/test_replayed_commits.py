@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from benchmarks.fleet.postgres import Server
 from benchmarks.fleet.replayed_commits import Replay, commands_of, measure
 
 LOG = """\
@@ -22,7 +22,8 @@ $10 = NULL
 
 def replay(**more: int) -> Replay:
     given = {"n_maps": 2, "n_clients": 3, "delay_ms": 0.5, "commits": 6}
-    return Replay(Server(Path("/nowhere")), Path("/nowhere"), **given | more)  # type: ignore[arg-type]
+    server: Any = None  # what is executed does not depend on where
+    return Replay(server, Path(), **given | more)  # type: ignore[arg-type]
 
 
 def test_commands_come_from_a_log_with_their_values() -> None:
