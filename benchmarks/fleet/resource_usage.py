@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from sqlalchemy import Connection
 
@@ -72,13 +72,9 @@ class Meter:
         meter = self
 
         @contextmanager
-        def timed(
-            database: Database, *, unchecked: bool = False, turn: bool = True,
-            map_number: int | None = None,
-        ) -> Iterator[Connection]:  # fmt: skip
+        def timed(database: Database, *, turn: bool = True, **how: Any) -> Iterator[Connection]:
             begun = time.perf_counter()
-            of = {"unchecked": unchecked, "turn": turn, "map_number": map_number}
-            with write(database, **of) as connection:  # type: ignore[arg-type]
+            with write(database, turn=turn, **how) as connection:
                 yield connection
             meter._commits[not turn] += 1
             if turn:
