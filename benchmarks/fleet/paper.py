@@ -19,8 +19,8 @@ PUTS, GETS, GB_MONTH = 5.0, 0.4, 0.023
 MONTH_S = 30 * 86_400
 #: Share of a processor, and of the turn, that is work on an ordinary day.
 USED = 0.6
-#: Bytes a frame of an index on a node's disk beside the signature, and in each process beside what
-#: it maps: the key, and the places of keys.
+#: Bytes a frame of an index on a node's disk beside the signature and its sketch, and in each
+#: process beside what it maps: the key, and the places of keys.
 INDEX, OWN = 8, 16
 
 
@@ -113,7 +113,8 @@ def _requests(found: Costs, rate: float) -> list[str]:
 def _of_frames(found: Costs, frames: int) -> list[str]:
     """What so many frames take, as lines of Markdown."""
     rows, blobs = sum(found.tables.values()), sum(found.blobs)
-    segment, each = found.signature_bytes + INDEX, frames / MAPS
+    # signature, sketch, and the rest
+    segment, each = found.signature_bytes * 9 // 8 + INDEX, frames / MAPS
     lines = [
         f"### On paper: {frames:,} frames in {MAPS} maps, `{found.model}`",
         "",
