@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
-from benchmarks.fleet.postgres import Server, binaries, of_nobody
+from benchmarks.fleet.postgres import OPTIONS, Server, binaries, of_nobody
 from sceneprint.engine import Engine
 from sceneprint.errors import UnknownFrame
 from sceneprint.maintenance.fsck.check import fsck
@@ -21,6 +24,8 @@ from sceneprint.settings import Settings
 from sceneprint_client.api import JobState, NewMap, Query
 
 SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "deployment" / "recover.sh"
+#: Of the server's command line, which the copy in its folder does not have.
+OPTIONS_TOLD = f"-c max_connections={OPTIONS['max_connections']} -c unix_socket_directories="
 Until = Callable[[Callable[[], Any]], Any]
 
 
@@ -45,91 +50,153 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+def archiving(page: Path, archive: Path) -> dict[str, str]:
+    """The settings of a page's section, for another folder."""
+    section = page.read_text().partition("### Point-in-time recovery")[2]
+    told = re.findall(r"^(archive_\w+) = '?(.*?)'?$", section, re.MULTILINE)
+    return {name: value.replace("/backup/log", str(archive)) for name, value in told}
+
+
 @pytest.fixture
 def primary(place: Path) -> Iterator[Server]:
-    kept = place / "archive" / "%f"
-    options = {
-        "archive_mode": "on", "archive_command": f"test ! -f {kept} && cp %p {kept}",
-        "wal_level": "replica", "unix_socket_directories": "",
-    }  # fmt: skip
-    server = Server(place / "primary", options=options)
+    options = archiving(SCRIPT.parents[1] / "deployment.md", place / "archive")
+    assert sorted(options) == ["archive_command", "archive_mode", "archive_timeout"]
+    server = Server(place / "primary", durable=True, options=options)
     server.start()
     yield server
     server.kill()
 
 
 def settings_of(url: str, data: Path) -> Settings:
-    return Settings.model_validate({"database_url": url, "data_dir": data, "undo_s": 0})
+    given = {"database_url": url, "data_dir": data, "undo_s": 0, "tail_frames": 1}
+    return Settings.model_validate(given)
 
 
-def add(engine: Engine, frame: Any) -> str:
-    added, _ = engine.add_frame("hall", *frame)
+def add(engine: Engine, frame: Any, name: str = "hall") -> str:
+    added, _ = engine.add_frame(name, *frame)
     work = engine.claim("w")
     assert work is not None
     assert engine.run(work) == JobState.SUCCEEDED
     return added.frame_id
 
 
-def test_a_map_that_was_deleted_by_mistake_is_brought_back(
-    primary: Server, place: Path, tmp_path: Path, small: list[Any], until: Until
-) -> None:
-    url, data = primary.create("fleet"), tmp_path / "data"
-    with Engine(settings_of(url, data)) as engine:
-        engine.create_map(NewMap(name="hall"))
-        ids = [add(engine, small[0])]
+def found(engine: Engine, frame: Any, name: str = "hall") -> list[str]:
+    asked = Query(k=9, candidates=9, keep=False, stages=["retrieve"])
+    return [one.frame_id for one in engine.queries.upload([name], *frame, asked).matches]
+
+
+def kinds(url: str, data: Path) -> Counter[str]:
+    """What fsck finds, notes as well."""
+    return Counter(one.finding.kind for one in fsck(settings_of(url, data)))
+
+
+class Drill(NamedTuple):
+    """What was there at the moment: frames of two maps; and what came after it."""
+
+    moment: str
+    hall: list[str]
+    yard: list[str]
+    late: list[str]
+
+
+def mistake(primary: Server, place: Path, data: Path, small: list[Any], until: Until) -> Drill:
+    """A map is deleted and begun again, and another goes on: published indexes know all that."""
+    with Engine(settings_of(primary.create("fleet"), data)) as engine:
+        for name in ("hall", "yard"):
+            engine.create_map(NewMap(name=name, model="depth"))
+        hall = [add(engine, small[0])]
         primary._run(
             "pg_basebackup", "--pgdata", str(place / "base"), "--host=127.0.0.1",
-            f"--port={primary.port}", "--username=postgres", "--checkpoint=fast", "--no-sync",
+            f"--port={primary.port}", "--username=postgres", "--checkpoint=fast",
         )  # fmt: skip
-        ids += [add(engine, frame) for frame in small[1:3]]
-        versions = shutil.copytree(data / "blobs", tmp_path / "versions")
+        hall += [add(engine, frame) for frame in small[1:3]]
+        yard = [add(engine, frame, "yard") for frame in small[5:7]]
+        shutil.copytree(data / "blobs", data.parent / "versions")
+        primary.execute("SELECT pg_create_restore_point('before_cleaning')")
         (known,) = primary.execute("SELECT clock_timestamp()")
         moment = datetime.fromisoformat(str(known[0])).astimezone(UTC)
         time.sleep(0.05)  # a commit of that very moment would be before it
         engine.delete_map("hall")
-        engine.create_map(NewMap(name="hall"))
-        late = add(engine, small[3])
-    (found,) = primary.execute("SELECT pg_walfile_name(pg_switch_wal())")
-    until((place / "archive" / str(found[0])).is_file)
+        engine.create_map(NewMap(name="hall", model="depth"))
+        late = [add(engine, small[3])] + [add(engine, one, "yard") for one in small[7:9]]
+        assert engine.publish_due() == 1  # of the yard
+    (last,) = primary.execute("SELECT pg_walfile_name(pg_switch_wal())")
+    until((place / "archive" / str(last[0])).is_file)
+    return Drill(moment.isoformat(" "), hall, yard, late)
 
-    new = Server(place / "unused")  # of which the port is taken, and nothing else
-    given = place / "base", place / "archive", place / "recovered", moment.isoformat(" ")
-    (shown,) = primary.execute("SHOW max_connections")
-    options = f"-c max_connections={shown[0]} -c unix_socket_directories="
-    done = recover(*given, new.port, options=options)
+
+@contextmanager
+def recovered(place: Path, data: Path, moment: str) -> Iterator[Server]:
+    """A server that the script made."""
+    new = Server(data.with_suffix(".unused"))  # of which the port is taken, and nothing else
+    done = recover(
+        place / "base", place / "archive", data, moment, new.port, options=OPTIONS_TOLD
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "recovered:" in done.stdout
+    said = done.stdout.splitlines()
+    assert said[:2] == [f"copying {place / 'base'}", f"recovering to {moment}"]
+    assert said[-1] == f"recovered: {data} serves port {new.port}"
     try:
-        _check_recovered(new.url("fleet"), tmp_path, versions, small, ids, late)
+        yield new
     finally:
-        stopping = [str(binaries() / "pg_ctl"), "-D", str(given[2]), "-m", "immediate", "stop"]
+        stopping = [str(binaries() / "pg_ctl"), "-D", str(data), "-m", "immediate", "stop"]
         subprocess.run([*of_nobody(), *stopping], check=True, capture_output=True, cwd="/")
-    again = recover(*given, new.port)
+
+
+def test_a_map_that_was_deleted_by_mistake_is_brought_back(
+    primary: Server, place: Path, tmp_path: Path, small: list[Any], until: Until
+) -> None:
+    data, versions = tmp_path / "data", tmp_path / "versions"
+    drill = mistake(primary, place, data, small, until)
+    with recovered(place, place / "recovered", drill.moment) as server:
+        url = server.url("fleet")
+        # what the deletion removed is named, and the index of what came later is passed over
+        assert kinds(url, data) == {
+            "missing-upload": 3, "missing-artifact": 3, "foreign-index": 1
+        }  # fmt: skip
+        with Engine(settings_of(url, data)) as engine:
+            assert sorted(found(engine, small[2])) == sorted(drill.hall)
+        shutil.copytree(versions, data / "blobs", dirs_exist_ok=True)
+        assert kinds(url, data) == {"foreign-index": 1}
+        _check_recovered(settings_of(url, data), small, drill)
+        assert kinds(url, data) == {}
+    again = recover(place / "base", place / "archive", place / "recovered", drill.moment)
     assert (again.returncode, again.stdout) == (2, "")
     assert again.stderr.count("\n") == 1
     assert "is not empty, and nothing is overwritten" in again.stderr
 
+    given = place / "base", place / "archive", place / "failed", "point:other"
+    failed = recover(*given, Server(place / "port").port, options=OPTIONS_TOLD)
+    assert failed.returncode == 2
+    assert "recovery ended before configured recovery target was reached" in failed.stderr
+    assert failed.stderr.count("\n") == 1
 
-def _check_recovered(
-    url: str, tmp_path: Path, versions: Path, small: list[Any], ids: list[str], late: str
-) -> None:
-    back = tmp_path / "back"
-    back.mkdir()
-    versions.rename(back / "blobs")
-    with Engine(settings_of(url, back)) as engine:
+    with recovered(place, place / "second", "point:before_cleaning") as server:
+        there = server.execute("SELECT id FROM frames ORDER BY number", "fleet")
+        assert [row[0] for row in there] == drill.hall + drill.yard
+        # as the first recovery had: hence processes are to be restarted
+        assert server.execute("SELECT left(pg_walfile_name(pg_current_wal_lsn()), 8)") == [
+            ("00000002",)
+        ]
+
+
+def _check_recovered(settings: Settings, small: list[Any], drill: Drill) -> None:
+    with Engine(settings) as engine:
+        assert engine.store.database.history == "00000002"
         assert engine.get_map("hall").frames == {"indexed": 3}
-        with pytest.raises(UnknownFrame):
-            engine.get_frame("hall", late)
-        asked = Query(k=3, candidates=3, keep=False, stages=["retrieve"])
-        answer = engine.queries.upload(["hall"], *small[2], asked)
-        assert {one.frame_id for one in answer.matches} == {*ids}
-        assert answer.matches[0].frame_id == ids[2]
-        ids.append(add(engine, small[4]))  # and it goes on
-        assert engine.get_map("hall").frames == {"indexed": 4}
-    assert [one for one in fsck(settings_of(url, back)) if one.left] == []
-    # where blobs have no versions, what the deletion removed is named
-    lost = [one.finding.kind for one in fsck(settings_of(url, tmp_path / "data")) if one.left]
-    assert "missing-upload" in lost
+        assert engine.get_map("yard").frames == {"indexed": 2}
+        for one in drill.late:
+            with pytest.raises(UnknownFrame):
+                engine.get_frame("hall" if one == drill.late[0] else "yard", one)
+        assert sorted(found(engine, small[2])) == sorted(drill.hall)
+        assert found(engine, small[2])[0] == drill.hall[2]
+        # the yard goes on with the keys and the revisions that the lost frames had
+        yard = [*drill.yard, *(add(engine, one, "yard") for one in small[9:11])]
+        assert sorted(found(engine, small[7], "yard")) == sorted(yard)
+        assert engine.publish_due() == 2
+    with Engine(settings) as engine:  # which begins with the new indexes
+        assert found(engine, small[10], "yard")[0] == yard[-1]
+        assert sorted(found(engine, small[10], "yard")) == sorted(yard)
 
 
 @pytest.mark.parametrize(
@@ -149,3 +216,30 @@ def test_what_it_is_given_is_checked_first(place: Path, at: int, value: str, sai
     assert said in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (place / "data").exists()
+
+
+@pytest.mark.parametrize("link", ["pg_wal", "pg_tblspc/16400"])
+def test_a_backup_whose_files_are_elsewhere_is_not_written_to(place: Path, link: str) -> None:
+    (place / "base" / "pg_tblspc").mkdir(parents=True)
+    (place / "base" / "PG_VERSION").write_text("18")
+    (place / "base" / link).symlink_to(place)
+    done = recover(place / "base", place / "archive", place / "data", "2026-11-28 12:00+00")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"recover.sh: {place / 'base' / link} is a link:")
+    assert done.stderr.count("\n") == 1
+    assert not (place / "data").exists()
+
+
+def test_the_archive_takes_a_file_again_and_never_another_of_its_name(place: Path) -> None:
+    archive = place / "archive"
+    command = archiving(SCRIPT.parents[1] / "deployment.md", archive)["archive_command"]
+
+    def take(content: str) -> int:
+        (place / "wal").write_text(content)
+        told = command.replace("%p", str(place / "wal")).replace("%f", "0001")
+        return subprocess.run(["sh", "-c", told], capture_output=True, check=False).returncode
+
+    assert [take("first"), take("first")] == [0, 0]
+    assert take("second") != 0
+    assert (archive / "0001").read_text() == "first"
+    assert [path.name for path in archive.iterdir()] == ["0001"]
