@@ -246,21 +246,33 @@ def _work(
         errors.append(error)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure, and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def tell(
+    arguments: list[str] | None, about: str | None, commits: int,
+    measured: Callable[[int, int, float, int], tuple[float, float, Feed]], how: str = "",
+) -> int:  # fmt: skip
+    """Measure as a command line asks for, and print.
+
+    Parameters
+    ----------
+    arguments : of the command line
+    about : what it does
+    commits : of each kind, unless told
+    measured : see `measure`
+    how : said of the figures
+    """
+    parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--maps", type=int, default=50)
     parser.add_argument("--clients", type=int, default=32)
     parser.add_argument("--delay-ms", type=float, default=0.5)
-    parser.add_argument("--commits", type=int, default=1000)
+    parser.add_argument("--commits", type=int, default=commits)
     asked = parser.parse_args(arguments)
-    uploads, ends, feed = measure(asked.maps, asked.clients, asked.delay_ms, asked.commits)
+    uploads, ends, feed = measured(asked.maps, asked.clients, asked.delay_ms, asked.commits)
     print(
-        f"{asked.maps} maps, {asked.clients} clients, {asked.delay_ms:g} ms: "
-        f"{uploads:.1f} uploads/s, {ends:.1f} index commits/s; events: {feed}"
+        f"{asked.maps} maps, {asked.clients} clients, {asked.delay_ms:g} ms{how}: "
+        f"{uploads:.0f} uploads/s, {ends:.0f} index commits/s; events: {feed}"
     )
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(tell(None, __doc__, 1000, measure))

@@ -9,7 +9,6 @@ each round trip it waits as long as a network would take.
 
 from __future__ import annotations
 
-import argparse
 import re
 import subprocess
 import sys
@@ -31,6 +30,7 @@ from benchmarks.fleet.commits import (
     in_process,
     index,
     make_maps,
+    tell,
     upload,
 )
 from benchmarks.fleet.postgres import Server, binaries
@@ -214,21 +214,5 @@ def _require_written(database: Database, n: int) -> None:
         raise RuntimeError(f"{n} were to be written: {found}")
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure, and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--maps", type=int, default=50)
-    parser.add_argument("--clients", type=int, default=32)
-    parser.add_argument("--delay-ms", type=float, default=0.5)
-    parser.add_argument("--commits", type=int, default=6400)
-    asked = parser.parse_args(arguments)
-    uploads, ends, feed = measure(asked.maps, asked.clients, asked.delay_ms, asked.commits)
-    print(
-        f"{asked.maps} maps, {asked.clients} clients, {asked.delay_ms:g} ms, replayed: "
-        f"{uploads:.0f} uploads/s, {ends:.0f} index commits/s; events of uploads: {feed}"
-    )
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(tell(None, __doc__, 6400, measure, ", replayed"))

@@ -411,7 +411,12 @@ def run_snapshot(options: argparse.Namespace) -> int:
     if options.url is not None:
         return _fetched(options, path)
     settings = named_database(options)
-    if options.out is None and settings.snapshot_url is not None and not options.since:
+    if options.out is None and settings.snapshot_url is not None:
+        if options.since:
+            raise InvalidRequest(
+                "SCENEPRINT_SNAPSHOT_URL is set, and full snapshots alone are kept there. Name the "
+                "archive with --out."
+            )
         return _shelved(settings)
     with ended_by_signals(), byte_progress("snapshot") as progress:
         taken = take_snapshot(settings, path, progress, options.since)

@@ -262,6 +262,11 @@ class IdempotentRequest:
         data: dict[str, Any] = row.data
         return data
 
+    def columns(self, data: dict[str, Any]) -> dict[str, Any]:
+        """Columns of `idempotency`, with what came of it."""
+        own = {"actor": self.actor, "key": self.key, "fingerprint": self.fingerprint}
+        return {**own, "data": data, "created_at": time.time()}
+
     def keep(self, connection: Connection, data: dict[str, Any]) -> None:
         """Remember what came of it, in the transaction that stores that.
 
@@ -272,16 +277,16 @@ class IdempotentRequest:
         ------
         Overtaken : another request with this key was stored since `found`, of another map.
         """
-        own, at = {"actor": self.actor, "key": self.key}, time.time()
-        known = {"fingerprint": self.fingerprint, "data": data, "created_at": at}
+        values, own = self.columns(data), ("actor", "key")
         kind: Any = sqlite if connection.dialect.name == "sqlite" else postgresql
-        made = kind.insert(idempotency).values(**own, **known)
+        made = kind.insert(idempotency).values(**values)
         gives_way = or_(
             idempotency.c.fingerprint == self.fingerprint,
-            idempotency.c.created_at <= at - KEPT_S,
+            idempotency.c.created_at <= values["created_at"] - KEPT_S,
         )
+        known = {name: value for name, value in values.items() if name not in own}
         kept = made.on_conflict_do_update(
-            index_elements=list(own), set_=known, where=gives_way
+            index_elements=own, set_=known, where=gives_way
         ).returning(idempotency.c.key)
         if connection.execute(kept).first() is None:
             raise Overtaken

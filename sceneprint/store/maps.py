@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 import uuid
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any
@@ -52,6 +52,7 @@ from sceneprint.store.tables import (
     frame_rows,
     frame_tags,
     frames,
+    idempotency,
     job_files,
     job_values,
     jobs,
@@ -311,6 +312,7 @@ def position(pose: Sequence[Sequence[float]] | None) -> dict[str, float | None]:
 def receive_frame(
     connection: Connection, row: MapRow, values: dict[str, Any], priority: int,
     data: dict[str, Any] | None = None, more_bytes: int = 0,
+    kept: Callable[[str], dict[str, Any]] | None = None,
 ) -> tuple[str, str] | None:  # fmt: skip
     """Take a frame whose content its map lacks, and queue its signing: all that most uploads are.
 
@@ -324,11 +326,16 @@ def receive_frame(
     values : see `add_frame`
     priority, data : of the job
     more_bytes : that its map counts beside the upload
+    kept : columns of `idempotency` by the id of the frame, PostgreSQL
 
     Returns
     -------
     ids : of the frame and of its job; None, and nothing was written, where the map is gone, has no
         room or has the content: `add_frame` and what is asked before it say which
+
+    Raises
+    ------
+    IntegrityError : something was done under the key of `kept` before.
     """
     frame_id, job = uuid.uuid4().hex, job_values(connection, "sign", priority, None, data)
     frame = _received(connection, row.number, frame_id, values)
@@ -347,6 +354,8 @@ def receive_frame(
         connection.execute(insert(events_table(connection)).values(told))
         return frame_id, job["id"]
     rows = {"frame": frame, "job": job, "event": told}
+    if kept is not None:
+        rows["kept"] = kept(frame_id)
     given = {
         f"{of}_{name}": value for of, values in rows.items() for name, value in values.items()
         if not isinstance(value, ColumnElement)
@@ -380,25 +389,29 @@ def _room_taken() -> ReturningUpdate[tuple[int]]:
 
 @cache
 def _reception(
-    told: Table, of_frame: tuple[str, ...], of_job: tuple[str, ...], of_event: tuple[str, ...]
-) -> Select[Any]:
-    """A frame taken with its job, its event and its tags, PostgreSQL.
+    told: Table, of_frame: tuple[str, ...], of_job: tuple[str, ...], of_event: tuple[str, ...],
+    of_kept: tuple[str, ...] = (),
+) -> Select[Any]:  # fmt: skip
+    """A frame taken with its job, its event and its tags, PostgreSQL; and with what is remembered
+    of the request.
 
     Parameters
     ----------
     told : where the event is inserted
-    of_frame, of_job, of_event : columns of each row, whose values are named `frame_<column>` and so
-        on; times are those of the statement
+    of_frame, of_job, of_event, of_kept : columns of each row, whose values are named
+        `frame_<column>` and so on; times are those of the statement
     """
     room = _room_taken().cte("room")
     made = _inserted(frames, "frame", of_frame, room).returning(frames.c.number)
     new = made.cte("new")
     tag = func.unnest(cast(bindparam("tags"), ARRAY(TEXT)))
-    others = (
+    others = [
         _inserted(jobs, "job", of_job, new, frame_number=new.c.number),
         _inserted(told, "event", of_event, new),
         insert(frame_tags).from_select(["frame_number", "tag"], select(new.c.number, tag)),
-    )
+    ]
+    if of_kept:
+        others.append(_inserted(idempotency, "kept", of_kept, new))
     return select(new.c.number).add_cte(*(one.cte(f"other_{i}") for i, one in enumerate(others)))
 
 

@@ -10,18 +10,29 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import func, insert, literal_column, select, text, update
+from sqlalchemy import event, func, insert, literal_column, select, text, update
 
 from sceneprint.engine import Engine
+from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
-from sceneprint.errors import NewerSchema, StoreLocked
+from sceneprint.errors import IdempotencyConflict, NewerSchema, StoreLocked
 from sceneprint.settings import Settings
 from sceneprint.store import Database, Store, open_database, queue
+from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import add_map, frame_of, keep_model, receive_frame
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame
-from sceneprint.store.tables import FrameRow, JobRow, MapRow, frames, jobs, maps, pending_events
+from sceneprint.store.tables import (
+    FrameRow,
+    JobRow,
+    MapRow,
+    frames,
+    idempotency,
+    jobs,
+    maps,
+    pending_events,
+)
 from sceneprint_client.api import JobState, NewMap
 
 Until = Callable[[Callable[[], Any]], Any]
@@ -353,3 +364,55 @@ def test_a_worker_that_missed_an_upload_tries_again(
     assert work is not None
     assert engine.run(work) == JobState.SUCCEEDED
     assert engine.get_map("hall").frames == {"indexed": 1}
+
+
+def once_of(what: str) -> IdempotentRequest:
+    return IdempotentRequest("robot", "a key", what * 64)
+
+
+def add(engine: Engine, frame: Any, once: IdempotentRequest, map_name: str = "hall") -> Any:
+    return engine.uploads.add(map_name, Upload(*frame), once)
+
+
+def test_what_a_request_came_to_is_remembered_with_its_frame(engine: Engine, small: Any) -> None:
+    said = list[str]()
+    event.listen(
+        engine.store.database._engine, "before_cursor_execute",
+        lambda connection, _cursor, statement, *_: said.append(statement)
+        if {"sceneprint_write", "sceneprint_single"} & connection.get_execution_options().keys()
+        else None,
+    )  # fmt: skip
+    first, replayed = add(engine, small[0], once_of("a"))
+    assert (first.new, replayed, len(said)) == (True, False, 1)
+    again, replayed = add(engine, small[0], once_of("a"))
+    assert replayed
+    assert (again.new, again.added) == (True, first.added)
+    with pytest.raises(IdempotencyConflict):
+        add(engine, small[1], once_of("b"))
+    with engine.store.database.write() as connection:  # a day later it is forgotten
+        connection.execute(update(idempotency).values(created_at=0.0))
+    other, replayed = add(engine, small[1], once_of("b"))
+    assert (other.new, replayed) == (True, False)
+    assert add(engine, small[1], once_of("b"))[1]
+    assert engine.get_map("hall").frames == {"received": 2}
+
+
+def test_a_request_whose_key_is_used_meanwhile_takes_nothing(
+    engine: Engine, small: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By another request, for another map, whose turn is another."""
+    engine.create_map(NewMap(name="other"))
+    run = Grouping.run_single
+
+    def overtaken(grouping: Grouping, do: Callable[[Any], Any]) -> Any:
+        monkeypatch.undo()
+        add(engine, small[1], once_of("b"), "other")
+        return run(grouping, do)
+
+    monkeypatch.setattr(Grouping, "run_single", overtaken)
+    with pytest.raises(IdempotencyConflict):
+        add(engine, small[0], once_of("a"))
+    assert (engine.get_map("hall").frames, engine.get_map("other").frames) == ({}, {"received": 1})
+    with engine.store.database.read() as connection:
+        assert connection.execute(select(func.sum(maps.c.used_frames))).scalar() == 1
+    assert len(list(engine.store.blobs.digests())) == 1

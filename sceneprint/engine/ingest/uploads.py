@@ -17,6 +17,7 @@ from typing import Any
 from weakref import WeakValueDictionary
 
 from sqlalchemy import Connection, select
+from sqlalchemy.exc import IntegrityError
 
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upload
@@ -202,12 +203,15 @@ def replayed(
 def _stored_outcome(outcome: UploadResult) -> dict[str, Any]:
     """What came of an upload, as JSON that is remembered."""
     if outcome.added is not None:
-        told = {"frame_id": outcome.added.frame_id, "new": outcome.new}
-        signed = outcome.added.signed
-        return told if signed is None else {**told, "signed": signed}
+        return _told_of(outcome.added.frame_id, outcome.added.signed, new=outcome.new)
     error = outcome.error
     fields = error.fields if isinstance(error, errors.InvalidRequest) else ()
     return {"error": type(error).__name__, "detail": str(error), "fields": fields}
+
+
+def _told_of(frame_id: str, signed: SentSignature | None, *, new: bool) -> dict[str, Any]:
+    told = {"frame_id": frame_id, "new": new}
+    return told if signed is None else {**told, "signed": signed}
 
 
 def _error(kept: dict[str, Any]) -> errors.SceneprintError:
@@ -317,7 +321,7 @@ class _Request:
     def is_single(self) -> bool:
         """Whether it is one upload, of which nothing but the frame is to be written."""
         alone = len(self.known) == len(self.todo) == 1
-        return alone and self.once is None and self.fence is None and len(self.blobs) == 1
+        return alone and self.fence is None and len(self.blobs) == 1
 
 
 class Uploads:
@@ -528,7 +532,12 @@ class Uploads:
         None where more has to be found out or written, and where others of this process write.
         """
         [one] = request.todo.values()
-        came_of = self._grouping(row).run_single(lambda connection: _taken(connection, row, one))
+        try:
+            came_of = self._grouping(row).run_single(
+                lambda connection: _taken(connection, row, one, request.once)
+            )
+        except IntegrityError:  # something was done under the request's key before: see what
+            return None
         if came_of is not None and not self._store.blobs.holds(one.blob):
             # a deletion removed it before the commit, and from now on none does; a worker that
             # missed it meanwhile tries again
@@ -590,14 +599,25 @@ def _keep(connection: Connection, once: IdempotentRequest, came: list[UploadResu
         once.keep(connection, {"frames": [_stored_outcome(one) for one in came]})
 
 
-def _taken(connection: Connection, row: MapRow, ready: _Prepared) -> UploadResult | None:
-    """An upload of a new frame; None where it is none, or was not taken: see `_stored`."""
+def _taken(
+    connection: Connection, row: MapRow, ready: _Prepared, once: IdempotentRequest | None = None
+) -> UploadResult | None:
+    """An upload of a new frame; None where it is none, or was not taken: see `_stored`.
+
+    With `once`, which PostgreSQL alone takes, what came of it is remembered in the same statement.
+    """
     if ready.upload.frame_id is not None:
         return None
     package = ready.package
     more = 0 if package is None else len(package[1])
+
+    def kept(frame_id: str) -> dict[str, Any]:
+        assert once is not None
+        return once.columns({"frames": [_told_of(frame_id, ready.signed, new=True)]})
+
     ids = receive_frame(
-        connection, row, ready.columns, ready.upload.priority, ready.of_job, more
+        connection, row, ready.columns, ready.upload.priority, ready.of_job, more,
+        None if once is None else kept,
     )  # fmt: skip
     if ids is None:
         return None

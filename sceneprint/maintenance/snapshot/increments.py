@@ -75,12 +75,12 @@ class BaseArchives:
         """
         if self.known == manifest.since:
             return
+        if not manifest.since:
+            raise SnapshotError(f"{archive} is a full snapshot. Leave out --since.")
         named = ", ".join(f"that of {one.created_at:%Y-%m-%dT%H:%M:%SZ}" for one in manifest.since)
         raise SnapshotError(
-            f"{archive} is a full snapshot. Leave out --since."
-            if not manifest.since
-            else f"{archive} has only what is new since earlier archives. Give each of them, and "
-            f"no other, with --since: {named}."
+            f"{archive} has only what is new since earlier archives. Give each of them, and no "
+            f"other, with --since: {named}."
         )
 
     def holds(self, digest: str) -> bool:

@@ -124,7 +124,7 @@ def test_a_chain_is_restored_into_a_fleet(chain, tmp_path, postgres_url, content
         assert engine.get_map("hall").frames == {"indexed": 3, "received": 4, "deleted": 2}
 
 
-def test_the_commands(chain, data, tmp_path, sceneprint):
+def test_the_commands(chain, data, tmp_path, sceneprint, monkeypatch):
     full, second = chain[:2]
     made = tmp_path / "made.tar"
     said = sceneprint("snapshot", "--data", data, "--out", made, "--since", full, "--since", second)
@@ -139,3 +139,6 @@ def test_the_commands(chain, data, tmp_path, sceneprint):
     assert "--since" in said.stderr
     said = sceneprint("snapshot", "--url", "http://127.0.0.1:9", "--since", full, expect=2)
     assert "--since is for archives of this machine" in said.stderr
+    monkeypatch.setenv("SCENEPRINT_SNAPSHOT_URL", "s3://bucket")
+    said = sceneprint("snapshot", "--data", data, "--since", full, expect=2)
+    assert "Name the archive with --out" in said.stderr
