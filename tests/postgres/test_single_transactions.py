@@ -15,8 +15,9 @@ from sqlalchemy import event, func, insert, literal_column, select, text, update
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.ingest.write_groups import Grouping
+from sceneprint.engine.jobs import signature_job
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
-from sceneprint.errors import IdempotencyConflict, NewerSchema, StoreLocked
+from sceneprint.errors import IdempotencyConflict, LostLease, NewerSchema, StoreLocked
 from sceneprint.settings import Settings
 from sceneprint.store import Database, Store, open_database, queue
 from sceneprint.store.keys import IdempotentRequest
@@ -32,6 +33,7 @@ from sceneprint.store.tables import (
     jobs,
     maps,
     pending_events,
+    signatures,
 )
 from sceneprint_client.api import JobState, NewMap
 
@@ -171,9 +173,10 @@ def test_it_is_committed_with_its_answer_and_keeps_no_turn(
     server_store: Store, row: MapRow
 ) -> None:
     database = server_store.database
-    asked = text(f"{LOCKS_HELD} AND pid = pg_backend_pid()")
+    asked = text(str(LOCKS_HELD).replace("count(*)", "mode") + " AND pid = pg_backend_pid()")
     with database.write(map_number=row.number, single=True) as connection:
-        assert connection.execute(asked).scalar_one() == 2  # it had its turn
+        found = connection.execute(asked).scalars().all()  # it had its turn, and its map alone
+        assert sorted(found) == ["ExclusiveLock", "ShareLock"]
         assert locks(server_store) == 0
     with database.write(map_number=row.number, single=True) as connection:
         connection.execute(update(maps).values(name="at once"))
@@ -257,6 +260,15 @@ def test_a_turn_that_does_not_come_in_time_is_said(
     edit(server_store.database, row, "later")
     assert named(server_store) == "later"
     assert not server_store.database._held
+
+
+def test_a_warning_of_before_is_not_one_of_its_commit(server_store: Store, row: MapRow) -> None:
+    """One of its commit says that it is not on the standby."""
+    with server_store.database.read() as connection:
+        warned = connection.execute(text("SELECT pg_cancel_backend(2147483647)")).scalar()
+    assert warned is False
+    edit(server_store.database, row, "after")
+    assert named(server_store) == "after"
 
 
 def test_what_fails_leaves_nothing(server_store: Store, row: MapRow) -> None:
@@ -366,6 +378,28 @@ def test_a_worker_that_missed_an_upload_tries_again(
     assert engine.get_map("hall").frames == {"indexed": 1}
 
 
+def test_an_artifact_that_a_deletion_removed_before_its_commit_is_put_again(
+    engine: Engine, small: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine.add_frame("hall", *small[0])
+    work = engine.claim("w")
+    assert work is not None
+    (upload,) = engine.store.blobs.digests()
+    index = signature_job.index_claimed_frame
+
+    def late(*given: Any, **how: Any) -> bool:
+        monkeypatch.undo()
+        collect_blobs(engine.store, [one for one in engine.store.blobs.digests() if one != upload])
+        assert list(engine.store.blobs.digests()) == [upload]
+        return index(*given, **how)
+
+    monkeypatch.setattr(signature_job, "index_claimed_frame", late)
+    assert engine.run(work) == JobState.SUCCEEDED
+    with engine.store.database.read() as connection:
+        artifact = connection.execute(select(signatures.c.geometry)).scalar_one()
+    assert engine.store.geometries.read(artifact).patches
+
+
 def once_of(what: str) -> IdempotentRequest:
     return IdempotentRequest("robot", "a key", what * 64)
 
@@ -416,3 +450,13 @@ def test_a_request_whose_key_is_used_meanwhile_takes_nothing(
     with engine.store.database.read() as connection:
         assert connection.execute(select(func.sum(maps.c.used_frames))).scalar() == 1
     assert len(list(engine.store.blobs.digests())) == 1
+
+
+def test_what_has_a_fence_is_taken_behind_it(engine: Engine, small: Any) -> None:
+    def lost(_: Any) -> None:
+        raise LostLease("another worker has it")
+
+    with pytest.raises(LostLease):
+        engine.uploads.add_all("hall", [Upload(*small[0])], fence=lost)
+    assert engine.get_map("hall").frames == {}
+    assert list(engine.store.blobs.digests()) == []

@@ -84,7 +84,7 @@ class Grouping:
         result : None, and nothing was written, where `do` says so, while others write, whom more
             may join, and on SQLite, whose transactions cost no round trip
         """
-        if self._map_number is None or self._waiting or not self._writing.acquire(blocking=False):
+        if self._map_number is None or not self._writing.acquire(blocking=False):
             return None
         try:
             with self._database.write(map_number=self._map_number, single=True) as connection:

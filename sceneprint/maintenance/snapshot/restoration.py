@@ -121,18 +121,12 @@ def blobs_of(
             size = member[1] if own and member is not None else bases.size(digest)
             chunks = reader.content(size or 0) if own else bases.take(digest)
             if size is None or chunks is None:
-                raise _changed(archive)
+                raise DamagedSnapshot(f"{archive} was changed while it was restored. Try again.")
             yield digest, size, chunks
             for _ in chunks:  # to its end, whoever has read how much
                 pass
             if own:
                 member = reader.next()
-        if member is None or member[0] != DAMAGED:
-            raise _changed(archive)
-
-
-def _changed(archive: Path) -> DamagedSnapshot:
-    return DamagedSnapshot(f"{archive} was changed while it was restored. Try again.")
 
 
 def _manifest(reader: ArchiveReader, archive: Path) -> SnapshotManifest:
