@@ -462,12 +462,13 @@ def _open_store(url: str, blobs: Path | str) -> Store:
         kept = FolderBlobs(blobs, make=new)
         if new:  # its folder need not be that of the blobs: `file:///folder`
             _make_folder_of(url)
-        return Store(open_database(url), kept)
-    if new:
+    elif new:
         _make_folder_of(url)
     database = open_database(url)
     try:
-        return Store(database, open_blobs(blobs, database))
+        found = kept if isinstance(blobs, Path) else open_blobs(blobs, database)
+        database.refuse_old_primaries(found)
+        return Store(database, found)
     except BaseException:
         database.close()
         raise

@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy import Connection, Engine, event
 
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
+from sceneprint.store.blobs.folder import Blobs
 from sceneprint.store.database_errors import database_label
 from sceneprint.store.postgres import connection as postgres
+from sceneprint.store.postgres.timelines import Timelines
 from sceneprint.store.sqlite import (
     BUSY_S,
     HELD_S,
@@ -309,11 +311,9 @@ class Database:
         file = None if sealed is not None else self.file
         self._line = None if file is None else WriterLine(file.parent)
         self._held = False  # by another process, for longer than anybody should wait
-        self._history: str | None = None
         self._guarded = False
         self._schema = postgres.KnownSchema(self._check_schema)
-        if not self.is_sqlite:
-            event.listen(engine, "connect", self._note_history)
+        self._timelines = None if self.is_sqlite else Timelines(engine)
 
     @property
     def history(self) -> str | None:
@@ -321,10 +321,21 @@ class Database:
         standby was promoted, which may lack what was committed last. Then nothing that is held in
         memory can be taken to be a part of it.
         """
-        return self._history
+        found = None if self._timelines is None else self._timelines.current
+        return None if found is None else str(found)
 
-    def _note_history(self, connection: Any, _record: object) -> None:
-        self._history = postgres.history_of(connection) or self._history
+    def refuse_old_primaries(self, blobs: Blobs) -> None:
+        """Use no primary that a promoted standby has replaced, as a note beside the blobs says; and
+        keep that note for other processes.
+
+        Raises
+        ------
+        StoreAway : only old primaries can be reached.
+        """
+        if self._timelines is not None:
+            self._timelines.follow(blobs)
+            with self.read():
+                pass
 
     @property
     def dialect(self) -> str:
@@ -539,12 +550,12 @@ class Database:
         ------
         UnusableStore : the server cannot be reached.
         """
-        import psycopg
-
+        if self._timelines is None:
+            raise ValueError(f"{self.shown} has no connections but those of its file")
         with self.explained():
             args, given = self._engine.dialect.create_connect_args(self._engine.url)
             options = {**postgres.connect_options(self._engine.url), **given}
-            found = psycopg.connect(*args, **options, autocommit=True)
+            found, _ = self._timelines.connect(*args, **options, autocommit=True)
             try:
                 postgres.configure(found)
             except BaseException:
