@@ -6,7 +6,8 @@ import random
 import threading
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,8 @@ from benchmarks.fleet import audit, failover_client, faults
 from benchmarks.fleet.__main__ import marks, table
 from benchmarks.fleet.audit import Found, check
 from benchmarks.fleet.failover_client import FailoverClient, RequestLog, Unreachable, Wait
-from benchmarks.fleet.faults import PRIMARY, Kill, Promotion, schedule
+from benchmarks.fleet.faults import CUT_OFF, FROZEN, PRIMARY, Kill, Promotion, schedule
+from benchmarks.fleet.lock_samples import LockSampler, LockShares
 from benchmarks.fleet.paper import Costs, paper
 from benchmarks.fleet.postgres import NoServer, binaries
 from benchmarks.fleet.qdrant_search import Compared, Searched
@@ -31,11 +33,17 @@ from benchmarks.pages import put_between
 from benchmarks.soak.load import free_port
 from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
+from sceneprint.store import open_store
 from sceneprint.types import DepthFrame
 from sceneprint_client import Client
 
 #: At reduced size.
 SMALL = Plan(seconds=6, robots=2, rate=2, kills=2, promotions=1, seed=1, workers=1)
+#: The same with robots that sign their frames, one that is offline, and all kinds of faults.
+HARD = replace(
+    SMALL, robots=6, rate=1, kills=1, partitions=1, returns=True, offline=5, retention_s=2.0,
+    signed=True, objects=True, delays=True,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +78,7 @@ def test_a_fleet_loses_nothing(
     assert (found.lost, found.window, found.damaged, found.faults) == (0, 0, 0, [])
     assert found.found == Found(
         acknowledged=found.found.acknowledged, indexed=found.found.acknowledged,
-        found=found.found.acknowledged,
+        looked_for=found.found.acknowledged, found=found.found.acknowledged,
     )  # fmt: skip
     assert found.found.acknowledged > 6
     assert found.sound
@@ -78,6 +86,29 @@ def test_a_fleet_loses_nothing(
     assert len(promotion.resumed) == 2
     assert max(promotion.resumed.values()) < 60  # the claim is 10 s; machines of tests are busy
     assert promotion.unreceived == frozenset()
+
+
+@pytest.mark.thorough
+def test_a_fleet_loses_nothing_whatever_becomes_of_it(
+    tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    try:
+        binaries()
+    except NoServer as error:
+        pytest.skip(str(error))
+    monkeypatch.setattr(faults, "AWAY_S", (0.0, 0.0))
+    monkeypatch.setattr(faults, "UNNOTICED_S", 0.2)
+    monkeypatch.setattr(faults, "CUT_OFF_S", 6.0)
+    monkeypatch.setattr(faults, "BACK_S", 1.0)
+    found = drive(tmp_path, replace(HARD, data=recording))
+    assert (found.lost, found.window, found.damaged, found.faults) == (0, 0, 0, [])
+    assert found.kills[CUT_OFF] == 1
+    assert [promotion.astray for promotion in found.promotions] == [frozenset()]
+    assert found.found.looked_for == found.found.found > 5  # of the spool, and of the shared map
+    assert found.found.acknowledged >= 11
+    assert found.locks.samples > 50
+    assert 0 < found.locks.one_map < found.locks.seconds
+    assert found.sound, found.exceeded
 
 
 def test_the_schedule_is_that_of_its_seed() -> None:
@@ -88,6 +119,9 @@ def test_the_schedule_is_that_of_its_seed() -> None:
     primaries = [at for at, victim in due if victim == PRIMARY]
     assert len(due) == 22
     assert [at < 50 for at in primaries] == [True, False]
+    more = schedule(100, 20, 2, random.Random(3), freezes=1, partitions=3)
+    assert Counter(victim for _, victim in more)[CUT_OFF] == 3
+    assert [one for one in more if one[1] not in (CUT_OFF, FROZEN)] == due
 
 
 def test_walks_have_nothing_in_common(recording: Path) -> None:
@@ -95,8 +129,43 @@ def test_walks_have_nothing_in_common(recording: Path) -> None:
     assert [len(one) for one in found] == [24, 24, 24]
     assert len({shot.png for walk in found for shot in walk}) == 72
     assert {shot.meta.intrinsics.width for shot in found[0] if shot.meta.intrinsics} == {160}
+    short = walks(recording, 30, 3)  # two robots share the frames of a grid
+    assert len({shot.png for walk in short for shot in walk}) == 90
     with pytest.raises(DatasetError, match=f"fewer than 850 frames in {GRIDS} grids"):
         walks(recording, 1, 850)
+
+
+@pytest.mark.parametrize(("retention_s", "shared"), [(None, [0, 1, 2, 4, 5, 6]), (9.0, [3, 7])])
+def test_robots_share_a_map_or_have_one_of_few(
+    retention_s: float | None, shared: list[int]
+) -> None:
+    plan = Plan(robots=1000, retention_s=retention_s)
+    maps = [plan.map_of(i) for i in range(1000)]
+    assert [i for i in range(8) if maps[i] == "fleet"] == shared
+    assert 19 <= len(set(maps)) <= 58
+    assert maps[5 if retention_s else 7] == ("fleet-5" if retention_s else "fleet-7")
+
+
+def test_locks_are_sampled(postgres_url: str, tmp_path: Path) -> None:
+    with closing(open_store(postgres_url, tmp_path)) as store:
+        with store.database.write():  # everybody waits
+            everybody = sampled(postgres_url)
+        with store.database.write(map_number=7), store.database.write(map_number=8):
+            two_maps = sampled(postgres_url)
+        nobody = sampled(postgres_url)
+    assert everybody.everybody == everybody.seconds > 0 == everybody.one_map
+    assert two_maps.one_map == pytest.approx(2 * two_maps.seconds)
+    assert two_maps.everybody == nobody.everybody == nobody.one_map == 0 < nobody.seconds
+
+
+def sampled(url: str) -> LockShares:
+    """A few samples of the locks of a server."""
+    sampler = LockSampler(lambda: url.replace("+psycopg", ""))
+    sampler.start()
+    while sampler.shares.samples < 5 and sampler.is_alive():
+        pass
+    sampler.stop()
+    return sampler.shares
 
 
 @pytest.mark.parametrize(
@@ -146,7 +215,7 @@ def test_a_robot_asks_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     log = RequestLog()
     with answering(503, 200, 500, 404) as url:
         dead = f"http://127.0.0.1:{free_port()}"
-        with FailoverClient([dead, url], "secret", log) as asked:
+        with FailoverClient([dead, url], log) as asked:
             assert asked.ask("upload", "GET", "/").status_code == 200
             assert asked.ask("query", "GET", "/").status_code == 404
     assert log.repeated == 3 + 2  # dead, 503, dead, 200; 500, dead, 404
@@ -158,7 +227,7 @@ def test_a_robot_gives_up_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(failover_client, "PAUSE_S", 0.01)
     monkeypatch.setattr(failover_client, "PATIENCE_S", 0.1)
     nobody = [f"http://127.0.0.1:{free_port()}"]
-    with FailoverClient(nobody, "secret", RequestLog()) as asked, pytest.raises(Unreachable):
+    with FailoverClient(nobody, RequestLog()) as asked, pytest.raises(Unreachable):
         asked.ask("upload", "GET", "/")
 
 
@@ -178,12 +247,13 @@ def test_what_is_not_there_is_seen(
         client.delete_frame("fleet", added[1].frame_id)
         # the second is gone, the third was told of as the fourth, and nobody of the fourth
         told = [kept[0], kept[1], Kept(kept[2].frame_id, "fleet", walk[3], 0.0), kept[4]]
-        listener = Listener("fleet", FailoverClient(["http://127.0.0.1:1"], "secret", RequestLog()))
+        nobody = FailoverClient(["http://127.0.0.1:1"], RequestLog())
+        listener = Listener("fleet", "secret", nobody)
         listener.heard["frame.received", kept[0].frame_id] = 2
         found = check(told, [client, client], [listener])
     assert found == Found(
-        acknowledged=4, indexed=2, found=1, missing={kept[1].frame_id}, stuck=1, strangers=1,
-        unheard=2, heard_twice=1,
+        acknowledged=4, indexed=2, looked_for=2, found=1, missing={kept[1].frame_id}, stuck=1,
+        strangers=1, unheard=2, heard_twice=1,
     )  # fmt: skip
 
 
@@ -195,7 +265,8 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         "steps": (), "refused": Counter(), "waits_ms": {"query": (90.0, 1200.0)},
         "memory": (200_000_000, 100_000_000),
         "answers": Counter(found=3), "repeated": 4, "faults": [], "damaged": 0, "leftovers": 0,
-        "lost": 0, "window": 0, "seconds": 99.0,
+        "lost": 0, "window": 0, "seconds": 99.0, "spooled_twice": 0,
+        "locks": LockShares(5_000, 100.0, 0.09, 0.9),
     }  # fmt: skip
     return FleetFigures(found=found, **same | changed)
 
@@ -205,10 +276,17 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
     [
         ({}, {}, True),
         ({}, {"leftovers": 3}, True),
-        ({"indexed": 8, "found": 8, "stated": 1}, {}, True),
+        ({"indexed": 8, "looked_for": 8, "found": 8, "stated": 1}, {}, True),
+        ({"indexed": 7, "looked_for": 5, "found": 5, "aged": 2}, {}, True),
+        ({"indexed": 7, "looked_for": 5, "found": 5, "aged": 1}, {}, False),
+        ({}, {"locks": LockShares(5_000, 100.0, 0.9, 0.9)}, False),  # 100 ms a frame
+        ({}, {"waits_ms": {"query": (90.0, 16_000.0)}}, False),
+        ({}, {"memory": (2 << 30, 1)}, False),
+        ({}, {"promotions": [Promotion(None, 1.0, 2.0, {}, frozenset(), frozenset())]}, True),
+        ({}, {"promotions": [Promotion(None, 1.0, 2.0, {}, frozenset(), frozenset("a"))]}, False),
         ({"acknowledged": 0, "indexed": 0, "found": 0}, {}, False),
         ({"found": 8}, {}, False),
-        ({"indexed": 8, "found": 8}, {}, False),
+        ({"indexed": 8, "looked_for": 8, "found": 8}, {}, False),
         ({"stuck": 1}, {}, False),
         ({"doubled": 1}, {}, False),
         ({"strangers": 1}, {}, False),
@@ -219,12 +297,12 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         ({}, {"damaged": 1}, False),
         ({}, {"faults": ["upload: 500"]}, False),
         # what an asynchronous standby had not received is missing, and nothing else
-        ({"indexed": 8, "found": 8, "missing": {"a"}}, {"window": 1}, True),
-        ({"indexed": 8, "found": 8, "missing": {"a"}}, {"window": 2}, False),
+        ({"indexed": 8, "looked_for": 8, "found": 8, "missing": {"a"}}, {"window": 1}, True),
+        ({"indexed": 8, "looked_for": 8, "found": 8, "missing": {"a"}}, {"window": 2}, False),
     ],
 )
 def test_what_is_wrong_fails(found: dict[str, Any], changed: dict[str, Any], sound: bool) -> None:
-    whole: dict[str, Any] = {"acknowledged": 9, "indexed": 9, "found": 9}
+    whole: dict[str, Any] = {"acknowledged": 9, "indexed": 9, "looked_for": 9, "found": 9}
     assert figures(Found(**whole | found), **changed).sound is sound
 
 
@@ -238,9 +316,27 @@ def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
     assert "SIGKILL of 1 of primary, 2 of service." in text
     assert "| **lost** | **0** |" in text
     assert "| query: median, p99 | 90, 1,200 ms |" in text
+    assert "| of a frame, all writers wait for one; those of its map do | 10.0, 100.0 ms |" in text
     assert "of a worker's | 200, 100 MB |" in text
     assert "| service | 0.0, 1.2 |" in text
     assert "each service answered 0.5, 2.0 s after that" in text
+    assert "came back" not in text
+
+
+def test_a_crowd_tells_what_it_met_with() -> None:
+    plan = Plan(robots=1000, signed=True, partitions=2, offline=360, retention_s=40.0)
+    found = Found(acknowledged=9, indexed=6, looked_for=5, found=5, aged=3)
+    back = [Promotion(None, 1.0, 2.0, {"a": 0.5}, frozenset(), frozenset({"a", "b"}))]
+    told = "\n".join(table(figures(found, plan=plan, promotions=back, spooled_twice=4)))
+    assert "1,000 robots send 1 frames a second each, and send their signatures along" in told
+    assert "For 12 s each, a host did not reach its servers." in told
+    assert "keep a frame for 40 s" in told
+    assert "| deleted as they were too old, and told to have been | 3 |" in told
+    assert (
+        "| frames spooled by the robot that was offline, sent again, doubled | 360, 4, 0 |" in told
+    )
+    assert "frames that came to it: **2**." in told
+    assert marks(plan)[0] == "<!-- fleet-crowd:begin -->"
 
 
 def test_an_upgrade_tells_its_steps_and_what_was_refused(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from benchmarks.fleet.faults import CUT_OFF_S
 from benchmarks.fleet.fleet import DATABASE_S, STORE_S
 from benchmarks.fleet.run import FleetFigures, Plan, drive
 from benchmarks.machine import describe_machine
@@ -24,6 +25,8 @@ def marks(plan: Plan) -> tuple[str, str]:
     name = "fleet-asynchronous" if plan.asynchronous else "fleet"
     if plan.delays:
         name = "fleet-delays"
+    if plan.signed:
+        name = "fleet-crowd"
     if plan.before is not None:
         name = "fleet-upgrade"
     return f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
@@ -41,6 +44,7 @@ def table(figures: FleetFigures) -> list[str]:
             f"{1e3 * STORE_S:g} ms)"
         )
     what = f"{standby} standby"
+    sent = "send their signatures along, as recorded" if plan.signed else "leave signing to workers"
     done = "SIGKILL of " + ", ".join(f"{n} of {name}" for name, n in sorted(figures.kills.items()))
     if plan.before is not None:
         what = "the version before replaced"
@@ -49,16 +53,25 @@ def table(figures: FleetFigures) -> list[str]:
         f"### {plan.robots} robots for {plan.seconds:.0f} s, {what}",
         "",
         f"PostgreSQL with {standby} standby, {plan.services} services, {plan.workers} workers, "
-        f"blobs in {blobs}{delayed}; {plan.robots} robots send {plan.rate:g} frames a second each. "
-        f"{done}.",
+        f"blobs in {blobs}{delayed}; {plan.robots:,} robots send {plan.rate:g} frames a second "
+        f"each, and {sent}. {done}.",
+        *_more(plan),
         "",
         "| | |",
         "|---|--:|",
         f"| frames acknowledged | {found.acknowledged} |",
         f"| of them indexed, or in a state that says why not | {found.indexed}, {found.stated} |",
-        f"| of the indexed, found by a query of themselves | {found.found} |",
+        f"| of the indexed, looked for by a query of themselves, found | {found.looked_for}, "
+        f"{found.found} |",
         f"| **lost** | **{figures.lost}** |",
     ]
+    if plan.retention_s is not None:
+        lines.append(f"| deleted as they were too old, and told to have been | {found.aged} |")
+    if plan.offline:
+        lines.append(
+            f"| frames spooled by the robot that was offline, sent again, doubled | "
+            f"{plan.offline}, {figures.spooled_twice}, {found.doubled} |"
+        )
     if plan.asynchronous:
         lines.append(
             f"| acknowledged, and not received by the standby when its primary died: missing, of "
@@ -77,6 +90,8 @@ def table(figures: FleetFigures) -> list[str]:
             f"| {kind}: median, p99 | {p50:,.0f}, {p99:,.0f} ms |"
             for kind, (p50, p99) in figures.waits_ms.items()
         ),
+        f"| of a frame, all writers wait for one; those of its map do | "
+        f"{figures.turn_ms[0]:.1f}, {figures.turn_ms[1]:.1f} ms |",
         f"| most memory of a service's process, of a worker's | {figures.memory[0] / 1e6:,.0f}, "
         f"{figures.memory[1] / 1e6:,.0f} MB |",
         "",
@@ -99,7 +114,30 @@ def table(figures: FleetFigures) -> list[str]:
             f"Primary dead for {one.promoted - one.killed:.1f} s until the standby was promoted; "
             f"each service answered {back} s after that."
         )
+        if one.astray is not None:
+            lines.append(
+                "Then the old primary came back as it was, and a service and a worker began anew: "
+                f"frames that came to it: **{len(one.astray)}**."
+            )
     return [*lines, ""]
+
+
+def _more(plan: Plan) -> list[str]:
+    """What else such a run has, as sentences."""
+    found = []
+    if plan.partitions:
+        found.append(f"For {CUT_OFF_S:g} s each, a host did not reach its servers.")
+    if plan.retention_s is not None:
+        found.append(
+            f"Three of four robots have maps that keep a frame for {plan.retention_s:g} s, so that "
+            "frames go as fast as they come."
+        )
+    if plan.offline:
+        found.append(
+            f"One more robot was offline, and sent {plan.offline} frames of its spool at once: an "
+            "hour of a frame in ten seconds, recorded at once."
+        )
+    return found
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -115,6 +153,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--services", type=int, default=plan.services)
     parser.add_argument("--workers", type=int, default=plan.workers)
     parser.add_argument("--freezes", type=int, default=plan.freezes, help="of the primary")
+    parser.add_argument("--partitions", type=int, default=plan.partitions, help="of a host")
+    parser.add_argument("--returns", action="store_true", help="old primaries come back")
+    parser.add_argument("--offline", type=int, default=plan.offline, help="frames of a spool")
+    parser.add_argument("--retention-s", type=float, help="of maps of single robots")
+    parser.add_argument("--signed", action="store_true", help="robots sign their frames")
     parser.add_argument("--objects", action="store_true", help="blobs in an object store")
     parser.add_argument("--delays", action="store_true", help="messages to the servers take time")
     parser.add_argument(
@@ -140,7 +183,7 @@ def main(arguments: list[str] | None = None) -> int:
             keep.mkdir(parents=True)
             folder = keep
         figures = drive(folder, plan)
-    for line in figures.faults[:20]:
+    for line in [*figures.faults[:20], *figures.exceeded]:
         print(line, file=sys.stderr)
     machine = describe_machine()
     when = (

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -18,8 +18,8 @@ from sceneprint_client.api import Frame, FrameState
 
 #: Seconds for the workers to come to the end of the queue, and for events to come.
 PATIENCE_S, EVENTS_S = 600.0, 20.0
-#: Frames that every service is asked for, and compared.
-COMPARED = 20
+#: Frames that every service is asked for, and compared; most that are looked for by a query.
+COMPARED, LOOKED_FOR = 20, 1_000
 #: States in which a frame is not on its way any more, and is there.
 STATED = (FrameState.REJECTED, FrameState.FAILED, FrameState.REDUNDANT)
 
@@ -32,7 +32,9 @@ class Found:
     ----------
     acknowledged : frames
     indexed, stated : of them, those that queries find, and those whose state says why they do not
-    found : of the indexed, those that a query of the same content has at distance 0
+    aged : frames of maps that keep none for long, deleted for that and told to have been
+    looked_for, found : of the indexed, those that were looked for by a query of the same content,
+        and those that it has at distance 0
     missing : ids of those acknowledged that are not there
     stuck : of those that are there, on their way still
     doubled : frames beyond one of a content in a map
@@ -44,6 +46,8 @@ class Found:
     acknowledged: int = 0
     indexed: int = 0
     stated: int = 0
+    aged: int = 0
+    looked_for: int = 0
     found: int = 0
     missing: set[str] = field(default_factory=set)
     stuck: int = 0
@@ -70,8 +74,11 @@ def await_idle(client: Client) -> None:
     raise RuntimeError(f"jobs are left after {PATIENCE_S:g} s: {client.status().jobs}")
 
 
-def check(kept: Sequence[Kept], clients: Sequence[Client], listeners: Sequence[Listener]) -> Found:
-    """Look every acknowledged frame up, everywhere."""
+def check(
+    kept: Sequence[Kept], clients: Sequence[Client], listeners: Sequence[Listener],
+    aging: Container[str] = (),
+) -> Found:  # fmt: skip
+    """Look every acknowledged frame up, everywhere; `aging`: maps that keep none for long."""
     maps = sorted({one.map_name for one in kept})
     lists = [{name: list(client.frames(name)) for name in maps} for client in clients]
     there = {frame.frame_id: frame for frames in lists[0].values() for frame in frames}
@@ -80,31 +87,42 @@ def check(kept: Sequence[Kept], clients: Sequence[Client], listeners: Sequence[L
     indexed = {name for name, one in present.items() if one.state == FrameState.INDEXED}
     stated = sum(one.state in STATED for one in present.values())
     contents = Counter((one.map, one.content_id) for one in there.values())
+    # frames of such maps may go while they are looked for
+    lasting = [
+        one for one in told.values() if one.frame_id in indexed and one.map_name not in aging
+    ]
+    looked_for = lasting[:: -(-len(lasting) // LOOKED_FOR) or 1]
     with ThreadPoolExecutor(len(clients)) as pool:
-        parts = [
-            [one for one in told.values() if one.frame_id in indexed][i :: len(clients)]
-            for i in range(len(clients))
-        ]
+        parts = [looked_for[i :: len(clients)] for i in range(len(clients))]
         found = sum(pool.map(_found, clients, parts))
+    deleted = {name for one in listeners for kind, name in one.heard if kind == "frame.deleted"}
+    gone = set(told) - set(there)
+    aged = {name for name in gone & deleted if told[name].map_name in aging}
     result = Found(
         acknowledged=len(told),
         indexed=len(indexed),
         stated=stated,
+        aged=len(aged),
+        looked_for=len(looked_for),
         found=found,
-        missing=set(told) - set(there),
+        missing=gone - aged,
         stuck=len(present) - len(indexed) - stated,
         doubled=sum(contents.values()) - len(contents),
         strangers=len(there.keys() - told.keys()),
-        disagreeing=sum(_plain(one) != _plain(lists[0]) for one in lists[1:]),
+        disagreeing=sum(_plain(one, aging) != _plain(lists[0], aging) for one in lists[1:]),
     )
-    some = [told[name] for name in sorted(indexed)][:: max(len(indexed) // COMPARED, 1)]
+    some = sorted(lasting, key=lambda one: one.frame_id)[:: max(len(lasting) // COMPARED, 1)]
     result.disagreeing += sum(_disagree(clients, one) for one in some)
     _hear(result, [told[name] for name in present], listeners)
     return result
 
 
-def _plain(lists: dict[str, list[Frame]]) -> dict[str, dict[str, str]]:
-    return {name: {one.frame_id: one.state for one in frames} for name, frames in lists.items()}
+def _plain(lists: dict[str, list[Frame]], aging: Container[str]) -> dict[str, dict[str, str]]:
+    return {
+        name: {one.frame_id: one.state for one in frames}
+        for name, frames in lists.items()
+        if name not in aging
+    }
 
 
 def _ranked(client: Client, map_name: str, shot: Shot, k: int) -> list[tuple[str, float]]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import select
+import signal
 import socket
 import threading
 import time
@@ -27,6 +29,19 @@ class DelayProxy:
         self._process = context.Process(target=_hand_on, args=(tell, port, delay_s), daemon=True)
         self._process.start()
         self.port: int = told.recv()
+
+    def freeze(self) -> None:
+        """Let nothing through, and break nothing: as a network that loses everything."""
+        os.kill(self._pid, signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """Let it through again, with all that has come meanwhile."""
+        os.kill(self._pid, signal.SIGCONT)
+
+    @property
+    def _pid(self) -> int:
+        assert self._process.pid is not None
+        return self._process.pid
 
     def end(self) -> None:
         """End it; connections break."""

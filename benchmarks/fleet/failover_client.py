@@ -78,22 +78,25 @@ class RequestLog:
             self.faults.append(text)
 
 
+def bearer(key: str) -> dict[str, str]:
+    """Headers of a request with a key."""
+    return {"Authorization": f"Bearer {key}"}
+
+
 class FailoverClient:
-    """A service at several addresses, asked with one key.
+    """A service at several addresses.
 
     Parameters
     ----------
     urls : of the service processes
-    key : of the robot
     log : where waits are noted
     first : number of the address that is asked first
     """
 
-    def __init__(self, urls: list[str], key: str, log: RequestLog, first: int = 0) -> None:
+    def __init__(self, urls: list[str], log: RequestLog, first: int = 0) -> None:
         self._log = log
-        headers = {"Authorization": f"Bearer {key}"}
         self.clients = [
-            httpx.Client(base_url=url, headers=headers, timeout=SILENCE_S, trust_env=False)
+            httpx.Client(base_url=url, timeout=SILENCE_S, trust_env=False)
             for url in urls[first % len(urls) :] + urls[: first % len(urls)]
         ]
         self._order = cycle(self.clients)

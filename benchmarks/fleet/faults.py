@@ -20,9 +20,13 @@ from benchmarks.fleet.fleet import Fleet, Process, await_service
 
 #: How often each is killed, in proportion: the process that signs, as well as who keeps it.
 VICTIMS = {"service": 3, "worker": 2, "signing process": 2}
-PRIMARY, FROZEN = "primary", "frozen primary"
+PRIMARY, FROZEN, CUT_OFF = "primary", "frozen primary", "network of a host"
 #: Seconds for which a primary is frozen: less than a connection is believed to live.
 FROZEN_S = 5.0
+#: Seconds for which a host does not reach the servers: longer than workers have a job for.
+CUT_OFF_S = 12.0
+#: Seconds for which an old primary is back: a service and a worker begin anew meanwhile.
+BACK_S = 10.0
 #: Part of the time before the first and after the last kill.
 CALM = 0.1
 #: Seconds until a killed part begins again; and until somebody promotes the standby.
@@ -51,6 +55,7 @@ class Promotion:
     killed, promoted : when
     resumed : by address of a service, seconds until it answered a query again
     unreceived : ids of the frames that the standby had not received
+    astray : ids of the frames that came to the old primary when it was back; None: it was not
     """
 
     stalled: float | None
@@ -58,11 +63,13 @@ class Promotion:
     promoted: float
     resumed: dict[str, float]
     unreceived: frozenset[str]
+    astray: frozenset[str] | None = None
 
 
 def schedule(
-    seconds: float, kills: int, promotions: int, rng: random.Random, freezes: int = 0
-) -> list[tuple[float, str]]:
+    seconds: float, kills: int, promotions: int, rng: random.Random, freezes: int = 0,
+    partitions: int = 0,
+) -> list[tuple[float, str]]:  # fmt: skip
     """Seconds from the beginning, and what is killed then."""
     first, last = CALM * seconds, (1 - CALM) * seconds
     victims = rng.choices(list(VICTIMS), list(VICTIMS.values()), k=kills)
@@ -70,6 +77,7 @@ def schedule(
     part = (last - first) / max(promotions, 1)
     told += [(first + part * (i + rng.random()), PRIMARY) for i in range(promotions)]
     told += [(rng.uniform(first, last), FROZEN) for _ in range(freezes)]
+    told += [(rng.uniform(first, last), CUT_OFF) for _ in range(partitions)]
     return sorted(told)
 
 
@@ -83,12 +91,14 @@ class FaultInjector:
     asked : a query that any service must answer
     rng : of the victims
     asynchronous : whether a standby is first cut off from its primary
+    returns : whether the old primary comes back as it was, before it follows the new one
     """
 
     fleet: Fleet
     asked: Callable[[str], bool]
     rng: random.Random
     asynchronous: bool = False
+    returns: bool = False
     kills: list[Kill] = field(default_factory=list)
     promotions: list[Promotion] = field(default_factory=list)
 
@@ -104,6 +114,10 @@ class FaultInjector:
                 self.kills.append(Kill(victim, time.monotonic()))
                 with self.fleet.pair.frozen():
                     time.sleep(FROZEN_S)
+            elif victim == CUT_OFF:
+                self.kills.append(Kill(victim, time.monotonic()))
+                with self.fleet.partitioned(self.rng.randrange(len(self.fleet.services))):
+                    time.sleep(CUT_OFF_S)
             else:
                 self._kill(victim)
 
@@ -151,8 +165,22 @@ class FaultInjector:
         unreceived = pair.unreceived()
         for one in watching:
             one.join()
-        self.promotions.append(Promotion(stalled, killed, promoted, resumed, frozenset(unreceived)))
+        astray = self._bring_back(unreceived) if self.returns else None
+        self.promotions.append(
+            Promotion(stalled, killed, promoted, resumed, frozenset(unreceived), astray)
+        )
         pair.renew()
+
+    def _bring_back(self, unreceived: set[str]) -> frozenset[str]:
+        """Let the old primary be there for a while, and let processes begin that never knew
+        another; ids of the frames that came to it.
+        """
+        with self.fleet.pair.old_primary_back() as only_there:
+            until = time.monotonic() + BACK_S
+            self._again(self.rng.choice(self.fleet.services), "service")
+            self._again(self.rng.choice(self.fleet.workers), "worker")
+            time.sleep(max(until - time.monotonic(), 0.0))
+            return frozenset(only_there() - unreceived)
 
     def _watch(self, url: str, promoted: float, resumed: dict[str, float]) -> None:
         """Note when a service answers a query again."""

@@ -9,7 +9,8 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from itertools import chain
 from pathlib import Path
 
 import httpx
@@ -19,8 +20,12 @@ from benchmarks.fleet.failover_client import PAUSE_S
 from benchmarks.fleet.postgres_pair import Pair
 from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.soak.load import Part, free_port
+from sceneprint.engine.jobs.robot_signatures import FIRST
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
+from sceneprint.store.database import reach_database
+from sceneprint.store.keys import find_named_key
+from sceneprint.store.sender_rows import add_verified
 
 #: Seconds for all service processes to begin, on a machine that is busy with much else.
 PATIENCE_S = 180.0
@@ -47,14 +52,19 @@ class Fleet:
     objects : keep blobs in an object store, and not in a folder that all hosts share
     before : checkout of another version, which all processes begin as; None: of this one
     delays : let messages to the database take DATABASE_S, and those to the object store STORE_S
+    partitions : whether `partitioned` is asked for
+    trusting : whether signatures of robots are used
     """
 
     def __init__(
         self, folder: Path, services: int, workers: int, *, synchronous: bool, objects: bool,
-        before: Path | None = None, delays: bool = False,
+        before: Path | None = None, delays: bool = False, partitions: bool = False,
+        trusting: bool = False,
     ) -> None:  # fmt: skip
-        self._folder, self._before, self._delays = folder, before, delays
-        self._proxies: list[DelayProxy] = []
+        self.folder, self._before = folder, before
+        self._delays, self._partitions, self._trusting = delays, partitions, trusting
+        #: By which each host reaches the servers, where it does not reach them itself.
+        self._networks: list[list[DelayProxy]] = []
         (folder / "database").mkdir()
         self.pair = Pair(folder / "database", synchronous=synchronous)
         self._sizes = services, workers
@@ -68,41 +78,74 @@ class Fleet:
         """Start all; the key of who may do everything."""
         n_services, n_workers = self._sizes
         self.pair.begin()
-        blobs = f"file://{self._folder / 'blobs'}"
+        blobs = f"file://{self.folder / 'blobs'}"
         if self._objects is not None:
             self._objects.start()
             blobs = f"{self._objects.bucket('fleet')}/blobs"
-            port = self._reached(self._objects.port, STORE_S)
-            self._shared = self._objects.env | {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}
-        database = self.pair.url_at([self._reached(one, DATABASE_S) for one in self.pair.ports])
-        self._shared = self._shared | SETTINGS | {
-            "SCENEPRINT_DATABASE_URL": database, "SCENEPRINT_BLOB_URL": blobs
+            self._shared = dict(self._objects.env)
+        self._shared |= SETTINGS | {
+            "SCENEPRINT_DATABASE_URL": self.pair.url, "SCENEPRINT_BLOB_URL": blobs
         }  # fmt: skip
+        if self._trusting:
+            self._shared["SCENEPRINT_TRUST_SIGNATURES"] = "1"
         made = subprocess.run(
             [sys.executable, "-c", _MAKE_KEY, str(self.host)], check=True, text=True,
             env=self.environment() | _path_of(self._before), stdout=subprocess.PIPE,
         )  # fmt: skip
         secret = made.stdout.strip()
+        hosts = [self._host_environment() for _ in range(n_services)]
         for host in range(n_services):
             port = free_port()
             self.urls.append(f"http://127.0.0.1:{port}")
             command = ["serve", "--workers", "0", "--port", str(port)]
-            self.services.append(self._part(f"service-{host + 1}", command, host))
+            self.services.append(self._part(f"service-{host + 1}", command, host, hosts[host]))
         for number in range(n_workers):
-            command = ["work", "--workers", "1"]
-            self.workers.append(self._part(f"worker-{number + 1}", command, number % n_services))
+            command, host = ["work", "--workers", "1"], number % n_services
+            self.workers.append(self._part(f"worker-{number + 1}", command, host, hosts[host]))
         for part in (*self.services, *self.workers):
             part.begin()
         for url in self.urls:
             await_service(url)
         return secret
 
+    def _host_environment(self) -> dict[str, str]:
+        """Of a host's processes, with a network of its own where messages take time or are lost."""
+        self._networks.append([])
+        if not (self._delays or self._partitions):
+            return self._shared
+        database = [self._reached(port, DATABASE_S) for port in self.pair.ports]
+        own = self._shared | {"SCENEPRINT_DATABASE_URL": self.pair.url_at(database)}
+        if self._objects is not None:
+            port = self._reached(self._objects.port, STORE_S)
+            own["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{port}"
+        return own
+
     def _reached(self, port: int, delay_s: float) -> int:
-        """By which port our processes reach a server."""
-        if not self._delays:
-            return port
-        self._proxies.append(DelayProxy(port, delay_s))
-        return self._proxies[-1].port
+        """By which port the last host reaches a server."""
+        proxy = DelayProxy(port, delay_s if self._delays else 0.0)
+        self._networks[-1].append(proxy)
+        return proxy.port
+
+    @contextmanager
+    def partitioned(self, host: int) -> Iterator[None]:
+        """Let nothing that a host's processes send come to the database or to the object store,
+        nor what these answer; whoever asks the host reaches it.
+        """
+        for proxy in self._networks[host]:
+            proxy.freeze()
+        try:
+            yield
+        finally:
+            for proxy in self._networks[host]:
+                proxy.thaw()
+
+    def trust(self, keys: Sequence[str]) -> None:
+        """Let workers take the signatures of keys unseen, as after many that were right."""
+        with closing(reach_database(self.pair.url)) as database:
+            for name in keys:
+                with database.write() as connection:
+                    for _ in range(FIRST):
+                        add_verified(connection, find_named_key(connection, name).id)
 
     def memory(self) -> tuple[int, int]:
         """Most bytes that a process of the services, and one of the workers, ever had."""
@@ -111,7 +154,7 @@ class Fleet:
     @property
     def host(self) -> Path:
         """Data folder of the first host."""
-        return self._folder / "host-1"
+        return self.folder / "host-1"
 
     def environment(self) -> dict[str, str]:
         """Of a process of this version."""
@@ -133,15 +176,17 @@ class Fleet:
         for part in (*self.workers, *self.services):
             part.kill()
         self.pair.end()
-        for proxy in self._proxies:
+        for proxy in chain.from_iterable(self._networks):
             proxy.end()
         if self._objects is not None:
             self._objects.kill()
 
-    def _part(self, name: str, command: list[str], host: int) -> Process:
-        arguments = ["sceneprint", *command, "--data", str(self._folder / f"host-{host + 1}")]
-        log = self._folder / f"{name}.log"
-        return Process(name, arguments, log, self._shared, self._before)
+    def _part(
+        self, name: str, command: list[str], host: int, environment: Mapping[str, str]
+    ) -> Process:
+        arguments = ["sceneprint", *command, "--data", str(self.folder / f"host-{host + 1}")]
+        log = self.folder / f"{name}.log"
+        return Process(name, arguments, log, environment, self._before)
 
     @contextmanager
     def _here(self) -> Iterator[Settings]:

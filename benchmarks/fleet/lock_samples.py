@@ -1,0 +1,82 @@
+"""For how long writers of a fleet exclude each other, sampled from the server's locks.
+
+LockSampler(server)  --look, every few milliseconds-->  LockShares
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import psycopg
+
+from sceneprint.store.postgres.connection import LOCKS, MAP_LOCKS, TURN
+
+#: Seconds between two looks, and until a server that does not answer is asked again.
+EVERY_S, AGAIN_S = 0.02, 0.25
+_ASKED = (
+    "SELECT count(*) FILTER (WHERE classid = %s AND objid = %s AND mode = 'ExclusiveLock'),"
+    " count(*) FILTER (WHERE classid = %s AND mode = 'ExclusiveLock')"
+    " FROM pg_locks WHERE locktype = 'advisory' AND granted"
+)
+
+
+@dataclass
+class LockShares:
+    """What the samples say.
+
+    Parameters
+    ----------
+    samples : how many
+    seconds : that they stand for: of a server that did not answer none is taken
+    everybody, one_map : seconds in which all writers of the fleet had to wait for one, and those of
+        a map for one of that map, maps added up
+    """
+
+    samples: int = 0
+    seconds: float = 0.0
+    everybody: float = 0.0
+    one_map: float = 0.0
+
+
+class LockSampler(threading.Thread):
+    """Looks at the locks of whichever server is the primary.
+
+    Parameters
+    ----------
+    url : tells where that is now
+    """
+
+    def __init__(self, url: Callable[[], str]) -> None:
+        super().__init__(name="locks", daemon=True)
+        self._url, self._ending = url, threading.Event()
+        self.shares = LockShares()
+
+    def stop(self) -> None:
+        """Look no more."""
+        self._ending.set()
+        self.join()
+
+    def run(self) -> None:
+        """Look until told to stop."""
+        while not self._ending.wait(AGAIN_S):
+            try:
+                with psycopg.connect(self._url(), autocommit=True, connect_timeout=3) as connection:
+                    self._look(connection)
+            except psycopg.Error:  # it fell
+                continue
+
+    def _look(self, connection: psycopg.Connection[tuple[int, int]]) -> None:
+        last = time.monotonic()
+        while not self._ending.wait(EVERY_S):
+            row = connection.execute(_ASKED, (LOCKS, TURN, MAP_LOCKS)).fetchone()
+            now = time.monotonic()
+            # after a pause of the machine, or of the server, a sample stands for itself alone
+            spent, last = min(now - last, 2 * EVERY_S), now
+            if row is not None:
+                self.shares.samples += 1
+                self.shares.seconds += spent
+                self.shares.everybody += spent * min(row[0], 1)
+                self.shares.one_map += spent * row[1]
