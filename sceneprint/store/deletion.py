@@ -32,7 +32,7 @@ from sqlalchemy import (
 
 from sceneprint.store.answer_rows import answers_of_map, remove_answers
 from sceneprint.store.database import Database
-from sceneprint.store.events import record_event, remember
+from sceneprint.store.events import events_table, record_event, remember
 from sceneprint.store.maps import ROOMLESS, count_on, next_revision
 from sceneprint.store.queue import cancel_jobs
 from sceneprint.store.tables import (
@@ -42,7 +42,6 @@ from sceneprint.store.tables import (
     deleted_frames,
     deletions,
     doomed,
-    events,
     frame_tags,
     frames,
     job_files,
@@ -119,7 +118,7 @@ def delete_frames(
     )  # fmt: skip
     at, data = time.time(), {} if reason is None else {"reason": reason}
     connection.execute(
-        insert(events),
+        insert(events_table(connection)),
         [
             {"at": at, "kind": "frame.deleted", "map": row.name, "frame_id": one.id, "data": data}
             for one in found

@@ -11,6 +11,7 @@ from sqlalchemy import (
     delete,
     func,
     select,
+    union,
     update,
 )
 
@@ -108,8 +109,7 @@ def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
     """Those of some blobs, a thousand at most, that a frame which is there or can be restored, a
     signature, a job, a tile or a kept answer refers to.
     """
-    found: set[str] = set()
-    for column, *conditions in (
+    referring = (
         (frames.c.blob, frames.c.state.not_in(ROOMLESS)),
         (signatures.c.geometry,),
         (job_files.c.blob,),
@@ -117,10 +117,9 @@ def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
         (surface_tiles.c.draft,),
         (deleted_frames.c.blob,),
         (kept_answers.c.blob,),
-    ):
-        asked = select(column).distinct().where(column.in_(blobs), *conditions)
-        found.update(connection.execute(asked).scalars())
-    return found
+    )
+    asked = (select(column).where(column.in_(blobs), *more) for column, *more in referring)
+    return set(connection.execute(union(*asked)).scalars())
 
 
 def count_states(connection: Connection, map_number: int | None = None) -> dict[str, int]:

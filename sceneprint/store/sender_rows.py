@@ -66,38 +66,36 @@ def package_of(connection: Connection, job_number: int) -> str | None:
     return found
 
 
-def remove_packages(connection: Connection, job_numbers: Sequence[int]) -> list[str]:
-    """Forget the packages of jobs, a few hundred at most, and count them no more.
+def remove_packages(
+    connection: Connection, map_number: int, job_numbers: Sequence[int]
+) -> list[str]:
+    """Forget the packages of jobs of a map, a few hundred at most, and count them no more.
 
     Returns
     -------
     blobs : that they were, and that are doomed: sweep them when this is committed
     """
     own = job_files.c.job_number.in_(job_numbers), job_files.c.name == PACKAGE
-    found = connection.execute(
-        select(job_files.c.blob, job_files.c.bytes, jobs.c.map_number)
-        .join(jobs, jobs.c.number == job_files.c.job_number)
-        .where(*own)
-    ).all()
+    removed = delete(job_files).where(*own).returning(job_files.c.blob, job_files.c.bytes)
+    found = connection.execute(removed).all()
     if found:
-        connection.execute(delete(job_files).where(*own))
-    for one in found:
-        count_on(connection, one.map_number, 0, -one.bytes)
-    blobs = [one.blob for one in found]
-    if blobs:
-        doom(connection, blobs)
-    return blobs
+        count_on(connection, map_number, 0, -sum(one.bytes for one in found))
+        doom(connection, [one.blob for one in found])
+    return [one.blob for one in found]
 
 
-def ended_packages(connection: Connection, limit: int) -> list[int]:
-    """Numbers of jobs that are over and still have their package, at most so many."""
+def ended_packages(connection: Connection, limit: int) -> dict[int, list[int]]:
+    """Numbers of jobs that are over and still have their package, at most so many, by their map."""
     asked = (
-        select(jobs.c.number)
+        select(jobs.c.map_number, jobs.c.number)
         .join(job_files, job_files.c.job_number == jobs.c.number)
         .where(job_files.c.name == PACKAGE, jobs.c.state.not_in(PENDING))
         .limit(limit)
     )
-    return list(connection.execute(asked).scalars())
+    found: dict[int, list[int]] = {}
+    for map_number, job in connection.execute(asked):
+        found.setdefault(map_number, []).append(job)
+    return found
 
 
 # Senders: keys, by their ids.

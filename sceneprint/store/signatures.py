@@ -112,8 +112,9 @@ def index_claimed_frame(
     Returns
     -------
     done : False, and nothing was written, on SQLite; where the job is not held any more; where
-        the map has another model, or is to have one: then what else has to be done must be found;
-        and where another statement would be needed, as pgvector searches the map
+        the map has another model, or is to have one, or the signature's sender is trusted no more:
+        then what else has to be done must be found; and where another statement would be needed, as
+        pgvector searches the map
     """
     if connection.dialect.name == "sqlite":
         return False
@@ -147,7 +148,9 @@ def _index_claimed(events_name: str) -> TextClause:
                 AND state = '{JobState.RUNNING}'
                 AND NOT (:single AND to_regclass(:vectors) IS NOT NULL) AND EXISTS (
                     SELECT FROM maps WHERE number = :map_number AND model_id = :model
-                        AND next_model_id IS NULL)
+                        AND next_model_id IS NULL) AND NOT EXISTS (
+                    SELECT FROM signature_senders
+                    WHERE key_id = :sender AND distrusted_at IS NOT NULL)
             RETURNING number
         ), revised AS (
             UPDATE maps SET revision = revision + 1

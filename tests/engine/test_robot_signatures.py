@@ -142,6 +142,7 @@ def test_what_a_robot_made_is_taken_without_signing(
     assert (tuple(row.n_patches), tuple(row.n_pairs)) == (package.n_patches, package.n_pairs)
     assert job(trusting, added).result == {"signed_by": "robot", "sent": "taken"}
     assert signed_by(trusting, added) == "robot"
+    tidy(trusting)
     assert packages(trusting) == []
     assert not trusting.store.blobs.holds(blob)
     assert usage(trusting) == (len(uploads[0].data),) * 2
@@ -180,6 +181,7 @@ def test_a_frame_under_an_id_of_the_robots_own(
     assert usage(trusting)[0] == usage(trusting)[1] > len(uploads[0].data)
     work_off(trusting)
     assert signed_by(trusting, added) == "robot"
+    tidy(trusting)
     assert usage(trusting) == (len(uploads[0].data),) * 2
 
 
@@ -188,10 +190,12 @@ def test_a_redundant_frame_leaves_nothing(
 ) -> None:
     add(trusting, uploads[0], package_of(trusting, uploads[0]))
     work_off(trusting)
+    tidy(trusting)
     added = add(trusting, uploads[1], package_of(trusting, uploads[1]), if_novel=1.0)
     [(blob, _)] = packages(trusting)
     work_off(trusting)
     assert trusting.get_frame("hall", added.frame_id).state == FrameState.REDUNDANT
+    tidy(trusting)
     assert packages(trusting) == []
     assert not trusting.store.blobs.holds(blob)
     assert usage(trusting) == (len(uploads[0].data),) * 2
@@ -231,6 +235,7 @@ def test_a_frame_that_is_there_already(trusting: Engine, uploads: Any, work_off:
     assert len(packages(trusting)) == 1
     work_off(trusting)
     assert add(trusting, uploads[0], moved(package)).signed == "known"
+    tidy(trusting)
     assert packages(trusting) == []
 
 
@@ -241,6 +246,7 @@ def test_robots_may_come_to_be_trusted_no_more(
     work_off(make_engine())
     assert signed_by(trusting, added) == "service"
     assert job(trusting, added).result["signed_by"] == "service"
+    tidy(trusting)
     assert packages(trusting) == []
 
 
@@ -344,6 +350,7 @@ def test_what_is_of_no_use_is_signed_by_the_worker(
     assert result["sent"].startswith("it is not usable: ")
     if how == "written otherwise":
         assert result["sent"].endswith(how)
+    tidy(trusting)
     assert packages(trusting) == []
     with trusting.store.database.read() as connection:  # nothing bad was taken
         assert find_sender(connection, key_id(trusting)).distrusted_at is None
@@ -367,6 +374,7 @@ def test_a_package_that_was_lost_costs_nothing(
     trusting.store.blobs.path(blob).unlink()
     assert work_off(trusting) == [JobState.SUCCEEDED]
     assert signed_by(trusting, added) == "service"
+    tidy(trusting)
     assert packages(trusting) == []
 
 
@@ -610,12 +618,15 @@ def test_a_worker_that_is_killed_about_its_commit(
     claimed = trusting.claim("dies")
     assert claimed is not None
 
-    def die(*_: object) -> None:
+    store = signature_job._store_patiently
+
+    def die(*given: Any) -> None:
+        if place == "after the commit":
+            store(*given)
         raise Killed
 
-    name = "_store_patiently" if place == "before the commit" else "collect_blobs"
     with monkeypatch.context() as patch:
-        patch.setattr(signature_job, name, die)
+        patch.setattr(signature_job, "_store_patiently", die)
         with pytest.raises(Killed):
             trusting.run(claimed)
     assert trusting.store.blobs.holds(blob)
@@ -624,6 +635,7 @@ def test_a_worker_that_is_killed_about_its_commit(
     assert done == ([JobState.SUCCEEDED] if place == "before the commit" else [])
     collect_doomed_blobs(trusting.store)
     assert signed_by(trusting, added) == "robot"
+    tidy(trusting)
     assert packages(trusting) == []
     assert not trusting.store.blobs.holds(blob)
     assert usage(trusting) == (len(uploads[0].data),) * 2

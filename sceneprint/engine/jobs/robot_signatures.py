@@ -200,12 +200,12 @@ class RobotSignatures:
         return queued
 
     def _remove_ended(self) -> bool:
-        with self._store.database.read() as connection:  # most often there is none: no lock
-            if not sender_rows.ended_packages(connection, 1):
-                return False
-        with self._store.database.write() as connection:
+        database, blobs = self._store.database, list[str]()
+        with database.read() as connection:
             ended = sender_rows.ended_packages(connection, BLOCK)
-            blobs = sender_rows.remove_packages(connection, ended)
+        for map_number, numbers in ended.items():
+            with database.write(map_number=map_number) as connection:
+                blobs += sender_rows.remove_packages(connection, map_number, numbers)
         collect_deleted_blobs(self._store, blobs)
         return bool(blobs)
 

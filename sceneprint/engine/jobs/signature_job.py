@@ -29,7 +29,7 @@ from sceneprint.store import Database, Store, queue
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import find_map, frame_of, geometry_blobs, map_of
 from sceneprint.store.reencoding_rows import REENCODE, enqueue_all, models_of
-from sceneprint.store.sender_rows import find_sender, remove_packages
+from sceneprint.store.sender_rows import find_sender
 from sceneprint.store.signatures import (
     StoredSignature,
     changes_since,
@@ -240,8 +240,8 @@ def _store(
 
     Returns
     -------
-    blobs : that nothing refers to any more: of the package of a robot, and of a frame that was not
-        to be kept, as its map has the place
+    blobs : that nothing refers to any more, of a frame that was not to be kept, as its map has the
+        place
     """
     made = result.signature
     if work.again:
@@ -267,7 +267,7 @@ def _store(
                 raise lifecycle.Outdated  # found to be wrong meanwhile: it is signed here
             is_held = store.blobs.holds(made.geometry)
             if is_indexed and is_held:
-                return _remove_package(connection, work, result)
+                return []
             row = map_of(connection, number)
             if row.model_id != made.model_id:
                 raise lifecycle.Outdated
@@ -277,8 +277,7 @@ def _store(
             if reason is not None:
                 set_state(connection, work.frame.number, FrameState.REDUNDANT, reason)
                 lifecycle.record_job_event(connection, "frame.redundant", work)
-                package = _remove_package(connection, work, result)
-                return [work.frame.blob, made.geometry, *package]
+                return [work.frame.blob, made.geometry]
             if not is_held:  # nothing referred to it until now
                 raise errors.DamagedBlob(
                     "A deletion elsewhere swept the artifact: it must be made again."
@@ -287,7 +286,7 @@ def _store(
             if row.next_model_id is not None:
                 enqueue_all(connection, row, [work.frame.number])
             lifecycle.record_job_event(connection, "frame.indexed", work)
-            return _remove_package(connection, work, result)
+            return []
 
 
 def _index_alone(store: Store, work: lifecycle.Work, result: Made) -> bool:
@@ -295,21 +294,16 @@ def _index_alone(store: Store, work: lifecycle.Work, result: Made) -> bool:
     where more has to be found out or written.
     """
     made = result.signature
-    if store.database.is_sqlite or work.frame.novelty is not None or result.result is not None:
+    if store.database.is_sqlite or work.frame.novelty is not None:
         return False
     with store.database.write(map_number=work.frame.map_number, single=True) as connection:
         is_indexed = index_claimed_frame(
-            connection, work.job, work.frame, work.map.name, made, single=True
+            connection, work.job, work.frame, work.map.name, made, result.result, single=True
         )
     if is_indexed and not store.blobs.holds(made.geometry):
         # a deletion removed it before the commit: from now on none does
         store.blobs.put(result.artifact)
     return is_indexed
-
-
-def _remove_package(connection: Connection, work: lifecycle.Work, made: Made) -> list[str]:
-    """Forget what a robot sent with a frame that is signed now; returns the blob that it was."""
-    return [] if made.result is None else remove_packages(connection, [work.job.number])
 
 
 def _replace_signature(store: Store, work: lifecycle.Work, made: StoredSignature) -> list[str]:

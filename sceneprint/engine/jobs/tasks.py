@@ -268,8 +268,8 @@ class Tasks:
 
     def _stored(self, task: LongJob, outcome: SliceResult) -> list[str]:
         """What a slice came to, in one commit; returns blobs that may be of no use any more."""
-        job = task.job
-        with self._store.database.write() as connection:
+        job, number = task.job, None if task.map is None else task.map.number
+        with self._store.database.write(map_number=number) as connection:
             if outcome.over:
                 queue.finish(
                     connection, task.job, JobState.SUCCEEDED, progress=outcome.progress,

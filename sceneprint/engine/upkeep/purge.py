@@ -126,7 +126,7 @@ class Retention:
             now = read_clock(connection) if at is None else at
             if not old_frames(connection, row.number, now - DAY_S * row.retention_days, 1):
                 return 0
-        with self._store.database.write() as connection:
+        with self._store.database.write(map_number=row.number) as connection:
             found = find_map(connection, row.name)  # it may have been told to keep them since
             if found.number != row.number or found.retention_days is None:
                 return 0
