@@ -11,7 +11,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Connection, Select, delete, insert, or_, select, tuple_, update
+from sqlalchemy import (
+    Connection,
+    Select,
+    bindparam,
+    delete,
+    insert,
+    or_,
+    select,
+    tuple_,
+    update,
+)
 from sqlalchemy.dialects import postgresql, sqlite
 
 from sceneprint.errors import Conflict, IdempotencyConflict, UnknownKey
@@ -210,9 +220,11 @@ class KeyUses:
             due, self._due = self._due, {}
         if not due or database.read_only:
             return
-        with database.write() as connection:
-            for key_id, at in due.items():
-                connection.execute(update(keys).where(keys.c.id == key_id).values(last_used_at=at))
+        # in one order, as two processes may write the same keys at once
+        used = [{"of": key_id, "at": at} for key_id, at in sorted(due.items())]
+        asked = update(keys).where(keys.c.id == bindparam("of"))
+        with database.write(turn=False) as connection:
+            connection.execute(asked.values(last_used_at=bindparam("at")), used)
 
 
 # Keys under which a caller may send a request again: what came of it, kept for a day.

@@ -393,7 +393,7 @@ def begin_job(connection: Connection, row: MapRow, surface: SurfaceRow) -> tuple
 
 def remove_block(store: Store, row: MapRow) -> bool:
     """Remove some of a surface that was deleted; whether nothing is left of it."""
-    with store.database.write() as connection:
+    with store.database.write(map_number=row.number) as connection:
         surface = stored.find_surface(connection, row.number)
         if surface is None or surface.wanted:
             return True
@@ -466,7 +466,7 @@ class SurfaceUpkeep:
         with self._store.database.read() as connection:  # most often there is nothing: no lock
             if not self._is_due(connection, row, surface):
                 return
-        with self._store.database.write() as connection:
+        with self._store.database.write(map_number=row.number) as connection:
             row = map_of(connection, row.number)
             now = stored.find_surface(connection, row.number)
             if now is None or not now.wanted:
