@@ -166,7 +166,8 @@ def remover(
 ) -> Iterator[Store]:  # fmt: skip
     """The store in another process: its requests to delete are held."""
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{held.port}")
-    monkeypatch.setattr("sceneprint.store.blobs.object_client.TRIED_S", 0.1)
+    for name, seconds in (("TRIED_S", 0.1), ("SMALL_S", 90)):
+        monkeypatch.setattr(f"sceneprint.store.blobs.object_client.{name}", seconds)
     opened = open_store(postgres_url, bucket)
     yield opened
     held.release()
@@ -225,10 +226,11 @@ def test_an_upload_does_not_wait_for_a_removal(
 ) -> None:
     digest = engine.store.blobs.put(b"of another frame")
     removing = removal(digest)
-    assert doomed_in(engine) == [digest]
     for add in (alone, in_a_group):
         add(engine, small)
     assert engine.get_map("hall").frames == {"received": 2}
+    assert doomed_in(engine) == [digest]
+    assert removing.is_alive()
     held.release()
     removing.result()
     assert not engine.store.blobs.holds(digest)
@@ -236,11 +238,14 @@ def test_an_upload_does_not_wait_for_a_removal(
     assert engine.store.blobs.get(hashlib.sha256(small[0].png).hexdigest()) == small[0].png
 
 
-@pytest.mark.parametrize("add", [alone, in_a_group])
+@pytest.mark.parametrize(("add", "turn_s"), [(alone, 0.001), (in_a_group, 60.0)])
 def test_the_same_content_is_there_after_its_removal(
     engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
-    until: Until, add: Callable[[Engine, Any], Any],
+    until: Until, add: Callable[[Engine, Any], Any], turn_s: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
+    """Who has committed its frame has no turn, and waits for longer."""
+    monkeypatch.setattr("sceneprint.store.blobs.object_store.TURN_S", turn_s)
     digest = engine.store.blobs.put(small[0].png)
     removing = removal(digest)
     adding = Background(lambda: add(engine, small))
