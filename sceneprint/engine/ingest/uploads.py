@@ -556,6 +556,8 @@ class Uploads:
         """As `_write`, in a transaction; None where a blob or the map is gone."""
         if request.fence is not None:
             request.fence(connection)
+        if not all(map(self._store.blobs.holds, request.blobs)):
+            return None  # a deletion has removed one, which an earlier request may refer to, too
         if request.once is not None:
             now = find_map(connection, row.name)
             if now.number != row.number:
@@ -564,8 +566,6 @@ class Uploads:
             if before is not None:
                 request.left[:] = request.blobs
                 return list(before), True
-        if not all(map(self._store.blobs.holds, request.blobs)):
-            return None  # a deletion has removed one
         request.left.clear()
         written = {}
         for i, one in request.todo.items():
