@@ -36,7 +36,7 @@ from functools import cache
 from secrets import token_bytes
 from typing import TYPE_CHECKING
 
-from sqlalchemy import URL, insert, inspect, make_url, select
+from sqlalchemy import URL, func, insert, inspect, make_url, select, update
 from sqlalchemy.exc import ArgumentError
 
 import migrations
@@ -58,9 +58,6 @@ _SAYS = re.compile(r'^(revision|down_revision) = (?:"(\w+)"|None)$', re.MULTILIN
 MAP_OPTION = "sceneprint_map"
 #: Writers of single maps at once in a process: each keeps a connection from the readers.
 MAP_WRITERS = 8
-#: The oldest revision whose processes may write to a store of this version: what the newest
-#: migration that changed or removed something wrote in `schema_range`.
-LEAST_REVISION = "0015"
 
 
 def migration_config() -> Config:
@@ -130,6 +127,12 @@ def schema_range_of(connection: Connection) -> SchemaRange | None:
     return SchemaRange(revision, connection.execute(select(schema_range)).scalar())
 
 
+def least_revision(connection: Connection) -> str:
+    """The oldest revision whose processes may write to a store of the schema of this version."""
+    found: str = connection.execute(select(func.max(schema_range.c.least_revision))).scalar_one()
+    return found
+
+
 def require_schema(connection: Connection) -> None:
     """See that a store has not been brought beyond what this process may write.
 
@@ -160,7 +163,7 @@ def create_schema(connection: Connection) -> None:
     """Create all tables of this version in an empty SQLite database, as the migrations would."""
     head, _ = known_revisions()
     metadata.create_all(connection, checkfirst=False)
-    connection.execute(insert(schema_range).values(least_revision=LEAST_REVISION))
+    connection.execute(insert(schema_range).values(least_revision=head))
     connection.execute(insert(secrets).values(name="seals", value=token_bytes(32)))
     connection.exec_driver_sql(
         "CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL, "
@@ -251,6 +254,8 @@ def migrate(database: Database) -> None:
                 connection.exec_driver_sql("SELECT version_num FROM alembic_version FOR UPDATE")
             with _migrating:
                 command.upgrade(config, "head")
+            if current is None:  # no process of an earlier version has it open
+                connection.execute(update(schema_range).values(least_revision=head))
             # what `unchecked` did not look at, looked at in the end
             if (
                 database.is_sqlite
@@ -261,6 +266,34 @@ def migrate(database: Database) -> None:
                     "not brought to the schema of this version, and nothing was changed. Run "
                     "`sceneprint fsck` of the version that wrote it."
                 )
+
+
+def complete_upgrade(database: Database) -> bool:
+    """Let only processes that work with this version's schema write from now on.
+
+    Returns
+    -------
+    whether earlier ones might write until now
+
+    Raises
+    ------
+    UnusableStore : its schema is another one; nothing is changed.
+    """
+    head, _ = known_revisions()
+    with database.write() as connection:
+        revision = revision_of(connection)
+        if revision != head:
+            raise UnusableStore(
+                f"{database.shown} has schema {revision or 'none'}, and this version of sceneprint "
+                f"works with {head}, so its upgrade cannot be completed. Run `sceneprint migrate` "
+                "first, and complete it with the version that all processes run."
+            )
+        if not database.is_sqlite:  # who writes out of turn ends first
+            connection.exec_driver_sql("SELECT version_num FROM alembic_version FOR UPDATE")
+        if least_revision(connection) == head:
+            return False
+        connection.execute(update(schema_range).values(least_revision=head))
+        return True
 
 
 def current_revision(connection: Connection) -> str | None:

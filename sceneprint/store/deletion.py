@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 from sqlalchemy import (
     ColumnElement,
@@ -26,9 +27,11 @@ from sqlalchemy import (
     not_,
     or_,
     select,
+    true,
     union,
     update,
 )
+from sqlalchemy.dialects import postgresql, sqlite
 
 from sceneprint.store.answer_rows import answers_of_map, remove_answers
 from sceneprint.store.database import Database
@@ -208,27 +211,36 @@ def remove_in_blocks(
     return removed
 
 
-def doom(connection: Connection, blobs: Iterable[str]) -> None:
-    """Note blobs that may have to be removed; a few thousand at most."""
-    wanted = sorted(set(blobs))
+def doom(connection: Connection, blobs: Iterable[str]) -> float:
+    """Note blobs that may have to be removed; a few thousand at most.
+
+    What is noted already is noted anew: who did so before may `settle` it no more.
+
+    Returns
+    -------
+    at : time of the notes, seconds since 1970
+    """
+    wanted, at = sorted(set(blobs)), time.time()
     known = set(
         connection.execute(select(doomed.c.blob).where(doomed.c.blob.in_(wanted))).scalars()
     )
-    new = [{"blob": blob, "at": time.time()} for blob in wanted if blob not in known]
+    if known:
+        connection.execute(update(doomed).where(doomed.c.blob.in_(known)).values(at=at))
+    new = [{"blob": blob, "at": at} for blob in wanted if blob not in known]
     if new:
         connection.execute(insert(doomed), new)
+    return at
 
 
 def doom_found(connection: Connection, *found: Select[tuple[str]]) -> None:
-    """Note the blobs that some statements find, however many."""
+    """Note the blobs that some statements find, however many; see `doom`."""
+    kind: Any = sqlite if connection.dialect.name == "sqlite" else postgresql
     blobs = union(*found).subquery()
+    # SQLite takes ON CONFLICT for a join's ON where there is no WHERE
+    noted = select(blobs.c[0], literal(time.time(), Float)).where(true())
+    made = kind.insert(doomed).from_select(["blob", "at"], noted)
     connection.execute(
-        insert(doomed).from_select(
-            ["blob", "at"],
-            select(blobs.c[0], literal(time.time(), Float)).where(
-                blobs.c[0].not_in(select(doomed.c.blob))
-            ),
-        )
+        made.on_conflict_do_update(index_elements=["blob"], set_={"at": made.excluded.at})
     )
 
 
@@ -244,9 +256,19 @@ def doomed_blobs(
     return list(connection.execute(asked).scalars())
 
 
-def settle(connection: Connection, blobs: Sequence[str]) -> None:
-    """Note no more that blobs are doomed: they are removed, or something refers to them."""
-    connection.execute(delete(doomed).where(doomed.c.blob.in_(blobs)))
+def settle(connection: Connection, blobs: Sequence[str], at: float | None = None) -> None:
+    """Note no more that blobs are doomed: they are removed, or something refers to them.
+
+    Parameters
+    ----------
+    connection : of a writing transaction of all maps
+    blobs : a few hundred at most
+    at : time of the notes; those of another one stay. None: all go
+    """
+    if not blobs:
+        return
+    own = doomed.c.blob.in_(blobs)
+    connection.execute(delete(doomed).where(own if at is None else own & (doomed.c.at == at)))
 
 
 # Frames that are older than their map keeps them.

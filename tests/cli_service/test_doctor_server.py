@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from sceneprint.cli.checks import Check
 from sceneprint.cli.doctor import database, object_stores, server
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
+from sceneprint.store.database import complete_upgrade
 
 
 def found_in(url: str, **other: object) -> dict[str, Check]:
@@ -63,6 +65,18 @@ def test_a_user_who_may_not_make_extensions(postgres: Server) -> None:
     assert found["connections"].verdict == "note"
     assert "Raise max_connections, or run fewer" in found["connections"].text
     assert found_in(mine, search="database")["pgvector"].verdict == "WRONG"
+
+
+def test_an_upgrade_that_is_not_completed(postgres_url: str) -> None:
+    assert found_in(postgres_url)["database"].verdict == "ok"
+    with closing(open_database(postgres_url)) as store, store.write() as connection:
+        connection.exec_driver_sql("UPDATE schema_range SET least_revision = '0020'")
+    found = found_in(postgres_url)["database"]
+    assert found.verdict == "note"
+    assert "earlier versions may still write. Run `sceneprint migrate --complete`" in found.text
+    with closing(open_database(postgres_url)) as store:
+        assert complete_upgrade(store)
+    assert found_in(postgres_url)["database"].verdict == "ok"
 
 
 @pytest.mark.parametrize(

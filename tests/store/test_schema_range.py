@@ -16,7 +16,7 @@ from benchmarks.fleet.postgres import Server
 from sceneprint.cli import main
 from sceneprint.errors import NewerSchema
 from sceneprint.store import Store, open_database
-from sceneprint.store.database import LEAST_REVISION, SchemaRange, known_revisions, reach_database
+from sceneprint.store.database import SchemaRange, known_revisions, reach_database
 
 #: Opens the store, says so, and makes an event for each line that it is sent.
 OLD_PROCESS = """
@@ -118,11 +118,27 @@ def test_which_processes_a_schema_allows(
     assert SchemaRange(revision, least).allows(own) is allowed
 
 
-def test_a_new_store_and_a_migrated_one_allow_the_same(store: Store) -> None:
-    with store.database.read() as connection:
-        found = connection.execute(text("SELECT least_revision FROM schema_range")).scalars().all()
-    assert found == [LEAST_REVISION]
-    assert known_revisions()[0] >= LEAST_REVISION
+def _range(url: str) -> tuple[str, str]:
+    """Revision of a store, and the oldest whose processes may write to it."""
+    asked = text("SELECT version_num, least_revision FROM alembic_version, schema_range")
+    with closing(reach_database(url)) as found, found.read() as connection:
+        revision, least = connection.execute(asked).one()
+        return revision, least
+
+
+def test_a_new_store_is_of_this_version_alone(url: str, store: Store) -> None:
+    head = known_revisions()[0]
+    assert store.database.dialect in url
+    assert _range(url) == (head, head)
+
+
+@pytest.mark.parametrize("least", ["0015", "0020"])
+def test_a_migrated_store_allows_what_it_allowed(url: str, store: Store, least: str) -> None:
+    assert store.database.dialect in url
+    _migrate(url, "0020", least)  # whose tables are the same
+    open_database(url).close()
+    assert _range(url) == (known_revisions()[0], least)
+    assert SchemaRange(*_range(url)).allows("0020")
 
 
 @pytest.fixture
@@ -171,3 +187,45 @@ def test_the_command_makes_the_schema_once(
     _migrate(url, "9999", "9998")
     code, _, error = migrate_command(url, data)
     assert (code, "a later one wrote it" in error) == (2, True)
+
+
+def test_the_command_completes_an_upgrade_once(
+    url: str, store: Store, tmp_path: Path,
+    migrate_command: Callable[..., tuple[int, str, str]],
+) -> None:  # fmt: skip
+    head, place = known_revisions()[0], store.database.shown
+
+    def complete() -> tuple[int, str, str]:
+        return migrate_command(url, tmp_path, "--complete")
+
+    completed = f"{place}: upgrade to schema {head} completed; earlier versions may not write"
+    before = completed.replace("completed", "was completed before")
+    assert complete() == (0, before, "")  # it is new
+    _migrate(url, head, "0015")
+    code, _, error = migrate_command(url, tmp_path)
+    assert (code, error, _range(url)) == (0, "", (head, "0015"))
+    assert complete() == (0, completed, "")
+    assert _range(url) == (head, head)
+    assert not SchemaRange(*_range(url)).allows("0020")
+    assert complete() == (0, before, "")
+    for other in ("0020", "9999"):
+        _migrate(url, other, "0015")
+        code, said, error = complete()
+        assert (code, said, len(error.splitlines())) == (2, "", 1)
+        assert f"has schema {other}, and this version of sceneprint works with {head}" in error
+        assert _range(url) == (other, "0015")
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_there_is_no_upgrade_to_complete_without_a_schema(
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest,
+    migrate_command: Callable[..., tuple[int, str, str]],
+) -> None:  # fmt: skip
+    url = f"sqlite:///{tmp_path}/data/sceneprint.db"
+    if kind == "postgresql":
+        server: Server = request.getfixturevalue("postgres")
+        url = server.create(f"empty_{token_hex(4)}")
+    code, said, error = migrate_command(url, tmp_path / "data", "--complete")
+    assert (code, said, len(error.splitlines())) == (2, "", 1)
+    assert "has no schema, so there is no upgrade to complete" in error
+    assert not (tmp_path / "data").exists()

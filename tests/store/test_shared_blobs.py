@@ -155,6 +155,22 @@ def test_a_remover_that_dies_is_not_forgotten(postgres_url: str, bucket: str) ->
     theirs.close()
 
 
+def test_who_lost_its_lock_does_not_end_the_removal_of_another(
+    postgres_url: str, bucket: str
+) -> None:
+    mine, theirs = (open_store(postgres_url, bucket) for _ in range(2))
+    removing = mine.blobs.removing()
+    assert removing.__enter__()
+    objects_of(mine)._locks.close()  # as the loss of its connection would
+    with theirs.blobs.removing() as allowed:
+        assert allowed
+        removing.__exit__(None, None, None)
+        assert objects_of(theirs)._locks.removals() is None
+    assert objects_of(theirs)._locks.removals() is not None
+    mine.close()
+    theirs.close()
+
+
 def test_a_lock_that_was_lost_is_said(postgres_url: str, bucket: str) -> None:
     store = open_store(postgres_url, bucket)
     kept = store.blobs.kept()

@@ -388,8 +388,11 @@ class Uploads:
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)  # before the work of decoding
             before = _before(connection, row, once)
-            if before is not None:
-                return before, True
+        if before is not None:
+            for upload, outcome in zip(uploads, before, strict=True):
+                if outcome.added is not None:  # it may have been told that it was not stored
+                    self._renew(map_name, outcome.added.frame_id, upload)
+            return before, True
         outcomes: list[UploadResult | None] = [None] * len(uploads)
         ready: dict[int, _Prepared] = {}
         for i, upload in enumerate(uploads):
@@ -477,12 +480,15 @@ class Uploads:
             raise
         except errors.SceneprintError as error:
             return UploadResult(None, error=error)
-        # what came takes the place of an upload that was lost
-        left = repair.take_upload(self._store, map_name, there.frame_id, ready.upload.data)
-        if left:
-            garbage_collection.collect_blobs(self._store, left)
+        self._renew(map_name, there.frame_id, ready.upload)
         told = {"reason": repair.without_loss(there.reason), "signed": _known(ready)}
         return UploadResult(there.model_copy(update=told))
+
+    def _renew(self, map_name: str, frame_id: str, upload: Upload) -> None:
+        """Let what came take the place of an upload that was lost."""
+        left = repair.take_upload(self._store, map_name, frame_id, upload.data)
+        if left:
+            garbage_collection.collect_blobs(self._store, left)
 
     def _write(
         self, row: MapRow, ready: dict[int, _Prepared], known: list[UploadResult | None],
@@ -538,10 +544,10 @@ class Uploads:
             )
         except IntegrityError:  # something was done under the request's key before: see what
             return None
-        if came_of is not None and not self._store.blobs.holds(one.blob):
-            # a deletion removed it before the commit, and from now on none does; a worker that
-            # missed it meanwhile tries again
-            self._store.blobs.put(one.upload.data)
+        if came_of is not None:
+            # a deletion may have removed it before the commit, and from now on none does; a worker
+            # that missed it meanwhile tries again
+            self._store.blobs.ensure(one.blob, one.upload.data)
         return came_of
 
     def _store_all(
@@ -550,6 +556,8 @@ class Uploads:
         """As `_write`, in a transaction; None where a blob or the map is gone."""
         if request.fence is not None:
             request.fence(connection)
+        if not all(map(self._store.blobs.holds, request.blobs)):
+            return None  # a deletion has removed one, which an earlier request may refer to, too
         if request.once is not None:
             now = find_map(connection, row.name)
             if now.number != row.number:
@@ -558,8 +566,6 @@ class Uploads:
             if before is not None:
                 request.left[:] = request.blobs
                 return list(before), True
-        if not all(map(self._store.blobs.holds, request.blobs)):
-            return None  # a deletion has removed one
         request.left.clear()
         written = {}
         for i, one in request.todo.items():

@@ -300,9 +300,8 @@ def _index_alone(store: Store, work: lifecycle.Work, result: Made) -> bool:
         is_indexed = index_claimed_frame(
             connection, work.job, work.frame, work.map.name, made, result.result, single=True
         )
-    if is_indexed and not store.blobs.holds(made.geometry):
-        # a deletion removed it before the commit: from now on none does
-        store.blobs.put(result.artifact)
+    if is_indexed:  # a deletion may have removed it before the commit: from now on none does
+        store.blobs.ensure(made.geometry, result.artifact)
     return is_indexed
 
 

@@ -2,6 +2,10 @@
 
 blobs  --collect_blobs-->  removed, or doomed while a snapshot is being taken
 doomed blobs  --collect_doomed_blobs-->  removed
+
+Where a fleet keeps its blobs in an object store, no writer waits for that store: one turn dooms
+blobs, they are removed after it, and another turn settles them. Who comes to refer to one of them
+meanwhile waits for the end of the removal (`ObjectBlobs.holds`).
 """
 
 from __future__ import annotations
@@ -10,17 +14,24 @@ import logging
 import math
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 
-from sceneprint.errors import UnusableStore
+from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store import Store
+from sceneprint.store.database import least_revision
 from sceneprint.store.deletion import doom, doomed_blobs, settle
 from sceneprint.store.frames import referred_blobs
 
 log = logging.getLogger(__name__)
 
-#: Blobs that are removed in one transaction, and of a store of objects by one request: writers wait
-#: meanwhile, and it may be far away.
+#: Blobs that are found and removed at once, of a store of objects by one request: writers wait
+#: while they are found, and in a folder while they are removed.
 SWEPT_AT_ONCE = 200
+#: The first schema whose processes wait for the end of a removal before they refer to a blob of it.
+#: Those of before look at once, so while they may write, blobs are removed in the turn.
+_WAITED_FOR = "0021"
+#: Seconds to wait for another removal.
+_PATIENCE_S = 5.0
 #: Blobs of deleted frames that are asked for at once.
 _LEFT_AT_ONCE = 1_000
 
@@ -28,24 +39,62 @@ _LEFT_AT_ONCE = 1_000
 def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
     """Remove blobs that nothing refers to any more.
 
-    In writing transactions, so that no upload comes to refer to one in between, and short ones.
-    While a snapshot is being taken they stay, as it may refer to them: `collect_doomed_blobs`
-    removes them later.
+    They are found in writing transactions, so that no upload comes to refer to one in between, and
+    short ones. While a snapshot is being taken they stay, as it may refer to them, and while
+    another process removes some: `collect_doomed_blobs` removes them later.
+
+    Raises
+    ------
+    UnusableStore : they could not be removed; those that are left are doomed.
     """
-    done = 0
     store.geometries.forget(blobs)
-    while done < len(blobs):
-        with store.database.write() as connection, store.blobs.removing() as allowed:
-            if not allowed:
-                doom(connection, blobs[done : done + SWEPT_AT_ONCE])
-                done += SWEPT_AT_ONCE
-                log.info("blob removal deferred", extra={"blobs": len(blobs)})
-                continue
-            block = blobs[done : done + SWEPT_AT_ONCE]
+    if not blobs:
+        return
+    remove = _remove_after_turn if _outlasts_turn(store) else _remove_in_turn
+    for first in range(0, len(blobs), SWEPT_AT_ONCE):
+        if not remove(store, blobs[first : first + SWEPT_AT_ONCE]):
+            log.info("blob removal deferred", extra={"blobs": len(blobs)})
+
+
+def _outlasts_turn(store: Store) -> bool:
+    """Whether blobs may be removed after the turn: whoever may write waits for that."""
+    if not store.blobs.outlast_turns:
+        return False
+    with store.database.read() as connection:  # it only ever becomes greater
+        return least_revision(connection) >= _WAITED_FOR
+
+
+def _remove_in_turn(store: Store, block: Sequence[str]) -> bool:
+    """Remove those of some blobs that nothing refers to; False where they have to stay for now."""
+    with store.database.write() as connection, store.blobs.removing() as allowed:
+        if not allowed:
+            doom(connection, block)
+            return False
+        kept = referred_blobs(connection, block)
+        store.blobs.remove(*(blob for blob in block if blob not in kept))
+        settle(connection, block)
+        return True
+
+
+def _remove_after_turn(store: Store, block: Sequence[str]) -> bool:
+    """As `_remove_in_turn`; they are doomed until they are known to be gone, whoever dies."""
+    with suppress(StoreLocked):
+        store.blobs.wait_for_removal(seconds=_PATIENCE_S)  # else these would be left for later
+    with ExitStack() as removal:
+        with store.database.write() as connection:
+            if not removal.enter_context(store.blobs.removing()):
+                doom(connection, block)  # and settle nothing: it may be on its way out elsewhere
+                return False
             kept = referred_blobs(connection, block)
-            store.blobs.remove(*(blob for blob in block if blob not in kept))
-            settle(connection, block)
-            done += len(block)
+            settle(connection, [*kept])
+            gone = [blob for blob in block if blob not in kept]
+            at = doom(connection, gone)
+        store.blobs.remove(*gone)
+    if not gone:
+        return True
+    with store.database.write() as connection:
+        settle(connection, gone, at)
+    return True
 
 
 def collect_deleted_blobs(store: Store, blobs: Sequence[str]) -> None:

@@ -18,6 +18,7 @@ from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.engine.upkeep.repair import PRIORITY, is_known_loss, reason_of_loss
 from sceneprint.errors import StoreError
 from sceneprint.maintenance.fsck.findings import (
+    BUSY_BLOBS,
     GONE,
     Finding,
     Folder,
@@ -294,7 +295,7 @@ def _sweep(folder: Folder, digest: str) -> str:
     with folder.store.database.read() as connection:
         if refers_to(connection, digest):  # its upload was only just committed
             return GONE
-    raise StoreError("a snapshot is being taken; run it again when that is done")
+    raise StoreError(BUSY_BLOBS)
 
 
 def changed_at(path: Path) -> float:

@@ -229,16 +229,23 @@ def sign_while_indexed(folder: Folder, connection: Connection, number: int, mode
     return "a worker makes it again from the upload"
 
 
+#: Why a blob stays where it is.
+BUSY_BLOBS = (
+    "a snapshot is being taken, or another process removes blobs; run it again when that is done"
+)
+
+
 def quarantine_blob(folder: Folder, digest: str) -> str:
     """Move a damaged blob out of the way.
 
     Raises
     ------
-    StoreError : a snapshot is being taken, which needs all blobs where they are.
+    StoreError : a snapshot is being taken, which needs all blobs where they are, or another
+        process removes some.
     """
     with folder.store.blobs.removing() as allowed:
         if not allowed:
-            raise StoreError("a snapshot is being taken; run it again when that is done")
+            raise StoreError(BUSY_BLOBS)
         place = folder.store.blobs.quarantine(digest, folder.quarantine)
     return "" if place is None else f"moved to {place}; "
 

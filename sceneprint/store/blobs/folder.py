@@ -32,6 +32,11 @@ from sceneprint.store.database_errors import unusable
 # server that of a connection.
 
 
+#: Seconds to wait for the end of a removal: for who has a turn, and for who has none. Its requests
+#: end by then (`object_client.SMALL_S`, `TRIED_S`).
+TURN_S, REMOVAL_S = 5.0, 25.0
+
+
 class Locks(ABC):
     """The lock of some blobs; see `Blobs.kept` and `Blobs.removing`."""
 
@@ -43,9 +48,28 @@ class Locks(ABC):
     def removing(self) -> AbstractContextManager[bool]:
         """Hold it alone, if that can be had at once."""
 
+    @property
+    def outlast_turns(self) -> bool:
+        """Whether a removal may go on after the turn in which it began."""
+        return False
+
     def removals(self) -> int | None:
         """A number that any removal changes; None where it cannot be told, or one is under way."""
         return None
+
+    def wait(self, digest: str | None, seconds: float) -> None:  # noqa: B027  (most have none)
+        """Wait for the end of a removal that outlasts its turn, and not for who has died.
+
+        Parameters
+        ----------
+        digest : the only blob whose removal is waited for; None: any is
+        seconds : to wait at most
+
+        Raises
+        ------
+        StoreLocked : it takes longer.
+        UnusableStore : it cannot be told.
+        """
 
     def close(self) -> None:  # noqa: B027  (most hold nothing)
         """Give back what it holds open."""
@@ -238,7 +262,28 @@ class Blobs(ABC):
 
     @abstractmethod
     def holds(self, digest: str) -> bool:
-        """Whether there is a blob of that digest."""
+        """Whether there is a blob of that digest, and will be for who refers to it.
+
+        Ask in the transaction that refers to it: no removal begins before its commit, and the end
+        of one that goes on is waited for.
+
+        Raises
+        ------
+        StoreLocked : such a removal takes too long.
+        UnusableStore : the store is away.
+        """
+
+    def ensure(self, digest: str, data: bytes) -> None:
+        """Put a blob once more where a removal took it before the commit of what refers to it.
+
+        After that commit, no removal begins that takes it.
+
+        Raises
+        ------
+        StoreLocked, UnusableStore : see `holds`; also from `put`.
+        """
+        if not self.holds(digest):
+            self.put(data)
 
     @abstractmethod
     def size(self, digest: str) -> int | None:
@@ -259,9 +304,22 @@ class Blobs(ABC):
         """Hold the right to remove blobs; False where somebody needs them kept, or removes some.
 
         Ask for it within a writing transaction: removers then come one after the other, and leave
-        room between them for who waits in `kept`.
+        room between them for who waits in `kept`. Hold it beyond that transaction only where
+        `outlast_turns`, and for blobs that it has doomed.
         """
         return self._locks.removing()
+
+    @property
+    def outlast_turns(self) -> bool:
+        """Whether blobs can be removed after the turn that found nothing to refer to them: who
+        comes to refer to one meanwhile waits for that in `holds`.
+        """
+        return self._locks.outlast_turns
+
+    def wait_for_removal(self, digest: str | None = None, seconds: float = REMOVAL_S) -> None:
+        """Wait for the end of a removal that is under way; see `Locks.wait`."""
+        if self._locks.removals() is None:
+            self._locks.wait(digest, seconds)
 
     @abstractmethod
     def remove(self, *digests: str) -> None:

@@ -28,6 +28,8 @@ from sceneprint.atomic_files import make_folder, sync_folder
 from sceneprint.errors import DamagedBlob, UnusableStore
 from sceneprint.store.blobs.folder import (
     DIGEST,
+    REMOVAL_S,
+    TURN_S,
     BlobEntry,
     Blobs,
     Condition,
@@ -230,16 +232,27 @@ class ObjectBlobs(Blobs):
         return self.objects.open(_key(digest))
 
     def holds(self, digest: str) -> bool:
-        """Whether there is a blob of that digest.
+        """Whether there is a blob of that digest; see `Blobs.holds`.
 
-        Asked in writing transactions, for which all others wait: where this process has put it,
-        and nothing was removed since, the database alone is asked.
+        Asked in writing transactions, for which others wait: where this process has put it, and
+        nothing was removed since, the database alone is asked.
         """
+        return self._holds(digest, TURN_S)
+
+    def ensure(self, digest: str, data: bytes) -> None:
+        """Put a blob once more where a removal took it; see `Blobs.ensure`."""
+        if not self._holds(digest, REMOVAL_S):
+            self.put(data)
+
+    def _holds(self, digest: str, seconds: float) -> bool:
         require_digest(digest)
         with self._lock:
             before = self._put.get(digest)
-        if before is not None and before == self._locks.removals():
+        now = self._locks.removals()
+        if before is not None and before == now:
             return True
+        if now is None:  # it may be there still, and go a moment later
+            self._locks.wait(digest, seconds)
         return self.objects.size(_key(digest)) is not None
 
     def size(self, digest: str) -> int | None:

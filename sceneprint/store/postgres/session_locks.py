@@ -38,6 +38,9 @@ _NEXT = f"SELECT nextval('{_COUNTER}')"
 _SHARE = "SELECT pg_advisory_lock_shared(%s, %s)"
 _TAKE = "SELECT pg_try_advisory_lock(%s, %s)"
 _GIVE = "SELECT pg_advisory_unlock(%s, %s)"
+_DOOMED = "SELECT EXISTS (SELECT FROM doomed WHERE blob = %s)"
+#: Given back when it is there.
+_WAIT = "SELECT set_config('lock_timeout', %s, true), pg_advisory_xact_lock_shared(%s, %s)"
 
 
 class SessionLocks(Locks):
@@ -96,17 +99,35 @@ class SessionLocks(Locks):
         finally:
             self._alone.release()
 
+    @property
+    def outlast_turns(self) -> bool:
+        """See `Locks`."""
+        return True
+
     def removals(self) -> int | None:
         """A number that any removal changes; None where it cannot be told, or one is under way."""
         number = self._reads.ask(_READ)
         return number if number is not None and number % 2 == 0 else None
+
+    def wait(self, digest: str | None, seconds: float) -> None:
+        """See `Locks`: who dies gives the lock back, although the counter stays odd."""
+        # what a removal takes away is doomed until after its end
+        if digest is not None and self._reads.ask(_DOOMED, digest) is False:
+            return
+        # of its own: other threads ask `removals` meanwhile
+        connection = self._database.driver_connection()
+        try:
+            with self._database.explained():
+                connection.execute(_WAIT, (f"{seconds * 1e3:.0f}", LOCKS, BLOBS))
+        finally:
+            connection.close()
 
     def _begin(self) -> bool:
         if not self._removes.ask(_TAKE, LOCKS, BLOBS):
             return False
         # who puts a blob while it is removed must find out: without the counter, nothing goes
         for _ in range(2):  # it is odd already after a remover that died
-            number = self._removes.ask(_NEXT)
+            number = self._removes.ask(_NEXT, same=True)
             if number is None:  # with the connection the lock is gone
                 break
             if number % 2 == 1:
@@ -115,7 +136,10 @@ class SessionLocks(Locks):
         return False
 
     def _end(self) -> None:
-        if self._removes.ask(_NEXT) is None or not self._removes.ask(_GIVE, LOCKS, BLOBS):
+        # another connection has no lock: who has it now would be counted to the end
+        ended = self._removes.ask(_NEXT, same=True) is not None
+        if not ended or not self._removes.ask(_GIVE, LOCKS, BLOBS, same=True):
+            log.warning("blob lock lost")
             self._removes.drop()  # the lock goes with its connection
 
 
@@ -169,13 +193,21 @@ class _Line:
         # not by __del__: the driver warns of what is collected while it is open
         weakref.finalize(self, _close, self._held)
 
-    def ask(self, statement: str, *values: int) -> Any:
-        """The value that answers; None where there is none, for whatever reason."""
+    def ask(self, statement: str, *values: int | str, same: bool = False) -> Any:
+        """The value that answers; None where there is none, for whatever reason.
+
+        Parameters
+        ----------
+        statement, values : to execute
+        same : by no other connection than the one of before, which has locks
+        """
         import psycopg
 
         with self._lock:
             try:
                 if not self._held or self._held[0].closed:
+                    if same:
+                        return None
                     self._held[:] = [self._database.driver_connection()]
                 connection = self._held[0]
                 try:
@@ -196,7 +228,7 @@ class _Line:
             _close(self._held)
 
 
-def _one(connection: psycopg.Connection[Any], statement: str, values: tuple[int, ...]) -> Any:
+def _one(connection: psycopg.Connection[Any], statement: str, values: tuple[int | str, ...]) -> Any:
     row = connection.execute(statement.encode(), values).fetchone()
     return None if row is None else row[0]
 

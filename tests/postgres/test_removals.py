@@ -1,0 +1,462 @@
+"""Blobs of a fleet that are removed after the turn: nobody waits for the object store, and nothing
+that is acknowledged goes with them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select, text
+
+from benchmarks.fleet.s3 import ObjectServer
+from sceneprint.engine import Engine
+from sceneprint.engine.ingest.uploads import Upload
+from sceneprint.engine.upkeep.garbage_collection import collect_blobs, collect_doomed_blobs
+from sceneprint.errors import StoreLocked, UnusableStore
+from sceneprint.settings import Settings
+from sceneprint.store import Store, open_store
+from sceneprint.store.deletion import doom, remove_map
+from sceneprint.store.keys import IdempotentRequest
+from sceneprint.store.maps import find_map
+from sceneprint.store.tables import doomed, signatures
+from sceneprint_client.api import JobState, NewMap
+
+Until = Callable[[Callable[[], Any]], Any]
+OTHER = hashlib.sha256(b"of another frame").hexdigest()
+WAITING = text(
+    "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted "
+    "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
+)
+#: Removes blobs; dies before it settles them where it is told so.
+REMOVER = """
+import os, signal, sys
+from sceneprint.engine.upkeep import garbage_collection
+from sceneprint.store import open_store
+
+url, bucket, dies, *blobs = sys.argv[1:]
+store = open_store(url, bucket)
+if dies == "after":
+    settle = garbage_collection.settle
+
+    def settle_all_but_what_is_gone(connection, some, at=None):
+        if at is not None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        settle(connection, some)
+
+    garbage_collection.settle = settle_all_but_what_is_gone
+garbage_collection.collect_blobs(store, blobs)
+"""
+
+
+class HeldDeletes:
+    """A port of an object server that holds requests to delete, until they are let through."""
+
+    def __init__(self, port: int) -> None:
+        self._to, self._is_dropped = port, False
+        self.arrived, self._passes = threading.Event(), threading.Event()
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listener.getsockname()[1]
+        self._open: list[socket.socket] = []
+        self._threads = [threading.Thread(target=self._accept, daemon=True)]
+        self._threads[0].start()
+
+    def release(self) -> None:
+        """Let them through, and those that come."""
+        self._passes.set()
+
+    def drop(self) -> None:
+        """Break their connections, and those of who comes."""
+        self._is_dropped = True
+        self._passes.set()
+
+    def close(self) -> None:
+        """End it."""
+        self.drop()
+        for one in (self._listener, *self._open):
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+        for thread in self._threads:
+            thread.join(60)
+        self._listener.close()
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                thread = threading.Thread(target=self._hand_on, args=(near,), daemon=True)
+                self._open.append(near)
+                self._threads.append(thread)
+                thread.start()
+
+    def _hand_on(self, near: socket.socket) -> None:
+        with near, socket.create_connection(("127.0.0.1", self._to)) as far:
+            back = threading.Thread(target=self._pump, args=(far, near), daemon=True)
+            back.start()
+            self._pump(near, far, holds=True)
+            back.join()
+
+    def _pump(self, source: socket.socket, to: socket.socket, *, holds: bool = False) -> None:
+        with suppress(OSError):
+            while data := source.recv(1 << 16):
+                method, _, rest = data.partition(b"\r\n")[0].partition(b" ")
+                if holds and (method == b"DELETE" or (method == b"POST" and b"?delete" in rest)):
+                    self.arrived.set()
+                    self._passes.wait()
+                    if self._is_dropped:
+                        break
+                to.sendall(data)
+        for one in (source, to):
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+
+
+class Background(threading.Thread):
+    """A call in a thread, of which is known what came of it."""
+
+    def __init__(self, do: Callable[[], Any]) -> None:
+        super().__init__(daemon=True)
+        self._do, self._found, self._error = do, None, None
+        self.start()
+
+    def run(self) -> None:
+        """Call it."""
+        try:
+            self._found = self._do()
+        except BaseException as error:
+            self._error = error
+
+    def result(self) -> Any:
+        """What it returned."""
+        self.join(60)
+        assert not self.is_alive()
+        if self._error is not None:
+            raise self._error
+        return self._found
+
+
+@pytest.fixture
+def held(object_server: ObjectServer) -> Iterator[HeldDeletes]:
+    proxy = HeldDeletes(object_server.port)
+    yield proxy
+    proxy.close()
+
+
+@pytest.fixture
+def engine(postgres_url: str, bucket: str, tmp_path: Path) -> Iterator[Engine]:
+    """A service of the fleet; it has its own way to the object store."""
+    given = {"database_url": postgres_url, "blob_url": bucket, "data_dir": tmp_path}
+    with Engine(Settings.model_validate(given)) as opened:
+        opened.create_map(NewMap(name="hall"))
+        yield opened
+
+
+@pytest.fixture
+def remover(
+    engine: Engine, postgres_url: str, bucket: str, held: HeldDeletes,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Store]:  # fmt: skip
+    """The store in another process: its requests to delete are held."""
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{held.port}")
+    for name, seconds in (("TRIED_S", 0.1), ("SMALL_S", 90)):
+        monkeypatch.setattr(f"sceneprint.store.blobs.object_client.{name}", seconds)
+    opened = open_store(postgres_url, bucket)
+    yield opened
+    held.release()
+    opened.close()
+
+
+@pytest.fixture
+def removal(remover: Store, held: HeldDeletes) -> Iterator[Callable[..., Background]]:
+    """Begin to remove blobs, and come back when the request to delete them is held."""
+    begun = list[Background]()
+
+    def begin(*blobs: str) -> Background:
+        begun.append(Background(lambda: collect_blobs(remover, blobs)))
+        assert held.arrived.wait(60)
+        return begun[-1]
+
+    yield begin
+    held.release()
+    for one in begun:
+        one.join(60)
+
+
+def waiting(engine: Engine) -> int:
+    with engine.store.database.read() as connection:
+        return int(connection.execute(WAITING).scalar_one())
+
+
+def doomed_in(engine: Engine) -> list[str]:
+    with engine.store.database.read() as connection:
+        return list(connection.execute(select(doomed.c.blob).order_by(doomed.c.blob)).scalars())
+
+
+@contextmanager
+def least(engine: Engine, revision: str) -> Iterator[None]:
+    """The oldest version that may write, and later the one that may now."""
+    change = text("UPDATE schema_range SET least_revision = :v")
+    with engine.store.database.write() as connection:
+        before = connection.execute(text("SELECT least_revision FROM schema_range")).scalar_one()
+        connection.execute(change, {"v": revision})
+    yield
+    with engine.store.database.write() as connection:
+        connection.execute(change, {"v": before})
+
+
+def alone(engine: Engine, small: Any) -> Any:
+    return engine.add_frame("hall", *small[0])
+
+
+def in_a_group(engine: Engine, small: Any) -> Any:
+    found, _ = engine.uploads.add_all("hall", [Upload(*one) for one in small[:2]])
+    return found
+
+
+def test_an_upload_does_not_wait_for_a_removal(
+    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background]
+) -> None:
+    digest = engine.store.blobs.put(b"of another frame")
+    removing = removal(digest)
+    for add in (alone, in_a_group):
+        add(engine, small)
+    assert engine.get_map("hall").frames == {"received": 2}
+    assert doomed_in(engine) == [digest]
+    assert removing.is_alive()
+    held.release()
+    removing.result()
+    assert not engine.store.blobs.holds(digest)
+    assert doomed_in(engine) == []
+    assert engine.store.blobs.get(hashlib.sha256(small[0].png).hexdigest()) == small[0].png
+
+
+@pytest.mark.parametrize(("add", "turn_s"), [(alone, 0.001), (in_a_group, 60.0)])
+def test_the_same_content_is_there_after_its_removal(
+    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
+    until: Until, add: Callable[[Engine, Any], Any], turn_s: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Who has committed its frame has no turn, and waits for longer."""
+    monkeypatch.setattr("sceneprint.store.blobs.object_store.TURN_S", turn_s)
+    digest = engine.store.blobs.put(small[0].png)
+    removing = removal(digest)
+    adding = Background(lambda: add(engine, small))
+    until(lambda: waiting(engine) == 1 or not adding.is_alive())
+    held.release()
+    removing.result()
+    adding.result()
+    assert engine.store.blobs.get(digest) == small[0].png
+    work = engine.claim("w")
+    assert work is not None
+    assert engine.run(work) == JobState.SUCCEEDED
+
+
+def test_an_artifact_is_there_after_its_removal(
+    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background], until: Until
+) -> None:
+    engine.create_map(NewMap(name="yard"))
+    for name in ("hall", "yard"):
+        engine.add_frame(name, *small[0])
+    work = engine.claim("w")
+    assert work is not None
+    assert engine.run(work) == JobState.SUCCEEDED
+    with engine.store.database.write() as connection:
+        artifact = connection.execute(select(signatures.c.geometry)).scalar_one()
+        blobs = remove_map(connection, find_map(connection, "hall"))
+    data = engine.store.blobs.get(artifact)
+    removing = removal(*blobs)
+    assert doomed_in(engine) == [artifact]  # the upload is the other map's, too
+    work = engine.claim("w")
+    assert work is not None
+    signing = Background(lambda: engine.run(work))
+    until(lambda: waiting(engine) == 1 or not signing.is_alive())
+    held.release()
+    removing.result()
+    assert signing.result() == JobState.SUCCEEDED
+    assert engine.store.blobs.get(artifact) == data
+
+
+def test_a_removal_that_takes_too_long_stores_nothing(
+    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr("sceneprint.store.blobs.object_store.TURN_S", 0.1)
+    monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
+    digest = engine.store.blobs.put(small[0].png)
+    removing = removal(digest)
+    with pytest.raises(StoreLocked, match="Come back later"):
+        in_a_group(engine, small)
+    assert engine.get_map("hall").frames == {}
+    held.release()
+    removing.result()
+    in_a_group(engine, small)
+    assert engine.store.blobs.get(digest) == small[0].png
+
+
+def test_an_upload_that_waited_in_vain_has_its_blob_when_it_is_sent_again(
+    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
+    once = IdempotentRequest("robot", "a key", "a" * 64)
+    digest = engine.store.blobs.put(small[0].png)
+    removing = removal(digest)
+    with monkeypatch.context() as patch:
+        patch.setattr("sceneprint.store.blobs.object_store.REMOVAL_S", 0.1)
+        with pytest.raises(StoreLocked):
+            engine.uploads.add("hall", Upload(*small[0]), once)
+    held.release()
+    removing.result()
+    assert not engine.store.blobs.holds(digest)
+    outcome, again = engine.uploads.add("hall", Upload(*small[0]), once)
+    assert (outcome.new, again) == (True, True)
+    assert engine.store.blobs.get(digest) == small[0].png
+
+
+def test_a_second_upload_waits_for_a_removal_too(
+    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
+    until: Until, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """The first one may die before it has put its blob once more."""
+    monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
+    digest = engine.store.blobs.put(small[0].png)
+    removing = removal(digest)
+    with monkeypatch.context() as patch:
+        patch.setattr("sceneprint.store.blobs.object_store.REMOVAL_S", 0.1)
+        with pytest.raises(StoreLocked):
+            alone(engine, small)
+    second = Background(lambda: alone(engine, small))
+    until(lambda: waiting(engine) == 1 or not second.is_alive())
+    held.release()
+    removing.result()
+    _, is_new = second.result()
+    assert not is_new
+    assert engine.store.blobs.get(digest) == small[0].png
+
+
+def test_what_is_on_its_way_out_stays_doomed_for_all(
+    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
+    until: Until, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Also where another removal finds that something refers to it by now."""
+    monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
+    digest = engine.store.blobs.put(small[0].png)
+    removing = removal(digest)
+    adding = Background(lambda: alone(engine, small))  # it is committed, and waits
+    until(lambda: waiting(engine) == 1 or not adding.is_alive())
+    collect_blobs(engine.store, [digest])
+    assert doomed_in(engine) == [digest]
+    held.release()
+    removing.result()
+    adding.result()
+    assert engine.store.blobs.get(digest) == small[0].png
+
+
+@pytest.mark.parametrize("dies", ["before", "after"])
+def test_what_a_killed_remover_leaves(
+    engine: Engine, small: Any, held: HeldDeletes, postgres_url: str, bucket: str, dies: str,
+    remover: Store, until: Until,
+) -> None:  # fmt: skip
+    digest = engine.store.blobs.put(small[0].png)
+    engine.store.blobs.put(b"of another frame")
+    if dies == "after":
+        held.release()
+    with subprocess.Popen(
+        [sys.executable, "-c", REMOVER, postgres_url, bucket, dies, digest, OTHER]
+    ) as process:
+        if dies == "before":
+            assert held.arrived.wait(60)
+            process.kill()
+    assert process.returncode == -9
+    assert doomed_in(engine) == sorted([digest, OTHER])
+    held.drop()  # what it had asked for is not carried out
+    alone(engine, small)  # who is dead is not waited for
+    assert engine.store.blobs.get(digest) == small[0].png
+    assert (OTHER in engine.store.blobs.digests()) == (dies == "before")
+    assert collect_doomed_blobs(engine.store) == 2
+    assert doomed_in(engine) == []
+    assert list(engine.store.blobs.digests()) == [digest]
+    assert engine.store.blobs.get(digest) == small[0].png
+
+
+@pytest.mark.parametrize("revision", ["0015", "0020"])
+def test_writers_wait_while_earlier_versions_may_write(
+    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
+    until: Until, revision: str,
+) -> None:  # fmt: skip
+    digest = engine.store.blobs.put(b"of another frame")
+    with least(engine, revision):
+        removing = removal(digest)
+        adding = Background(lambda: alone(engine, small))
+        until(lambda: waiting(engine) == 1 or not adding.is_alive())
+        assert adding.is_alive()
+        held.release()
+        removing.result()
+        adding.result()
+        assert not engine.store.blobs.holds(digest)
+    assert engine.get_map("hall").frames == {"received": 1}
+
+
+def test_a_snapshot_defers_a_removal(engine: Engine) -> None:
+    digest = engine.store.blobs.put(b"of another frame")
+    with engine.store.blobs.kept():
+        collect_blobs(engine.store, [digest])
+        assert engine.store.blobs.holds(digest)
+        assert doomed_in(engine) == [digest]
+    assert collect_doomed_blobs(engine.store) == 1
+    assert not engine.store.blobs.holds(digest)
+    assert doomed_in(engine) == []
+
+
+def test_blobs_stay_doomed_where_the_object_store_is_away(
+    engine: Engine, held: HeldDeletes, removal: Callable[..., Background]
+) -> None:
+    digest = engine.store.blobs.put(b"of another frame")
+    removing = removal(digest)
+    held.drop()
+    with pytest.raises(UnusableStore, match="cannot be removed"):
+        removing.result()
+    assert doomed_in(engine) == [digest]
+    assert engine.store.blobs.holds(digest)
+    assert collect_doomed_blobs(engine.store) == 1
+    assert not engine.store.blobs.holds(digest)
+
+
+def test_what_is_doomed_again_meanwhile_is_not_settled(
+    engine: Engine, held: HeldDeletes, removal: Callable[..., Background]
+) -> None:
+    """It may have been put again, and its frame deleted, by who died before it removed it."""
+    first, second = (engine.store.blobs.put(one) for one in (b"of another frame", b"of a third"))
+    removing = removal(first, second)
+    with engine.store.database.write() as connection:
+        doom(connection, [first])
+    held.release()
+    removing.result()
+    assert doomed_in(engine) == [first]
+
+
+def test_one_removal_waits_for_another(
+    engine: Engine, held: HeldDeletes, removal: Callable[..., Background], until: Until,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    blobs = [engine.store.blobs.put(one) for one in (b"a", b"b", b"c")]
+    removing = removal(blobs[0])
+    with monkeypatch.context() as patch:
+        patch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
+        collect_blobs(engine.store, [blobs[1]])  # not for long
+    assert doomed_in(engine) == sorted(blobs[:2])
+    also = Background(lambda: collect_blobs(engine.store, [blobs[2]]))
+    until(lambda: waiting(engine) == 1 or not also.is_alive())
+    held.release()
+    removing.result()
+    also.result()
+    assert doomed_in(engine) == [blobs[1]]
+    assert list(engine.store.blobs.digests()) == [blobs[1]]
