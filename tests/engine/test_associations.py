@@ -23,6 +23,7 @@ from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.settings import Settings
+from sceneprint.store.events import number_events
 from sceneprint.store.tables import events, frames, job_items, jobs
 from sceneprint.types import Floats
 from sceneprint_client.api import Filter, JobState, NewMap
@@ -111,6 +112,7 @@ def test_two_robots_maps_are_joined(engine: Engine, work_off: Callable[[Engine],
         here = pose_of(engine, edge.from_frame)
         assert difference(T @ here, true @ here)[0] < 0.02
     assert difference(T, true)[1] < np.radians(0.5)
+    number_events(engine.store.database)
     with engine.store.database.read() as connection:
         kind = events.c.kind == "association.found"
         data = connection.execute(select(events.c.data).where(kind)).scalar_one()

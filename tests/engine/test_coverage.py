@@ -24,6 +24,7 @@ from sceneprint.engine.maps.map_plans import COLOURS, FOOTER, WIDTH
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.settings import Settings
+from sceneprint.store.events import number_events
 from sceneprint.store.frame_queries import stops_of
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import events, job_items, jobs
@@ -144,6 +145,7 @@ def test_equal_rooms_are_ambiguous_and_linked(engine: Engine, rooms: Rooms) -> N
         else:
             assert (frame.outcome, frame.error_m) == ("ambiguous", None)
             assert others == {"b" if frame.session == "a" else "a"}
+    number_events(engine.store.database)
     with engine.store.database.read() as connection:
         kind = events.c.kind == "coverage.measured"
         data = connection.execute(select(events.c.data).where(kind)).scalars().first()

@@ -445,6 +445,7 @@ def test_a_number_is_given_once(built: Engine) -> None:
     assert shared(built).head(row) == head
 
 
+@pytest.mark.sqlite_only("a folder is put back with its database")
 def test_a_restored_database_is_not_given_what_came_after(
     make_engine: Make, tmp_path: Path, fill: Any, uploads: Any, put_back: Any
 ) -> None:

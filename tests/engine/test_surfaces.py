@@ -21,6 +21,7 @@ from sceneprint.engine.maps.surface_job import surface_points
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotFound
 from sceneprint.geometry.rigid import moved
 from sceneprint.settings import Settings
+from sceneprint.store.events import number_events
 from sceneprint.store.frame_queries import numbers_of_runs, stops_of
 from sceneprint.store.frames import refers_to, write_frame
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
@@ -155,6 +156,7 @@ def test_a_surface_is_that_of_its_frames(engine: Engine) -> None:
     assert told.first_taken is not None
     assert told.last_taken is not None
     assert (told.last_taken - told.first_taken).total_seconds() == 110.0
+    number_events(engine.store.database)
     with engine.store.database.read() as connection:
         own = select(events.c.data).where(events.c.kind == "surface.updated")
         (data,) = connection.execute(own).scalars()

@@ -15,6 +15,7 @@ from sceneprint.engine.jobs.tasks import SLICE_S, Handler, IsOver, LongJob, Slic
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
 from sceneprint.process import work_of
+from sceneprint.store.events import number_events
 from sceneprint.store.queue import JobFile, files_of, find_job, items_of, remove_job
 from sceneprint.store.tables import events, jobs
 from sceneprint_client.api import Job, JobState, NewMap
@@ -67,6 +68,7 @@ def test_each_slice_is_kept_and_the_last_one_ends_the_job(engine, work_off):
     ended = engine.get_job(job.job_id)
     assert (ended.state, ended.result) == (JobState.SUCCEEDED, {"sum": 3})
     assert items(engine, job) == [0, 1, 2]
+    number_events(engine.store.database)
     with engine.store.database.read() as connection:
         number = find_job(connection, job.job_id).number
         assert engine.store.blobs.get(files_of(connection, number)["part"].blob) == b"part 2"
