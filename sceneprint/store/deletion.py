@@ -220,15 +220,13 @@ def doom(connection: Connection, blobs: Iterable[str]) -> float:
     -------
     at : time of the notes, seconds since 1970
     """
-    wanted, at = sorted(set(blobs)), time.time()
-    known = set(
-        connection.execute(select(doomed.c.blob).where(doomed.c.blob.in_(wanted))).scalars()
-    )
-    if known:
-        connection.execute(update(doomed).where(doomed.c.blob.in_(known)).values(at=at))
-    new = [{"blob": blob, "at": at} for blob in wanted if blob not in known]
-    if new:
-        connection.execute(insert(doomed), new)
+    at = time.time()
+    # in one order, as writers of two maps may doom the same ones at once
+    if wanted := [{"blob": blob, "at": at} for blob in sorted(set(blobs))]:
+        kind: Any = sqlite if connection.dialect.name == "sqlite" else postgresql
+        made = kind.insert(doomed)
+        noted = made.on_conflict_do_update(index_elements=["blob"], set_={"at": made.excluded.at})
+        connection.execute(noted, wanted)
     return at
 
 

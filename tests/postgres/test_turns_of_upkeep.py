@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
+import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import event
+from sqlalchemy import event, text
 
 from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import next_events
@@ -19,7 +20,8 @@ from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.jobs.robot_signatures import EVERY_S, FIRST
 from sceneprint.engine.upkeep.purge import Retention
 from sceneprint.settings import Settings
-from sceneprint.store.deletion import DAY_S
+from sceneprint.store import open_store
+from sceneprint.store.deletion import DAY_S, doom, doomed_blobs
 from sceneprint.store.events import Wanted
 from sceneprint.store.keys import find_named_key
 from sceneprint.store.maps import find_map, use_of
@@ -28,6 +30,7 @@ from sceneprint.store.sender_rows import add_verified
 from sceneprint_client.api import JobState, NewMap
 
 _ALL = re.compile(rf"pg_advisory_xact_lock\({LOCKS}, {TURN}\)")
+_WAITING = text("SELECT count(*) FROM pg_locks WHERE locktype = 'transactionid' AND NOT granted")
 _ONE = "pg_advisory_xact_lock_shared("
 
 
@@ -64,6 +67,35 @@ def used_bytes(engine: Engine) -> int:
     """Bytes that the map is counted to hold."""
     with engine.store.database.read() as connection:
         return use_of(connection, find_map(connection, "hall").number).bytes
+
+
+def test_writers_of_two_maps_may_doom_the_same_blobs(
+    engine: Engine, postgres_url: str, tmp_path: Path, until: Callable[..., Any]
+) -> None:
+    blobs = [f"{number:064x}" for number in range(3)]
+    done = threading.Event()
+
+    def doom_elsewhere() -> None:
+        with (
+            closing(open_store(postgres_url, tmp_path / "blobs")) as other,
+            other.database.write(map_number=8) as connection,
+        ):
+            doom(connection, blobs)
+        done.set()
+
+    with engine.store.database.write(map_number=7) as connection:
+        doom(connection, blobs[:2])
+        threading.Thread(target=doom_elsewhere).start()
+        until(lambda: waiting(engine))
+    until(done.is_set)
+    with engine.store.database.read() as connection:
+        assert doomed_blobs(connection, 9) == blobs
+
+
+def waiting(engine: Engine) -> bool:
+    """Whether a transaction waits for the end of another."""
+    with engine.store.database.read() as connection:
+        return bool(connection.execute(_WAITING).scalar_one())
 
 
 def test_retention_takes_the_turn_of_its_map(engine: Engine, small: Any) -> None:
