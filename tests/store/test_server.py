@@ -190,9 +190,11 @@ def test_a_reader_sees_one_state_and_writes_nothing(served: Database) -> None:
                 connection.execute(text(f"SHOW {name}")).scalar()
                 for name in ("transaction_isolation", "transaction_read_only", "lock_timeout",
                              "statement_timeout", "idle_in_transaction_session_timeout",
-                             "application_name")
+                             "application_name", "tcp_keepalives_idle",
+                             "tcp_keepalives_interval", "tcp_keepalives_count")
             ]  # fmt: skip
-            assert shown == ["repeatable read", "on", "10s", "1min", "30s", "sceneprint"]
+            assert shown[:6] == ["repeatable read", "on", "10s", "1min", "30s", "sceneprint"]
+            assert shown[6:] == ["3", "2", "3"]
         before = {one.execute(text("SELECT pg_backend_pid()")).scalar_one() for one in held}
     with pytest.raises(UnusableStore, match="read-only transaction"), served.read() as connection:
         keep_model(connection, "m", "toy", b"x")

@@ -123,11 +123,19 @@ def configure(connection: Any, _record: object = None) -> None:
     connection.execute(
         "SELECT set_config('lock_timeout', %s, false), set_config('statement_timeout', %s, false),"
         " set_config('idle_in_transaction_session_timeout', %s, false),"
+        # the server gives up a client whose host is gone as soon as the client would give it up:
+        # locks of its session would else stay for hours
+        " set_config('tcp_keepalives_idle', %s, false),"
+        " set_config('tcp_keepalives_interval', %s, false),"
+        " set_config('tcp_keepalives_count', %s, false),"
         # a commit that was acknowledged survives the power, and the fall of the server where a
         # standby is waited for: more than `on` is left as it is
         " set_config('synchronous_commit', CASE current_setting('synchronous_commit')"
         " WHEN 'off' THEN 'on' ELSE current_setting('synchronous_commit') END, false)",
-        [_milliseconds(seconds) for seconds in (BUSY_S, STATEMENT_S, IDLE_S)],
+        [
+            *(_milliseconds(seconds) for seconds in (BUSY_S, STATEMENT_S, IDLE_S)),
+            *(_CONNECT[f"keepalives_{name}"] for name in ("idle", "interval", "count")),
+        ],
     )
     connection.autocommit = before
 
