@@ -280,7 +280,7 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         ({"indexed": 7, "looked_for": 5, "found": 5, "aged": 2}, {}, True),
         ({"indexed": 7, "looked_for": 5, "found": 5, "aged": 1}, {}, False),
         ({}, {"locks": LockShares(5_000, 100.0, 0.9, 0.9)}, False),  # 100 ms a frame
-        ({}, {"waits_ms": {"query": (90.0, 16_000.0)}}, False),
+        ({}, {"waits_ms": {"query": (90.0, 25_001.0)}}, False),
         ({}, {"memory": (2 << 30, 1)}, False),
         ({}, {"promotions": [Promotion(None, 1.0, 2.0, {}, frozenset(), frozenset())]}, True),
         ({}, {"promotions": [Promotion(None, 1.0, 2.0, {}, frozenset(), frozenset("a"))]}, False),
@@ -327,9 +327,12 @@ def test_a_crowd_tells_what_it_met_with() -> None:
     plan = Plan(robots=1000, signed=True, partitions=2, offline=360, retention_s=40.0)
     found = Found(acknowledged=9, indexed=6, looked_for=5, found=5, aged=3)
     back = [Promotion(None, 1.0, 2.0, {"a": 0.5}, frozenset(), frozenset({"a", "b"}))]
-    told = "\n".join(table(figures(found, plan=plan, promotions=back, spooled_twice=4)))
+    kills = Counter({"service": 2, PRIMARY: 1, CUT_OFF: 2})
+    more = {"kills": kills, "promotions": back, "spooled_twice": 4}
+    told = "\n".join(table(figures(found, plan=plan, **more)))
     assert "1,000 robots send 1 frames a second each, and send their signatures along" in told
-    assert "For 12 s each, a host did not reach its servers." in told
+    assert "2 times a host did not reach its servers for 12 s." in told
+    assert "SIGKILL of 1 of primary, 2 of service." in told
     assert "keep a frame for 40 s" in told
     assert "| deleted as they were too old, and told to have been | 3 |" in told
     assert (

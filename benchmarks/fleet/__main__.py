@@ -12,7 +12,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from benchmarks.fleet.faults import CUT_OFF_S
+from benchmarks.fleet.faults import CUT_OFF, CUT_OFF_S, FROZEN, FROZEN_S
 from benchmarks.fleet.fleet import DATABASE_S, STORE_S
 from benchmarks.fleet.run import FleetFigures, Plan, drive
 from benchmarks.machine import describe_machine
@@ -45,7 +45,8 @@ def table(figures: FleetFigures) -> list[str]:
         )
     what = f"{standby} standby"
     sent = "send their signatures along, as recorded" if plan.signed else "leave signing to workers"
-    done = "SIGKILL of " + ", ".join(f"{n} of {name}" for name, n in sorted(figures.kills.items()))
+    killed = {name: n for name, n in figures.kills.items() if name not in (FROZEN, CUT_OFF)}
+    done = "SIGKILL of " + ", ".join(f"{n} of {name}" for name, n in sorted(killed.items()))
     if plan.before is not None:
         what = "the version before replaced"
         done = "Replaced by this version, in this order: " + ", ".join(figures.steps)
@@ -125,8 +126,12 @@ def table(figures: FleetFigures) -> list[str]:
 def _more(plan: Plan) -> list[str]:
     """What else such a run has, as sentences."""
     found = []
+    if plan.freezes:
+        found.append(f"The primary was frozen {plan.freezes} times for {FROZEN_S:g} s (SIGSTOP).")
     if plan.partitions:
-        found.append(f"For {CUT_OFF_S:g} s each, a host did not reach its servers.")
+        found.append(
+            f"{plan.partitions} times a host did not reach its servers for {CUT_OFF_S:g} s."
+        )
     if plan.retention_s is not None:
         found.append(
             f"Three of four robots have maps that keep a frame for {plan.retention_s:g} s, so that "
@@ -134,8 +139,8 @@ def _more(plan: Plan) -> list[str]:
         )
     if plan.offline:
         found.append(
-            f"One more robot was offline, and sent {plan.offline} frames of its spool at once: an "
-            "hour of a frame in ten seconds, recorded at once."
+            f"One more robot was offline, and sent its spool of {plan.offline} frames: of an hour "
+            "with a frame in ten seconds, spooled at once."
         )
     return found
 
