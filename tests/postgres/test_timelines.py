@@ -121,6 +121,16 @@ def test_connections_that_are_open_to_it_are_given_up(
         assert [one for one in blobs.entries() if not one.unfinished] == []  # fsck minds no note
 
 
+def test_a_role_that_may_not_ask_for_the_system(pair: tuple[Server, Server]) -> None:
+    server, _ = pair
+    server.execute("REVOKE EXECUTE ON FUNCTION pg_control_system() FROM PUBLIC", "fleet")
+    server.execute("CREATE ROLE robot LOGIN")
+    url = f"postgresql+psycopg://robot@127.0.0.1:{server.port}/fleet"
+    with closing(reach_database(url)) as database:
+        assert place_of(database) == server.port
+        assert database.history == "/00000001"
+
+
 def test_another_database_in_its_place_is_used(
     postgres_url: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
