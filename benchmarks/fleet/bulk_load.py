@@ -47,7 +47,7 @@ def walk(n: int, length: int, seed: int = 0, walks: int = 1) -> Bytes:
 
 def fill(
     database: Database, name: str, model: Model, made: Bytes,
-    known: Sequence[Mapping[str, Any]] | None = None,
+    known: Sequence[Mapping[str, Any]] | None = None, blob: str = "0" * 64,
 ) -> list[str]:  # fmt: skip
     """Put indexed frames into a map, which is made if it is not there; their ids.
 
@@ -58,18 +58,20 @@ def fill(
     model : of its signatures
     made : (n, D) their signatures
     known : columns of each frame that differ from those of any other
+    blob : digest of the upload and the artifact of each frame
     """
     names = []
     for start in range(0, len(made), BLOCK):
         some = made[start : start + BLOCK]
         more = known[start : start + BLOCK] if known is not None else [{}] * len(some)
-        names += _block(database, name, model, some, more)
+        names += _block(database, name, model, some, more, blob)
     return names
 
 
 def _block(
-    database: Database, name: str, model: Model, made: Bytes, known: Sequence[Mapping[str, Any]]
-) -> list[str]:
+    database: Database, name: str, model: Model, made: Bytes, known: Sequence[Mapping[str, Any]],
+    blob: str,
+) -> list[str]:  # fmt: skip
     now = time.time()
     with database.write() as connection:
         number = connection.execute(select(maps.c.number).where(maps.c.name == name)).scalar()
@@ -88,7 +90,7 @@ def _block(
             insert(frames),
             [
                 {
-                    "id": one, "map_number": number, "state": FrameState.INDEXED, "blob": "0" * 64,
+                    "id": one, "map_number": number, "state": FrameState.INDEXED, "blob": blob,
                     "content_id": one, "bytes": 1, "intrinsics": None, "depth_scale": 0.001,
                     "depth_along_ray": False, "tags": [], "received_at": now, "indexed_at": now,
                     "revision": last - len(made) + i, "session": None, "robot": None, **more,
@@ -106,7 +108,7 @@ def _block(
             [
                 {
                     "frame_number": frame, "model_id": model.id, "vector": row.tobytes(),
-                    "checksum": zlib.crc32(row), "geometry": "0" * 64, "n_patches": [1],
+                    "checksum": zlib.crc32(row), "geometry": blob, "n_patches": [1],
                     "n_pairs": [1],
                 }
                 for frame, row in zip(found, made, strict=True)
