@@ -402,15 +402,17 @@ def small_signer(small_model: Model) -> Signer:
 def room_views(once: Once) -> Callable[..., SynthRoom]:
     """As `synthesise_room` with noise; each is rendered once for all processes of the run."""
 
-    def views(seed: int, index: int, n: int, *, along_path: bool = False) -> SynthRoom:
+    def views(
+        seed: int, index: int, n: int, *, along_path: bool = False, step: int = 1
+    ) -> SynthRoom:
         def make(folder: Path) -> None:
             folder.mkdir()
-            frames = synthesise_room(seed, index, n, along_path=along_path).frames
+            frames = synthesise_room(seed, index, n, along_path=along_path, step=step).frames
             np.save(folder / "depth.npy", [frame.depth for frame in frames])
             np.save(folder / "poses.npy", np.array([frame.pose for frame in frames]))
 
         kind = "path" if along_path else "room"
-        folder, name = once(f"{kind}-{seed}-{index}-{n}", make), f"room-{index:03d}"
+        folder, name = once(f"{kind}-{seed}-{index}-{n}-{step}", make), f"room-{index:03d}"
         both = np.load(folder / "depth.npy"), np.load(folder / "poses.npy")
         frames = (
             DepthFrame(depth, KINECT, f"{name}/frame-{k:06d}", pose)
