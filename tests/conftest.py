@@ -46,6 +46,14 @@ from sceneprint.types import DepthFrame
 #: Folders whose files share what is dear to begin, such as a service with its workers: all of one
 #: run in one process, one after another. The longest are first, and are begun first.
 TOGETHER = ("dashboard", "service", "client", "cli_service", "scenes", "ros2")
+#: Long files in them that begin all they need themselves, and so may run beside the others.
+APART = (
+    "service/test_lifecycle.py", "service/test_hostile.py", "service/test_tracing.py",
+    "service/test_kill.py", "service/test_connections.py", "service/test_qdrant.py",
+    "service/test_tenancy.py", "service/test_server.py", "service/test_overload.py",
+    "service/test_hostile_files.py", "service/test_faults.py", "client/test_tracker.py",
+    "client/test_keyed.py",
+)  # fmt: skip
 #: Files that are begun next: no process is left alone with one of them in the end.
 LONG = (
     "test_container.py", "test_on_postgres.py", "test_deployment.py", "test_fleet.py",
@@ -89,8 +97,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def unit_of(nodeid: str) -> str:
     """The folder or the file whose tests run in one process."""
     file = nodeid.partition("::")[0]
-    folder = "/".join(file.split("/")[:2])
-    return folder if folder.partition("/")[2] in TOGETHER else file
+    folder, _, name = file.removeprefix("tests/").partition("/")
+    return f"tests/{folder}" if folder in TOGETHER and f"{folder}/{name}" not in APART else file
 
 
 class UnitScheduling(LoadFileScheduling):
@@ -144,6 +152,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return places.get(unit, places.get(item.path.name, len(places)))
 
     items.sort(key=place)
+    for item in items:
+        apart = f"{item.path.parent.name}/{item.path.name}" in APART
+        if apart and "folder_stack" in getattr(item, "fixturenames", ()):
+            raise pytest.UsageError(f"{item.nodeid} is of APART, and needs what its folder shares")
     for item in items:
         if item.get_closest_marker("thorough") is not None:
             item.add_marker(pytest.mark.timeout(THOROUGH_S))
