@@ -51,7 +51,7 @@ ROOMS, VIEWS = 2, 8
 TAKEN = "2026-11-20T09:{minute:02d}:{second:02d}Z"
 Settle = Callable[[Page], None]
 #: What axe looks at where nothing but colours is another.
-COLOURS = {"type": "tag", "values": ["cat.color"]}
+COLOURS = {"type": "rule", "values": ["color-contrast", "link-in-text-block"]}
 
 
 def until(what: Callable[[], Any], seconds: float = PATIENCE_S) -> Any:
