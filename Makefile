@@ -16,7 +16,7 @@ unexport PYTHONDONTWRITEBYTECODE
 export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
 	'import os; print(2 * len(os.sched_getaffinity(0)))')
 
-.PHONY: help demo test pytest test-thorough test-postgres lint kernels format bench screenshots docs docs-serve soak siege \
+.PHONY: help demo test pytest test-thorough test-postgres lint kernels bytecode format bench screenshots docs docs-serve soak siege \
 	fleet models lock sbom advisories dist clean
 
 help:
@@ -63,13 +63,18 @@ kernels: $(STAMP)
 	@$(BIN)/python -c 'from sceneprint.cli.options import prepare_presets; \
 		from sceneprint.settings import Settings; prepare_presets(Settings(), clouds=True)'
 
+# Nor does each compile the tests, whose assertions pytest writes anew, where nobody has yet; what
+# is wrong with them is said by the run itself.
+bytecode: $(STAMP)
+	@test -d tests/__pycache__ || $(BIN)/python -m pytest --collect-only -q > /dev/null || true
+
 # The linters run beside the kernels and the first tests; where one fails, the target fails too.
 test: $(STAMP)
 	@$(MAKE) --no-print-directory -j2 lint pytest
 
 # Files stay whole, as their fixtures are dear, and so do folders that share a service; their order
 # is that of tests/conftest.py.
-pytest: kernels
+pytest: kernels bytecode
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # What takes long and seldom breaks: the image built step by step, whole recordings, benchmarks.

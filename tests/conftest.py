@@ -46,13 +46,28 @@ from sceneprint.types import DepthFrame
 #: Folders whose files share what is dear to begin, such as a service with its workers: all of one
 #: run in one process, one after another. The longest are first, and are begun first.
 TOGETHER = ("dashboard", "service", "client", "cli_service", "scenes", "ros2")
+#: Long files in them that begin all they need themselves, and so may run beside the others.
+APART = (
+    "service/test_lifecycle.py", "service/test_hostile.py", "service/test_tracing.py",
+    "service/test_kill.py", "service/test_connections.py", "service/test_qdrant.py",
+    "service/test_tenancy.py", "service/test_server.py", "service/test_overload.py",
+    "service/test_hostile_files.py", "service/test_faults.py", "client/test_tracker.py",
+    "client/test_keyed.py",
+)  # fmt: skip
 #: Files that are begun next: no process is left alone with one of them in the end.
 LONG = (
-    "test_container.py", "test_on_postgres.py", "test_deployment.py", "test_fleet.py",
-    "test_failover.py", "test_fleets.py", "test_bench_rows.py", "test_quality.py",
-    "test_same_as_evaluate.py", "test_soak.py", "test_siege.py", "test_tour.py", "test_docs.py",
-    "test_survival.py", "test_training.py", "test_lookalikes.py", "test_examples.py",
-    "test_work.py", "test_limits.py",
+    "test_container.py", "test_on_postgres.py", "test_deployment.py", "test_shared_index.py",
+    "test_qdrant_search.py", "test_commands.py", "test_surfaces.py", "test_quality.py",
+    "test_lookalikes.py", "test_stored_search.py", "test_lifecycle.py", "test_tracing.py",
+    "test_hostile.py", "test_pulled_copies.py", "test_fleets.py", "test_fuzz.py",
+    "test_training.py", "test_survival.py", "test_robot_signatures.py", "test_work.py",
+    "test_recovery.py", "test_siege.py", "test_cli.py", "test_map_copy.py", "test_failover.py",
+    "test_connections.py", "test_kill.py", "test_tracker.py", "test_purging.py",
+    "test_associations.py", "test_evaluate.py", "test_equal_rooms.py", "test_shared_rates.py",
+    "test_replayed_commits.py", "test_qdrant.py", "test_sequences.py", "test_inspecting.py",
+    "test_reencoding_switch.py", "test_decoders.py", "test_benchmarks.py", "test_tenancy.py",
+    "test_bench_rows.py", "test_same_as_evaluate.py", "test_soak.py", "test_tour.py",
+    "test_docs.py", "test_examples.py", "test_limits.py", "test_fleet.py",
 )  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -89,8 +104,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def unit_of(nodeid: str) -> str:
     """The folder or the file whose tests run in one process."""
     file = nodeid.partition("::")[0]
-    folder = "/".join(file.split("/")[:2])
-    return folder if folder.partition("/")[2] in TOGETHER else file
+    folder, _, name = file.removeprefix("tests/").partition("/")
+    return f"tests/{folder}" if folder in TOGETHER and f"{folder}/{name}" not in APART else file
 
 
 class UnitScheduling(LoadFileScheduling):
@@ -144,6 +159,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return places.get(unit, places.get(item.path.name, len(places)))
 
     items.sort(key=place)
+    for item in items:
+        apart = f"{item.path.parent.name}/{item.path.name}" in APART
+        if apart and "folder_stack" in getattr(item, "fixturenames", ()):
+            raise pytest.UsageError(f"{item.nodeid} is of APART, and needs what its folder shares")
     for item in items:
         if item.get_closest_marker("thorough") is not None:
             item.add_marker(pytest.mark.timeout(THOROUGH_S))
@@ -402,15 +421,17 @@ def small_signer(small_model: Model) -> Signer:
 def room_views(once: Once) -> Callable[..., SynthRoom]:
     """As `synthesise_room` with noise; each is rendered once for all processes of the run."""
 
-    def views(seed: int, index: int, n: int, *, along_path: bool = False) -> SynthRoom:
+    def views(
+        seed: int, index: int, n: int, *, along_path: bool = False, step: int = 1
+    ) -> SynthRoom:
         def make(folder: Path) -> None:
             folder.mkdir()
-            frames = synthesise_room(seed, index, n, along_path=along_path).frames
+            frames = synthesise_room(seed, index, n, along_path=along_path, step=step).frames
             np.save(folder / "depth.npy", [frame.depth for frame in frames])
             np.save(folder / "poses.npy", np.array([frame.pose for frame in frames]))
 
         kind = "path" if along_path else "room"
-        folder, name = once(f"{kind}-{seed}-{index}-{n}", make), f"room-{index:03d}"
+        folder, name = once(f"{kind}-{seed}-{index}-{n}-{step}", make), f"room-{index:03d}"
         both = np.load(folder / "depth.npy"), np.load(folder / "poses.npy")
         frames = (
             DepthFrame(depth, KINECT, f"{name}/frame-{k:06d}", pose)

@@ -193,7 +193,7 @@ def test_names_that_no_line_can_hold(model_file: Path, tmp_path: Path) -> None:
     y, x = np.mgrid[:120, :160]
     good = np.where(x < 80, 1500 + 3 * y, 2500 - 4 * y).astype(np.uint16)
     Image.fromarray(good).save(folder / "a\nb\x1b[2Jü.png")
-    done = run_process("sign", folder, "--model", model_file)
+    done = run("sign", folder, "--model", model_file)
     assert len(done.stdout.splitlines()) == 1
     assert "\x1b" not in done.stdout
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.geometry.validation.validation import ValidationParameters, validate_guided
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint.localization import QueryFrame, localize
 from sceneprint.pipeline import PairMatch, associate, open_signer, prepare, searched
 from sceneprint.types import Floats, Geometry
@@ -19,10 +20,10 @@ Room = tuple[list[Geometry], list[Floats]]
 
 
 @pytest.fixture(scope="module")
-def walk() -> Room:
+def walk(room_views: Callable[..., SynthRoom]) -> Room:
     """Six frames along a path through a room, more than 10 cm apart; the third asks the others."""
     signer = open_signer("depth")
-    frames = synthesise_room(21, 0, 36, along_path=True, step=6).frames
+    frames = room_views(21, 0, 36, along_path=True, step=6).frames
     frames = (frames[2], *frames[:2], *frames[3:])
     poses = [frame.pose for frame in frames if frame.pose is not None]
     return [prepare(frame, signer)[1] for frame in frames], poses

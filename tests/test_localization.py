@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +24,7 @@ from sceneprint.geometry.validation.map_verification import (
     starts_about,
 )
 from sceneprint.geometry.validation.validation import PairValidation
-from sceneprint.lab.synth import KINECT, render, symmetric_box, synthesise_room
+from sceneprint.lab.synth import KINECT, SynthRoom, render, symmetric_box
 from sceneprint.localization import (
     SAME_SURFACES_M,
     LocalizationParameters,
@@ -252,9 +252,11 @@ def looking_at_the_box(degrees: float) -> Floats:
     return T
 
 
-def test_a_room_bears_out_the_true_pose_alone(signer: Signer) -> None:
+def test_a_room_bears_out_the_true_pose_alone(
+    signer: Signer, room_views: Callable[..., SynthRoom]
+) -> None:
     p, overlap_p = MapParameters(), OverlapParameters()
-    frames = synthesise_room(21, 0, 3, along_path=True).frames
+    frames = room_views(21, 0, 4, along_path=True).frames[:3]
     geometries = [prepare(frame, signer)[1] for frame in frames]
     poses = np.stack([frame.pose for frame in frames if frame.pose is not None])
     views = MapViews(poses[1:3], geometries[1:3].__getitem__, p, overlap_p)

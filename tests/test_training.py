@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -19,11 +20,12 @@ from sceneprint.geometry.signature.segmentation import (
     patches_of,
     segment,
 )
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom, synthesise_room
 from sceneprint.lab.training import TrainingParameters, preset_parameters, preset_whitening, train
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import distance, open_signer, sign
 from sceneprint.signing import see
+from sceneprint.types import DepthFrame
 
 MODEL = ModelParameters(
     segmentation=SegmentationParameters(n_patches=200),
@@ -56,10 +58,18 @@ def test_progress_is_told_to_the_end(trained: tuple[Model, list[tuple[str, int, 
     assert [s for s in steps if s[0] == "mixture"] == [("mixture", i, 3) for i in range(1, 4)]
 
 
-def test_quantiser_and_d0_fit_new_rooms(trained: tuple[Model, object]) -> None:
+@pytest.fixture(scope="module")
+def unseen(room_views: Callable[..., SynthRoom]) -> list[DepthFrame]:
+    """A view of each of eight rooms that no model was trained on."""
+    return [room_views(99, i, 1).frames[0] for i in range(8)]
+
+
+def test_quantiser_and_d0_fit_new_rooms(
+    trained: tuple[Model, object], unseen: list[DepthFrame]
+) -> None:
     """d0 is near the median distance of rooms it never saw; few bytes are clipped."""
     signer = open_signer(trained[0], cached=False)
-    signed = [sign(synthesise_room(99, i, 1).frames[0], signer) for i in range(8)]
+    signed = [sign(frame, signer) for frame in unseen]
     between = [distance(a, b) for i, a in enumerate(signed) for b in signed[:i]]
     assert np.median(between) / trained[0].unrelated_distance == pytest.approx(1.0, abs=0.3)
     stored = np.concatenate([s.vector for s in signed])
@@ -67,13 +77,15 @@ def test_quantiser_and_d0_fit_new_rooms(trained: tuple[Model, object]) -> None:
     assert stored.astype(int).std() > 10  # the bytes are used
 
 
-def test_descriptors_are_learnt_from_the_rooms(trained: tuple[Model, object]) -> None:
+def test_descriptors_are_learnt_from_the_rooms(
+    trained: tuple[Model, object], unseen: list[DepthFrame]
+) -> None:
     model = trained[0]
     axes = model.compression.matrix.astype(float)
     assert axes.shape == (128, model.parameters.surroundings.dimension)
     np.testing.assert_allclose(axes @ axes.T, np.eye(128), atol=1e-5)
     # of rooms it never saw the axes keep most of what differs, and random ones would not
-    seen = [see(synthesise_room(99, i, 1).frames[0], model.parameters) for i in range(4)]
+    seen = [see(frame, model.parameters) for frame in unseen[:4]]
     p = model.parameters
     patches = [patches_of(one, segment(one, p.validation_segmentation)) for one in seen]
     rows = np.concatenate([patch_descriptors(one, p.surroundings) for one in patches])
@@ -95,7 +107,7 @@ def test_provenance_says_what_it_saw(trained: tuple[Model, object]) -> None:
     [
         (replace(TRAINING, rooms=0), "0 usable frames of fewer than two places"),
         (replace(TRAINING, rooms=1), "2 usable frames of fewer than two places"),
-        (replace(TRAINING, pairs=100), "too few for 16 components"),
+        (replace(TRAINING, rooms=2, pairs=100), "too few for 16 components"),
         (replace(TRAINING, rooms=2, views=1), r"^\d{3} patches are too few to learn what 927 bins"),
     ],
 )
@@ -143,7 +155,7 @@ def test_too_little_for_a_whitening(changes: dict[str, Any], message: str) -> No
         TRAINING, whitening_rooms=4, levels=(0,), whitening=WhiteningParameters(dimension=12)
     )
     with pytest.raises(TrainingError, match=message):
-        train("tiny", MODEL, MIXTURE, replace(p, **changes))
+        train("tiny", MODEL, MIXTURE, replace(p, rooms=2, **changes))
 
 
 def test_presets() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from sceneprint.cli import main
 from sceneprint.cli.coverage import change_lines, coverage_lines
 from sceneprint.errors import InvalidRequest, JobOver, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.formats.dataset import write_depth_png
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.coverage import (
@@ -33,13 +33,15 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @pytest.fixture(scope="module")
-def covered(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
+def covered(
+    service_url: str, tmp_path_factory: pytest.TempPathFactory, room_views: Callable[..., SynthRoom]
+) -> Iterator[Client]:
     """A client of a map with four frames along a path, a second apart."""
     path = tmp_path_factory.mktemp("covered") / "depth.png"
     with Client(service_url) as client:
         client.create_map(MAP, model="depth")
         jobs = []
-        for i, frame in enumerate(synthesise_room(21, 0, 4, along_path=True).frames):
+        for i, frame in enumerate(room_views(21, 0, 4, along_path=True).frames):
             write_depth_png(path, frame.depth, 1000.0)
             k = frame.intrinsics
             assert frame.pose is not None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import httpx
@@ -14,7 +14,7 @@ from sceneprint.cli import main
 from sceneprint.cli.sessions import difference_lines
 from sceneprint.errors import InvalidRequest, UnknownJob
 from sceneprint.formats.dataset import write_depth_png
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.sessions import SAME
@@ -23,13 +23,15 @@ MAP = "changed"
 
 
 @pytest.fixture(scope="module")
-def changed(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
+def changed(
+    service_url: str, tmp_path_factory: pytest.TempPathFactory, room_views: Callable[..., SynthRoom]
+) -> Iterator[Client]:
     """A client of a map with sessions a and b, of two frames each along one path."""
     path = tmp_path_factory.mktemp("changed") / "depth.png"
     with Client(service_url) as client:
         client.create_map(MAP, model="depth")
         jobs = []
-        for i, frame in enumerate(synthesise_room(21, 0, 4, along_path=True).frames):
+        for i, frame in enumerate(room_views(21, 0, 4, along_path=True).frames):
             write_depth_png(path, frame.depth, 1000.0)
             k = frame.intrinsics
             assert frame.pose is not None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from sceneprint.cli import main
 from sceneprint.errors import InvalidRequest, NotFound, UnknownMap
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.formats.points.ply import read_ply
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.surface import SurfaceTile
@@ -29,14 +29,16 @@ PATH = f"/v1/maps/{MAP}/surface"
 
 
 @pytest.fixture(scope="module")
-def fused(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
+def fused(
+    service_url: str, tmp_path_factory: pytest.TempPathFactory, room_views: Callable[..., SynthRoom]
+) -> Iterator[Client]:
     """A client of a map with four posed frames and their surface, and of one without poses."""
     path = tmp_path_factory.mktemp("fused") / "depth.png"
     with Client(service_url) as client:
         for name in (MAP, PLAIN):
             client.create_map(name, model="depth")
         jobs = []
-        for i, frame in enumerate(synthesise_room(21, 0, 4, along_path=True).frames):
+        for i, frame in enumerate(room_views(21, 0, 4, along_path=True).frames):
             write_depth_png(path, frame.depth, 1000.0)
             k = frame.intrinsics
             assert frame.pose is not None

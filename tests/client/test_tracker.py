@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.lab.synth import corridor, render, synthesise_lookalike, synthesise_room
+from sceneprint.lab.synth import KINECT, SynthRoom, corridor, render, synthesise_lookalike
 from sceneprint.lab.synth.trajectories import pose as camera_pose
-from sceneprint.types import DepthFrame, Floats
+from sceneprint.types import DepthFrame, Floats, Intrinsics
 from sceneprint_client import AsyncTracker, Client, Tracker, errors
 from sceneprint_client.api import FrameMeta, GivenPose, Localization
 from sceneprint_client.frame_files import camera_of
@@ -254,19 +254,23 @@ class Building:
 
 
 @pytest.fixture
-def building(client: Client, map_name: str) -> Callable[[DepthFrame], Building]:
-    def make(frame: DepthFrame) -> Building:
-        k = frame.intrinsics
+def building(client: Client, map_name: str) -> Callable[[Intrinsics], Building]:
+    def make(k: Intrinsics) -> Building:
         return Building(client, map_name, camera_of((k.fx, k.fy, k.cx, k.cy), (k.width, k.height)))
 
     return make
 
 
-def walked(seed: int, index: int, views: int) -> tuple[list[Seen], list[Seen]]:
+@pytest.fixture
+def walked(room_views: Callable[..., SynthRoom]) -> Callable[..., tuple[list[Seen], list[Seen]]]:
     """Of a walk in a room every third frame for the map, and the others."""
-    frames = [shifted(one, 20.0 * index) for one in
-              synthesise_room(seed, index, views, along_path=True).frames]  # fmt: skip
-    return frames[::3], [one for i, one in enumerate(frames) if i % 3]
+
+    def walk(seed: int, index: int, views: int) -> tuple[list[Seen], list[Seen]]:
+        room = room_views(seed, index, views, along_path=True)
+        frames = [shifted(one, 20.0 * index) for one in room.frames]
+        return frames[::3], [one for i, one in enumerate(frames) if i % 3]
+
+    return walk
 
 
 def check_kidnapping(site: Building, runs: list[list[Seen]]) -> None:
@@ -293,10 +297,10 @@ def check_kidnapping(site: Building, runs: list[list[Seen]]) -> None:
 
 
 def test_it_tracks_and_is_found_again_after_a_kidnapping(
-    building: Callable[[DepthFrame], Building],
+    building: Callable[[Intrinsics], Building], walked: Callable[..., tuple[list[Seen], list[Seen]]]
 ) -> None:
     rooms = [walked(5, index, 24) for index in (0, 1)]
-    site = building(synthesise_room(5, 0, 1).frames[0])
+    site = building(KINECT)
     site.fill([view for seen, _ in rooms for view in seen])
     check_kidnapping(site, [rooms[0][1][::2], rooms[1][1][::2]])
 
@@ -304,10 +308,12 @@ def test_it_tracks_and_is_found_again_after_a_kidnapping(
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", [5, 6])
 def test_it_tracks_through_a_building(
-    building: Callable[[DepthFrame], Building], seed: int
+    building: Callable[[Intrinsics], Building],
+    walked: Callable[..., tuple[list[Seen], list[Seen]]],
+    seed: int,
 ) -> None:
     rooms = [walked(seed, index, 60) for index in range(3)]
-    site = building(synthesise_room(seed, 0, 1).frames[0])
+    site = building(KINECT)
     site.fill([view for seen, _ in rooms for view in seen])
     check_kidnapping(site, [run for _, run in rooms])
 
@@ -337,10 +343,10 @@ def test_it_tracks_through_a_kitchen_that_was_recorded(
 @pytest.mark.parametrize("kind", ["object", "offices"])
 @pytest.mark.parametrize("index", range(4))
 def test_beside_what_looks_alike_it_never_tracks_wrongly(
-    building: Callable[[DepthFrame], Building], kind: str, index: int
+    building: Callable[[Intrinsics], Building], kind: str, index: int
 ) -> None:
     site = synthesise_lookalike(kind, 7000, index, queries=12)
-    place = building(site.map[0])
+    place = building(site.map[0].intrinsics)
     place.fill([shifted(one, 0.0) for one in site.map])
     run = [shifted(one, 0.0) for one in site.queries]
     for state, off in place.drive(run, drifted([one.T_map_sensor for one in run], index)):
@@ -349,16 +355,15 @@ def test_beside_what_looks_alike_it_never_tracks_wrongly(
 
 @pytest.mark.thorough
 def test_in_a_corridor_of_equal_doors_it_never_tracks_wrongly(
-    building: Callable[[DepthFrame], Building],
+    building: Callable[[Intrinsics], Building],
 ) -> None:
     hall = corridor(8)
-    camera = synthesise_room(5, 0, 1).frames[0]
 
     def looking(x: float, yaw: float) -> Seen:
         T = camera_pose(np.array([x, 0.9, 1.4, yaw, -0.05, 0.0]))
-        return Seen(render(hall, T, camera.intrinsics), T)
+        return Seen(render(hall, T, KINECT), T)
 
-    place = building(camera)
+    place = building(KINECT)
     place.fill([looking(x, yaw) for x in np.arange(1, 15.1, 0.7) for yaw in (0.3, -0.3)])
     run = [looking(x, 0.25) for x in np.arange(4.1, 14, 0.25)]
     states = list(place.drive(run, drifted([one.T_map_sensor for one in run], 1)))

@@ -35,7 +35,7 @@ from playwright.sync_api import (
 
 from benchmarks.rooms import circled, send
 from sceneprint.formats.dataset import write_depth_png
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 
 FLAGS = [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -50,6 +50,8 @@ ROOMS, VIEWS = 2, 8
 #: When the first frame was taken; each next one is a second later.
 TAKEN = "2026-11-20T09:{minute:02d}:{second:02d}Z"
 Settle = Callable[[Page], None]
+#: What axe looks at where nothing but colours is another.
+COLOURS = {"type": "rule", "values": ["color-contrast", "link-in-text-block"]}
 
 
 def until(what: Callable[[], Any], seconds: float = PATIENCE_S) -> Any:
@@ -180,8 +182,9 @@ def browser(chromium: str, folder_stack: ExitStack) -> Browser:
 
 @pytest.fixture(scope="session")
 def station(
-    chromium: str, tmp_path_factory: pytest.TempPathFactory, folder_stack: ExitStack
-) -> Station:
+    chromium: str, tmp_path_factory: pytest.TempPathFactory, folder_stack: ExitStack,
+    room_views: Callable[..., SynthRoom],
+) -> Station:  # fmt: skip
     """A service with two workers, and a map `building` of two rooms, all of it indexed.
 
     Tests leave `building` as it is; what they change they make. The frames of a room have the
@@ -191,7 +194,7 @@ def station(
     found = folder_stack.enter_context(running(tmp_path_factory.mktemp("station"), 2))
     found.client.post("/v1/maps", json={"name": "building", "title": "Two rooms", "model": "depth"})
     metas, files = [], []
-    for meta, png in _shots(tmp_path_factory.mktemp("shots")):
+    for meta, png in _shots(tmp_path_factory.mktemp("shots"), room_views):
         metas.append(meta)
         files.append(("frame", (f"{len(files)}.png", png, "image/png")))
     sent = found.client.post(
@@ -230,11 +233,13 @@ def four_sides(station: Station) -> dict[str, Any]:
     return told
 
 
-def _shots(folder: Path) -> Iterator[tuple[dict[str, Any], bytes]]:
+def _shots(
+    folder: Path, room_views: Callable[..., SynthRoom]
+) -> Iterator[tuple[dict[str, Any], bytes]]:
     """Views along a path through each room, with what is known of them, in the order of time."""
     path = folder / "frame.png"
     for room in range(ROOMS):
-        for view, frame in enumerate(synthesise_room(21, room, VIEWS, along_path=True).frames):
+        for view, frame in enumerate(room_views(21, room, VIEWS, along_path=True).frames):
             write_depth_png(path, frame.depth, 1000.0)
             lens, who = frame.intrinsics, "bob" if view % 2 else "ann"
             assert frame.pose is not None
@@ -355,14 +360,15 @@ def settle() -> Settle:
 
 @pytest.fixture(scope="session")
 def axe() -> Callable[[Page], list[str]]:
-    """What axe finds on a page, in the light theme and in the dark one."""
+    """What axe finds on a page, in the light theme and in the dark one, which is other colours."""
     judge = Axe()
 
     def look(page: Page) -> list[str]:
         found = []
-        for theme in ("light", "dark"):
+        for theme, rules in (("light", {}), ("dark", {"runOnly": COLOURS})):
             page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
-            for one in judge.run(page).response["violations"]:
+            options = {"resultTypes": ["violations"], **rules}
+            for one in judge.run(page, options=options).response["violations"]:
                 where = [node["html"][:200] for node in one["nodes"][:5]]
                 found.append(f"{theme}: {one['id']}: {one['help']}: {where}")
         return found

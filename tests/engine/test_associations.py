@@ -21,7 +21,7 @@ from sceneprint.engine.sessions import associations
 from sceneprint.engine.sessions.association_job import Associating
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.geometry.rigid import difference, inverse
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
 from sceneprint.store.tables import events, frames, job_items, jobs
@@ -47,11 +47,11 @@ ORIGINS = {"ann/a": origin(1), "bob/b": origin(2)}
 @pytest.fixture(scope="session")
 def two_runs(
     tmp_path_factory: pytest.TempPathFactory, make_upload: Callable[..., Any],
-    work_off: Callable[[Engine], list[JobState | None]],
+    work_off: Callable[[Engine], list[JobState | None]], room_views: Callable[..., SynthRoom],
 ) -> Path:  # fmt: skip
     """A map `hall`: even frames of a path are ann's run a, odd ones bob's run b."""
     folder = tmp_path_factory.mktemp("runs") / "data"
-    room = synthesise_room(21, 0, 12, along_path=True)
+    room = room_views(21, 0, 12, along_path=True)
     with Engine(Settings(data_dir=folder)) as engine:
         engine.create_map(NewMap(name="hall", model="depth"))
         for i, frame in enumerate(room.frames):

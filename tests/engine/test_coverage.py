@@ -22,7 +22,7 @@ from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.maps.map_coverage import CoverageHandler, frames_to_query
 from sceneprint.engine.maps.map_plans import COLOURS, FOOTER, WIDTH
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
 from sceneprint.store.frame_queries import stops_of
@@ -65,7 +65,7 @@ class Rooms:
 @pytest.fixture(scope="session")
 def rooms(
     tmp_path_factory: pytest.TempPathFactory, uploads: Any, make_upload: Callable[..., Any],
-    work_off: WorkOff,
+    work_off: WorkOff, room_views: Callable[..., SynthRoom],
 ) -> Rooms:  # fmt: skip
     """A map `hall`: five frames of a room in session a, five of a room equal to it in session b,
     and four of another room in session c, a second apart. The first two share a parent frame.
@@ -73,7 +73,7 @@ def rooms(
     Map `pair` holds two frames of one session that differ by a millimetre of noise.
     """
     folder = tmp_path_factory.mktemp("rooms") / "data"
-    path = synthesise_room(21, 0, 10, along_path=True)
+    path = room_views(21, 0, 12, along_path=True)
     positions: list[Floats] = []
     with Engine(Settings(data_dir=folder)) as engine:
         for name in ("hall", "pair"):
@@ -95,7 +95,7 @@ def rooms(
         positions.clear()
         shift = np.eye(4)
         shift[0, 3] = APART_M
-        for i, frame in enumerate(path.frames):
+        for i, frame in enumerate(path.frames[:10]):
             assert frame.pose is not None
             pose = (np.eye(4), shift)[i % 2] @ frame.pose
             add("hall", replace(frame, pose=pose), path.name, "ab"[i % 2])

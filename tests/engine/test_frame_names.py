@@ -16,7 +16,7 @@ from sceneprint.engine.maps.map_frames import list_frames, trajectory, trajector
 from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.errors import InvalidRequest, PreconditionFailed
 from sceneprint.formats.dataset import read_trajectory
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
 from sceneprint_client.api.listing import FrameListing, Run
 from sceneprint_client.api.sessions import NewAssociation
@@ -40,13 +40,13 @@ def listed(engine: Engine, map_name: str = "hall", **wanted: Any) -> list[str | 
 @pytest.fixture(scope="module")
 def two_orders(
     tmp_path_factory: pytest.TempPathFactory, make_upload: Callable[..., Any],
-    work_off: Callable[[Engine], list[JobState | None]],
+    work_off: Callable[[Engine], list[JobState | None]], room_views: Callable[..., SynthRoom],
 ) -> Any:  # fmt: skip
     """Maps `sorted` and `shuffled`: one run without times, uploaded in two orders."""
     from sceneprint.settings import Settings
 
     folder = tmp_path_factory.mktemp("orders") / "data"
-    frames = synthesise_room(21, 0, 8, along_path=True).frames
+    frames = room_views(21, 0, 8, along_path=True).frames
     with Engine(Settings(data_dir=folder)) as engine:
         for name, order in (("sorted", IN_ORDER), ("shuffled", SHUFFLED)):
             engine.create_map(NewMap(name=name, model="depth"))

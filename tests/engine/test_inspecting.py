@@ -15,7 +15,7 @@ from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownQ
 from sceneprint.formats.export import points_of
 from sceneprint.geometry.registration.icp import adjoint
 from sceneprint.geometry.rigid import difference
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint.pipeline import Signature, distance, validate
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.types import Geometry
@@ -252,10 +252,11 @@ def test_the_uncertainty_of_a_place_is_told_in_its_axes(full: Engine, uploads: A
 
 
 def test_a_guided_match_is_labelled_and_had_again(
-    empty: Engine, make_upload: Any, work_off: Callable[[Engine], list[Any]]
-) -> None:
+    empty: Engine, make_upload: Any, work_off: Callable[[Engine], list[Any]],
+    room_views: Callable[..., SynthRoom],
+) -> None:  # fmt: skip
     """Views more than 10 cm apart: two that agree give the transforms of the rest."""
-    frames = synthesise_room(21, 0, 36, along_path=True, step=6).frames
+    frames = room_views(21, 0, 36, along_path=True, step=6).frames
     for frame in [*frames[:2], *frames[3:]]:
         one = make_upload(frame, "room")
         empty.add_frame("hall", one.data, one.meta)
@@ -281,10 +282,11 @@ def test_a_guided_match_is_labelled_and_had_again(
 
 
 def test_guided_matches_are_searched_for_where_the_answer_is_undecided(
-    empty: Engine, make_upload: Any, work_off: Callable[[Engine], list[Any]]
-) -> None:
+    empty: Engine, make_upload: Any, work_off: Callable[[Engine], list[Any]],
+    room_views: Callable[..., SynthRoom],
+) -> None:  # fmt: skip
     """Two frames whose poses are 3 m off vote elsewhere, after others have guided the rest."""
-    path = synthesise_room(21, 0, 48, along_path=True, step=3).frames
+    path = room_views(21, 0, 48, along_path=True, step=3).frames
     for i in (2, 6, 0, 8, 7, 1, 10, 11):
         frame, pose = path[i], path[i].pose
         assert pose is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ import pytest
 from sceneprint.engine.maps import map_copy
 from sceneprint.engine.maps.map_copy import PulledMap, pull_map
 from sceneprint.errors import Conflict, DamagedBlob, InvalidRequest, UnknownMap
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint.store import open_store
 from sceneprint.types import DepthFrame
 from sceneprint_client import Client
@@ -31,8 +31,8 @@ OF_THE_QUERY = ("query_id", "milliseconds")
 
 
 @pytest.fixture(scope="module")
-def walk() -> tuple[DepthFrame, ...]:
-    return synthesise_room(5, 1, 16, along_path=True).frames
+def walk(room_views: Callable[..., SynthRoom]) -> tuple[DepthFrame, ...]:
+    return room_views(5, 1, 24, along_path=True).frames[:16]
 
 
 def camera_of(view: DepthFrame) -> CameraIntrinsics:

@@ -86,6 +86,12 @@ def filled(node: Node, made: Bytes, model: Model) -> Engine:
     return engine
 
 
+#: Of files in a node's own folder, in which the database has no part.
+of_files = pytest.mark.parametrize(
+    "store_url", ["sqlite", pytest.param("postgresql", marks=pytest.mark.thorough)], indirect=True
+)
+
+
 def ask(engine: Engine, number: int, **more: Any) -> Answer:
     query = Query.model_validate({"stages": ["retrieve"], "k": 50, "keep": False} | more)
     return engine.queries.stored(["hall"], NamedFrame(map="hall", frame_id=f"hall-{number}"), query)
@@ -161,6 +167,7 @@ def test_a_node_that_starts_again_reads_nothing_of_the_map(
     assert (len(held.generation), len(held.tail)) == (FRAMES - LATE, LATE)
 
 
+@of_files
 @pytest.mark.parametrize("what", ["truncated", "removed", "swapped"])
 def test_a_damaged_shard_is_passed_over_and_made_anew(
     filled: Engine, node: Node, made: Bytes, model: Model, what: str
@@ -205,6 +212,7 @@ def test_an_index_of_another_history_is_not_used(filled: Engine, node: Node) -> 
     assert len(view(fresh).generation or ()) == FRAMES
 
 
+@of_files
 def test_no_byte_of_a_deleted_frame_is_left(filled: Engine, made: Bytes) -> None:
     secret = made[77].tobytes()[:48]
 
@@ -224,6 +232,7 @@ def test_no_byte_of_a_deleted_frame_is_left(filled: Engine, made: Bytes) -> None
     assert filled.purging.now().indexes == 0
 
 
+@of_files
 def test_nothing_of_a_map_that_is_deleted_is_left(filled: Engine) -> None:
     assert list(filled.settings.indexes.glob("hall-*/*.qdrant"))
     filled.delete_map("hall")
@@ -231,6 +240,7 @@ def test_nothing_of_a_map_that_is_deleted_is_left(filled: Engine) -> None:
     assert list(filled.settings.indexes.glob("hall-*")) == []
 
 
+@of_files
 def test_the_setting_can_change(
     filled: Engine, node: Node, made: Bytes, model: Model, searches: list[int]
 ) -> None:
@@ -258,6 +268,7 @@ def test_the_setting_can_change(
     assert searches
 
 
+@of_files
 def test_an_index_without_a_shard_gets_one(
     filled: Engine, node: Node, whitened_model: Model
 ) -> None:
@@ -287,6 +298,7 @@ def test_it_can_be_looked_at_and_rebuilt(filled: Engine) -> None:
     assert (state.generation, state.tail) == (2, 0)
 
 
+@of_files
 def test_a_model_that_qdrant_cannot_hold_has_none(
     filled: Engine, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:

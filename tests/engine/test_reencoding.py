@@ -17,7 +17,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.maps import map_lifecycle
 from sceneprint.errors import Conflict, InvalidRequest, UnknownMap, UnreadableModel
 from sceneprint.geometry.retrieval.ranking import Metric
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint.models import Model, save_model
 from sceneprint.settings import Settings
 from sceneprint.store.tables import frames, jobs, signatures
@@ -41,9 +41,9 @@ def short_sighted(small_model: Model, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.fixture(scope="module")
-def far_off(make_upload: Callable[..., Any]) -> Any:
+def far_off(make_upload: Callable[..., Any], room_views: Callable[..., SynthRoom]) -> Any:
     """A view from so far off that the nearest of it is beyond 4.5 m."""
-    frame = synthesise_room(33, 0, 1).frames[0]
+    frame = room_views(99, 0, 1).frames[0]
     depth = np.where(frame.depth > 0, frame.depth * 0.5 + 4.6, 0).astype(np.float32)
     return make_upload(replace(frame, depth=depth), "far")
 

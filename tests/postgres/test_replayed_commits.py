@@ -47,6 +47,7 @@ def test_what_is_one_message_is_one_round_trip() -> None:
     assert lines[4:] == [*trip, "SELECT 1;", "UPDATE a;", "\\endpipeline"]
 
 
+@pytest.mark.thorough  # of a measurement, which says itself when it is wrong
 def test_all_that_is_counted_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
     uploads, ends, feed = measure(2, 3, 0.0, 12)
     assert min(uploads, ends) > 0

@@ -13,6 +13,7 @@ from anyio import fail_after, to_thread
 from fastapi.security import HTTPAuthorizationCredentials
 from starlette.requests import Request
 
+from sceneprint.cli import main
 from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import list_keys
 from sceneprint.settings import Settings
@@ -104,26 +105,24 @@ def test_the_secret_is_in_no_file_and_no_line(wide, secret):
     assert any(b"robot 7" in path.read_bytes() for path in files)
 
 
-def test_a_name_is_given_once(wide, secret):
-    done = make(wide.folder, "robot 7")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == (
-        "sceneprint keys: There is a key named 'robot 7'. Choose another name.\n"
-    )
+def test_a_name_is_given_once(wide, secret, capsys):
+    assert main(["keys", "--create", "robot 7", "--data", str(wide.folder)]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err == ("sceneprint keys: There is a key named 'robot 7'. Choose another name.\n")
     headers = {"Authorization": f"Bearer {secret}"}
     assert wide.client.get("/v1/maps", headers=headers).status_code == 200
 
 
 @pytest.mark.parametrize("name", ["", "two\nlines", "x" * 129])
-def test_a_key_has_a_name_that_can_be_printed(name: str, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "sceneprint", "keys", "--create", name, "--data", str(tmp_path)],
-        capture_output=True,
-        text=True,
-    )
-    assert (done.returncode, done.stdout) == (2, "")
-    assert len(done.stderr.splitlines()) == 1
-    assert "is not a valid key name" in done.stderr
+def test_a_key_has_a_name_that_can_be_printed(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["keys", "--create", name, "--data", str(tmp_path)]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert len(said.err.splitlines()) == 1
+    assert "is not a valid key name" in said.err
 
 
 def test_who_uses_a_key_waits_for_no_note_of_it(tmp_path):

@@ -17,6 +17,10 @@ import httpx
 import pytest
 from sqlalchemy.exc import OperationalError
 
+from sceneprint.engine import Engine
+from sceneprint.settings import Settings
+from sceneprint_client.api import NewMap
+
 #: Frames that a robot may send for each kill.
 FRAMES_A_KILL = 4
 
@@ -66,13 +70,12 @@ def done(rows: Callable[..., list[tuple[Any, ...]]], tmp_path: Path) -> Callable
 
 @pytest.mark.parametrize("kills", [3, pytest.param(9, marks=pytest.mark.thorough)])
 def test_no_kill_loses_what_was_acknowledged(
-    kills, begin, make_map, small_shots, tmp_path, capsys, until, rows, done
+    kills, begin, small_shots, tmp_path, capsys, until, rows, done
 ):
     rng, n_frames = random.Random(20), FRAMES_A_KILL * kills
     uploader = Uploader([shot.form(robot="r1") for shot in small_shots[:n_frames]])
-    first = begin(folder=tmp_path)
-    make_map(first, "hall")
-    first.kill()
+    with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
+        engine.create_map(NewMap(name="hall", model="depth"))
     # a third each: while it starts, while it receives, while it signs
     moments = [("starts", "receives", "signs")[i % 3] for i in range(kills)]
     rng.shuffle(moments)

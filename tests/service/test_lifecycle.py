@@ -160,16 +160,19 @@ def test_a_host_that_is_none_is_refused_in_one_line(begin):
     assert "no.such.host.invalid:0 is not available" in line
 
 
-def test_a_port_that_is_taken_is_refused_in_one_line(begin, served, tmp_path):
-    port = served.url.rpartition(":")[2]
-    line = refusal(begin, "--port", port, folder=tmp_path / "new")
-    assert not (tmp_path / "new").exists()
-    assert line == (
-        f"sceneprint serve: 127.0.0.1:{port} is not available (Address already in use). "
-        "Choose another --port, 0 for a free one, or stop the process that uses it."
-    )
-    with socket.create_connection(("127.0.0.1", int(port))):
-        assert served.client.get("/healthz").status_code == 200
+def test_a_port_that_is_taken_is_refused_in_one_line(begin, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        line = refusal(begin, "--port", str(port), folder=tmp_path / "new")
+        assert not (tmp_path / "new").exists()
+        assert line == (
+            f"sceneprint serve: 127.0.0.1:{port} is not available (Address already in use). "
+            "Choose another --port, 0 for a free one, or stop the process that uses it."
+        )
+        with socket.create_connection(("127.0.0.1", port)) as asking:
+            asked, address = taken.accept()  # who had it, has it
+            asked.close()
+            assert address == asking.getsockname()
 
 
 def test_service_and_worker_alone_do_the_job_together(begin, make_map, small_shots, tmp_path):

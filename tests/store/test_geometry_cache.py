@@ -10,16 +10,15 @@ import pytest
 from sceneprint.errors import DamagedBlob
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.registration.overlap import sampled
-from sceneprint.lab.synth import synthesise_room
 from sceneprint.pipeline import Signer, prepare
 from sceneprint.store import GeometryCache
 from sceneprint.store.blobs.folder import FolderBlobs
+from sceneprint.types import DepthFrame
 
 
 @pytest.fixture(scope="module")
-def artifacts(small_signer: Signer) -> list[bytes]:
-    room = synthesise_room(3, 0, 4)
-    return [write_geometry(prepare(frame, small_signer)[1]) for frame in room.frames]
+def artifacts(small_signer: Signer, room_frames: tuple[DepthFrame, ...]) -> list[bytes]:
+    return [write_geometry(prepare(frame, small_signer)[1]) for frame in room_frames[:4]]
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 
 from sceneprint.cli import main
 from sceneprint.cli.demo import serving
-from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.synth import SynthRoom
 from sceneprint.maintenance.snapshot.restoration import _replace_queries as replace_queries
 from sceneprint.types import DepthFrame
 from sceneprint_client import Client, Spool, Tracker
@@ -26,8 +27,14 @@ OF_THE_QUERY = ("query_id", "milliseconds")
 
 
 @pytest.fixture(scope="module")
-def walk() -> tuple[DepthFrame, ...]:
-    return synthesise_room(5, 1, 24, along_path=True).frames
+def walk(room_views: Callable[..., SynthRoom]) -> tuple[DepthFrame, ...]:
+    return room_views(5, 1, 24, along_path=True).frames
+
+
+@pytest.fixture(scope="module")
+def nowhere(room_views: Callable[..., SynthRoom]) -> DepthFrame:
+    """A view that is nowhere in the map."""
+    return room_views(5, 3, 2).frames[0]
 
 
 def camera_of(view: DepthFrame) -> CameraIntrinsics:
@@ -43,9 +50,8 @@ def upload(client: Client, views: tuple[DepthFrame, ...]) -> None:
 
 
 def answers(client: Client, views: tuple[DepthFrame, ...]) -> list[dict[str, Any]]:
-    """All that is answered to each view, and to one that is nowhere in the map."""
-    nowhere = synthesise_room(5, 3, 2).frames[0]
-    asked = [client.query(MAP, one.depth, camera_of(one)) for one in (*views, nowhere)]
+    """All that is answered to each view."""
+    asked = [client.query(MAP, one.depth, camera_of(one)) for one in views]
     told = [one.model_dump(mode="json") for one in asked]
     return [{name: one[name] for name in one if name not in OF_THE_QUERY} for one in told]
 
@@ -62,8 +68,9 @@ def states(client: Client, views: tuple[DepthFrame, ...]) -> list[tuple[Any, ...
 
 @pytest.mark.sqlite_only("the service of this test is one process with SQLite")
 def test_a_copy_answers_as_the_service_did_and_is_renewed(
-    walk: tuple[DepthFrame, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    walk: tuple[DepthFrame, ...], nowhere: DepthFrame, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
     data, copy = tmp_path / "data", tmp_path / "robot" / "copy"
     data.mkdir()
     with serving(data, 1) as url, Client(url) as client:
@@ -73,13 +80,13 @@ def test_a_copy_answers_as_the_service_did_and_is_renewed(
         assert "keeps no snapshot" in capsys.readouterr().err
         upload(client, walk[:14:2])
         first = client.take_snapshot(wait_s=400)
-        online, tracked = answers(client, walk[3:10:2]), states(client, walk[3:10:2])
+        online, tracked = answers(client, (*walk[3:10:2], nowhere)), states(client, walk[3:10:2])
         assert main(pull) == 0
         upload(client, walk[14:15])
         client.take_snapshot(wait_s=400)
         capsys.readouterr()
         second = [path.name for path in copy.parent.iterdir()]
-        renewed = answers(client, walk[15:16])
+        renewed = answers(client, (walk[15], nowhere))
     # nobody answers at the address any more
     assert first.result is not None
     assert second == ["copy"]
@@ -87,7 +94,7 @@ def test_a_copy_answers_as_the_service_did_and_is_renewed(
     assert online[-1]["status"] == "not_found"
     with Client.embedded(copy) as offline:
         assert list(offline.queries()) == []  # the service's are none of the robot's
-        assert answers(offline, walk[3:10:2]) == online
+        assert answers(offline, (*walk[3:10:2], nowhere)) == online
         asked = [one.query_id for one in offline.queries()]
         assert len(asked) == len(online)
         assert states(offline, walk[3:10:2]) == tracked
@@ -108,7 +115,7 @@ def test_a_copy_answers_as_the_service_did_and_is_renewed(
                 sent = [one.query_id for one in client.queries(MAP) if one.offline]
             assert sent == own
         with Client.embedded(copy) as offline:
-            assert answers(offline, walk[15:16]) == renewed
+            assert answers(offline, (walk[15], nowhere)) == renewed
             assert sum(1 for _ in offline.frames(MAP)) == 8
             upload(offline, walk[16:17])
         with Client(url) as client:
