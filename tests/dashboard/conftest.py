@@ -50,8 +50,6 @@ ROOMS, VIEWS = 2, 8
 #: When the first frame was taken; each next one is a second later.
 TAKEN = "2026-11-20T09:{minute:02d}:{second:02d}Z"
 Settle = Callable[[Page], None]
-#: What axe looks at where nothing but colours is another.
-COLOURS = {"type": "rule", "values": ["color-contrast", "link-in-text-block"]}
 
 
 def until(what: Callable[[], Any], seconds: float = PATIENCE_S) -> Any:
@@ -360,14 +358,14 @@ def settle() -> Settle:
 
 @pytest.fixture(scope="session")
 def axe() -> Callable[[Page], list[str]]:
-    """What axe finds on a page, in the light theme and in the dark one, which is other colours."""
+    """What axe finds on a page, in the light theme and in the dark one."""
     judge = Axe()
 
     def look(page: Page) -> list[str]:
         found = []
-        for theme, rules in (("light", {}), ("dark", {"runOnly": COLOURS})):
+        for theme in ("light", "dark"):
             page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
-            options = {"resultTypes": ["violations"], **rules}
+            options = {"resultTypes": ["violations"]}
             for one in judge.run(page, options=options).response["violations"]:
                 where = [node["html"][:200] for node in one["nodes"][:5]]
                 found.append(f"{theme}: {one['id']}: {one['help']}: {where}")
