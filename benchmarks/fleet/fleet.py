@@ -86,8 +86,8 @@ class Fleet:
         self._shared |= SETTINGS | {
             "SCENEPRINT_DATABASE_URL": self.pair.url, "SCENEPRINT_BLOB_URL": blobs
         }  # fmt: skip
-        if self._trusting:
-            self._shared["SCENEPRINT_TRUST_SIGNATURES"] = "1"
+        if self._trusting:  # of many walks in one map nobody wants a surface
+            self._shared |= {"SCENEPRINT_TRUST_SIGNATURES": "1", "SCENEPRINT_SURFACES": "asked"}
         made = subprocess.run(
             [sys.executable, "-c", _MAKE_KEY, str(self.host)], check=True, text=True,
             env=self.environment() | _path_of(self._before), stdout=subprocess.PIPE,
