@@ -331,7 +331,7 @@ def test_a_crowd_tells_what_it_met_with() -> None:
     more = {"kills": kills, "promotions": back, "spooled_twice": 4}
     told = "\n".join(table(figures(found, plan=plan, **more)))
     assert "1,000 robots send 1 frames a second each, and send their signatures along" in told
-    assert "2 times a host did not reach its servers for 12 s." in told
+    assert "A host was cut off twice from its servers for 12 s." in told
     assert "SIGKILL of 1 of primary, 2 of service." in told
     assert "keep a frame for 40 s" in told
     assert "| deleted as they were too old, and told to have been | 3 |" in told

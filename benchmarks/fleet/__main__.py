@@ -127,11 +127,11 @@ def _more(plan: Plan) -> list[str]:
     """What else such a run has, as sentences."""
     found = []
     if plan.freezes:
-        found.append(f"The primary was frozen {plan.freezes} times for {FROZEN_S:g} s (SIGSTOP).")
+        often = _often(plan.freezes)
+        found.append(f"The primary was frozen {often} for {FROZEN_S:g} s (SIGSTOP).")
     if plan.partitions:
-        found.append(
-            f"{plan.partitions} times a host did not reach its servers for {CUT_OFF_S:g} s."
-        )
+        often = _often(plan.partitions)
+        found.append(f"A host was cut off {often} from its servers for {CUT_OFF_S:g} s.")
     if plan.retention_s is not None:
         found.append(
             f"Three of four robots have maps that keep a frame for {plan.retention_s:g} s, so that "
@@ -143,6 +143,10 @@ def _more(plan: Plan) -> list[str]:
             "with a frame in ten seconds, spooled at once."
         )
     return found
+
+
+def _often(n: int) -> str:
+    return {1: "once", 2: "twice"}.get(n, f"{n} times")
 
 
 def main(arguments: list[str] | None = None) -> int:
