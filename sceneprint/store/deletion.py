@@ -254,7 +254,10 @@ def doomed_blobs(
     return list(connection.execute(asked).scalars())
 
 
-def settle(connection: Connection, blobs: Sequence[str], at: float | None = None) -> None:
+def settle(
+    connection: Connection, blobs: Sequence[str], at: float | None = None,
+    before: float | None = None,
+) -> None:  # fmt: skip
     """Note no more that blobs are doomed: they are removed, or something refers to them.
 
     Parameters
@@ -262,11 +265,14 @@ def settle(connection: Connection, blobs: Sequence[str], at: float | None = None
     connection : of a writing transaction of all maps
     blobs : a few hundred at most
     at : time of the notes; those of another one stay. None: all go
+    before : those that are as young, or younger, stay as well
     """
     if not blobs:
         return
-    own = doomed.c.blob.in_(blobs)
-    connection.execute(delete(doomed).where(own if at is None else own & (doomed.c.at == at)))
+    which: list[ColumnElement[bool]] = [doomed.c.blob.in_(blobs)]
+    which += [] if at is None else [doomed.c.at == at]
+    which += [] if before is None else [doomed.c.at < before]
+    connection.execute(delete(doomed).where(*which))
 
 
 # Frames that are older than their map keeps them.

@@ -798,6 +798,6 @@ def remove_job(connection: Connection, job: JobRow) -> list[str]:
     blobs : that it referred to: sweep them when this is committed
     """
     blobs = remove_parts(connection, job.number)
-    keep_turns(connection)
+    keep_turns(connection, job.tenant)
     connection.execute(delete(jobs).where(jobs.c.number == job.number))
     return blobs

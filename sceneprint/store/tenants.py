@@ -99,8 +99,9 @@ def unknown_tenant(name: str) -> UnknownTenant:
     )
 
 
-def keep_turns(connection: Connection) -> None:
-    """Keep each tenant's latest turn at the workers; call it before jobs are removed.
+def keep_turns(connection: Connection, *names: str) -> None:
+    """Keep the latest turns of some tenants at the workers, or of all where none is named; call it
+    before jobs are removed.
 
     Else whoever deletes its maps again and again would always come first.
     """
@@ -110,7 +111,8 @@ def keep_turns(connection: Connection) -> None:
         .correlate(tenants)
         .scalar_subquery()
     )
-    connection.execute(update(tenants).where(tenants.c.turn < last).values(turn=last))
+    which = [tenants.c.name.in_(names)] if names else []
+    connection.execute(update(tenants).where(tenants.c.turn < last, *which).values(turn=last))
 
 
 def _first_key(connection: Connection, tenant: str) -> str | None:

@@ -10,20 +10,23 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import select, text
+from sqlalchemy import select, text, update
 
+from benchmarks.fleet.postgres import Server
 from benchmarks.fleet.s3 import ObjectServer
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs, collect_doomed_blobs
-from sceneprint.errors import StoreLocked, UnusableStore
+from sceneprint.errors import StoreAway, StoreLocked, UnusableStore
 from sceneprint.settings import Settings
 from sceneprint.store import Store, open_store
+from sceneprint.store.blobs.folder import LONGEST_S
+from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.deletion import doom, remove_map
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map
@@ -47,10 +50,10 @@ store = open_store(url, bucket)
 if dies == "after":
     settle = garbage_collection.settle
 
-    def settle_all_but_what_is_gone(connection, some, at=None):
+    def settle_all_but_what_is_gone(connection, some, at=None, before=None):
         if at is not None:
             os.kill(os.getpid(), signal.SIGKILL)
-        settle(connection, some)
+        settle(connection, some, at, before)
 
     garbage_collection.settle = settle_all_but_what_is_gone
 garbage_collection.collect_blobs(store, blobs)
@@ -200,6 +203,12 @@ def doomed_in(engine: Engine) -> list[str]:
         return list(connection.execute(select(doomed.c.blob).order_by(doomed.c.blob)).scalars())
 
 
+def grow_old(engine: Engine) -> None:
+    """Let the time pass after which no removal of before goes on."""
+    with engine.store.database.write() as connection:
+        connection.execute(update(doomed).values(at=doomed.c.at - LONGEST_S))
+
+
 @contextmanager
 def least(engine: Engine, revision: str) -> Iterator[None]:
     """The oldest version that may write, and later the one that may now."""
@@ -273,7 +282,8 @@ def test_an_artifact_is_there_after_its_removal(
         blobs = remove_map(connection, find_map(connection, "hall"))
     data = engine.store.blobs.get(artifact)
     removing = removal(*blobs)
-    assert doomed_in(engine) == [artifact]  # the upload is the other map's, too
+    # the upload is the other map's, too, and stays noted until no earlier removal can take it
+    assert doomed_in(engine) == sorted(blobs)
     work = engine.claim("w")
     assert work is not None
     signing = Background(lambda: engine.run(work))
@@ -378,13 +388,54 @@ def test_what_a_killed_remover_leaves(
     assert process.returncode == -9
     assert doomed_in(engine) == sorted([digest, OTHER])
     held.drop()  # what it had asked for is not carried out
+    if dies == "before":
+        with pytest.raises(StoreLocked, match="lost its connection, and may still remove them"):
+            alone(engine, small)  # nobody can tell whether it is dead, or cut off
+        grow_old(engine)
     alone(engine, small)  # who is dead is not waited for
     assert engine.store.blobs.get(digest) == small[0].png
     assert (OTHER in engine.store.blobs.digests()) == (dies == "before")
+    grow_old(engine)
     assert collect_doomed_blobs(engine.store) == 2
     assert doomed_in(engine) == []
     assert list(engine.store.blobs.digests()) == [digest]
     assert engine.store.blobs.get(digest) == small[0].png
+
+
+def test_a_server_that_fell_tells_of_the_removal_that_was_under_way(
+    tmp_path: Path, bucket: str
+) -> None:
+    server = Server(tmp_path / "server")
+    server.start()
+    try:
+        server.create("fleet")
+        with closing(open_store(server.url("fleet"), bucket)) as store:
+            digest = store.blobs.put(b"a frame")
+            with store.database.write() as connection:
+                doom(connection, [digest])
+            for _ in range(3):
+                with store.blobs.removing() as allowed:
+                    assert allowed
+            assert store.blobs._locks.removals() == 6
+            with store.blobs.removing():
+                server.kill()
+                server.start()
+                assert store.blobs._locks.removals() is None
+                # the lock went with the server, and the request to remove may still come
+                with pytest.raises(StoreLocked):
+                    store.blobs.holds(digest)
+    finally:
+        server.kill()
+
+
+def test_what_is_removed_one_by_one_ends_in_time(tmp_path: Path) -> None:
+    objects = open_objects(f"file://{tmp_path}")
+    for key in ("a", "c"):
+        objects.put(key, b"x")
+    with pytest.raises(StoreAway, match="too slow"):
+        objects.delete("missing", "a", "c", seconds=-1.0)
+    objects.delete("missing", "a", "c", seconds=60.0)
+    assert [one.key for one in objects.list("")] == []
 
 
 @pytest.mark.parametrize("revision", ["0015", "0020"])

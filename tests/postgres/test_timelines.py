@@ -13,11 +13,12 @@ import pytest
 
 from benchmarks.fleet.postgres import Server
 from sceneprint.engine import Engine
-from sceneprint.errors import StoreAway
+from sceneprint.errors import StoreAway, UnusableStore
 from sceneprint.settings import Settings
 from sceneprint.store import open_store
 from sceneprint.store.blobs.folder import TIMELINE, FolderBlobs
 from sceneprint.store.database import Database, reach_database
+from sceneprint.store.postgres import timelines
 from sceneprint_client.api import NewMap
 
 
@@ -119,6 +120,49 @@ def test_connections_that_are_open_to_it_are_given_up(
         [system] = old.execute("SELECT (pg_control_system()).system_identifier::text")[0]
         assert database.history == f"{system}/00000002"
         assert [one for one in blobs.entries() if not one.unfinished] == []  # fsck minds no note
+
+
+class Away(FolderBlobs):
+    """Blobs whose notes cannot be read."""
+
+    def get_note(self, name: str) -> bytes | None:
+        raise UnusableStore(f"{name}: away")
+
+
+def test_a_running_process_learns_from_the_note(
+    pair: tuple[Server, Server], tmp_path: Path, until: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was cut off while the standby was promoted, and others used that."""
+    old, new = pair
+    blobs = FolderBlobs(tmp_path)
+    with closing(reach_database(url_of(old, new))) as database:
+        database.refuse_old_primaries(blobs)
+        assert place_of(database) == old.port
+        caught_up(old, new, until)
+        new.promote()
+        with closing(reach_database(url_of(new))) as other:
+            other.refuse_old_primaries(blobs)
+        with closing(database.driver_connection()) as connection:
+            assert connection.info.port == old.port  # it looked a moment ago
+        monkeypatch.setattr(timelines, "COMPARED_S", 0.0)
+        with closing(database.driver_connection()) as connection:
+            assert connection.info.port == new.port
+        assert place_of(database) == new.port
+
+
+def test_a_note_is_never_lowered(pair: tuple[Server, Server], tmp_path: Path) -> None:
+    server, _ = pair
+    [(system,)] = server.execute("SELECT (pg_control_system()).system_identifier::text")
+    noted = json.dumps({"system": system, "number": 7}).encode()
+    FolderBlobs(tmp_path).put_note(TIMELINE, noted)
+    with closing(reach_database(url_of(server))) as database:
+        assert place_of(database) == server.port
+        database.refuse_old_primaries(Away(tmp_path))  # nothing is learnt, and nothing noted
+        assert place_of(database) == server.port
+        assert FolderBlobs(tmp_path).get_note(TIMELINE) == noted
+        with pytest.raises(StoreAway):
+            database.refuse_old_primaries(FolderBlobs(tmp_path))
+    assert FolderBlobs(tmp_path).get_note(TIMELINE) == noted
 
 
 def test_a_role_that_may_not_ask_for_the_system(pair: tuple[Server, Server]) -> None:

@@ -18,6 +18,7 @@ from contextlib import ExitStack, suppress
 
 from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store import Store
+from sceneprint.store.blobs.folder import LONGEST_S
 from sceneprint.store.database import least_revision
 from sceneprint.store.deletion import doom, doomed_blobs, settle
 from sceneprint.store.frames import referred_blobs
@@ -86,7 +87,8 @@ def _remove_after_turn(store: Store, block: Sequence[str]) -> bool:
                 doom(connection, block)  # and settle nothing: it may be on its way out elsewhere
                 return False
             kept = referred_blobs(connection, block)
-            settle(connection, [*kept])
+            # a removal that lost its lock may still be at the others, and `holds` must know
+            settle(connection, [*kept], before=time.time() - LONGEST_S)
             gone = [blob for blob in block if blob not in kept]
             at = doom(connection, gone)
         store.blobs.remove(*gone)

@@ -32,9 +32,11 @@ from sceneprint.store.database_errors import unusable
 # server that of a connection.
 
 
-#: Seconds to wait for the end of a removal: for who has a turn, and for who has none. Its requests
-#: end by then (`object_client.SMALL_S`, `TRIED_S`).
+#: Seconds to wait for the end of a removal: for who has a turn, and for who has none.
 TURN_S, REMOVAL_S = 5.0, 25.0
+#: Seconds after which a removal is over, whatever became of who removes: it begins no request after
+#: REMOVAL_S, and each ends within `object_client.TRIED_S` and `SMALL_S`.
+LONGEST_S = 90.0
 
 
 class Locks(ABC):

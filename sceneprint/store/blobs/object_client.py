@@ -11,6 +11,7 @@ library's own hold whole URLs.
 from __future__ import annotations
 
 import io
+import math
 import os
 import re
 import time
@@ -284,12 +285,19 @@ class Objects:
             for one in page:
                 yield ListedObject(one["path"], one["size"], one["last_modified"].timestamp())
 
-    def delete(self, *keys: str) -> None:
-        """Remove objects; of no consequence where there are none."""
+    def delete(self, *keys: str, seconds: float = math.inf) -> None:
+        """Remove objects; of no consequence where there are none.
+
+        Parameters
+        ----------
+        keys : within the prefix
+        seconds : after which no further request is begun; StoreAway where keys are left then
+        """
         import obstore
 
         if not keys:
             return
+        until = time.monotonic() + seconds
         with self._explained(f"{keys[0]} cannot be removed"):
             try:
                 obstore.delete(self._small, keys)
@@ -298,6 +306,8 @@ class Objects:
                     raise
                 if len(keys) > 1:  # it stopped at the first that was gone
                     for key in keys:
+                        if time.monotonic() > until:
+                            raise self._fault(key, "too slow", StoreAway) from None
                         self.delete(key)
 
     def _make_durable(self, key: str) -> None:

@@ -119,6 +119,7 @@ def configure(connection: Any, _record: object = None) -> None:
             f"{_OLDEST} or later is needed, and a database made with ENCODING 'UTF8'."
         )
     connection.adapters.register_dumper(str, _texts())
+    given = {**_CONNECT, **connection.info.get_parameters()}
     before, connection.autocommit = connection.autocommit, True
     connection.execute(
         "SELECT set_config('lock_timeout', %s, false), set_config('statement_timeout', %s, false),"
@@ -134,7 +135,7 @@ def configure(connection: Any, _record: object = None) -> None:
         " WHEN 'off' THEN 'on' ELSE current_setting('synchronous_commit') END, false)",
         [
             *(_milliseconds(seconds) for seconds in (BUSY_S, STATEMENT_S, IDLE_S)),
-            *(_CONNECT[f"keepalives_{name}"] for name in ("idle", "interval", "count")),
+            *(given[f"keepalives_{name}"] for name in ("idle", "interval", "count")),
         ],
     )
     connection.autocommit = before

@@ -6,14 +6,15 @@ The server gives them back when a connection ends, however its process dies.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from sceneprint.errors import UnusableStore
-from sceneprint.store.blobs.folder import Locks
+from sceneprint.errors import StoreLocked, UnusableStore
+from sceneprint.store.blobs.folder import LONGEST_S, Locks
 from sceneprint.store.postgres.connection import LOCK_BITS, LOCKS
 
 if TYPE_CHECKING:
@@ -34,12 +35,21 @@ log = logging.getLogger(__name__)
 _COUNTER = "sceneprint_removals"
 _MAKE = f"CREATE SEQUENCE IF NOT EXISTS {_COUNTER}"
 _READ = f"SELECT CASE WHEN is_called THEN last_value ELSE 0 END FROM {_COUNTER}"
-_NEXT = f"SELECT nextval('{_COUNTER}')"
+#: As `nextval`, which the server's log has in advance: after a crash it would go on 32 further, and
+#: an odd number be an even one. Only who removes counts, and has the lock.
+_NEXT = (
+    f"SELECT setval('{_COUNTER}', CASE WHEN is_called THEN last_value ELSE 0 END + 1)"
+    f" FROM {_COUNTER}"
+)
 _SHARE = "SELECT pg_advisory_lock_shared(%s, %s)"
 _TAKE = "SELECT pg_try_advisory_lock(%s, %s)"
 _GIVE = "SELECT pg_advisory_unlock(%s, %s)"
-_DOOMED = "SELECT EXISTS (SELECT FROM doomed WHERE blob = %s)"
-#: Given back when it is there.
+#: Seconds since a blob was doomed; infinity where it is not.
+_DOOMED = (
+    "SELECT coalesce(extract(epoch FROM clock_timestamp()) - max(at), 'infinity')::float"
+    " FROM doomed WHERE blob = %s"
+)
+#: The lock is released as soon as it is granted.
 _WAIT = "SELECT set_config('lock_timeout', %s, true), pg_advisory_xact_lock_shared(%s, %s)"
 
 
@@ -111,8 +121,8 @@ class SessionLocks(Locks):
 
     def wait(self, digest: str | None, seconds: float) -> None:
         """See `Locks`: who dies gives the lock back, although the counter stays odd."""
-        # what a removal takes away is doomed until after its end
-        if digest is not None and self._reads.ask(_DOOMED, digest) is False:
+        # what is removed after its turn is doomed until the removal has ended
+        if digest is not None and self._reads.ask(_DOOMED, digest) == math.inf:
             return
         # of its own: other threads ask `removals` meanwhile
         connection = self._database.driver_connection()
@@ -121,6 +131,16 @@ class SessionLocks(Locks):
                 connection.execute(_WAIT, (f"{seconds * 1e3:.0f}", LOCKS, BLOBS))
         finally:
             connection.close()
+        if digest is not None and self.removals() is None:
+            # whoever removed it has lost its lock: it is dead, or cut off, and then its requests
+            # may still be on their way
+            age_s = self._reads.ask(_DOOMED, digest)
+            if age_s is None or age_s < LONGEST_S:
+                raise StoreLocked(
+                    f"{self._database.shown}: a process that removes the same bytes lost its "
+                    "connection, and may still remove them. Nothing was stored. Come back in a "
+                    "minute or two."
+                )
 
     def _begin(self) -> bool:
         if not self._removes.ask(_TAKE, LOCKS, BLOBS):

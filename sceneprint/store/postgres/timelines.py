@@ -4,7 +4,7 @@ A standby that is promoted begins a timeline of its own. Its old primary, where 
 writes the one before, and what it acknowledges is lost when it is made a standby. A process that
 knows the later timeline refuses it, and connects to the next host of its URL.
 
-    connect  --timeline-->  Timelines  --remember-->  timeline.json beside the blobs
+    hosts  --Timelines.connect-->  connection to a primary  --Timelines.follow-->  timeline.json
 
 The note lets processes that begin later, on whatever host, refuse the old primary too.
 """
@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import threading
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+#: Seconds for which what was noted beside the blobs is believed to be the newest.
+COMPARED_S = 5.0
 _NUMBER = (
     "CASE WHEN pg_is_in_recovery() THEN NULL"
     " ELSE left(pg_walfile_name(pg_current_wal_lsn()), 8) END"
@@ -71,6 +75,7 @@ class Timelines:
         self._lock = threading.Lock()
         self._newest: dict[str, int] = {}
         self._blobs: Blobs | None = None
+        self._compared = -math.inf
         self._refused: tuple[str, str] | None = None
         #: That of the last connection to a primary.
         self.current: Timeline | None = None
@@ -121,22 +126,33 @@ class Timelines:
         Where the blobs are away, nothing is learnt. Connections that are open to an old primary are
         given up when they are used next.
         """
+        self._blobs = blobs
+        self._compare_note()
+
+    def _compare_note(self) -> None:
+        """Learn what is noted beside the blobs, and note what is newer; neither where they are
+        away.
+        """
+        if self._blobs is None:
+            return
+        self._compared = time.monotonic()
         try:
-            noted = _read(blobs)
+            noted = _read(self._blobs)
+            with self._lock:
+                if noted is not None:
+                    before = self._newest.get(noted.system, 0)
+                    self._newest[noted.system] = max(before, noted.number)
+            current = self.current
+            if current is None or not self._is_newest(current) or current == noted:
+                return
+            self._blobs.put_note(TIMELINE, json.dumps(vars(current)).encode())
         except UnusableStore as error:
-            log.warning("timeline unknown", extra={"error": str(error)})
-            noted = None
-        with self._lock:
-            self._blobs = blobs
-            if noted is not None:
-                before = self._newest.get(noted.system, 0)
-                self._newest[noted.system] = max(before, noted.number)
-        current = self.current
-        if current is not None and self._is_newest(current) and current != noted:
-            self._note(current)
+            log.warning("timeline note unavailable", extra={"error": str(error)})
 
     def _admit(self, found: Timeline) -> bool:
         """Whether a primary may be used: none writes a later timeline."""
+        if time.monotonic() - self._compared > COMPARED_S:  # others may have used a later one
+            self._compare_note()
         with self._lock:
             before = self._newest.get(found.system, 0)
             if found.number < before:
@@ -145,17 +161,8 @@ class Timelines:
             is_new = self.current is None or found != self.current
             self.current = found
         if is_new:
-            self._note(found)
+            self._compare_note()
         return True
-
-    def _note(self, found: Timeline) -> None:
-        """Write it beside the blobs; where that fails, the next process that begins tries again."""
-        if self._blobs is None:
-            return
-        try:
-            self._blobs.put_note(TIMELINE, json.dumps(vars(found)).encode())
-        except UnusableStore as error:
-            log.warning("timeline not noted", extra={"error": str(error)})
 
     def _is_newest(self, found: Timeline) -> bool:
         with self._lock:
