@@ -251,6 +251,11 @@ def test_what_is_not_there_is_seen(
         listener = Listener("fleet", "secret", nobody)
         listener.heard["frame.received", kept[0].frame_id] = 2
         found = check(told, [client, client], [listener])
+        ages = {"fleet": 10.0}
+        for at, missing in ((9.0, {kept[1].frame_id}), (10.0, set[str]())):
+            listener.retired = {kept[1].frame_id: at}  # its robot began to send it at 0
+            aged = check(told, [client, client], [listener], ages)
+            assert (aged.missing, aged.aged, aged.looked_for) == (missing, 1 - len(missing), 0)
     assert found == Found(
         acknowledged=4, indexed=2, looked_for=2, found=1, missing={kept[1].frame_id}, stuck=1,
         strangers=1, unheard=2, heard_twice=1,
@@ -265,7 +270,7 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         "steps": (), "refused": Counter(), "waits_ms": {"query": (90.0, 1200.0)},
         "memory": (200_000_000, 100_000_000),
         "answers": Counter(found=3), "repeated": 4, "faults": [], "damaged": 0, "leftovers": 0,
-        "lost": 0, "window": 0, "seconds": 99.0, "spooled_twice": 0,
+        "lost": 0, "window": 0, "seconds": 99.0, "spooled": 0, "spooled_twice": 0,
         "locks": LockShares(5_000, 100.0, 0.09, 0.9),
     }  # fmt: skip
     return FleetFigures(found=found, **same | changed)
@@ -282,6 +287,9 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         ({}, {"locks": LockShares(5_000, 100.0, 0.9, 0.9)}, False),  # 100 ms a frame
         ({}, {"waits_ms": {"query": (90.0, 25_001.0)}}, False),
         ({}, {"memory": (2 << 30, 1)}, False),
+        ({}, {"locks": LockShares(5_000, 59.0, 0.0, 0.0)}, False),  # half of 120 s is too few
+        ({}, {"plan": Plan(offline=9), "spooled": 9}, True),
+        ({}, {"plan": Plan(offline=9), "spooled": 8}, False),
         ({}, {"promotions": [Promotion(None, 1.0, 2.0, {}, frozenset(), frozenset())]}, True),
         ({}, {"promotions": [Promotion(None, 1.0, 2.0, {}, frozenset(), frozenset("a"))]}, False),
         ({"acknowledged": 0, "indexed": 0, "found": 0}, {}, False),
@@ -328,7 +336,7 @@ def test_a_crowd_tells_what_it_met_with() -> None:
     found = Found(acknowledged=9, indexed=6, looked_for=5, found=5, aged=3)
     back = [Promotion(None, 1.0, 2.0, {"a": 0.5}, frozenset(), frozenset({"a", "b"}))]
     kills = Counter({"service": 2, PRIMARY: 1, CUT_OFF: 2})
-    more = {"kills": kills, "promotions": back, "spooled_twice": 4}
+    more = {"kills": kills, "promotions": back, "spooled": 360, "spooled_twice": 4}
     told = "\n".join(table(figures(found, plan=plan, **more)))
     assert "1,000 robots send 1 frames a second each, and send their signatures along" in told
     assert "A host was cut off twice from its servers for 12 s." in told

@@ -71,7 +71,7 @@ def table(figures: FleetFigures) -> list[str]:
     if plan.offline:
         lines.append(
             f"| frames spooled by the robot that was offline, sent again, doubled | "
-            f"{plan.offline}, {figures.spooled_twice}, {found.doubled} |"
+            f"{figures.spooled}, {figures.spooled_twice}, {found.doubled} |"
         )
     if plan.asynchronous:
         lines.append(
@@ -139,8 +139,8 @@ def _more(plan: Plan) -> list[str]:
         )
     if plan.offline:
         found.append(
-            f"One more robot was offline, and sent its spool of {plan.offline} frames: of an hour "
-            "with a frame in ten seconds, spooled at once."
+            "One more robot was offline for a simulated hour, at one frame every ten seconds; its "
+            f"{plan.offline} frames were spooled at once."
         )
     return found
 

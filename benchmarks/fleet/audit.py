@@ -5,11 +5,13 @@ Ledger, listeners, every service  -->  Found
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 from benchmarks.fleet.recordings import Shot
 from benchmarks.fleet.robots import Kept, Listener
@@ -76,9 +78,11 @@ def await_idle(client: Client) -> None:
 
 def check(
     kept: Sequence[Kept], clients: Sequence[Client], listeners: Sequence[Listener],
-    aging: Container[str] = (),
+    aging: Mapping[str, float] = MappingProxyType({}),
 ) -> Found:  # fmt: skip
-    """Look every acknowledged frame up, everywhere; `aging`: maps that keep none for long."""
+    """Look every acknowledged frame up, everywhere; `aging`: seconds for which some maps keep a
+    frame.
+    """
     maps = sorted({one.map_name for one in kept})
     lists = [{name: list(client.frames(name)) for name in maps} for client in clients]
     there = {frame.frame_id: frame for frames in lists[0].values() for frame in frames}
@@ -95,9 +99,13 @@ def check(
     with ThreadPoolExecutor(len(clients)) as pool:
         parts = [looked_for[i :: len(clients)] for i in range(len(clients))]
         found = sum(pool.map(_found, clients, parts))
-    deleted = {name for one in listeners for kind, name in one.heard if kind == "frame.deleted"}
     gone = set(told) - set(there)
-    aged = {name for name in gone & deleted if told[name].map_name in aging}
+    retired = {name: at for one in listeners for name, at in one.retired.items() if name in gone}
+    aged = {
+        str(name)
+        for name, at in retired.items()
+        if at - told[str(name)].begun >= aging.get(told[str(name)].map_name, math.inf)
+    }
     result = Found(
         acknowledged=len(told),
         indexed=len(indexed),
@@ -113,7 +121,7 @@ def check(
     )
     some = sorted(lasting, key=lambda one: one.frame_id)[:: max(len(lasting) // COMPARED, 1)]
     result.disagreeing += sum(_disagree(clients, one) for one in some)
-    _hear(result, [told[name] for name in present], listeners)
+    _hear(result, [told[name] for name in (*present, *sorted(aged))], listeners)
     return result
 
 

@@ -16,6 +16,8 @@ from sceneprint.store.postgres.connection import LOCKS, MAP_LOCKS, TURN
 
 #: Seconds between two looks, and until a server that does not answer is asked again.
 EVERY_S, AGAIN_S = 0.02, 0.25
+#: Seconds for the last answer.
+PATIENCE_S = 10.0
 _ASKED = (
     "SELECT count(*) FILTER (WHERE classid = %s AND objid = %s AND mode = 'ExclusiveLock'),"
     " count(*) FILTER (WHERE classid = %s AND mode = 'ExclusiveLock')"
@@ -57,7 +59,7 @@ class LockSampler(threading.Thread):
     def stop(self) -> None:
         """Look no more."""
         self._ending.set()
-        self.join()
+        self.join(PATIENCE_S)  # a server that hangs answers nobody
 
     def run(self) -> None:
         """Look until told to stop."""

@@ -22,10 +22,10 @@ from benchmarks.fleet.failover_client import (
     PAUSE_S,
     FailoverClient,
     RequestLog,
-    Unreachable,
     bearer,
 )
 from benchmarks.fleet.recordings import Shot
+from sceneprint.engine.upkeep.purge import REASON
 from sceneprint_client import Client, Spool, errors
 from sceneprint_client.api import Added, Answer
 from sceneprint_client.http import StreamPosition, frame_form, read_events
@@ -49,13 +49,13 @@ class Kept:
     frame_id : of it
     map_name : of its map
     shot : that was sent
-    at : when, time of `time.monotonic`
+    begun : when it was sent for the first time, of `time.monotonic`
     """
 
     frame_id: str
     map_name: str
     shot: Shot
-    at: float
+    begun: float
 
 
 @dataclass
@@ -147,8 +147,8 @@ class Crowd:
                         again = max(due + 1 / self._rate, time.monotonic())
                         with self._lock:
                             heappush(self._due, (again, i, number + 1))
-        except Unreachable as error:
-            self._log.fault(str(error))
+        except Exception as error:  # whatever it is, its robots walk no more
+            self._log.fault(f"{type(error).__name__}: {error}")
 
     def _next(self) -> tuple[float, int, int] | None:
         """Whose turn is next, once it is; None where nobody walks any more."""
@@ -165,7 +165,7 @@ class Crowd:
     def _upload(self, client: FailoverClient, robot: Robot, number: int) -> None:
         shot = robot.walk[number]
         meta = shot.meta.model_copy(update={"robot": robot.name, "session": robot.name})
-        sent = frame_form(shot.png, meta)
+        sent, begun = frame_form(shot.png, meta), time.monotonic()
         if shot.signed is not None:
             sent["files"]["signed"] = ("signed", shot.signed, "application/octet-stream")
         response = client.ask(
@@ -176,7 +176,7 @@ class Crowd:
             self._log.fault(f"upload: {response.status_code} {response.text:.300}")
             return
         added = Added.model_validate_json(response.content)
-        kept = Kept(added.frame_id, robot.map_name, shot, time.monotonic())
+        kept = Kept(added.frame_id, robot.map_name, shot, begun)
         with self._ledger.lock:
             self._ledger.kept.append(kept)
 
@@ -211,7 +211,6 @@ class OfflineRobot(threading.Thread):
         super().__init__(name=robot.name, daemon=True)
         self._robot, self._file, self._offline_s, self._urls = robot, file, offline_s, urls
         self._ledger, self._log = ledger, log
-        self._stop_waiting = threading.Event()
         #: Frames that the service was told twice, as an answer did not come.
         self.there = 0
 
@@ -222,14 +221,14 @@ class OfflineRobot(threading.Thread):
             with Spool(self._file) as spool:
                 for number, shot in enumerate(self._robot.walk):
                     spool.add(shot.png, shot.meta.model_copy(update=self._named(number)))
-                self._stop_waiting.wait(max(begun + self._offline_s - time.monotonic(), 0.0))
+                time.sleep(max(begun + self._offline_s - time.monotonic(), 0.0))
                 self._send(spool)
                 left, refused = spool.status().waiting, spool.refusals()
             if left or refused:
                 self._log.fault(f"{self.name}: {left} frames wait, refused: {refused[:3]}")
             self._learn()
-        except errors.SceneprintError as error:
-            self._log.fault(f"{self.name}: {error}")
+        except Exception as error:  # whatever it is, nothing of its spool is looked for
+            self._log.fault(f"{self.name}: {type(error).__name__}: {error}")
 
     def _named(self, number: int) -> dict[str, str]:
         return {"robot": self.name, "session": self.name, "name": f"{self.name}-{number}"}
@@ -287,6 +286,8 @@ class Listener(threading.Thread):
         self._ending = threading.Event()
         #: How often each was heard, by kind and frame.
         self.heard: Counter[tuple[str, str | None]] = Counter()
+        #: When retention was heard to have deleted a frame, of `time.monotonic`.
+        self.retired: dict[str | None, float] = {}
 
     def stop(self) -> None:
         """Hear no more."""
@@ -313,5 +314,7 @@ class Listener(threading.Thread):
                 return
             for event in read_events(response.iter_lines(), place):
                 self.heard[event.kind, event.frame_id] += 1
+                if event.kind == "frame.deleted" and event.data.get("reason") == REASON:
+                    self.retired.setdefault(event.frame_id, time.monotonic())
                 if self._ending.is_set():
                     return

@@ -46,6 +46,8 @@ MAP, MODEL, OWN, OWN_MAPS = "fleet", "depth", 4, 19
 OFFLINE_MAP, OFFLINE = "fleet-offline", 0.4
 #: Seconds that a robot may take to have its last frame acknowledged.
 PATIENCE_S = 240.0
+#: Least part of the time for which locks have to be sampled.
+SAMPLED = 0.5
 #: Threads that drive the robots.
 DRIVERS = 32
 
@@ -138,7 +140,8 @@ class FleetFigures:
     lost : acknowledged frames that are not there, beyond those that a standby had not received
     window : acknowledged frames that the standbys had not received
     locks : see LockShares
-    spooled_twice : frames of the robot that was offline that were sent again
+    spooled, spooled_twice : frames of the robot that was offline that were looked for, and that
+        were sent again
     seconds : of all
     """
 
@@ -159,6 +162,7 @@ class FleetFigures:
     lost: int
     window: int
     locks: LockShares
+    spooled: int
     spooled_twice: int
     seconds: float
 
@@ -195,6 +199,9 @@ class FleetFigures:
             there - found.indexed - found.stated, astray, len(self.exceeded),
         )  # fmt: skip
         tried = found.acknowledged > 0 and self.window == len(found.missing)
+        # a server that fell, or was frozen, is not sampled
+        tried &= self.locks.seconds >= SAMPLED * self.plan.seconds
+        tried &= self.spooled == self.plan.offline
         return tried and not any(wrong) and (self.plan.asynchronous or not found.unheard)
 
 
@@ -287,6 +294,7 @@ class _Run:
             lost=len(found.missing - window),
             window=len(window),
             locks=self._locks.shares,
+            spooled=sum(one.map_name == OFFLINE_MAP for one in self._ledger.kept),
             spooled_twice=sum(one.there for one in offline),
             seconds=time.monotonic() - self._begun,
         )
@@ -297,9 +305,10 @@ class _Run:
         return list(dict.fromkeys([MAP, *map(self._plan.map_of, range(self._plan.robots))]))
 
     @property
-    def _aging(self) -> set[str]:
-        """Maps that keep no frame for long."""
-        return set() if self._plan.retention_s is None else {*self._maps} - {MAP}
+    def _aging(self) -> dict[str, float]:
+        """Seconds for which maps keep a frame, those that keep none for long."""
+        kept_s = self._plan.retention_s
+        return {} if kept_s is None else dict.fromkeys({*self._maps} - {MAP}, kept_s)
 
     def _walk(
         self, robots: list[Robot], others: list[Listener | OfflineRobot], injector: FaultInjector
@@ -333,7 +342,7 @@ class _Run:
         """Robots with keys and maps, and who hears the events of each map."""
         plan = self._plan
         for name in self._maps:
-            kept_s = plan.retention_s if name in self._aging else None
+            kept_s = self._aging.get(name)
             days = None if kept_s is None else kept_s / DAY_S
             client.create_map(name, model=MODEL, retention_days=days)
         robots = []
