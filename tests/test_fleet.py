@@ -285,6 +285,9 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         ({"indexed": 7, "looked_for": 5, "found": 5, "aged": 2}, {}, True),
         ({"indexed": 7, "looked_for": 5, "found": 5, "aged": 1}, {}, False),
         ({}, {"locks": LockShares(5_000, 100.0, 0.9, 0.9)}, False),  # 100 ms a frame
+        # 12 s are a host's that was cut off, and 0.225 s those of 9 frames
+        ({}, {"plan": Plan(partitions=1), "locks": LockShares(5_000, 99.0, 12.2, 0.9)}, True),
+        ({}, {"plan": Plan(partitions=1), "locks": LockShares(5_000, 99.0, 12.3, 0.9)}, False),
         ({}, {"waits_ms": {"query": (90.0, 25_001.0)}}, False),
         ({}, {"memory": (2 << 30, 1)}, False),
         ({}, {"locks": LockShares(5_000, 59.0, 0.0, 0.0)}, False),  # half of 120 s is too few
