@@ -61,16 +61,21 @@ def recording(
     return folder.parent
 
 
-@pytest.mark.thorough
-def test_a_fleet_loses_nothing(
-    tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def begin_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bring killed parts back at once, where there is a PostgreSQL to run."""
     try:
         binaries()
     except NoServer as error:
         pytest.skip(str(error))
     monkeypatch.setattr(faults, "AWAY_S", (0.0, 0.0))
     monkeypatch.setattr(faults, "UNNOTICED_S", 0.2)
+
+
+@pytest.mark.thorough
+def test_a_fleet_loses_nothing(
+    tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin_soon(monkeypatch)
     monkeypatch.setattr(audit, "COMPARED", 4)
     plan = Plan(**vars(SMALL) | {"data": recording})
     found = drive(tmp_path, plan)
@@ -92,12 +97,7 @@ def test_a_fleet_loses_nothing(
 def test_a_fleet_loses_nothing_whatever_becomes_of_it(
     tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    try:
-        binaries()
-    except NoServer as error:
-        pytest.skip(str(error))
-    monkeypatch.setattr(faults, "AWAY_S", (0.0, 0.0))
-    monkeypatch.setattr(faults, "UNNOTICED_S", 0.2)
+    begin_soon(monkeypatch)
     monkeypatch.setattr(faults, "CUT_OFF_S", 6.0)
     monkeypatch.setattr(faults, "BACK_S", 1.0)
     found = drive(tmp_path, replace(HARD, data=recording))

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from benchmarks.fleet.postgres import Server
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.store import Store, open_store
 from sceneprint.types import DepthFrame
@@ -63,3 +64,16 @@ def server_store(postgres_url: str, tmp_path: Path) -> Iterator[Store]:
     opened = open_store(postgres_url, tmp_path / "blobs")
     yield opened
     opened.database.close()
+
+
+@pytest.fixture
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, Server]]:
+    """A primary, and an asynchronous standby: the primary goes on without it."""
+    folder = tmp_path_factory.mktemp("pair")
+    primary = Server(folder / "primary")
+    primary.start()
+    primary.create("fleet")
+    standby = primary.standby(folder / "standby", synchronous=False)
+    yield primary, standby
+    primary.kill()
+    standby.kill()

@@ -23,18 +23,6 @@ ASKED = Query(k=5, candidates=5, keep=False)
 
 
 @pytest.fixture
-def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, Server]]:
-    folder = tmp_path_factory.mktemp("pair")
-    primary = Server(folder / "primary")
-    primary.start()
-    primary.create("fleet")
-    standby = primary.standby(folder / "standby", synchronous=False)
-    yield primary, standby
-    primary.kill()
-    standby.kill()
-
-
-@pytest.fixture
 def engine(pair: tuple[Server, Server], tmp_path: Path) -> Iterator[Engine]:
     hosts = "&".join(f"host=127.0.0.1:{server.port}" for server in pair)
     url = f"postgresql://postgres@/fleet?{hosts}&target_session_attrs=read-write"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -20,19 +19,6 @@ from sceneprint.store.blobs.folder import TIMELINE, FolderBlobs
 from sceneprint.store.database import Database, reach_database
 from sceneprint.store.postgres import timelines
 from sceneprint_client.api import NewMap
-
-
-@pytest.fixture
-def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, Server]]:
-    """A primary, and an asynchronous standby: the primary goes on without it."""
-    folder = tmp_path_factory.mktemp("pair")
-    primary = Server(folder / "primary")
-    primary.start()
-    primary.create("fleet")
-    standby = primary.standby(folder / "standby", synchronous=False)
-    yield primary, standby
-    primary.kill()
-    standby.kill()
 
 
 def url_of(*servers: Server) -> str:
