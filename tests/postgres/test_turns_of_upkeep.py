@@ -18,6 +18,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import next_events
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.jobs.robot_signatures import EVERY_S, FIRST
+from sceneprint.engine.jobs.tasks import SliceResult
 from sceneprint.engine.upkeep.purge import Retention
 from sceneprint.settings import Settings
 from sceneprint.store import open_store
@@ -107,6 +108,18 @@ def test_retention_takes_the_turn_of_its_map(engine: Engine, small: Any) -> None
     assert engine.get_map("hall").frames == {"deleted": 3}
     told = next_events(engine.store.database, Wanted(), 0, 100).found
     assert [one.kind for one in told].count("frame.deleted") == 3
+
+
+def test_a_slice_takes_the_turn_of_its_map(engine: Engine) -> None:
+    engine.tasks.register("count", lambda _task, _is_over: SliceResult(True, {}, event="counted"))
+    engine.tasks.begin("count", "hall", {})
+    work = engine.claim("w")
+    assert work is not None
+    with turns(engine) as taken:
+        assert engine.run(work) == JobState.SUCCEEDED
+    assert taken == {"one": 1, "all": 0}
+    told = next_events(engine.store.database, Wanted(), 0, 100).found
+    assert [one.kind for one in told].count("counted") == 1
 
 
 def test_packages_of_robots_are_removed_together(
