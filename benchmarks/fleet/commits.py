@@ -1,9 +1,10 @@
 """Commits in a second of many writers, with a network between them and PostgreSQL.
 
 `python -m benchmarks.fleet.commits [--maps N] [--clients N] [--delay-ms X] [--commits N]`: uploads,
-then the index commits of the same frames, as services and workers make them. Each client has a
-database of its own, and a few of them share a process. A reader follows the events meanwhile, as
-services do for those who listen: what it misses, or sees out of a map's order, and how late it is.
+then the index commits of the same frames, as services and workers make them: the clients are
+spread over some processes, and uploads that wait in one are written together. A reader follows the
+events meanwhile, as services do for those who listen: what it misses, or sees out of a map's order,
+and how late it is.
 """
 
 from __future__ import annotations
@@ -27,9 +28,11 @@ import numpy as np
 from benchmarks.fleet.delay_proxy import DelayProxy
 from benchmarks.fleet.postgres import Server
 from sceneprint.engine.admin.operations import next_events
+from sceneprint.engine.ingest.write_groups import NewFrames
 from sceneprint.store import Database, open_database, queue
 from sceneprint.store.events import Wanted
-from sceneprint.store.maps import add_map, frame_of, keep_model, receive_frame
+from sceneprint.store.maps import add_map, frame_of, keep_model
+from sceneprint.store.new_frames import NewFrame
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
 
@@ -38,7 +41,7 @@ T = TypeVar("T")
 #: Seconds between two looks for events, and events of one, as in `service/event_stream.py`.
 POLL_S, MOST = 0.1, 500
 #: Processes that clients share, each with a network of its own.
-PROCESSES = 8
+PROCESSES = 4
 #: Commits of each client before those that are timed.
 WARM = 10
 MODEL, LEASE_S = "ab" * 32, 3600.0
@@ -60,18 +63,25 @@ class Feed:
     missed : events of uploads and index commits that it never saw
     disordered : frames whose end it saw before their upload
     late_ms : from each event's time to when it was read
+    sizes : uploads that were written together
     """
 
     missed: int = 0
     disordered: int = 0
     late_ms: list[float] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
 
     def __str__(self) -> str:
         late = np.percentile(self.late_ms, [50, 99])
-        return (
+        told = (
             f"{self.missed} missed, {self.disordered} out of order, {late[0]:.0f} ms late "
             f"(p99 {late[1]:.0f} ms)"
         )
+        if not self.sizes:
+            return told
+        quarters = np.percentile(self.sizes, [12.5, 37.5, 62.5, 87.5], method="nearest")
+        sizes = ", ".join(map(str, quarters))
+        return f"{told}; uploads written together: {np.mean(self.sizes):.1f} ({sizes})"
 
 
 def measure(
@@ -105,12 +115,13 @@ def measure(
         warm, all_ = WARM * n_clients, WARM * n_clients + commits
         uploads = [(rows[i % n_maps], i) for i in range(all_)]
         _timed(clients, upload, uploads[:warm])
-        uploaded = _timed(clients, upload, uploads[warm:])
+        uploaded, sizes = _timed(clients, upload, uploads[warm:])
         claimed = [claim(near) for _ in range(all_)]
         _timed(clients, index, claimed[:warm])
-        ended = _timed(clients, index, claimed[warm:])
+        ended, _ = _timed(clients, index, claimed[warm:])
         reader.send("over")
         feed: Feed = reader.recv()
+        feed.sizes = sizes
     return commits / uploaded, commits / ended, feed
 
 
@@ -169,12 +180,30 @@ def make_maps(database: Database, n: int) -> list[MapRow]:
         return [add_map(connection, f"map-{i}", None, MODEL) for i in range(n)]
 
 
-def upload(database: Database, work: tuple[MapRow, int]) -> None:
-    """Write a frame to a map, as a service does."""
+class CountedFrames(NewFrames):
+    """New frames, and how many were written together."""
+
+    def __init__(self, database: Database) -> None:
+        super().__init__(database)
+        self.sizes: list[int] = []
+
+    def _write_together(self, taken: list[Any]) -> None:
+        super()._write_together(taken)
+        self.sizes.append(len(taken))
+
+
+class Writer:
+    """What clients of one process write with."""
+
+    def __init__(self, database: Database) -> None:
+        self.database, self.new_frames = database, CountedFrames(database)
+
+
+def upload(writer: Writer, work: tuple[MapRow, int]) -> None:
+    """Write a frame to a map, as a service does, with those that come meanwhile."""
     row, number = work
-    with database.write(map_number=row.number, single=True) as connection:
-        if receive_frame(connection, row, {**KNOWN, "content_id": f"{number:064x}"}, 0) is None:
-            raise RuntimeError("an upload was not taken")
+    if not writer.new_frames.receive(NewFrame(row, {**KNOWN, "content_id": f"{number:064x}"})):
+        raise RuntimeError("an upload was not taken")
 
 
 def claim(database: Database) -> tuple[JobRow, FrameRow]:
@@ -186,16 +215,18 @@ def claim(database: Database) -> tuple[JobRow, FrameRow]:
         return held, frame_of(connection, held.frame)
 
 
-def index(database: Database, work: tuple[JobRow, FrameRow]) -> None:
+def index(writer: Writer, work: tuple[JobRow, FrameRow]) -> None:
     """Write the signature of a claimed frame, as a worker does."""
     held, frame = work
-    with database.write(map_number=frame.map_number, single=True) as connection:
+    with writer.database.write(map_number=frame.map_number, single=True) as connection:
         if not index_claimed_frame(connection, held, frame, "map", MADE, single=True):
             raise RuntimeError("a frame was not indexed")
 
 
-def _timed(clients: list[Pipe], do: Callable[[Database, T], None], works: list[T]) -> float:
-    """Seconds until all is done by the clients at once."""
+def _timed(
+    clients: list[Pipe], do: Callable[[Writer, T], None], works: list[T]
+) -> tuple[float, list[int]]:
+    """Seconds until all is done by the clients at once, and how many frames were new together."""
     for i, client in enumerate(clients):
         client.send((do, works[i :: len(clients)]))
     for client in clients:
@@ -203,26 +234,27 @@ def _timed(clients: list[Pipe], do: Callable[[Database, T], None], works: list[T
     begun = time.perf_counter()
     for client in clients:
         client.send("begin")
-    errors = [client.recv() for client in clients]
-    for error in filter(None, errors):
-        raise error
-    return time.perf_counter() - begun
+    sizes = list[int]()
+    for client in clients:
+        error, own = client.recv()
+        if error is not None:
+            raise error
+        sizes += own
+    return time.perf_counter() - begun, sizes
 
 
 def _write(pipe: Pipe, url: str, n_clients: int) -> None:
     """Some clients, which do what they are told as fast as they can."""
-    databases = [open_database(url) for _ in range(n_clients)]
+    writer = Writer(open_database(url))
     pipe.send("begun")
     while True:
         do, works = pipe.recv()
         waiting, errors = SimpleQueue[Any](), list[Exception]()
         for work in works:
             waiting.put(work)
-        for one in databases:  # a first connection costs more than a commit
-            with one.read():
-                pass
         threads = [
-            threading.Thread(target=_work, args=(one, do, waiting, errors)) for one in databases
+            threading.Thread(target=_work, args=(writer, do, waiting, errors))
+            for _ in range(n_clients)
         ]
         pipe.send("ready")
         pipe.recv()
@@ -230,16 +262,17 @@ def _write(pipe: Pipe, url: str, n_clients: int) -> None:
             thread.start()
         for thread in threads:
             thread.join()
-        pipe.send(errors[0] if errors else None)
+        pipe.send((errors[0] if errors else None, writer.new_frames.sizes))
+        writer.new_frames.sizes = []
 
 
 def _work(
-    database: Database, do: Callable[[Database, Any], None], waiting: SimpleQueue[Any],
+    writer: Writer, do: Callable[[Writer, Any], None], waiting: SimpleQueue[Any],
     errors: list[Exception],
 ) -> None:  # fmt: skip
     try:
         while True:
-            do(database, waiting.get_nowait())
+            do(writer, waiting.get_nowait())
     except Empty:
         return
     except Exception as error:

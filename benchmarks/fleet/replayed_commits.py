@@ -2,9 +2,10 @@
 
 `python -m benchmarks.fleet.replayed_commits [--maps N] [--clients N] [--delay-ms X] [--commits N]`:
 as `commits`, but the statements of an upload and of an index commit are taken from the server's log
-while the product executes them, and pgbench executes them from then on, each time for another frame
-of any map. It needs little of the processors, which our clients in a fleet have of their own. For
-each round trip it waits as long as a network would take.
+while the product executes them, and pgbench executes them from then on, each time for other frames
+of any maps. It needs little of the processors, which our clients in a fleet have of their own. For
+each round trip it waits as long as a network would take. Uploads are sent as services send them, to
+which proxies route requests by their map: some together, one message after the other.
 """
 
 from __future__ import annotations
@@ -16,15 +17,19 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import accumulate
+from math import lcm
 from pathlib import Path
 
 import psycopg
 from sqlalchemy import func, select, update
 
 from benchmarks.fleet.commits import (
+    PROCESSES,
     Feed,
+    Writer,
     claim,
     follow,
     in_process,
@@ -40,6 +45,8 @@ from sceneprint_client.api import FrameState
 
 #: First numbers of rows, so that each is known by its number in a statement.
 FIRST = {"maps": 700_001, "frames": 2_000_001, "jobs": 5_000_001}
+#: Uploads that services write together, as shares of their clients: `commits` measures that.
+TOGETHER = (1 / 8, 4 / 8, 6 / 8, 1)
 #: Writes before the one that is taken: until then nothing is prepared.
 WARM = 12
 #: A line that begins with a date ends the one before.
@@ -95,55 +102,92 @@ def _log(server: Server, which: str) -> None:
 
 @dataclass(frozen=True)
 class Replay:
-    """Commands that pgbench executes again and again; see `measure`."""
+    """What pgbench sends again and again; see `measure`."""
 
     server: Server
     folder: Path
     n_maps: int
-    n_clients: int
+    n_senders: int
     delay_ms: float
     commits: int
 
-    def run(self, commands: Sequence[str], replaced: dict[str, str]) -> float:
-        """Transactions in a second, each of another frame.
+    def run(
+        self, messages: Sequence[Sequence[str]], n_frames: int, *, own_maps: bool = False
+    ) -> float:
+        """Frames written in a second.
 
         Parameters
         ----------
-        commands : of one transaction
-        replaced : by literals, what is put in their place
+        messages : commands of each, which are a transaction, and a round trip
+        n_frames : that all messages write, each time others
+        own_maps : whether each sender writes to maps of its own, as requests are routed to services
         """
-        for literal, expression in replaced.items():
-            commands = [one.replace(literal, expression) for one in commands]
         path = self.folder / "commit.sql"
-        path.write_text(self.script(commands))
+        path.write_text(self.script(messages, n_frames, own_maps=own_maps))
+        rounds = self.commits // self.n_senders // n_frames
         command = [
             str(binaries() / "pgbench"), "--no-vacuum", "-h", "127.0.0.1",
-            "-p", str(self.server.port), "-U", "postgres", "-M", "prepared",
-            "-c", str(self.n_clients), "-t", str(self.commits // self.n_clients),
-            "-D", "k=-1", "-D", f"maps={self.n_maps}", "-f", str(path), "commits",
+            "-p", str(self.server.port), "-U", "postgres", "-M", "prepared", "-D", "k=-1",
+            "-c", str(self.n_senders), "-t", str(rounds), "-f", str(path), "commits",
         ]  # fmt: skip
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         said = re.search(r"failed transactions: 0 .*tps = ([\d.]+)", done.stdout, re.DOTALL)
         if said is None or done.returncode:
             raise RuntimeError(done.stderr[-2000:] + done.stdout[-500:])
-        return float(said[1])
+        return n_frames * float(said[1])
 
-    def script(self, commands: Sequence[str]) -> str:
-        """What pgbench does for a transaction: commands that begin none are one pipeline, as the
-        product sends them; of others each is a round trip, however many statements it has.
-        """
-        if commands[0].startswith("BEGIN"):
-            trips = [[f"{part};" for part in one.split("; ")] for one in commands]
-        else:
-            trips = [[f"{one};" for one in commands]]
-        lines = [
-            "\\set m random(0, :maps - 1)", "\\set r random(1, 1000000000000000)",
-            "\\set k :k + 1", f"\\set n :client_id + {self.n_clients} * :k",
-        ]  # fmt: skip
-        for trip in trips:
-            lines += [f"\\sleep {round(2e3 * self.delay_ms)} us"]
-            lines += ["\\startpipeline", *trip, "\\endpipeline"]
+    def script(self, messages: Sequence[Sequence[str]], n_frames: int, *, own_maps: bool) -> str:
+        """What pgbench does again and again; a message is a pipeline, as the product sends it."""
+        lines = ["\\set k :k + 1", f"\\set n :client_id + {self.n_senders} * :k"]
+        any_ = f"random(0, {self.n_maps - 1})"
+        if own_maps and self.n_maps > self.n_senders:
+            any_ = f"random(0, {self.n_maps // self.n_senders - 1}) * {self.n_senders} + :client_id"
+        for i in range(n_frames):
+            lines += [f"\\set m{i} {any_}",
+                      f"\\set r{i} random(1, 1000000000000000)"]  # fmt: skip
+        for message in messages:
+            lines += [f"\\sleep {round(2e3 * self.delay_ms)} us", "\\startpipeline"]
+            lines += [f"{one};" for one in message] + ["\\endpipeline"]
         return "\n".join(line.replace("\n", " ") for line in lines) + "\n"
+
+
+def uploads_together(commands: Sequence[str], frames_: Sequence[int]) -> list[str]:
+    """Uploads that a service has written together, from the commands of one.
+
+    Parameters
+    ----------
+    commands : of an upload to the first map
+    frames_ : numbers of the variables that say which frames are written
+    """
+    [records] = {one for command in commands for one in re.findall(r"'(\[\{.*?\}\])'", command)}
+    numbers = ", ".join(f"{FIRST['maps']} + :m{i}" for i in frames_)
+    locks = f"(SELECT array_agg(n ORDER BY n) FROM unnest(ARRAY[{numbers}]) AS t (n))"
+    made = "('[' || " + " || ',' || ".join(_record(records[1:-1], i) for i in frames_) + " || ']')"
+    replaced = {f"'{records}'": made, f"'{{{FIRST['maps']}}}'": locks}
+    return [_replaced(one, replaced) for one in commands]
+
+
+def _replaced(command: str, replaced: dict[str, str]) -> str:
+    for literal, expression in replaced.items():
+        command = command.replace(literal, expression)
+    return command
+
+
+def _record(record: str, i: int) -> str:
+    """A record of `new_frames` as an expression, of another frame each time."""
+    values = {
+        f'"{WARM:064x}"': f"'\"' || md5('c' || :r{i}) || md5('d' || :r{i}) || '\"'",
+        str(FIRST["maps"]): f"{FIRST['maps']} + :m{i}",
+        '"map-0"': f"'\"map-' || :m{i} || '\"'",
+    }
+    for j, one in enumerate(dict.fromkeys(re.findall(r'"[0-9a-f]{32}"', record))):
+        values[one] = f"'\"' || md5('{j}' || :r{i}) || '\"'"
+    for one in dict.fromkeys(re.findall(r"\b\d{10}\.\d+", record)):
+        values[one] = _NOW
+    text = record.replace("%", "%%").replace('"place": 0', f'"place": {i}')
+    for n, literal in enumerate(values, 1):
+        text = text.replace(literal, f"%{n}$s")
+    return f"format('{text}', {', '.join(values.values())})"
 
 
 def measure(
@@ -162,32 +206,39 @@ def measure(
         _number_from(database)
         rows = make_maps(database, n_maps)
         number = iter(range(1_000_000))
-        uploaded = record(server, lambda: upload(database, (rows[0], next(number))))
-        indexed = record(server, lambda: index(database, claim(database)))
+        writer = Writer(database)
+        uploaded = record(server, lambda: upload(writer, (rows[0], next(number))))
+        indexed = record(server, lambda: index(writer, claim(database)))
         # what claimed it is not part of the commit
-        begins = max(i for i, one in enumerate(indexed) if "advisory" in one)
-        begins -= indexed[begins - 1].startswith("BEGIN")
+        begins = max(i for i, one in enumerate(indexed) if "lock_shared" in one)
         indexed = indexed[begins:]
-        content, map_, map_name = f"'{WARM:064x}'", f"'{FIRST['maps']}'", "'map-0'"
-        ids = dict.fromkeys(re.findall(r"'[0-9a-f]{32}'", " ".join(uploaded)))
-        times = dict.fromkeys(re.findall(r"'\d{10}\.\d+'", " ".join(uploaded)), _NOW)
-        replaced = {
-            content: "(md5('c' || :r) || md5('d' || :r))",
-            map_: f"({FIRST['maps']} + :m)", map_name: "('map-' || :m)",
-            **{one: f"md5('{i}' || :r)" for i, one in enumerate(ids)}, **times,
-        }  # fmt: skip
-        replay = Replay(server, Path(folder), n_maps, n_clients, delay_ms, commits)
-        written = commits // n_clients * n_clients + WARM + 1
-        with in_process(follow, server.url("commits"), written + WARM + 1) as reader:
-            uploads = replay.run(uploaded, replaced)
+        services = min(PROCESSES, n_clients)
+        sizes = [max(1, round(one * n_clients / services)) for one in TOGETHER]
+        round_ = lcm(services * sum(sizes), n_clients)
+        written = commits // round_ * round_
+        replay = Replay(server, Path(folder), n_maps, services, delay_ms, written)
+        ends_ = accumulate(sizes)
+        messages = [
+            uploads_together(uploaded, range(end - size, end))
+            for size, end in zip(sizes, ends_, strict=True)
+        ]
+        n = 2 * written + WARM + 1
+        events = written + 2 * (WARM + 1)
+        with in_process(follow, server.url("commits"), events) as reader:
+            replay.run(messages, sum(sizes), own_maps=True)
             reader.send("over")
             feed: Feed = reader.recv()
+        # the reader has a processor of its own, too
+        uploads = replay.run(messages, sum(sizes), own_maps=True)
         with database.write() as connection:
             connection.execute(update(jobs).values(state="running", token=1, worker="commits"))
         last = FIRST["frames"] + WARM, FIRST["jobs"] + WARM
-        taken = {f"'{one}'": f"({one + 1} + :n)" for one in last}
-        ends = replay.run(indexed, {map_: replaced[map_], **taken})
-        _require_written(database, written)
+        first = FIRST["maps"]
+        replaced = {f"'{first}'": f"({first} + :m0)", f"'{{{first}}}'": f"ARRAY[{first} + :m0]",
+                    **{f"'{one}'": f"({one + 1} + :n)" for one in last}}  # fmt: skip
+        indexed = [_replaced(one, replaced) for one in indexed]
+        ends = replace(replay, n_senders=n_clients, commits=2 * written).run([indexed], 1)
+        _require_written(database, n)
     return uploads, ends, feed
 
 
@@ -215,4 +266,4 @@ def _require_written(database: Database, n: int) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(tell(None, __doc__, 6400, measure, ", replayed"))
+    sys.exit(tell(None, __doc__, 24320, measure, ", replayed"))

@@ -6,7 +6,7 @@ URL  --open_database-->  Database  --read | write-->  Connection
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,8 +54,8 @@ _FOLDER = Path(migrations.__file__).parent
 _SAYS = re.compile(r'^(revision|down_revision) = (?:"(\w+)"|None)$', re.MULTILINE)
 
 
-#: Option of a connection: number of the only map that its transaction writes to, or None.
-MAP_OPTION = "sceneprint_map"
+#: Option of a connection: whether its transaction writes to single maps, and others to others.
+MAPS_OPTION = "sceneprint_maps"
 #: Writers of single maps at once in a process: each keeps a connection from the readers.
 MAP_WRITERS = 8
 
@@ -473,24 +473,57 @@ class Database:
         if unchecked and not self.is_sqlite:
             wait_s = postgres.MIGRATION_S
         with (
-            self._threads_turn(map_number, wait_s),
+            self._threads_turn(self._turns if map_number is None else self._map_turns, wait_s),
             self.explained(),
             self._writers.connect() as connection,
         ):
             if single and map_number is not None:
-                known = self._schema if self._guarded else None
-                only = postgres.SingleStatement(map_number, wait_s, known)
-                writing = connection.execution_options(
-                    **{MAP_OPTION: map_number, postgres.SINGLE: only}
-                )
-                postgres.forget_warnings(writing)
-                yield writing
-                self._held = False
+                with self._single(connection, [map_number], wait_s, wait_s) as writing:
+                    yield writing
             else:
                 with self._begun(connection, wait_s, map_number, unchecked) as writing:
                     yield writing
             if not self.is_sqlite:
                 postgres.require_synchronous(writing)
+
+    @contextmanager
+    def write_maps(self, map_numbers: Collection[int], wait_s: float) -> Iterator[Connection]:
+        """As `write` of a single statement, which writes to some maps at once, PostgreSQL.
+
+        Parameters
+        ----------
+        map_numbers : of the only maps that are written to
+        wait_s : seconds to wait for one of them. Writers of the others wait for that, too
+
+        Raises
+        ------
+        MapsInUse : it was not free by then; nothing was written.
+        ReadOnlyStore and others : see `write`.
+        """
+        self.require_writable()
+        turn_s = postgres.HELD_S if self._held else BUSY_S
+        with (
+            self._threads_turn(self._map_turns, turn_s),
+            self.explained(),
+            self._writers.connect() as connection,
+        ):
+            with self._single(connection, map_numbers, turn_s, wait_s) as writing:
+                yield writing
+            postgres.require_synchronous(writing)
+
+    @contextmanager
+    def _single(
+        self, connection: Connection, map_numbers: Collection[int], wait_s: float,
+        maps_wait_s: float,
+    ) -> Iterator[Connection]:  # fmt: skip
+        """A transaction of one statement; see `SingleStatement`."""
+        known = self._schema if self._guarded else None
+        only = postgres.SingleStatement(map_numbers, wait_s, maps_wait_s, known)
+        options: dict[str, Any] = {MAPS_OPTION: True, postgres.SINGLE: only}
+        writing = connection.execution_options(**options)
+        postgres.forget_warnings(writing)
+        yield writing
+        self._held = False
 
     @contextmanager
     def _write_out_of_turn(self) -> Iterator[Connection]:
@@ -504,9 +537,8 @@ class Database:
             yield connection
 
     @contextmanager
-    def _threads_turn(self, map_number: int | None, wait_s: float) -> Iterator[None]:
+    def _threads_turn(self, turns: ThreadTurns, wait_s: float) -> Iterator[None]:
         """The turn among the threads of this process."""
-        turns = self._turns if map_number is None else self._map_turns
         tenant = current_tenant()
         if not turns.acquire(tenant, wait_s):
             raise StoreLocked(
@@ -529,7 +561,7 @@ class Database:
         options: dict[str, Any] = {
             "sceneprint_write": wait_s,
             "sceneprint_line": self._line,
-            MAP_OPTION: map_number,
+            MAPS_OPTION: map_number is not None,
         }
         if unchecked and self.is_sqlite:
             options["sceneprint_unchecked"] = True

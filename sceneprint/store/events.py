@@ -29,7 +29,7 @@ from sqlalchemy import (
 )
 
 from sceneprint.errors import UnusableStore
-from sceneprint.store.database import MAP_OPTION, Database
+from sceneprint.store.database import MAPS_OPTION, Database
 from sceneprint.store.tables import (
     MapRow,
     among,
@@ -57,8 +57,8 @@ def record_event(
 
 def events_table(connection: Connection) -> Table:
     """Where a writer's events are inserted."""
-    of_map = connection.get_execution_options().get(MAP_OPTION) is not None
-    return pending_events if of_map else events
+    of_maps = connection.get_execution_options().get(MAPS_OPTION)
+    return pending_events if of_maps else events
 
 
 #: Seconds that who numbers events waits for another who does: a long transaction may be one.

@@ -18,7 +18,7 @@ from sqlalchemy import (
 from sceneprint.errors import UnknownFrame
 from sceneprint.store.deletion import delete_frames
 from sceneprint.store.events import record_event
-from sceneprint.store.maps import ROOMLESS, _write_tags, count_on, find_map, frame_of
+from sceneprint.store.maps import ROOMLESS, count_on, find_map, frame_of, write_tags
 from sceneprint.store.surface_rows import FUSED_COLUMNS, note_edit
 from sceneprint.store.tables import (
     FrameRow,
@@ -196,7 +196,7 @@ def write_frame(
     connection.execute(update(frames).where(frames.c.number == frame.number).values(**written))
     if "tags" in changed:
         connection.execute(delete(frame_tags).where(frame_tags.c.frame_number == frame.number))
-        _write_tags(connection, frame.number, changed["tags"])
+        write_tags(connection, frame.number, changed["tags"])
     if FUSED_COLUMNS & set(changed):
         note_edit(connection, frame.number, row.number)
     record_event(connection, "frame.edited", row.name, frame.id, fields=sorted(changed))

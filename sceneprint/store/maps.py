@@ -5,56 +5,41 @@ from __future__ import annotations
 import json
 import time
 import uuid
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
 from sqlalchemy import (
-    CTE,
-    Column,
     ColumnElement,
     Connection,
-    Insert,
     Integer,
     Select,
-    String,
-    Table,
     bindparam,
     cast,
-    exists,
     func,
     insert,
     null,
-    or_,
     select,
     update,
 )
-from sqlalchemy.dialects.postgresql import ARRAY
-from sqlalchemy.sql.dml import ReturningUpdate
-from sqlalchemy.types import TypeEngine
 
 from sceneprint.errors import QuotaExceeded, UnknownFrame, UnknownMap
-from sceneprint.store.events import events_table, inherited, record_event
+from sceneprint.store.events import inherited, record_event
 from sceneprint.store.tables import (
     FRAME_COLUMNS,
     MAP_COLUMNS,
     PACKAGE,
-    STATEMENT_TIME,
     TEXT,
-    WHOLE,
     FrameRow,
     MapRow,
     among_numbers,
-    event_values,
     frame_row,
     frame_rows,
     frame_tags,
     frames,
-    idempotency,
     job_files,
-    job_values,
     jobs,
     map_row,
     maps,
@@ -288,154 +273,25 @@ def add_frame(
         frame_id = uuid.uuid4().hex
     else:
         free_id(connection, map_number, frame_id)
-    made = insert(frames).values(_received(connection, map_number, frame_id, values))
+    made = insert(frames).values(received_values(connection, map_number, frame_id, values))
     row = frame_row(connection.execute(made.returning(frames)).mappings().one())
     count_on(connection, map_number, 1, values["bytes"])
-    _write_tags(connection, row.number, row.tags)
+    write_tags(connection, row.number, row.tags)
     return row
 
 
-def _received(
+def received_values(
     connection: Connection, map_number: int, frame_id: str, values: dict[str, Any]
 ) -> dict[str, Any]:
-    place = {} if values["pose"] is None else position(values["pose"])
+    """Columns of a frame that is received now; see `add_frame`."""
     state, at = FrameState.RECEIVED, now(connection)
     own = {"id": frame_id, "map_number": map_number, "state": state, "received_at": at}
-    return {**own, **values, **place}
+    return {**own, **values, **position(values["pose"])}
 
 
 def position(pose: Sequence[Sequence[float]] | None) -> dict[str, float | None]:
     """Columns of a frame's position, to be searched for."""
     return {f"pose_{axis}": None if pose is None else pose[i][3] for i, axis in enumerate("xyz")}
-
-
-def receive_frame(
-    connection: Connection, row: MapRow, values: dict[str, Any], priority: int,
-    data: dict[str, Any] | None = None, more_bytes: int = 0,
-    kept: Callable[[str], dict[str, Any]] | None = None,
-) -> tuple[str, str] | None:  # fmt: skip
-    """Take a frame whose content its map lacks, and queue its signing: all that most uploads are.
-
-    Others wait for this, so it is one statement on PostgreSQL, whose answer takes a round trip, and
-    on SQLite, where nothing but inserting follows the first one, one for each table.
-
-    Parameters
-    ----------
-    connection : of a writing transaction
-    row : of the map, as it was when somebody looked
-    values : see `add_frame`
-    priority, data : of the job
-    more_bytes : that its map counts beside the upload
-    kept : columns of `idempotency` by the id of the frame, PostgreSQL
-
-    Returns
-    -------
-    ids : of the frame and of its job; None, and nothing was written, where the map is gone, has no
-        room or has the content: `add_frame` and what is asked before it say which
-
-    Raises
-    ------
-    IntegrityError : something was done under the key of `kept` before.
-    """
-    frame_id, job = uuid.uuid4().hex, job_values(connection, "sign", priority, None, data)
-    frame = _received(connection, row.number, frame_id, values)
-    job["map_number"] = row.number
-    told = event_values("frame.received", row.name, frame_id, job["id"], {})
-    room = {"map_number": row.number, "map_name": row.name, "size": values["bytes"] + more_bytes,
-            "content": values["content_id"]}  # fmt: skip
-    tags = sorted(set(values["tags"]))
-    if connection.dialect.name == "sqlite":
-        if connection.execute(_room_taken(), room).first() is None:
-            return None
-        made = insert(frames).values(frame).returning(frames.c.number)
-        number = connection.execute(made).scalar_one()
-        _write_tags(connection, number, tags)
-        connection.execute(insert(jobs).values(frame_number=number, **job))
-        connection.execute(insert(events_table(connection)).values(told))
-        return frame_id, job["id"]
-    rows = {"frame": frame, "job": job, "event": told}
-    if kept is not None:
-        rows["kept"] = kept(frame_id)
-    given = {
-        f"{of}_{name}": value for of, values in rows.items() for name, value in values.items()
-        if not isinstance(value, ColumnElement)
-    }  # fmt: skip
-    asked = _reception(events_table(connection), *map(tuple, rows.values()))
-    found = connection.execute(asked, {**given, **room, "tags": tags}).first()
-    return None if found is None else (frame_id, job["id"])
-
-
-@cache
-def _room_taken() -> ReturningUpdate[tuple[int]]:
-    """Count a frame more, if its map is the one that was looked at still, has room, and lacks the
-    content.
-    """
-    number, size = bindparam("map_number", type_=WHOLE), bindparam("size", type_=WHOLE)
-    content = bindparam("content", type_=TEXT)
-    alike = frames.c.map_number == number, frames.c.content_id == content
-    return (
-        update(maps)
-        .where(
-            maps.c.number == number,
-            maps.c.name == bindparam("map_name", type_=TEXT),
-            or_(maps.c.quota_frames.is_(None), maps.c.used_frames < maps.c.quota_frames),
-            or_(maps.c.quota_bytes.is_(None), maps.c.used_bytes + size <= maps.c.quota_bytes),
-            ~exists().where(*alike),
-        )
-        .values(used_frames=maps.c.used_frames + 1, used_bytes=maps.c.used_bytes + size)
-        .returning(maps.c.number)
-    )
-
-
-@cache
-def _reception(
-    told: Table, of_frame: tuple[str, ...], of_job: tuple[str, ...], of_event: tuple[str, ...],
-    of_kept: tuple[str, ...] = (),
-) -> Select[Any]:  # fmt: skip
-    """A frame taken with its job, its event and its tags, PostgreSQL; and with what is remembered
-    of the request.
-
-    Parameters
-    ----------
-    told : where the event is inserted
-    of_frame, of_job, of_event, of_kept : columns of each row, whose values are named
-        `frame_<column>` and so on; times are those of the statement
-    """
-    room = _room_taken().cte("room")
-    made = _inserted(frames, "frame", of_frame, room).returning(frames.c.number)
-    new = made.cte("new")
-    tag = func.unnest(cast(bindparam("tags"), ARRAY(TEXT)))
-    others = [
-        _inserted(jobs, "job", of_job, new, frame_number=new.c.number),
-        _inserted(told, "event", of_event, new),
-        insert(frame_tags).from_select(["frame_number", "tag"], select(new.c.number, tag)),
-    ]
-    if of_kept:
-        others.append(_inserted(idempotency, "kept", of_kept, new))
-    return select(new.c.number).add_cte(*(one.cte(f"other_{i}") for i, one in enumerate(others)))
-
-
-#: Columns whose values are the time of the statement.
-_STAMPED = frozenset(("received_at", "run_after", "created_at"))
-
-
-def _inserted(
-    table: Table, of: str, names: tuple[str, ...], source: CTE, **more: ColumnElement[Any]
-) -> Insert:
-    """A row inserted for each of another statement's, PostgreSQL."""
-    given = [
-        STATEMENT_TIME if name in _STAMPED else _typed(f"{of}_{name}", table.c[name])
-        for name in names
-    ]
-    rows = select(*given, *more.values()).select_from(source)
-    return insert(table).from_select([*names, *more], rows)
-
-
-def _typed(name: str, column: Column[Any]) -> ColumnElement[Any]:
-    """A value of a SELECT, whose columns have the types of the values, not of the table."""
-    # a cast to a length would cut off what the table refuses
-    kind: TypeEngine[Any] = TEXT if isinstance(column.type, String) else column.type
-    return cast(bindparam(name, type_=column.type), kind)
 
 
 def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
@@ -501,7 +357,8 @@ def _first(connection: Connection, *conditions: ColumnElement[bool]) -> FrameRow
     return None if found is None else frame_row(found)
 
 
-def _write_tags(connection: Connection, number: int, tags: Iterable[str]) -> None:
+def write_tags(connection: Connection, number: int, tags: Iterable[str]) -> None:
+    """Write the tags of a frame that has none yet."""
     named = [{"frame_number": number, "tag": tag} for tag in sorted(set(tags))]
     if named:
         connection.execute(insert(frame_tags), named)

@@ -10,7 +10,8 @@ from sqlalchemy import Connection, Table, insert, select, update
 
 from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
-from sceneprint.store.maps import add_frame, add_map, frame_of, keep_model, map_of, receive_frame
+from sceneprint.store.maps import add_frame, add_map, frame_of, keep_model, map_of
+from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame, index_frame
 from sceneprint.store.tables import (
     JobRow,
@@ -56,7 +57,7 @@ def pair(server_store: Store) -> list[MapRow]:
 def received(store: Store, row: MapRow, *, at_once: bool) -> None:
     with store.database.write(map_number=row.number) as connection:
         if at_once:
-            assert receive_frame(connection, row, VALUES, 3) is not None
+            assert len(receive_frames(connection, [NewFrame(row, VALUES, 3)])) == 1
             return
         frame = add_frame(connection, row.number, VALUES)
         job = queue.enqueue(connection, "sign", frame.number, 3)
@@ -139,7 +140,7 @@ def test_a_frame_that_has_no_place_leaves_nothing(
             connection.execute(update(maps).where(maps.c.number == row.number).values(**change))
     before = rows(server_store, row)
     with server_store.database.write(map_number=row.number) as connection:
-        assert receive_frame(connection, row, VALUES, 0) is None
+        assert receive_frames(connection, [NewFrame(row, VALUES)]) == set()
     assert rows(server_store, row) == before
 
 
@@ -237,7 +238,7 @@ def test_revisions_of_a_map_follow_each_other(server_store: Store, pair: list[Ma
     with server_store.database.write(map_number=row.number) as connection:
         for i in range(3):
             values = {**VALUES, "content_id": f"{i}" * 64}
-            assert receive_frame(connection, row, values, 0) is not None
+            assert receive_frames(connection, [NewFrame(row, values)])
     for _ in range(3):
         assert indexed(server_store, row, claimed(server_store, row), at_once=True)
     assert [one["revision"] for one in rows(server_store, row)["frames"]] == [1, 2, 3]

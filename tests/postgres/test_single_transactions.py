@@ -15,14 +15,15 @@ from sqlalchemy import event, func, insert, literal_column, select, text, update
 
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
-from sceneprint.engine.ingest.write_groups import Grouping
+from sceneprint.engine.ingest.write_groups import NewFrames
 from sceneprint.engine.jobs import signature_job
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import IdempotencyConflict, LostLease, NewerSchema, StoreLocked
 from sceneprint.settings import Settings
 from sceneprint.store import Database, Store, open_database, queue
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import add_map, frame_of, keep_model, receive_frame
+from sceneprint.store.maps import add_map, find_map, frame_of, keep_model
+from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.sender_rows import distrust_sender
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame
@@ -110,7 +111,7 @@ def counted(server_store: Store, row: MapRow) -> Iterator[tuple[Database, TripCo
 def upload(database: Database, row: MapRow, number: int) -> None:
     with database.write(map_number=row.number, single=True) as connection:
         values = {**KNOWN, "content_id": f"{number:064x}"}
-        assert receive_frame(connection, row, values, 0) is not None
+        assert receive_frames(connection, [NewFrame(row, values)])
 
 
 def claimed(database: Database) -> tuple[JobRow, FrameRow]:
@@ -348,17 +349,17 @@ def removed_before(
     engine: Engine, monkeypatch: pytest.MonkeyPatch, then: Callable[[], None]
 ) -> None:
     """Have a deletion remove an upload just before its commit, and something done after that."""
-    once = Grouping.run_single
+    once = NewFrames.receive
 
-    def run(grouping: Grouping, do: Callable[[Any], Any]) -> Any:
+    def run(group: NewFrames, frame: NewFrame) -> bool:
         monkeypatch.undo()
         collect_blobs(engine.store, list(engine.store.blobs.digests()))
-        found = once(grouping, do)
+        found = once(group, frame)
         assert list(engine.store.blobs.digests()) == []
         then()
         return found
 
-    monkeypatch.setattr(Grouping, "run_single", run)
+    monkeypatch.setattr(NewFrames, "receive", run)
 
 
 def test_an_upload_that_a_deletion_removed_before_its_commit_is_put_again(
@@ -395,6 +396,31 @@ def test_a_worker_that_missed_an_upload_tries_again(
     assert work is not None
     assert engine.run(work) == JobState.SUCCEEDED
     assert engine.get_map("hall").frames == {"indexed": 1}
+
+
+def test_an_upload_to_a_map_in_use_waits_for_it_and_others_go_on(
+    engine: Engine, small: Any, until: Until
+) -> None:
+    engine.create_map(NewMap(name="other"))
+    with engine.store.database.read() as connection:
+        row = find_map(connection, "hall")
+    done = list[bool]()
+
+    def late(number: int) -> None:
+        done.append(engine.add_frame("hall", *small[number])[1])
+
+    first, second = (threading.Thread(target=late, args=(i,)) for i in (0, 1))
+    with held(engine.store, row):
+        first.start()
+        until(lambda: row.number in engine.uploads._writes)  # it was not waited for any longer
+        second.start()
+        until(lambda: len(engine.uploads._writes[row.number]._waiting) == 2)
+        assert engine.add_frame("other", *small[2])[1]
+        assert done == []
+    first.join(60)
+    second.join(60)
+    assert done == [True, True]
+    assert engine.get_map("hall").frames == {"received": 2}
 
 
 def test_an_artifact_that_a_deletion_removed_before_its_commit_is_put_again(
@@ -455,14 +481,14 @@ def test_a_request_whose_key_is_used_meanwhile_takes_nothing(
 ) -> None:
     """By another request, for another map, whose turn is another."""
     engine.create_map(NewMap(name="other"))
-    run = Grouping.run_single
+    run = NewFrames.receive
 
-    def overtaken(grouping: Grouping, do: Callable[[Any], Any]) -> Any:
+    def overtaken(group: NewFrames, frame: NewFrame) -> bool:
         monkeypatch.undo()
         add(engine, small[1], once_of("b"), "other")
-        return run(grouping, do)
+        return run(group, frame)
 
-    monkeypatch.setattr(Grouping, "run_single", overtaken)
+    monkeypatch.setattr(NewFrames, "receive", overtaken)
     with pytest.raises(IdempotencyConflict):
         add(engine, small[0], once_of("a"))
     assert (engine.get_map("hall").frames, engine.get_map("other").frames) == ({}, {"received": 1})

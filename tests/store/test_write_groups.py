@@ -23,8 +23,13 @@ def database(store: Store) -> Database:
     return store.database
 
 
-def together(database: Database, works: list[Callable[[Connection], Any]]) -> tuple[list[Any], int]:
-    """What came of works that all waited for one writer, and how often was committed."""
+def together(
+    database: Database, works: list[Callable[[Connection], Any]], *, one_by_one: bool = False
+) -> tuple[list[Any], int]:
+    """What came of works that all waited for one writer, and how often was committed.
+
+    With `one_by_one`, they come in their order, and the first of them writes for all.
+    """
     group, commits = Grouping(database), [0]
     event.listen(database._engine, "commit", lambda _: commits.__setitem__(0, commits[0] + 1))
     found: list[Any] = [None] * len(works)
@@ -32,13 +37,15 @@ def together(database: Database, works: list[Callable[[Connection], Any]]) -> tu
     def run(i: int) -> None:
         try:
             found[i] = group.run(works[i])
-        except Exception as error:
+        except BaseException as error:
             found[i] = error
 
     threads = [threading.Thread(target=run, args=(i,)) for i in range(len(works))]
     with database.write():  # until this is over nobody else writes
-        for one in threads:
+        for i, one in enumerate(threads):
             one.start()
+            if one_by_one:
+                until_waiting(group, i + 1)
         until_waiting(group, len(works))
     for one in threads:
         one.join()
@@ -137,18 +144,36 @@ def test_ctrl_c_ends_its_own_writer_alone(database: Database) -> None:
 
 
 def test_ctrl_c_in_a_second_try_forgets_nobody(database: Database) -> None:
-    group, errors = Grouping(database), [ValueError, KeyboardInterrupt]
+    """It ends the thread that writes for all: those that it has not written go on themselves."""
+    errors = [ValueError, KeyboardInterrupt]
 
     def stop(_: Connection) -> None:
         if errors:
             raise errors.pop(0)
 
-    before, broken, after = (_Waiting(do) for do in (noting("a", 1), stop, noting("a", 2)))
-    group._waiting += [before, broken, after]
+    found, _ = together(
+        database, [noting("a", 0), noting("a", 1), stop, noting("a", 3)], one_by_one=True
+    )
+    assert [type(found[0]), *found[1:]] == [KeyboardInterrupt, 1, None, 3]
+    assert (errors, count(database, "a")) == ([], 3)
+
+
+def test_ctrl_c_of_one_that_waits_is_its_own(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where it was to lead next."""
+    group, found = Grouping(database), list[Any]()
+    interrupted = _Waiting(noting("a", 2))
+
+    def wait() -> None:
+        group._hand_over()  # before it notices
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(interrupted.told, "wait", wait)
+    monkeypatch.setattr("sceneprint.engine.ingest.write_groups._Waiting", lambda _: interrupted)
+    group._led = True  # somebody writes
     with pytest.raises(KeyboardInterrupt):
-        group.run(noting("a", 3))
-    assert (before.done, before.result) == (True, 1)
-    assert group._waiting == [broken, after]
-    assert group.run(noting("a", 4)) == 4
-    assert (broken.done, after.done, after.result) == (True, True, 2)
-    assert count(database, "a") == 3
+        group.run(noting("a", 2))
+    monkeypatch.undo()
+    found.append(group.run(noting("a", 3)))
+    assert (found, count(database, "a"), group._led, group._waiting) == ([3], 1, False, [])

@@ -17,11 +17,10 @@ from typing import Any
 from weakref import WeakValueDictionary
 
 from sqlalchemy import Connection, select
-from sqlalchemy.exc import IntegrityError
 
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upload
-from sceneprint.engine.ingest.write_groups import Grouping
+from sceneprint.engine.ingest.write_groups import Grouping, NewFrames
 from sceneprint.engine.upkeep import garbage_collection, repair
 from sceneprint.formats.signature_package import read_package
 from sceneprint.signing import SIGNING_VERSION
@@ -34,9 +33,9 @@ from sceneprint.store.maps import (
     find_map,
     frames_of_content,
     living_frame,
-    receive_frame,
     require_room,
 )
+from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.queue import enqueue, job_ids_of
 from sceneprint.store.sender_rows import add_package, find_sender
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames, request_data
@@ -338,6 +337,7 @@ class Uploads:
         # of each map that is written to, as long as somebody writes to it
         self._writes = WeakValueDictionary[int | None, Grouping]()
         self._guard = threading.Lock()
+        self._new_frames = NewFrames(store.database)
 
     def add(
         self, map_name: str, upload: Upload, once: IdempotentRequest | None = None
@@ -533,22 +533,24 @@ class Uploads:
                 return found
 
     def _received(self, row: MapRow, request: _Request) -> UploadResult | None:
-        """Take one new frame, as most uploads are, in one round trip to PostgreSQL.
+        """Take one new frame, as most uploads are, in one round trip to PostgreSQL, with those that
+        come meanwhile.
 
-        None where more has to be found out or written, and where others of this process write.
+        None where more has to be found out or written, and on SQLite, whose transactions cost no
+        round trip.
         """
         [one] = request.todo.values()
-        try:
-            came_of = self._grouping(row).run_single(
-                lambda connection: _taken(connection, row, one, request.once)
-            )
-        except IntegrityError:  # something was done under the request's key before: see what
+        if self._store.database.is_sqlite or one.upload.frame_id is not None:
             return None
-        if came_of is not None:
-            # a deletion may have removed it before the commit, and from now on none does; a worker
-            # that missed it meanwhile tries again
-            self._store.blobs.ensure(one.blob, one.upload.data)
-        return came_of
+        if row.number in self._writes:  # others wait for the map already: behind them is its place
+            return None
+        new = _new_frame(row, one, request.once)
+        if not self._new_frames.receive(new):
+            return None
+        # a deletion may have removed it before the commit, and from now on none does; a worker
+        # that missed it meanwhile tries again
+        self._store.blobs.ensure(one.blob, one.upload.data)
+        return _new_result(new, one)
 
     def _store_all(
         self, row: MapRow, request: _Request, connection: Connection
@@ -567,15 +569,14 @@ class Uploads:
                 request.left[:] = request.blobs
                 return list(before), True
         request.left.clear()
-        written = {}
+        written = _received_together(connection, row, request.todo)
         for i, one in request.todo.items():
-            came_of = _taken(connection, row, one)
-            if came_of is None:
-                now = find_map(connection, row.name)
-                if now.number != row.number:
-                    return None
-                came_of = _stored(connection, now, one, request.left)
-            written[i] = came_of
+            if i in written:
+                continue
+            now = find_map(connection, row.name)
+            if now.number != row.number:
+                return None
+            written[i] = _stored(connection, now, one, request.left)
         outcomes = [written.get(i, one) for i, one in enumerate(request.known)]
         if request.once is not None:
             _keep(connection, request.once, [one for one in outcomes if one is not None])
@@ -605,31 +606,41 @@ def _keep(connection: Connection, once: IdempotentRequest, came: list[UploadResu
         once.keep(connection, {"frames": [_stored_outcome(one) for one in came]})
 
 
-def _taken(
-    connection: Connection, row: MapRow, ready: _Prepared, once: IdempotentRequest | None = None
-) -> UploadResult | None:
-    """An upload of a new frame; None where it is none, or was not taken: see `_stored`.
+def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = None) -> NewFrame:
+    """An upload as a frame that its map may lack.
 
     With `once`, which PostgreSQL alone takes, what came of it is remembered in the same statement.
     """
-    if ready.upload.frame_id is not None:
-        return None
-    package = ready.package
-    more = 0 if package is None else len(package[1])
 
     def kept(frame_id: str) -> dict[str, Any]:
         assert once is not None
         return once.columns({"frames": [_told_of(frame_id, ready.signed, new=True)]})
 
-    ids = receive_frame(
-        connection, row, ready.columns, ready.upload.priority, ready.of_job, more,
-        None if once is None else kept,
+    package = ready.package
+    return NewFrame(
+        row, ready.columns, ready.upload.priority, ready.of_job,
+        0 if package is None else len(package[1]), None if once is None else kept,
     )  # fmt: skip
-    if ids is None:
-        return None
-    if package is not None:
-        add_package(connection, row.number, ids[1], package[0], more, counted=True)
-    return UploadResult(_added(ids[0], ids[1], FrameState.RECEIVED, ready), new=True)
+
+
+def _new_result(new: NewFrame, ready: _Prepared) -> UploadResult:
+    """What came of an upload whose frame was taken."""
+    return UploadResult(_added(new.frame_id, new.job_id, FrameState.RECEIVED, ready), new=True)
+
+
+def _received_together(
+    connection: Connection, row: MapRow, todo: dict[int, _Prepared]
+) -> dict[int, UploadResult]:
+    """Uploads of new frames that were taken, by their place; see `_stored` for the others."""
+    new = {i: _new_frame(row, one) for i, one in todo.items() if one.upload.frame_id is None}
+    ids = receive_frames(connection, list(new.values()))
+    taken = {i: one for i, one in new.items() if one.frame_id in ids}
+    for i, one in taken.items():
+        package = todo[i].package
+        if package is not None:
+            blob, data = package
+            add_package(connection, row.number, one.job_id, blob, len(data), counted=True)
+    return {i: _new_result(one, todo[i]) for i, one in taken.items()}
 
 
 def _added(frame_id: str, job_id: str, state: FrameState, ready: _Prepared) -> Added:

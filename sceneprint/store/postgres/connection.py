@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import select
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
@@ -189,23 +189,29 @@ def begin(connection: Connection, *statements: str) -> Any:
     return answer.first() if answer.returns_rows else None
 
 
+class MapsInUse(Exception):
+    """Another transaction had a map for longer than was waited for it; nothing was written."""
+
+
 @dataclass(eq=False)
 class SingleStatement:
     """A transaction of one statement: it takes its turn, is executed and committed in one round
-    trip. Others of its map wait for that long, wherever the client is.
+    trip. Others of its maps wait for that long, wherever the client is.
 
     It sees what was committed before its turn.
 
     Parameters
     ----------
-    map_number : of the only map that is written to
+    map_numbers : of the only maps that are written to
     wait_s : seconds to wait for the turn
+    maps_wait_s : seconds to wait for one of the maps, once it is the turn of writers of maps
     schema : what this process knows of the schema; None: that is not looked at
     executed : whether it was sent
     """
 
-    map_number: int
+    map_numbers: Collection[int]
     wait_s: float
+    maps_wait_s: float
     schema: KnownSchema | None
     executed: bool = False
 
@@ -215,6 +221,7 @@ class SingleStatement:
         Raises
         ------
         NewerSchema : another version has brought the store beyond what this one may write.
+        MapsInUse : a map was not free within `maps_wait_s`.
         ValueError : it is the second.
         """
         import psycopg
@@ -232,28 +239,44 @@ class SingleStatement:
             self._send(cursor, statement, parameters)
 
     def _send(self, cursor: Any, statement: str, parameters: Any) -> None:
+        import psycopg
+
         connection = cursor.connection
-        # without a BEGIN, all up to the end of the pipeline is one transaction
-        with connection.pipeline():
-            # a commit that waits for its standby would be cut off by the limit of statements,
-            # and be acknowledged although the standby may lack it
-            connection.execute(
-                "SELECT set_config('statement_timeout', '0', true),"
-                " set_config('lock_timeout', %s, true),"
-                " pg_advisory_xact_lock_shared(%s, %s), pg_advisory_xact_lock(%s, %s)",
-                (_milliseconds(self.wait_s), LOCKS, TURN, MAP_LOCKS, self.map_number & LOCK_BITS),
-            )
-            if self.schema is not None:
-                connection.execute(_SAME_SCHEMA, self.schema.found)
-            cursor.execute(statement, parameters)
+        # in one order, so that nobody waits for one who waits for him
+        locks = sorted({number & LOCK_BITS for number in self.map_numbers})
+        turn = connection.cursor()
+        try:
+            # without a BEGIN, all up to the end of the pipeline is one transaction
+            with connection.pipeline():
+                # a commit that waits for its standby would be cut off by the limit of statements,
+                # and be acknowledged although the standby may lack it
+                turn.execute(
+                    "SELECT set_config('statement_timeout', '0', true),"
+                    " set_config('lock_timeout', %s, true), pg_advisory_xact_lock_shared(%s, %s),"
+                    " set_config('lock_timeout', %s, true)",
+                    (_milliseconds(self.wait_s), LOCKS, TURN, _milliseconds(self.maps_wait_s)),
+                )
+                if self.schema is None:
+                    connection.execute(f"{_MAPS} {_NUMBERS}", (MAP_LOCKS, locks))
+                else:
+                    known = self.schema.found or ()
+                    connection.execute(_MAPS_AND_SCHEMA, (MAP_LOCKS, *known, locks))
+                cursor.execute(statement, parameters)
+        except psycopg.errors.LockNotAvailable as error:
+            if turn.pgresult is None or self.maps_wait_s == self.wait_s:
+                raise
+            raise MapsInUse from error
 
 
 #: The schema that a process may write to, as it found it last.
 SCHEMA = "SELECT version_num, (SELECT max(least_revision) FROM schema_range) FROM alembic_version"
-#: Fails where it is another one, so that what follows in the transaction is not executed.
-_SAME_SCHEMA = (
-    "SELECT 1 / cast(version_num = %s AND (SELECT max(least_revision) FROM schema_range)"
-    " IS NOT DISTINCT FROM %s AS integer) FROM alembic_version"
+#: The locks of maps, one after the other.
+_MAPS, _NUMBERS = "SELECT pg_advisory_xact_lock(%s, number)", "FROM unnest(%s::integer[]) AS number"
+#: Fails, too, where the schema is another one, so that what follows in the transaction is not
+#: executed. It stays the same while this has its turn.
+_MAPS_AND_SCHEMA = (
+    f"{_MAPS}, (SELECT 1 / cast(version_num = %s AND (SELECT max(least_revision) FROM schema_range)"
+    f" IS NOT DISTINCT FROM %s AS integer) FROM alembic_version) {_NUMBERS}"
 )
 
 

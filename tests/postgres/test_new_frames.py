@@ -1,0 +1,307 @@
+"""New frames of several maps, taken by one statement, and those of many threads together."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from sqlalchemy import event, select, text, update
+from sqlalchemy.exc import IntegrityError
+
+from sceneprint.engine.ingest import write_groups
+from sceneprint.engine.ingest.write_groups import NewFrames
+from sceneprint.errors import StoreLocked
+from sceneprint.process import of_request
+from sceneprint.store import Database, Store
+from sceneprint.store.keys import IdempotentRequest
+from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.new_frames import NewFrame, receive_frames
+from sceneprint.store.postgres.connection import MapsInUse, take_turn
+from sceneprint.store.tables import (
+    MapRow,
+    frame_tags,
+    frames,
+    idempotency,
+    jobs,
+    maps,
+    pending_events,
+)
+
+MODEL = "ab" * 32
+VALUES: dict[str, Any] = {
+    "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1}, "depth_scale": 1000.0,
+    "depth_along_ray": False, "robot": None, "session": None, "captured_at": None, "tags": [],
+    "pose_parent": None, "pose": None, "name": None, "sequence": None,
+}  # fmt: skip
+Until = Callable[[Callable[[], Any]], Any]
+
+
+@pytest.fixture
+def rows(server_store: Store) -> list[MapRow]:
+    with server_store.database.write() as connection:
+        keep_model(connection, MODEL, "toy", b"a model")
+        return [add_map(connection, name, None, MODEL) for name in ("a", "b", "c")]
+
+
+def new(row: MapRow, content: int, **given: Any) -> NewFrame:
+    known = {name: given.pop(name) for name in list(given) if name in VALUES}
+    return NewFrame(row, {**VALUES, **known, "content_id": f"{content:064x}"}, **given)
+
+
+def receive(database: Database, *given: NewFrame, wait_s: float = 10.0) -> list[bool]:
+    """Whether each was taken."""
+    with database.write_maps({one.row.number for one in given}, wait_s) as connection:
+        ids = receive_frames(connection, given)
+    return [one.frame_id in ids for one in given]
+
+
+def counted(database: Database) -> list[tuple[str, int, int]]:
+    with database.read() as connection:
+        asked = select(maps.c.name, maps.c.used_frames, maps.c.used_bytes).order_by(maps.c.name)
+        return [tuple(row) for row in connection.execute(asked)]
+
+
+def content_of(database: Database) -> list[tuple[int, str, str]]:
+    """Map, content and job of each frame in the order of their numbers."""
+    with database.read() as connection:
+        asked = (
+            select(frames.c.map_number, frames.c.content_id, jobs.c.id)
+            .join(jobs, jobs.c.frame_number == frames.c.number)
+            .order_by(frames.c.number)
+        )
+        return [tuple(row) for row in connection.execute(asked)]
+
+
+def test_frames_of_several_maps_are_taken_in_their_order(
+    server_store: Store, rows: list[MapRow]
+) -> None:
+    database, (a, b, c) = server_store.database, rows
+    given = [new(c, 5), new(a, 9), new(b, 9, bytes=70, more_bytes=7), new(a, 1), new(c, 4)]
+    assert receive(database, *given) == [True] * 5
+    assert content_of(database) == [
+        (one.row.number, one.values["content_id"], one.job_id) for one in given
+    ]
+    assert counted(database) == [("a", 2, 6), ("b", 1, 77), ("c", 2, 6)]
+    with database.read() as connection:
+        told = connection.execute(select(pending_events).order_by(pending_events.c.number))
+        assert [(one.map, one.frame_id, one.job_id) for one in told] == [
+            (one.row.name, one.frame_id, one.job_id) for one in given
+        ]
+
+
+def test_each_has_its_own_columns_tags_and_priority(
+    server_store: Store, rows: list[MapRow]
+) -> None:
+    pose = [[1.0, 0.0, 0.0, 2.5], [0.0, 1.0, 0.0, -1.0], [0.0, 0.0, 1.0, 0.5], [0, 0, 0, 1.0]]
+    plain = new(rows[0], 1)
+    full = new(
+        rows[1], 2, robot="cart \U0001f916 \"'\\", captured_at=0.1, tags=["wet", "dark", "wet"],
+        pose=pose, pose_parent="odom", sequence=2**40, priority=-3,
+    )  # fmt: skip
+    assert receive(server_store.database, plain, full) == [True, True]
+    with server_store.database.read() as connection:
+        one, other = connection.execute(select(frames).order_by(frames.c.number)).mappings()
+        kept = {name: other[name] for name in (*VALUES, "pose_x", "pose_y", "pose_z")}
+        tags = connection.execute(select(frame_tags.c.frame_number, frame_tags.c.tag)).all()
+        priorities = connection.execute(select(jobs.c.priority).order_by(jobs.c.number)).scalars()
+        assert list(priorities) == [0, -3]
+        nulls = text("SELECT number FROM frames WHERE pose IS NULL")
+        assert connection.execute(nulls).scalars().all() == [one["number"]]
+    assert {name: one[name] for name in VALUES} == VALUES
+    assert kept["robot"] == full.values["robot"]
+    assert (kept["captured_at"], kept["sequence"], kept["pose"]) == (0.1, 2**40, pose)
+    assert (kept["pose_x"], kept["pose_y"], kept["pose_z"]) == (2.5, -1.0, 0.5)
+    assert sorted(map(tuple, tags)) == [(other["number"], "dark"), (other["number"], "wet")]
+
+
+def test_what_is_there_or_comes_twice_is_taken_once(
+    server_store: Store, rows: list[MapRow]
+) -> None:
+    database, (a, b, _) = server_store.database, rows
+    assert receive(database, new(a, 1)) == [True]
+    given = [new(a, 2), new(a, 1), new(b, 1), new(a, 2), new(a, 3)]
+    assert receive(database, *given) == [True, False, True, False, True]
+    assert counted(database)[:2] == [("a", 3, 9), ("b", 1, 3)]
+    assert receive(database, *given) == [False] * 5
+
+
+@pytest.mark.parametrize(
+    ("change", "taken"),
+    [
+        ({"quota_frames": 2}, True), ({"quota_frames": 1}, False), ({"quota_bytes": 6}, True),
+        ({"quota_bytes": 5}, False), ({"name": "renamed"}, False),
+    ],
+)  # fmt: skip
+def test_a_map_without_room_for_all_takes_none_and_others_take_theirs(
+    server_store: Store, rows: list[MapRow], change: dict[str, Any], taken: bool
+) -> None:
+    database, (a, b, _) = server_store.database, rows
+    with database.write() as connection:
+        connection.execute(update(maps).where(maps.c.number == a.number).values(**change))
+    assert receive(database, new(a, 1), new(b, 1), new(a, 2)) == [taken, True, taken]
+    assert {one[0]: one[1] for one in counted(database)} == {
+        change.get("name", "a"): 2 * taken, "b": 1, "c": 0,
+    }  # fmt: skip
+
+
+def test_what_was_done_under_its_key_is_not_done_again(
+    server_store: Store, rows: list[MapRow]
+) -> None:
+    """And the answers of the others are remembered."""
+    database, (a, b, _) = server_store.database, rows
+    requests = [IdempotentRequest("robot", key, "0" * 64) for key in ("old", "new")]
+
+    def kept(request: IdempotentRequest) -> Callable[[str], dict[str, Any]]:
+        return lambda frame_id: request.columns({"frames": [frame_id]})
+
+    assert receive(database, new(a, 1, kept=kept(requests[0]))) == [True]
+    given = [new(b, 2, kept=kept(one)) for one in requests[:1]]
+    given += [new(b, 3), new(a, 3, kept=kept(requests[1]))]
+    assert receive(database, *given) == [False, True, True]
+    with database.read() as connection:
+        assert requests[1].found(connection) == {"frames": [given[2].frame_id]}
+        assert len(connection.execute(select(idempotency.c.key)).all()) == 2
+    both = IdempotentRequest("robot", "both", "0" * 64)
+    with pytest.raises(IntegrityError, match="pk_idempotency"):
+        receive(database, new(a, 8, kept=kept(both)), new(b, 8, kept=kept(both)))
+    assert counted(database) == [("a", 2, 6), ("b", 1, 3), ("c", 0, 0)]
+
+
+def test_each_is_of_the_request_that_it_came_with(server_store: Store, rows: list[MapRow]) -> None:
+    given = list[NewFrame]()
+    for name in ("one", "two"):
+        with of_request(name):
+            given.append(new(rows[0], len(given)))
+    with of_request("who writes"):
+        receive(server_store.database, *given)
+    with server_store.database.read() as connection:
+        data = connection.execute(select(jobs.c.data).order_by(jobs.c.number)).scalars()
+        assert [one["request_id"] for one in data] == ["one", "two"]
+
+
+def test_what_comes_next_in_the_index_is_looked_at_whatever_the_tables_were(
+    server_store: Store, rows: list[MapRow]
+) -> None:
+    """A plan of an empty store took any index of a map's frames, and read all of them."""
+    database = server_store.database
+    said = list[tuple[str, Any]]()
+    event.listen(
+        database._engine, "before_cursor_execute",
+        lambda _c, _cursor, statement, given, *_: said.append((statement, given)),
+    )  # fmt: skip
+    receive(database, new(rows[0], 1))
+    [(statement, given)] = [one for one in said if "json_to_recordset" in one[0]]
+    with database._writers.connect() as connection:
+        raw = connection.connection.driver_connection
+        assert raw is not None
+        plan = "\n".join(row[0] for row in raw.execute(f"EXPLAIN {statement}", given))
+    probe = plan.partition("SubPlan")[2].partition("CTE")[0]
+    assert "ix_frames_map_number_content_id" in probe
+    assert "Sort" not in probe
+
+
+@contextmanager
+def in_use(database: Database, row: MapRow) -> Iterator[Any]:
+    """The map's turn, of another process."""
+    with database._writers.begin() as other:
+        take_turn(other, 10.0, None, row.number)
+        yield other
+
+
+def test_a_map_that_is_in_use_is_waited_for_shortly(
+    server_store: Store, rows: list[MapRow]
+) -> None:
+    database, (a, b, _) = server_store.database, rows
+    with in_use(database, b):
+        with pytest.raises(MapsInUse):
+            receive(database, new(a, 1), new(b, 1), wait_s=0.05)
+        assert receive(database, new(a, 1), wait_s=0.05) == [True]
+    assert not database._held  # others need not hurry
+    assert receive(database, new(b, 1), wait_s=0.05) == [True]
+
+
+def test_a_turn_that_does_not_come_is_no_map_in_use(
+    server_store: Store, rows: list[MapRow], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = server_store.database
+    monkeypatch.setattr("sceneprint.store.database.BUSY_S", 0.1)
+    with database._writers.begin() as other:
+        take_turn(other, 10.0)
+        with pytest.raises(StoreLocked):
+            receive(database, new(rows[0], 1), wait_s=10.0)
+    assert database._held
+
+
+def together(group: NewFrames, given: list[NewFrame], until: Until) -> list[Any]:
+    """What came of frames that all waited for one statement."""
+    found: list[Any] = [None] * len(given)
+
+    def run(i: int) -> None:
+        try:
+            found[i] = group.receive(given[i])
+        except Exception as error:
+            found[i] = error
+
+    threads = [threading.Thread(target=run, args=(i,)) for i in range(len(given))]
+    group._led = True  # somebody writes
+    for one in threads:
+        one.start()
+    until(lambda: len(group._waiting) == len(given))
+    group._hand_over()
+    for one in threads:
+        one.join()
+    assert (group._waiting, group._led) == ([], False)
+    return found
+
+
+def test_frames_of_many_threads_are_one_transaction(
+    server_store: Store, rows: list[MapRow], until: Until, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database, sizes = server_store.database, list[int]()
+
+    def noted(connection: Any, given: list[NewFrame]) -> set[str]:
+        sizes.append(len(given))
+        return receive_frames(connection, given)
+
+    monkeypatch.setattr(write_groups, "receive_frames", noted)
+    monkeypatch.setattr(write_groups, "MOST_TOGETHER", 5)
+    given = [new(rows[i % 3], i // 2) for i in range(8)] + [new(rows[0], 0)]
+    found = together(NewFrames(database), given, until)
+    assert (sorted(sizes), sum(found)) == ([4, 5], 8)
+    assert sum(one[1] for one in counted(database)) == 8
+    with database.read() as connection:
+        assert set(connection.execute(select(frames.c.id)).scalars()) == {
+            one.frame_id for one, taken in zip(given, found, strict=True) if taken
+        }
+
+
+def test_one_that_cannot_be_written_sends_all_on_alone(
+    server_store: Store, rows: list[MapRow], until: Until
+) -> None:
+    given = [new(rows[0], 1), new(rows[1], 2, sequence=2**80), new(rows[2], 3)]
+    assert together(NewFrames(server_store.database), given, until) == [False] * 3
+    assert [one[1] for one in counted(server_store.database)] == [0, 0, 0]
+
+
+def test_a_map_in_use_sends_all_on_alone(
+    server_store: Store, rows: list[MapRow], until: Until, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(write_groups, "MAPS_WAIT_S", 0.05)
+    given = [new(rows[0], 1), new(rows[1], 2)]
+    with in_use(server_store.database, rows[1]):
+        found = together(NewFrames(server_store.database), given, until)
+    assert found == [False, False]
+
+
+def test_a_store_that_cannot_be_used_is_told_to_all(
+    server_store: Store, rows: list[MapRow], until: Until, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sceneprint.store.database.BUSY_S", 0.1)
+    given = [new(rows[0], 1), new(rows[1], 2)]
+    with server_store.database._writers.begin() as other:
+        take_turn(other, 10.0)
+        found = together(NewFrames(server_store.database), given, until)
+    assert [type(one) for one in found] == [StoreLocked, StoreLocked]
