@@ -143,10 +143,10 @@ def locks(store: Store, which: Any = LOCKS_HELD) -> int:
 
 
 @contextmanager
-def held(store: Store, row: MapRow) -> Iterator[Any]:
-    """The map's turn, of another process."""
+def held(store: Store, row: MapRow | None) -> Iterator[Any]:
+    """The map's turn, of another process; None: that of all maps."""
     with store.database._writers.begin() as other:
-        postgres.take_turn(other, 10.0, None, row.number)
+        postgres.take_turn(other, 10.0, None, None if row is None else row.number)
         yield other
 
 
@@ -242,7 +242,7 @@ def test_who_waited_for_a_migration_writes_nothing(
             raised.append(error)
 
     writer = threading.Thread(target=late)
-    with held(server_store, row) as other:
+    with held(server_store, None) as other:
         writer.start()
         until(lambda: locks(server_store, WAITING) == 1)
         other.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
