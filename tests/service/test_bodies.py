@@ -11,6 +11,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from sceneprint.store.blobs.folder import TIMELINE
+
 LIMIT = 100_000
 
 
@@ -120,7 +122,8 @@ def test_a_form_that_is_none_is_refused(narrow, refused, name):
 
 
 def kept(folder: Path) -> list[Path]:
-    return [path for path in (folder / "blobs").rglob("*") if path.is_file()]
+    found = (path for path in (folder / "blobs").rglob("*") if path.is_file())
+    return [path for path in found if path.name != TIMELINE]
 
 
 def test_the_length_is_believed_before_a_byte_is_read(wire):
