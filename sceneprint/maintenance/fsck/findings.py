@@ -113,11 +113,12 @@ class Folder:
         done, after = 0, 0
         with self.store.database.read() as connection:
             own = self._map_number(connection)
-            here = frames.c.map_number == own if own is not None else frames.c.number > 0
-            total = int(connection.execute(select(func.count()).where(here)).scalar_one())
+            here = [] if own is None else [frames.c.map_number == own]
+            asked = select(func.count(frames.c.number)).where(*here)
+            total = int(connection.execute(asked).scalar_one())
         self.progress(subject, 0, total)
         while True:
-            wanted = select(frames.c.number).where(here, frames.c.number > after)
+            wanted = select(frames.c.number).where(*here, frames.c.number > after)
             with self.store.database.read() as connection:
                 found = connection.execute(wanted.order_by(frames.c.number).limit(BLOCK))
                 block = list(found.scalars())
