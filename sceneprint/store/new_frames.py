@@ -36,6 +36,7 @@ from sqlalchemy import (
     func,
     insert,
     literal,
+    literal_column,
     or_,
     select,
     true,
@@ -355,7 +356,10 @@ def _inserted(
             return STATEMENT_TIME
         if key in fixed:
             return literal(fixed[key], _kind(table.c[name].type))
-        return lacking.c[_SAME.get(key, key)]
+        sent, kind = lacking.c[_SAME.get(key, key)], table.c[name].type
+        if isinstance(kind, JSON) and not kind.none_as_null:  # a record's null is that of SQL
+            return func.coalesce(sent, literal_column("CAST('null' AS json)"))
+        return sent
 
     rows = select(*map(value, names), *more.values()).select_from(source).where(*conditions)
     return insert(table).from_select([*names, *more], rows.order_by(lacking.c.place))

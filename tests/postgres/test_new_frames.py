@@ -117,6 +117,17 @@ def test_each_has_its_own_columns_tags_and_priority(
     assert sorted(map(tuple, tags)) == [(other["number"], "dark"), (other["number"], "wet")]
 
 
+def test_a_cloud_has_no_intrinsics(server_store: Store, rows: list[MapRow]) -> None:
+    """They are null as JSON has it: the column takes no other."""
+    given = [new(rows[0], 1), new(rows[0], 2, intrinsics=None)]
+    assert receive(server_store.database, *given) == [True, True]
+    with server_store.database.read() as connection:
+        asked = text("SELECT CAST(intrinsics AS text), pose IS NULL FROM frames ORDER BY number")
+        assert [tuple(one) for one in connection.execute(asked)] == [
+            ('{"width": 1}', True), ("null", True),
+        ]  # fmt: skip
+
+
 def test_what_is_there_or_comes_twice_is_taken_once(
     server_store: Store, rows: list[MapRow]
 ) -> None:
