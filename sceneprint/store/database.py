@@ -478,7 +478,7 @@ class Database:
             self._writers.connect() as connection,
         ):
             if single and map_number is not None:
-                with self._single(connection, [map_number], wait_s, wait_s) as writing:
+                with self._single(connection, [map_number], wait_s, None) as writing:
                     yield writing
             else:
                 with self._begun(connection, wait_s, map_number, unchecked) as writing:
@@ -514,7 +514,7 @@ class Database:
     @contextmanager
     def _single(
         self, connection: Connection, map_numbers: Collection[int], wait_s: float,
-        maps_wait_s: float,
+        maps_wait_s: float | None,
     ) -> Iterator[Connection]:  # fmt: skip
         """A transaction of one statement; see `SingleStatement`."""
         known = self._schema if self._guarded else None

@@ -10,7 +10,7 @@ trip is waited for, it is a statement for each table and frame.
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import Context, copy_context
 from dataclasses import dataclass, field
 from functools import cache
@@ -63,10 +63,6 @@ from sceneprint.store.tables import (
 )
 
 
-def _new_id() -> str:
-    return uuid.uuid4().hex
-
-
 @dataclass(frozen=True, eq=False)
 class NewFrame:
     """A frame whose content its map may lack.
@@ -77,7 +73,7 @@ class NewFrame:
     values : see `add_frame`
     priority, data : of the job that signs it
     more_bytes : that its map counts beside the upload
-    kept : columns of `idempotency` by the id of the frame, PostgreSQL
+    kept : columns of `idempotency`, PostgreSQL
     frame_id, job_id : that they get
     context : of the request that it came with, whoever writes it
     """
@@ -87,9 +83,9 @@ class NewFrame:
     priority: int = 0
     data: dict[str, Any] | None = None
     more_bytes: int = 0
-    kept: Callable[[str], dict[str, Any]] | None = None
-    frame_id: str = field(default_factory=_new_id)
-    job_id: str = field(default_factory=_new_id)
+    kept: dict[str, Any] | None = None
+    frame_id: str = field(default_factory=lambda: uuid.uuid4().hex)
+    job_id: str = field(default_factory=lambda: uuid.uuid4().hex)
     context: Context = field(default_factory=copy_context)
 
     @property
@@ -119,7 +115,7 @@ class NewFrame:
             "job": {**job, "id": self.job_id, "map_number": number},
             "event": told,
         }
-        return rows if self.kept is None else {**rows, "kept": self.kept(self.frame_id)}
+        return rows if self.kept is None else {**rows, "kept": self.kept}
 
 
 def receive_frames(connection: Connection, given: Sequence[NewFrame]) -> set[str]:

@@ -165,15 +165,15 @@ def test_what_was_done_under_its_key_is_not_done_again(
     database, (a, b, _) = server_store.database, rows
     requests = [IdempotentRequest("robot", key, "0" * 64) for key in ("old", "new")]
 
-    def kept(request: IdempotentRequest) -> Callable[[str], dict[str, Any]]:
-        return lambda frame_id: request.columns({"frames": [frame_id]})
+    def kept(request: IdempotentRequest) -> dict[str, Any]:
+        return request.columns({"frames": request.key})
 
     assert receive(database, new(a, 1, kept=kept(requests[0]))) == [True]
     given = [new(b, 2, kept=kept(one)) for one in requests[:1]]
     given += [new(b, 3), new(a, 3, kept=kept(requests[1]))]
     assert receive(database, *given) == [False, True, True]
     with database.read() as connection:
-        assert requests[1].found(connection) == {"frames": [given[2].frame_id]}
+        assert requests[1].found(connection) == {"frames": "new"}
         assert len(connection.execute(select(idempotency.c.key)).all()) == 2
     both = IdempotentRequest("robot", "both", "0" * 64)
     with pytest.raises(IntegrityError, match="pk_idempotency"):
@@ -232,6 +232,26 @@ def test_a_map_that_is_in_use_is_waited_for_shortly(
         assert receive(database, new(a, 1), wait_s=0.05) == [True]
     assert not database._held  # others need not hurry
     assert receive(database, new(b, 1), wait_s=0.05) == [True]
+
+
+def test_maps_are_locked_in_one_order(
+    server_store: Store, rows: list[MapRow], until: Until
+) -> None:
+    """Who waits for a map has none that comes after it: nobody waits for one who waits for him."""
+    database = server_store.database
+    with database.write() as connection:
+        rows += [add_map(connection, f"map-{i}", None, MODEL) for i in range(5)]
+    first, last = rows[0], rows[7]  # a set of their numbers has the greater one first
+    assert list({last.number, first.number}) == [8, 1]
+    waiting = text("SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted")
+    others = text("SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND objid = 8")
+    writer = threading.Thread(target=receive, args=(database, new(last, 1), new(first, 1)))
+    with in_use(database, first) as other:
+        writer.start()
+        until(lambda: other.execute(waiting).scalar_one() == 1)
+        assert other.execute(others).scalar_one() == 0
+    writer.join(60)
+    assert {name: n for name, n, _ in counted(database) if n} == {"a": 1, last.name: 1}
 
 
 def test_a_turn_that_does_not_come_is_no_map_in_use(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
+import uuid
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -611,15 +612,13 @@ def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = N
 
     With `once`, which PostgreSQL alone takes, what came of it is remembered in the same statement.
     """
-
-    def kept(frame_id: str) -> dict[str, Any]:
-        assert once is not None
-        return once.columns({"frames": [_told_of(frame_id, ready.signed, new=True)]})
-
-    package = ready.package
+    package, frame_id = ready.package, uuid.uuid4().hex
+    kept = None
+    if once is not None:
+        kept = once.columns({"frames": [_told_of(frame_id, ready.signed, new=True)]})
     return NewFrame(
         row, ready.columns, ready.upload.priority, ready.of_job,
-        0 if package is None else len(package[1]), None if once is None else kept,
+        0 if package is None else len(package[1]), kept, frame_id,
     )  # fmt: skip
 
 

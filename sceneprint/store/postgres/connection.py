@@ -204,14 +204,15 @@ class SingleStatement:
     ----------
     map_numbers : of the only maps that are written to
     wait_s : seconds to wait for the turn
-    maps_wait_s : seconds to wait for one of the maps, once it is the turn of writers of maps
+    maps_wait_s : seconds to wait for one of the maps, once it is the turn of writers of maps; None:
+        as long as for that
     schema : what this process knows of the schema; None: that is not looked at
     executed : whether it was sent
     """
 
     map_numbers: Collection[int]
     wait_s: float
-    maps_wait_s: float
+    maps_wait_s: float | None
     schema: KnownSchema | None
     executed: bool = False
 
@@ -244,6 +245,7 @@ class SingleStatement:
         connection = cursor.connection
         # in one order, so that nobody waits for one who waits for him
         locks = sorted({number & LOCK_BITS for number in self.map_numbers})
+        maps_wait_s = self.wait_s if self.maps_wait_s is None else self.maps_wait_s
         turn = connection.cursor()
         try:
             # without a BEGIN, all up to the end of the pipeline is one transaction
@@ -254,7 +256,7 @@ class SingleStatement:
                     "SELECT set_config('statement_timeout', '0', true),"
                     " set_config('lock_timeout', %s, true), pg_advisory_xact_lock_shared(%s, %s),"
                     " set_config('lock_timeout', %s, true)",
-                    (_milliseconds(self.wait_s), LOCKS, TURN, _milliseconds(self.maps_wait_s)),
+                    (_milliseconds(self.wait_s), LOCKS, TURN, _milliseconds(maps_wait_s)),
                 )
                 if self.schema is None:
                     connection.execute(f"{_MAPS} {_NUMBERS}", (MAP_LOCKS, locks))
@@ -263,7 +265,7 @@ class SingleStatement:
                     connection.execute(_MAPS_AND_SCHEMA, (MAP_LOCKS, *known, locks))
                 cursor.execute(statement, parameters)
         except psycopg.errors.LockNotAvailable as error:
-            if turn.pgresult is None or self.maps_wait_s == self.wait_s:
+            if turn.pgresult is None or self.maps_wait_s is None:
                 raise
             raise MapsInUse from error
 
