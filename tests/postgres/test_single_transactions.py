@@ -399,9 +399,17 @@ def test_a_worker_that_missed_an_upload_tries_again(
 
 
 def test_an_upload_to_a_map_in_use_waits_for_it_and_others_go_on(
-    engine: Engine, small: Any, until: Until
+    engine: Engine, small: Any, until: Until, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Those for the same map wait behind it, and nobody with them."""
     engine.create_map(NewMap(name="other"))
+    tried, receive = list[str](), NewFrames.receive
+
+    def noted(group: NewFrames, frame: NewFrame) -> bool:
+        tried.append(frame.row.name)
+        return receive(group, frame)
+
+    monkeypatch.setattr(NewFrames, "receive", noted)
     with engine.store.database.read() as connection:
         row = find_map(connection, "hall")
     done = list[bool]()
@@ -419,8 +427,19 @@ def test_an_upload_to_a_map_in_use_waits_for_it_and_others_go_on(
         assert done == []
     first.join(60)
     second.join(60)
-    assert done == [True, True]
+    assert (done, tried) == ([True, True], ["hall", "other"])
     assert engine.get_map("hall").frames == {"received": 2}
+
+
+def test_a_frame_has_the_id_that_it_is_put_under(engine: Engine, small: Any) -> None:
+    mine, other, no = (
+        Upload(*small[i], frame_id=frame_id) for i, frame_id in enumerate(("mine", "other", None))
+    )
+    assert engine.uploads.add("hall", mine)[0].taken.frame_id == "mine"
+    outcomes, _ = engine.uploads.add_all("hall", [other, no])
+    own, given = (one.taken.frame_id for one in outcomes)
+    assert (own, len(given)) == ("other", 32)
+    assert engine.get_map("hall").frames == {"received": 3}
 
 
 def test_an_artifact_that_a_deletion_removed_before_its_commit_is_put_again(
