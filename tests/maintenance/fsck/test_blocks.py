@@ -39,6 +39,7 @@ def fill(store: Store, *maps: MapRow) -> None:
         connection.execute(insert(frames), rows)
 
 
+@pytest.mark.sqlite_only("counts SQLite's steps")
 @pytest.mark.parametrize("map_name", [None, "hall"])
 def test_a_late_block_costs_no_more_than_the_first(
     engine: Engine, monkeypatch: pytest.MonkeyPatch, map_name: str | None

@@ -129,6 +129,7 @@ def test_a_copy_answers_as_the_service_did_and_is_renewed(
     assert (data / "sceneprint.db").is_file()
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_copys_records_follow_their_maps(tmp_path: Path) -> None:
     """Into a new copy, whose maps have other numbers; not those of a map that was created again."""
     ids = {}
