@@ -117,6 +117,30 @@ def test_gallery_shows_and_filters_what_the_api_lists(
     assert len(ids(page)) == 16
 
 
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_click_counts_although_what_was_pressed_is_drawn_anew(
+    page: Page, station: Any, settle: Callable[[Page], None], moved: bool
+) -> None:
+    name = f"pressed-{moved}".lower()
+    station.make_map(name)
+    (first,) = add(station, name, range(1))
+    page.goto(f"{station.home}#/maps/{name}")
+    settle(page)
+    link = page.locator(".tile-name a")
+    link.hover()
+    pressed = link.element_handle()
+    page.mouse.down()
+    add(station, name, range(1, 2))
+    expect(page.locator("#frames .tile")).to_have_count(2, timeout=30_000)
+    assert not pressed.evaluate("(link) => link.isConnected")
+    if moved:
+        page.mouse.move(2, 2)  # taken back, as anywhere
+    page.mouse.up()
+    settle(page)
+    there = f"#/maps/{name}" if moved else f"#/maps/{name}/frames/{first}"
+    expect(page).to_have_url(f"{station.home}{there}")
+
+
 def test_gallery_pages_by_cursor_and_says_why_frames_were_rejected(
     page: Page, station: Any, settle: Callable[[Page], None], until: Callable[..., Any]
 ) -> None:

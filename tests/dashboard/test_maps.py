@@ -126,6 +126,22 @@ def test_counts_move_while_workers_sign(station: Any, page: Page, settle: Settle
     expect(page.locator("#summary")).to_contain_text("frames indexed")
 
 
+def test_a_map_keeps_the_focus_while_its_counts_move(
+    station: Any, page: Page, settle: Settle
+) -> None:
+    path = station.make_map("focused")
+    page.goto(station.home)
+    settle(page)
+    one = card(page, "focused")
+    title = one.get_by_role("heading").get_by_role("link")
+    title.focus()
+    station.client.post(f"{path}/frames", **station.frames[0].form())
+    expect(one.locator(".map-number")).to_have_text("1", timeout=30_000)
+    expect(title).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page).to_have_url(f"{station.home}#/maps/focused/place")
+
+
 def test_many_maps_are_few_requests(station: Any, page: Page, settle: Settle) -> None:
     for number in range(40):
         station.make_map(f"many-{number:02d}")

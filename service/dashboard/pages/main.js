@@ -2,6 +2,7 @@
 import { get, lives, Problem } from "./lib/api.js";
 import { h, put } from "./lib/dom.js";
 import { ago } from "./lib/format.js";
+import { keepPresses } from "./lib/press.js";
 import { go, parse } from "./lib/router.js";
 import { doubt, identify, may } from "./lib/session.js";
 import { empty, failed, gone, soon, toast } from "./lib/states.js";
@@ -156,4 +157,5 @@ document.querySelector(".skip").addEventListener("click", (event) => {
   event.preventDefault(); // its `#main` would be taken for an address
   main.focus();
 });
+keepPresses();
 show();

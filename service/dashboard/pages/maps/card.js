@@ -30,7 +30,7 @@ export function waiting(map) {
 export function mapCard(map, { signal, changed }) {
   const id = `map-${map.name}`;
   const parts = {
-    heading: h("h2", { id }), name: h("p", { class: "muted mono map-name" }),
+    title: h("a", { href: link("maps", map.name, "place") }), name: h("p", { class: "muted mono map-name" }),
     number: h("strong", { class: "map-number" }), badges: h("div", { class: "toolbar badges" }),
     growth: h("div", { class: "map-growth" }), model: h("dd", { class: "mono" }),
     index: h("dd", {}, "…"), disk: h("dd", { class: "number" }, "…"),
@@ -39,7 +39,7 @@ export function mapCard(map, { signal, changed }) {
     tool(PENCIL, `Rename ${map.name}`, async () => (await edit()).retitleMap(card.map, changed)),
     tool(BIN, `Delete ${map.name}`, async () => (await edit()).deleteMap(card.map, changed)));
   const element = h("article", { class: "card map", "aria-labelledby": id, dataset: { map: map.name } },
-    h("div", { class: "map-head" }, h("div", {}, parts.heading, parts.name), tools),
+    h("div", { class: "map-head" }, h("div", {}, h("h2", { id }, parts.title), parts.name), tools),
     h("div", { class: "map-figures" },
       h("a", { class: "map-count", href: link("maps", map.name) }, parts.number, h("span", { class: "muted" }, " indexed frames")), parts.growth),
     parts.badges,
@@ -65,7 +65,7 @@ export function mapCard(map, { signal, changed }) {
 
   function draw() {
     const { name, title, frames, model, reencoding } = card.map;
-    put(parts.heading, h("a", { href: link("maps", name, "place") }, title ?? name));
+    put(parts.title, title ?? name); // the link itself stays, and with it the focus
     put(parts.name, title === null || title === name ? "" : name);
     put(parts.number, count(frames.indexed ?? 0));
     const badges = [
