@@ -15,9 +15,9 @@ export function keepPresses() {
   }, capture);
   window.addEventListener("pointercancel", () => { press = null; }, capture); // it scrolls
   window.addEventListener("pointerup", ({ clientX, clientY, ctrlKey, metaKey, shiftKey, altKey }) => {
-    const { on, x, y } = press ?? {};
+    const began = press;
     press = null;
-    if (!on || on.isConnected || Math.hypot(clientX - x, clientY - y) > SPOT) return;
-    on.dispatchEvent(new MouseEvent("click", { bubbles: true, cancelable: true, ctrlKey, metaKey, shiftKey, altKey }));
+    if (began === null || began.on.isConnected || Math.hypot(clientX - began.x, clientY - began.y) > SPOT) return;
+    began.on.dispatchEvent(new MouseEvent("click", { bubbles: true, cancelable: true, ctrlKey, metaKey, shiftKey, altKey }));
   }, capture);
 }
