@@ -87,9 +87,9 @@ class Crew:
         with self.engine.store.database.write():
             self.send(signal.SIGSTOP)
 
-    def send(self, number: int) -> None:
-        """A signal to both workers."""
-        for line in self.log("worker ready"):
+    def send(self, number: int, workers: int = 2) -> None:
+        """A signal to both workers, or to the first."""
+        for line in self.log("worker ready")[:workers]:
             os.kill(int(line["worker"].rpartition(":")[2]), number)
 
 
