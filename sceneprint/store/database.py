@@ -488,7 +488,8 @@ class Database:
 
     @contextmanager
     def write_maps(self, map_numbers: Collection[int], wait_s: float) -> Iterator[Connection]:
-        """As `write` of a single statement, which writes to some maps at once, PostgreSQL.
+        """As `write` of a single statement, which writes to some maps at once, PostgreSQL. One
+        thread of a process does at a time.
 
         Parameters
         ----------
@@ -502,11 +503,9 @@ class Database:
         """
         self.require_writable()
         turn_s = postgres.HELD_S if self._held else BUSY_S
-        with (
-            self._threads_turn(self._map_turns, turn_s),
-            self.explained(),
-            self._writers.connect() as connection,
-        ):
+        # not in the turn among threads: whoever leads, it is of many tenants, and would wait for
+        # the maps of its own that are in use
+        with self._locks_noted(), self.explained(), self._writers.connect() as connection:
             with self._single(connection, map_numbers, turn_s, wait_s) as writing:
                 yield writing
             postgres.require_synchronous(writing)
@@ -546,12 +545,19 @@ class Database:
                 "nothing was stored. Come back later."
             )
         try:
+            with self._locks_noted():
+                yield
+        finally:
+            turns.release(tenant)
+
+    @contextmanager
+    def _locks_noted(self) -> Iterator[None]:
+        """Have those that come next wait for less where a lock could not be had."""
+        try:
             yield
         except StoreLocked:
             self._held = True
             raise
-        finally:
-            turns.release(tenant)
 
     @contextmanager
     def _begun(

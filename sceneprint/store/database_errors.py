@@ -154,6 +154,11 @@ _MEANT: dict[str, tuple[type[UnusableStore], str]] = {
         "The server is a standby, or is set to be read alone. Name the one that writes in "
         "SCENEPRINT_DATABASE_URL, or all with `target_session_attrs=read-write`.",
     ),
+    "26": (
+        StoreLocked,
+        "A prepared statement is gone, and nothing was stored. Come back. Where this goes on, a "
+        "pooler gives one connection to several clients: connect to the server itself.",
+    ),
     "25P03": (UnusableStore, "This transaction was silent for long, and nothing was stored."),
     "57014": (UnusableStore, "The server took too long, and nothing was stored. Come back later."),
     "57": (StoreAway, "The server was stopped, or is starting. It is tried again."),
@@ -197,6 +202,13 @@ def explain_error(url: URL, error: object, broken: bool) -> UnusableStore | None
     if what == _AWAY and not broken:
         return None
     return kind(f"{database_label(url)}: {said:.400}. {what}")
+
+
+def is_conflict(error: UnusableStore) -> bool:
+    """Whether PostgreSQL gave up a transaction for the sake of another, such as in a deadlock."""
+    cause = error.__cause__
+    state = getattr(getattr(cause, "orig", cause), "sqlstate", None)
+    return state is not None and str(state).startswith("40")
 
 
 def is_of_old_plan(error: object) -> bool:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager, suppress
 from typing import Any
 
 import pytest
@@ -14,8 +15,9 @@ from sqlalchemy.exc import IntegrityError
 from sceneprint.engine.ingest import write_groups
 from sceneprint.engine.ingest.write_groups import NewFrames
 from sceneprint.errors import StoreLocked
-from sceneprint.process import of_request
-from sceneprint.store import Database, Store
+from sceneprint.process import of_request, work_of
+from sceneprint.store import Database, Store, open_database
+from sceneprint.store.database import MAP_WRITERS
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import add_map, keep_model
 from sceneprint.store.new_frames import NewFrame, receive_frames
@@ -336,3 +338,48 @@ def test_a_store_that_cannot_be_used_is_told_to_all(
         take_turn(other, 10.0)
         found = together(NewFrames(server_store.database), given, until)
     assert [type(one) for one in found] == [StoreLocked, StoreLocked]
+
+
+def test_others_do_not_wait_for_the_maps_of_who_leads(
+    server_store: Store, rows: list[MapRow], until: Until
+) -> None:
+    """A tenant whose own maps are all in use comes first in the group of all."""
+    database, group = server_store.database, NewFrames(server_store.database)
+    with database.write() as connection:
+        busy = [add_map(connection, f"busy-{i}", None, MODEL) for i in range(MAP_WRITERS)]
+
+    def write(row: MapRow) -> None:
+        with work_of("its tenant"), database.write(map_number=row.number):
+            pass
+
+    def lead() -> bool:
+        with work_of("its tenant"):
+            return group.receive(new(rows[0], 1))
+
+    with ThreadPoolExecutor(len(busy) + 1) as pool, ExitStack() as others:
+        for row in busy:
+            others.enter_context(in_use(database, row))
+        writers = [pool.submit(write, row) for row in busy]
+        until(lambda: database._map_turns._order._held.get("its tenant", 0) > 0)
+        assert pool.submit(lead).result(60)
+        assert group.receive(new(rows[1], 1))
+        assert not any(one.done() for one in writers)
+        others.close()
+        for one in writers:
+            one.result(60)
+
+
+def test_a_statement_that_was_prepared_in_vain_is_prepared_again(
+    server_store: Store, rows: list[MapRow]
+) -> None:
+    """The driver takes a statement for prepared that an error before it kept from being so."""
+    database, (a, b, _) = server_store.database, rows
+    for content in range(5):  # it prepares what comes for the sixth time
+        assert receive(database, new(a, content)) == [True]
+    # another process: of one pool, the connection would be another
+    url = database._engine.url.render_as_string(hide_password=False)
+    with closing(open_database(url)) as other, in_use(other, b), pytest.raises(MapsInUse):
+        receive(database, new(a, 90), new(b, 91), wait_s=0.05)
+    with suppress(StoreLocked):
+        receive(database, new(a, 100))
+    assert [receive(database, new(a, content)) for content in range(101, 104)] == [[True]] * 3

@@ -25,11 +25,12 @@ from sceneprint.engine.upkeep.garbage_collection import collect_blobs, collect_d
 from sceneprint.errors import StoreAway, StoreLocked, UnusableStore
 from sceneprint.settings import Settings
 from sceneprint.store import Store, open_store
-from sceneprint.store.blobs.folder import LONGEST_S
+from sceneprint.store.blobs.folder import LONGEST_S, FolderBlobs
 from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.deletion import doom, remove_map
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map
+from sceneprint.store.postgres.connection import LOCKS
 from sceneprint.store.tables import doomed, signatures
 from sceneprint_client.api import JobState, NewMap
 
@@ -39,6 +40,13 @@ WAITING = text(
     "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted "
     "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
 )
+SESSIONS = (
+    f"SELECT count(pg_terminate_backend(pid)) FROM pg_locks WHERE granted AND classid = {LOCKS} "
+    "AND locktype = 'advisory' "
+    "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
+)
+#: Seconds that a removal whose remover is gone is taken to go on.
+LONGEST = "sceneprint.store.postgres.session_locks.LONGEST_S"
 #: Removes blobs; dies before it settles them where it is told so.
 REMOVER = """
 import os, signal, sys
@@ -201,6 +209,13 @@ def waiting(engine: Engine) -> int:
 def doomed_in(engine: Engine) -> list[str]:
     with engine.store.database.read() as connection:
         return list(connection.execute(select(doomed.c.blob).order_by(doomed.c.blob)).scalars())
+
+
+def end_sessions(engine: Engine, which: str) -> None:
+    """Cut the one process off that has an advisory lock of that kind."""
+    with engine.store.database.read() as connection:
+        ended = connection.execute(text(f"{SESSIONS} AND {which}")).scalar_one()
+    assert ended == 1
 
 
 def grow_old(engine: Engine) -> None:
@@ -373,7 +388,7 @@ def test_what_is_on_its_way_out_stays_doomed_for_all(
 @pytest.mark.parametrize("dies", ["before", "after"])
 def test_what_a_killed_remover_leaves(
     engine: Engine, small: Any, held: HeldDeletes, postgres_url: str, bucket: str, dies: str,
-    remover: Store, until: Until,
+    remover: Store, until: Until, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     digest = engine.store.blobs.put(small[0].png)
     engine.store.blobs.put(b"of another frame")
@@ -396,6 +411,7 @@ def test_what_a_killed_remover_leaves(
     assert engine.store.blobs.get(digest) == small[0].png
     assert (OTHER in engine.store.blobs.digests()) == (dies == "before")
     grow_old(engine)
+    monkeypatch.setattr(LONGEST, 0.0)
     assert collect_doomed_blobs(engine.store) == 2
     assert doomed_in(engine) == []
     assert list(engine.store.blobs.digests()) == [digest]
@@ -468,17 +484,91 @@ def test_a_snapshot_defers_a_removal(engine: Engine) -> None:
 
 
 def test_blobs_stay_doomed_where_the_object_store_is_away(
-    engine: Engine, held: HeldDeletes, removal: Callable[..., Background]
-) -> None:
+    engine: Engine, held: HeldDeletes, removal: Callable[..., Background],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     digest = engine.store.blobs.put(b"of another frame")
     removing = removal(digest)
     held.drop()
     with pytest.raises(UnusableStore, match="cannot be removed"):
         removing.result()
     assert doomed_in(engine) == [digest]
-    assert engine.store.blobs.holds(digest)
+    assert digest in engine.store.blobs.digests()
+    collect_blobs(engine.store, [digest])  # what was asked for may still come
+    assert digest in engine.store.blobs.digests()
+    monkeypatch.setattr(LONGEST, 0.0)
     assert collect_doomed_blobs(engine.store) == 1
     assert not engine.store.blobs.holds(digest)
+    assert doomed_in(engine) == []
+
+
+def test_another_removal_does_not_hide_that_of_who_was_cut_off(
+    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background]
+) -> None:
+    """What it had asked for is carried out later, and not after an upload that is acknowledged."""
+    digest, other = (engine.store.blobs.put(one) for one in (small[0].png, b"of another frame"))
+    removing = removal(digest)
+    end_sessions(engine, "objid = 2 AND mode = 'ExclusiveLock'")
+    for _ in range(2):
+        with pytest.raises(StoreLocked, match="lost its connection, and may still remove them"):
+            alone(engine, small)
+        collect_blobs(engine.store, [other])
+    assert doomed_in(engine) == sorted([digest, other])
+    held.release()
+    removing.result()
+    grow_old(engine)
+    alone(engine, small)
+    assert engine.store.blobs.get(digest) == small[0].png
+
+
+def test_a_request_without_an_answer_may_be_carried_out_later(
+    engine: Engine, small: Any, held: HeldDeletes, postgres_url: str, bucket: str,
+    monkeypatch: pytest.MonkeyPatch, until: Until,
+) -> None:  # fmt: skip
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{held.port}")
+    monkeypatch.setattr("sceneprint.store.blobs.object_client.SMALL_S", 1)
+    digest = engine.store.blobs.put(small[0].png)
+    with closing(open_store(postgres_url, bucket)) as remover:
+        with pytest.raises(UnusableStore, match="cannot be removed"):
+            collect_blobs(remover, [digest])
+        with pytest.raises(StoreLocked, match="may still remove them"):
+            alone(engine, small)
+        held.release()
+        until(lambda: digest not in engine.store.blobs.digests())
+    grow_old(engine)
+    alone(engine, small)
+    assert engine.store.blobs.get(digest) == small[0].png
+
+
+def test_who_lost_its_turn_while_it_removes_files_is_waited_for(
+    small: Any, postgres_url: str, tmp_path: Path, until: Until, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its disk may stall for longer than the server waits for it."""
+    given = Settings.model_validate({"database_url": postgres_url, "data_dir": tmp_path})
+    given.blobs.mkdir()
+    arrived, passes = threading.Event(), threading.Event()
+    remove = FolderBlobs.remove
+
+    def stall(self: FolderBlobs, *digests: str) -> None:
+        arrived.set()
+        passes.wait()
+        remove(self, *digests)
+
+    with Engine(given) as engine, closing(open_store(postgres_url, given.blobs)) as remover:
+        engine.create_map(NewMap(name="hall"))
+        digest = engine.store.blobs.put(small[0].png)
+        monkeypatch.setattr(FolderBlobs, "remove", stall)
+        removing = Background(lambda: collect_blobs(remover, [digest]))
+        assert arrived.wait(60)
+        end_sessions(engine, "objid = 1 AND mode = 'ExclusiveLock'")
+        adding = Background(lambda: alone(engine, small))
+        until(lambda: not adding.is_alive() or engine.get_map("hall").frames == {"received": 1})
+        assert adding.is_alive()
+        passes.set()
+        with pytest.raises(UnusableStore):
+            removing.result()
+        adding.result()
+        assert engine.store.blobs.get(digest) == small[0].png
 
 
 def test_what_is_doomed_again_meanwhile_is_not_settled(

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import errno
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 from sqlalchemy import text
 
-from sceneprint.errors import UnusableStore
+from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store import Store, open_blobs, open_database, open_store
 from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.blobs.object_store import MARK, ObjectBlobs
 
+#: Seconds that a removal whose remover is gone is taken to go on.
+LONGEST = "sceneprint.store.postgres.session_locks.LONGEST_S"
 HOLDS = """
 import sys, time
 from sceneprint.store import open_store
@@ -137,7 +141,9 @@ def test_what_was_put_is_held_without_asking_until_something_is_removed(
     theirs.close()
 
 
-def test_a_remover_that_dies_is_not_forgotten(postgres_url: str, bucket: str) -> None:
+def test_a_remover_that_dies_is_not_forgotten(
+    postgres_url: str, bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     mine, theirs = (open_store(postgres_url, bucket) for _ in range(2))
     removing = theirs.blobs.removing()
     assert removing.__enter__()
@@ -145,7 +151,11 @@ def test_a_remover_that_dies_is_not_forgotten(postgres_url: str, bucket: str) ->
     objects_of(theirs)._locks.close()  # as its process would, before it counted to the end
     objects_of(theirs).objects.delete(f"blobs/{digest[:2]}/{digest}")
     assert not mine.blobs.holds(digest)
-    with mine.blobs.removing() as allowed:  # its lock is free
+    with mine.blobs.removing() as allowed:  # its lock is free, and its requests may still come
+        assert not allowed
+    assert objects_of(mine)._locks.removals() is None
+    monkeypatch.setattr(LONGEST, 0.0)
+    with mine.blobs.removing() as allowed:
         assert allowed
     digest = mine.blobs.put(b"depth")
     objects_of(mine).objects.delete(f"blobs/{digest[:2]}/{digest}")
@@ -156,8 +166,9 @@ def test_a_remover_that_dies_is_not_forgotten(postgres_url: str, bucket: str) ->
 
 
 def test_who_lost_its_lock_does_not_end_the_removal_of_another(
-    postgres_url: str, bucket: str
+    postgres_url: str, bucket: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(LONGEST, 0.0)
     mine, theirs = (open_store(postgres_url, bucket) for _ in range(2))
     removing = mine.blobs.removing()
     assert removing.__enter__()
@@ -169,6 +180,39 @@ def test_who_lost_its_lock_does_not_end_the_removal_of_another(
     assert objects_of(theirs)._locks.removals() is not None
     mine.close()
     theirs.close()
+
+
+def test_a_folder_without_locks_holds_what_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is removed there, so there is nothing to wait for."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks available")
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    store = open_store(f"sqlite:///{tmp_path / 'a.db'}", tmp_path / "blobs")
+    digest = store.blobs.put(b"depth")
+    with store.blobs.removing() as allowed:
+        assert not allowed
+    assert store.blobs.holds(digest)
+    store.close()
+
+
+def test_a_folder_waits_for_who_removes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = open_store(f"sqlite:///{tmp_path / 'a.db'}", tmp_path / "blobs")
+    digest = store.blobs.put(b"depth")
+    with ThreadPoolExecutor(1) as pool, store.blobs.removing() as allowed:
+        assert allowed
+        held = pool.submit(store.blobs.holds, digest)
+        with pytest.raises(TimeoutError):
+            held.result(0.05)
+        store.blobs.remove(digest)
+    assert held.result() is False
+    monkeypatch.setattr("sceneprint.store.blobs.folder.TURN_S", 0.0)
+    with store.blobs.removing(), pytest.raises(StoreLocked, match="Come back later"):
+        store.blobs.holds(digest)
+    store.close()
 
 
 def test_a_lock_that_was_lost_is_said(postgres_url: str, bucket: str) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, event, func, select
 
-from sceneprint.engine.ingest.write_groups import MOST_TOGETHER, Grouping, _Waiting
+from sceneprint.engine.ingest.write_groups import MOST_TOGETHER, Grouping, _Group, _Waiting
 from sceneprint.errors import FrameConflict, LostLease, StoreFull
 from sceneprint.process import of_request, request_id
 from sceneprint.store import Database, Store
@@ -52,7 +52,7 @@ def together(
     return found, commits[0] - 1
 
 
-def until_waiting(group: Grouping, count: int) -> None:
+def until_waiting(group: _Group[Any], count: int) -> None:
     end = time.monotonic() + 60
     while len(group._waiting) < count:
         assert time.monotonic() < end
@@ -177,3 +177,42 @@ def test_ctrl_c_of_one_that_waits_is_its_own(
     monkeypatch.undo()
     found.append(group.run(noting("a", 3)))
     assert (found, count(database, "a"), group._led, group._waiting) == ([3], 1, False, [])
+
+
+def test_ctrl_c_of_who_leads_and_of_one_that_it_took_ends_both_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    entered, taken_by_now, leave = (threading.Event() for _ in range(3))
+
+    class Interrupted(_Group[str]):
+        def _write_together(self, taken: list[_Waiting[str]]) -> None:
+            entered.set()
+            assert taken_by_now.wait(60)
+            self._take(taken)
+            leave.set()
+            waiter.join(60)
+            raise KeyboardInterrupt
+
+    class Leaving(_Waiting[str]):
+        def __init__(self, work: str) -> None:
+            super().__init__(work)
+            monkeypatch.setattr(self.told, "wait", self.leave)
+
+        def leave(self) -> None:
+            assert leave.wait(60)
+            raise KeyboardInterrupt
+
+    def run(name: str) -> None:
+        with pytest.raises(KeyboardInterrupt):
+            group._await(name)
+
+    group = Interrupted()
+    leader, waiter = (threading.Thread(target=run, args=(name,)) for name in ("leader", "waiter"))
+    leader.start()
+    assert entered.wait(60)
+    monkeypatch.setattr("sceneprint.engine.ingest.write_groups._Waiting", Leaving)
+    waiter.start()
+    until_waiting(group, 2)
+    taken_by_now.set()
+    leader.join(60)
+    assert (group._led, group._waiting) == (False, [])

@@ -17,6 +17,7 @@ from sqlalchemy import Connection
 
 from sceneprint.errors import SceneprintError, UnusableStore
 from sceneprint.store import Database
+from sceneprint.store.database_errors import is_conflict
 from sceneprint.store.new_frames import NewFrame, receive_frames
 
 T = TypeVar("T")
@@ -36,12 +37,13 @@ class _Waiting(Generic[W]):
     ----------
     leads : whether its thread writes what waits, or is to begin with that; see `_Group`
     told : set when it is done, or leads
+    left : whether its thread waits no more
     """
 
     def __init__(self, work: W) -> None:
         self.work = work
         self.leads, self.told = False, threading.Event()
-        self.done = False
+        self.done = self.left = False
         self.result: Any = None
         self.error: Exception | None = None
 
@@ -69,6 +71,7 @@ class _Group(Generic[W]):
                 self._write()
         except BaseException:  # such as Ctrl-C
             with self._list:
+                mine.left = True  # and is not put back by who has taken it
                 if mine in self._waiting:
                     self._waiting.remove(mine)
             raise
@@ -94,7 +97,8 @@ class _Group(Generic[W]):
             self._write_together(taken)
         except BaseException:  # Ctrl-C is the caller's alone: the others write themselves
             with self._list:
-                self._waiting = [one for one in taken if not one.done] + self._waiting
+                back = [one for one in taken if not (one.done or one.left)]
+                self._waiting = back + self._waiting
             raise
         finally:
             for one in taken:
@@ -152,7 +156,8 @@ class Grouping(_Group[_Work]):
         except Exception as error:
             if not taken:  # it was never our turn: who waits has waited as long
                 self._take(taken, all_=True)
-            if len(taken) == 1 or isinstance(error, UnusableStore):
+            of_all = isinstance(error, UnusableStore) and not is_conflict(error)
+            if len(taken) == 1 or of_all:
                 for one in taken:
                     one.result, one.error = None, error
             else:

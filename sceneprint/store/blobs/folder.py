@@ -8,6 +8,7 @@ import hashlib
 import os
 import re
 import secrets
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -23,7 +24,7 @@ from sceneprint.atomic_files import (
     sync_folder,
     write_durable,
 )
-from sceneprint.errors import DamagedBlob, UnusableStore
+from sceneprint.errors import DamagedBlob, StoreLocked, UnusableStore
 from sceneprint.store.database_errors import unusable
 
 # Who needs blobs kept, and who may remove some: one lock for all processes that share them.
@@ -37,6 +38,8 @@ TURN_S, REMOVAL_S = 5.0, 25.0
 #: Seconds after which a removal is over, whatever became of who removes: it begins no request after
 #: REMOVAL_S, and each ends within `object_client.TRIED_S` and `SMALL_S`.
 LONGEST_S = 90.0
+#: Seconds between two looks at the lock of a folder.
+_LOOK_S = 0.01
 
 
 class Locks(ABC):
@@ -59,8 +62,12 @@ class Locks(ABC):
         """A number that any removal changes; None where it cannot be told, or one is under way."""
         return None
 
+    def doubt(self) -> None:  # noqa: B027  (a folder does what it is asked, or does not)
+        """Have the removal of this thread stay under way: what was asked for may be done later."""
+
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: B027  (most have none)
-        """Wait for the end of a removal that outlasts its turn, and not for who has died.
+        """Wait for the end of a removal that outlasts its turn, whether it may or lost it, and not
+        for who has died.
 
         Parameters
         ----------
@@ -118,6 +125,25 @@ class FileLocks(Locks):
             yield True
         finally:
             os.close(descriptor)
+
+    def wait(self, digest: str | None, seconds: float) -> None:  # noqa: ARG002  (one lock for all)
+        """See `Locks`: who removes in its turn may lose that, to a server that waits no longer."""
+        until = time.monotonic() + seconds
+        while True:
+            try:
+                os.close(self._lock(fcntl.LOCK_SH | fcntl.LOCK_NB))
+            except BlockingIOError:
+                pass
+            except OSError:  # there are no locks, and so no removals
+                return
+            else:
+                return
+            if time.monotonic() > until:
+                raise StoreLocked(
+                    f"{self._path}: another process removes blobs for longer than {seconds:.0f} s, "
+                    "and nothing was stored. Come back later."
+                )
+            time.sleep(_LOOK_S)
 
     def _lock(self, how: int) -> int:
         # of this call alone: flock then keeps out other threads as well as other processes
@@ -495,7 +521,8 @@ class FolderBlobs(Blobs):
         return data
 
     def holds(self, digest: str) -> bool:
-        """Whether there is a blob of that digest."""
+        """Whether there is a blob of that digest; see `Blobs.holds`."""
+        self._locks.wait(digest, TURN_S)  # a remover that lost its turn may still be at it
         return self.path(digest).exists()
 
     def size(self, digest: str) -> int | None:

@@ -121,6 +121,7 @@ class Objects:
     Parameters
     ----------
     small, large : the store, for requests of a few bytes and for those of many
+    once : for those that are not tried again
     url : to show
     variables : of the environment that it is configured by, to show
     folder : where it is one
@@ -130,10 +131,10 @@ class Objects:
     """
 
     def __init__(
-        self, small: ObjectStore, large: ObjectStore, url: str, variables: str = "none",
-        folder: Path | None = None,
+        self, small: ObjectStore, large: ObjectStore, once: ObjectStore, url: str,
+        variables: str = "none", folder: Path | None = None,
     ) -> None:  # fmt: skip
-        self._small, self._large, self._folder = small, large, folder
+        self._small, self._large, self._once, self._folder = small, large, once, folder
         self._variables = variables
         #: Where it is, to show; there are no credentials in it.
         self.url = url
@@ -285,13 +286,15 @@ class Objects:
             for one in page:
                 yield ListedObject(one["path"], one["size"], one["last_modified"].timestamp())
 
-    def delete(self, *keys: str, seconds: float = math.inf) -> None:
+    def delete(self, *keys: str, seconds: float = math.inf, once: bool = False) -> None:
         """Remove objects; of no consequence where there are none.
 
         Parameters
         ----------
         keys : within the prefix
         seconds : after which no further request is begun; StoreAway where keys are left then
+        once : do not try again what failed: a request without an answer may be carried out after
+            the one that was tried again, and this would not tell of it
         """
         import obstore
 
@@ -300,7 +303,7 @@ class Objects:
         until = time.monotonic() + seconds
         with self._explained(f"{keys[0]} cannot be removed"):
             try:
-                obstore.delete(self._small, keys)
+                obstore.delete(self._once if once else self._small, keys)
             except FileNotFoundError as error:
                 if _NO_BUCKET.search(str(error)):
                     raise
@@ -308,7 +311,7 @@ class Objects:
                     for key in keys:
                         if time.monotonic() > until:
                             raise self._fault(key, "too slow", StoreAway) from None
-                        self.delete(key)
+                        self.delete(key, once=once)
 
     def _make_durable(self, key: str) -> None:
         """Of a folder: the library does not sync what it writes."""
@@ -374,6 +377,8 @@ class Objects:
 #: Seconds for a connection, for a request of a few bytes, and for one of a part; and seconds after
 #: which no request is tried again.
 CONNECT_S, SMALL_S, PART_S, TRIED_S = 3, 10, 60, 8
+#: How often one is at most.
+RETRIES = 8
 #: Kinds of stores, and the beginnings of the environment variables they are configured by.
 VARIABLES = {
     "s3": "AWS_", "s3a": "AWS_", "gs": "GOOGLE_", "az": "AZURE_", "azure": "AZURE_",
@@ -447,7 +452,7 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
         )
     if kind == "memory":
         memory = MemoryStore()
-        return Objects(memory, memory, "memory:///")
+        return Objects(memory, memory, memory, "memory:///")
     if kind == "file":
         folder = Path(unquote(urlsplit(url).path))
         try:
@@ -457,11 +462,11 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
                 f"{folder}: the folder cannot be made ({error.strerror}). Check its permissions."
             ) from error
         local = LocalStore(folder)
-        return Objects(local, local, url, folder=folder)
+        return Objects(local, local, local, url, folder=folder)
     try:
-        small, large = (
-            from_url(url, client_options=_client(seconds), retry_config=_retries())
-            for seconds in (SMALL_S, PART_S)
+        small, large, once = (
+            from_url(url, client_options=_client(seconds), retry_config=_retries(most))
+            for seconds, most in ((SMALL_S, RETRIES), (PART_S, RETRIES), (SMALL_S, 0))
         )
     except (BaseError, ValueError) as error:
         said = str(error).partition("\n")[0]
@@ -469,7 +474,7 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
             f"{url}: the store cannot be opened ({said:.200}). See {setting} and the variables "
             f"{VARIABLES[kind]}... of the environment."
         ) from None
-    return Objects(small, large, url, f"{VARIABLES[kind]}...")
+    return Objects(small, large, once, url, f"{VARIABLES[kind]}...")
 
 
 def _client(seconds: int) -> ClientConfig:
@@ -486,11 +491,11 @@ def _allows_http() -> bool:
     return any(os.environ.get(name, "").lower() in ("1", "true", "yes") for name in names)
 
 
-def _retries() -> RetryConfig:
+def _retries(most: int) -> RetryConfig:
     backoff: Any = {
         "init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=1), "base": 2,
     }  # fmt: skip
-    return {"max_retries": 8, "retry_timeout": timedelta(seconds=TRIED_S), "backoff": backoff}
+    return {"max_retries": most, "retry_timeout": timedelta(seconds=TRIED_S), "backoff": backoff}
 
 
 def check_objects(objects: Objects) -> float:

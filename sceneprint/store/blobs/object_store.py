@@ -268,7 +268,11 @@ class ObjectBlobs(Blobs):
         with self._lock:
             for digest in digests:
                 self._put.pop(digest, None)
-        self.objects.delete(*map(_key, digests), seconds=REMOVAL_S)
+        try:
+            self.objects.delete(*map(_key, digests), seconds=REMOVAL_S, once=True)
+        except BaseException:
+            self._locks.doubt()
+            raise
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
         """Whether a blob is as it was stored; see `Blobs.condition`."""

@@ -122,7 +122,8 @@ def configure(connection: Any, _record: object = None) -> None:
     given = {**_CONNECT, **connection.info.get_parameters()}
     before, connection.autocommit = connection.autocommit, True
     connection.execute(
-        "SELECT set_config('lock_timeout', %s, false), set_config('statement_timeout', %s, false),"
+        "SELECT set_config('default_transaction_isolation', 'read committed', false),"
+        " set_config('lock_timeout', %s, false), set_config('statement_timeout', %s, false),"
         " set_config('idle_in_transaction_session_timeout', %s, false),"
         # the server gives up a client whose host is gone as soon as the client would give it up:
         # locks of its session would else stay for hours
@@ -232,10 +233,14 @@ class SingleStatement:
         self.executed = True
         if self.schema is not None and self.schema.found is None:
             self.schema.look(cursor.connection)
+        sent = None if self.schema is None else self.schema.found
         try:
             self._send(cursor, statement, parameters)
         except psycopg.errors.DivisionByZero:  # nothing was written
-            if self.schema is None or not self.schema.look(cursor.connection):
+            if self.schema is None:
+                raise
+            self.schema.look(cursor.connection)
+            if self.schema.found == sent:
                 raise
             self._send(cursor, statement, parameters)
 
@@ -433,7 +438,7 @@ def _leave_behind(context: ExceptionContext) -> None:
     writes; and those that prepared statements for tables that another process changed.
     """
     error = context.original_exception
-    if getattr(error, "sqlstate", None) == "25006" or is_of_old_plan(error):
+    if getattr(error, "sqlstate", None) in ("25006", "26000") or is_of_old_plan(error):
         context.is_disconnect = True
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -63,6 +64,9 @@ class SessionLocks(Locks):
         self._database = database
         self._alone = threading.Lock()  # of who removes in this process
         self._removes, self._reads = _Line(database), _Line(database)
+        self._doubted = False
+        # an odd number of `_COUNTER`, and since when this process has seen it
+        self._odd: tuple[int, float] | None = None
 
     def close(self) -> None:
         """Give back the connections."""
@@ -100,7 +104,7 @@ class SessionLocks(Locks):
             yield False
             return
         try:
-            allowed = self._begin()
+            allowed, self._doubted = self._begin(), False
             try:
                 yield allowed
             finally:
@@ -108,6 +112,10 @@ class SessionLocks(Locks):
                     self._end()
         finally:
             self._alone.release()
+
+    def doubt(self) -> None:
+        """See `Locks`: nobody begins another one, or takes it to be over, for LONGEST_S."""
+        self._doubted = True
 
     @property
     def outlast_turns(self) -> bool:
@@ -145,6 +153,9 @@ class SessionLocks(Locks):
     def _begin(self) -> bool:
         if not self._removes.ask(_TAKE, LOCKS, BLOBS):
             return False
+        if not self._is_over(self._removes.ask(_READ, same=True)):
+            self._removes.drop()
+            return False
         # who puts a blob while it is removed must find out: without the counter, nothing goes
         for _ in range(2):  # it is odd already after a remover that died
             number = self._removes.ask(_NEXT, same=True)
@@ -155,7 +166,21 @@ class SessionLocks(Locks):
         self._removes.drop()
         return False
 
+    def _is_over(self, number: int | None) -> bool:
+        """Whether the removal of before is over: an odd number is of one whose remover died or was
+        cut off, or whose requests failed, and these may still be carried out."""
+        if number is None:
+            return False
+        if number % 2 == 0:
+            return True
+        if self._odd is None or self._odd[0] != number:
+            self._odd = number, time.monotonic()
+        return time.monotonic() - self._odd[1] >= LONGEST_S
+
     def _end(self) -> None:
+        if self._doubted:  # the number stays odd
+            self._removes.drop()
+            return
         # another connection has no lock: who has it now would be counted to the end
         ended = self._removes.ask(_NEXT, same=True) is not None
         if not ended or not self._removes.ask(_GIVE, LOCKS, BLOBS, same=True):

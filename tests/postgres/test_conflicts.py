@@ -1,0 +1,135 @@
+"""Transactions of PostgreSQL that are in each other's way, and servers that are set otherwise."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from typing import Any
+
+import pytest
+from sqlalchemy import Connection
+
+from benchmarks.fleet.postgres import Server
+from sceneprint.engine.ingest.write_groups import Grouping
+from sceneprint.errors import StoreLocked
+from sceneprint.store import Store, open_database
+from sceneprint.store.events import record_event
+from sceneprint.store.keys import IdempotentRequest
+from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.postgres import connection as postgres
+from sceneprint.store.tables import MapRow
+
+MODEL = "ab" * 32
+
+
+@pytest.fixture
+def rows(server_store: Store) -> list[MapRow]:
+    with server_store.database.write() as connection:
+        keep_model(connection, MODEL, "toy", b"a model")
+        return [add_map(connection, name, None, MODEL) for name in ("a", "b")]
+
+
+def test_a_deadlock_of_two_costs_none_of_those_written_with_them(
+    server_store: Store, rows: list[MapRow]
+) -> None:
+    """Two robots use the same two keys in another order, in groups of two maps."""
+    database = server_store.database
+    first, second = (IdempotentRequest("robot", key, "0" * 64) for key in ("1", "2"))
+    both, tries = threading.Barrier(2), list[str]()
+
+    def keep(request: IdempotentRequest, meet: bool = False) -> Callable[[Connection], str]:
+        def work(connection: Connection) -> str:
+            is_first = request.key not in tries
+            tries.append(request.key)
+            request.keep(connection, {})
+            if meet and is_first:
+                both.wait(60)
+            return "kept"
+
+        return work
+
+    def innocent(connection: Connection) -> str:
+        record_event(connection, "a", None, None)
+        return "done"
+
+    def run(group: Grouping, work: Callable[[Connection], str]) -> str:
+        try:
+            return group.run(work)
+        except StoreLocked:
+            return "in the way"
+
+    works = [
+        (keep(first, meet=True), keep(second), innocent),
+        (keep(second, meet=True), keep(first), innocent),
+    ]
+    groups = [Grouping(database, row.number) for row in rows]
+    with ThreadPoolExecutor(6) as pool:
+        found = []
+        with database.write():  # until this is over nobody else writes
+            for group, three in zip(groups, works, strict=True):
+                for work in three:
+                    before = len(group._waiting)
+                    found.append(pool.submit(run, group, work))
+                    while len(group._waiting) == before:
+                        pass
+        came = [one.result(60) for one in found]
+    assert [came[2], came[5]] == ["done", "done"]
+    assert len(tries) > 4  # there was a deadlock, and those of one group were written again
+
+
+@pytest.mark.parametrize("level", ["repeatable read", "serializable"])
+def test_who_waited_for_its_turn_sees_what_was_committed_meanwhile(
+    postgres: Server, level: str
+) -> None:
+    """Whatever the database's own level is: a remover would not see the frame that needs a blob."""
+    url = postgres.create(f"level_{level.partition(' ')[0]}")
+    postgres.execute(
+        f"ALTER DATABASE level_{level.partition(' ')[0]} "
+        f"SET default_transaction_isolation = '{level}'"
+    )
+    with closing(open_database(url)) as database:
+        with database.write() as connection:
+            keep_model(connection, MODEL, "toy", b"a model")
+            row = add_map(connection, "a", None, MODEL)
+        for how in ({}, {"map_number": row.number}, {"turn": False}):
+            with database.write(**how) as connection:
+                said = connection.exec_driver_sql("SHOW transaction_isolation").scalar_one()
+                assert said == "read committed"
+        with database.read() as connection:
+            said = connection.exec_driver_sql("SHOW transaction_isolation").scalar_one()
+            assert said == "repeatable read"
+
+
+def test_a_new_schema_is_looked_at_by_each_who_sent_the_one_of_before(
+    server_store: Store, rows: list[MapRow], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = server_store.database
+    database.guard_schema()
+
+    def sign(row: MapRow) -> bool:
+        with database.write(map_number=row.number, single=True) as connection:
+            return bool(connection.exec_driver_sql("SELECT 1").scalar_one())
+
+    assert sign(rows[0])
+    with database.write() as connection:
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+    both, look = threading.Barrier(2), postgres.KnownSchema.look
+
+    def look_together(self: Any, connection: Any) -> bool:
+        both.wait(60)  # both have sent the schema of before
+        return look(self, connection)
+
+    monkeypatch.setattr(postgres.KnownSchema, "look", look_together)
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(sign, rows)) == [True, True]
+
+
+def test_a_prepared_statement_that_is_gone_is_told(server_store: Store) -> None:
+    """As behind a pooler that gives one connection to several clients."""
+    with (
+        pytest.raises(StoreLocked, match="A prepared statement is gone"),
+        server_store.database.read() as connection,
+    ):
+        connection.exec_driver_sql("EXECUTE nothing")
