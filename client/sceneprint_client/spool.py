@@ -62,11 +62,11 @@ _PAUSE_S = 1.0
 _LOCKED_S = 30.0
 #: Bytes of a page of the file. A frame is charged whole pages, and one for its rows of the indexes.
 _PAGE = 4096
-#: Pages that the journal keeps on disk, so that frames can be removed when the disk is full: one
-#: request's frames change fewer.
+#: Pages that the journal keeps on disk, so that frames can be removed or set aside when the disk is
+#: full: one request's frames change fewer, as their own pages are not written for that.
 _RESERVE = 512
 #: Marks the file as a spool, and its schema.
-_APPLICATION, _SCHEMA = 0x53705370, 2
+_APPLICATION, _SCHEMA = 0x53705370, 3
 
 # Schema 1. `reason` is null while a frame waits. `data` is last, so that other columns are read
 # without it.
@@ -139,6 +139,22 @@ CREATE TRIGGER query_moved AFTER UPDATE OF reason ON queries BEGIN
         queries_refused = queries_refused + (NEW.reason IS NOT NULL) - (OLD.reason IS NOT NULL);
 END;
 """
+
+# Schema 3: why frames were refused. `frames.reason` is '' then: as long as null, so that a frame is
+# set aside without being written again, for which a full disk has no room.
+_REASON_TABLES = """
+CREATE TABLE reasons (frame INTEGER PRIMARY KEY, reason TEXT NOT NULL);
+CREATE TRIGGER reason_removed AFTER DELETE ON frames WHEN OLD.reason IS NOT NULL BEGIN
+    DELETE FROM reasons WHERE frame = OLD.id;
+END;
+CREATE TRIGGER reason_retried AFTER UPDATE OF reason ON frames WHEN NEW.reason IS NULL BEGIN
+    DELETE FROM reasons WHERE frame = NEW.id;
+END;
+"""
+#: Tables of later schemas than the first, by which.
+_LATER = ((2, _QUERY_TABLES), (3, _REASON_TABLES))
+#: What is told of a frame whose reason was not kept.
+_NO_REASON = "The service refused it; the disk had no room for its reason"
 
 
 @dataclass(frozen=True)
@@ -407,7 +423,9 @@ class Spool:
         """Frames that the service refused, oldest first, and then records of queries."""
         with self._transaction(write=False) as database:
             rows = database.execute(
-                "SELECT meta, reason FROM frames WHERE reason IS NOT NULL ORDER BY id"
+                "SELECT meta, coalesce(nullif(frames.reason, ''), reasons.reason, ?) FROM frames "
+                "LEFT JOIN reasons ON frame = id WHERE frames.reason IS NOT NULL ORDER BY id",
+                (_NO_REASON,),
             ).fetchall()
             queries = database.execute(
                 "SELECT query_id, at, reason FROM queries WHERE reason IS NOT NULL ORDER BY id"
@@ -461,7 +479,9 @@ class Spool:
         how = {"priority": priority, "if_novel": if_novel}
         upload_fields(priority, if_novel)  # what is wrong with these is no fault of a frame
         target = _Target(client, map_name, how, time.monotonic() + patience_s)
-        with self._transaction(write=False) as database:
+        with self._transaction() as database:
+            # written whatever it was: else what is sent would be found out to be so once it is sent
+            database.execute(f"PRAGMA user_version = {_SCHEMA}")
             query = "SELECT count(*), max(id) FROM frames WHERE reason IS NULL"
             total, last = database.execute(query).fetchone()
         report = SyncReport()
@@ -539,8 +559,16 @@ class Spool:
             for number in taken:
                 removed = database.execute("DELETE FROM frames WHERE id = ?", (number,)).rowcount
                 database.execute("UPDATE counters SET uploaded = uploaded + ?", (removed,))
-            for number, reason in refused.items():
-                database.execute("UPDATE frames SET reason = ? WHERE id = ?", (reason, number))
+            database.executemany(
+                "UPDATE frames SET reason = '' WHERE id = ?", [(number,) for number in refused]
+            )
+        # a full disk may have no room for these: whoever reads them is told so
+        with suppress(errors.StoreFull), self._transaction() as database:
+            database.executemany(
+                "INSERT OR REPLACE INTO reasons SELECT id, ?2 FROM frames "
+                "WHERE id = ?1 AND reason IS NOT NULL",
+                list(refused.items()),
+            )
 
     # records of queries
 
@@ -632,6 +660,9 @@ class Spool:
         with self._told():
             self._database.execute("PRAGMA journal_mode = PERSIST")
             self._database.execute("PRAGMA synchronous = FULL")
+            # where it is on, as Debian compiles SQLite, all of a frame that is removed would go
+            # through the journal
+            self._database.execute("PRAGMA secure_delete = OFF")
         with self._transaction() as database:
             mark = database.execute("PRAGMA application_id").fetchone()[0]
             schema = database.execute("PRAGMA user_version").fetchone()[0]
@@ -650,9 +681,10 @@ class Spool:
                 )
             elif most_bytes is not None:
                 database.execute("UPDATE counters SET most_bytes = ?", (most_bytes,))
-            if not tables or schema < _SCHEMA:
-                for statement in _statements(_QUERY_TABLES):
-                    database.execute(statement)
+            missing = [one for first, one in _LATER if not tables or schema < first]
+            for statement in _statements("".join(missing)):
+                database.execute(statement)
+            if missing:
                 database.execute(f"PRAGMA user_version = {_SCHEMA}")
         self._reserve()
 

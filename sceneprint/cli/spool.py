@@ -108,20 +108,22 @@ def _add(options: argparse.Namespace) -> int:
     """Add frames; returns 2 where one cannot be read."""
     sequences = sequences_of(options.paths, options)
     found = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
-    new, errors = 0, []
+    new, there, errors = 0, 0, []
     with Spool(options.spool, options.most_bytes) as spool:
         before = spool.status()
         try:
             for sequence, frame in tqdm(found, desc="spool", unit="frame", disable=None):
                 try:
-                    new += spool.add(frame, meta_for(options, sequence, frame))
+                    is_new = spool.add(frame, meta_for(options, sequence, frame))
+                    new, there = new + is_new, there + (not is_new)
                 except OF_FRAME as error:
                     errors.append(f"{one_line(frame.name)}: {one_line(str(error))}")
         finally:  # what was added stays, however the run ended
             now = spool.status()
-            there = f", {len(found) - new - len(errors)} already there"
+            left = len(found) - new - there - len(errors)
             print(
-                f"{len(found)} frames: {new} added{there}, {len(errors)} refused; "
+                f"{len(found)} frames: {new} added, {there} already there, {len(errors)} refused"
+                f"{f', {left} not added' if left else ''}; "
                 f"{now.waiting} wait, {now.thinned - before.thinned} thinned"
             )
             for sequence in sequences:

@@ -72,6 +72,22 @@ def large(number: int, known: FrameMeta) -> tuple[np.ndarray[Any, Any], FrameMet
     return np.tile(depth(number), (4, 4)), known.model_copy(update={"intrinsics": lens})
 
 
+def wide(number: int, known: FrameMeta) -> tuple[np.ndarray[Any, Any], FrameMeta]:
+    """One of 150 kB."""
+    lens = CAMERA.model_copy(update={"width": 320, "height": 240})
+    return np.tile(depth(number), (20, 20)), known.model_copy(update={"intrinsics": lens})
+
+
+def broken(number: int, known: FrameMeta) -> tuple[bytes, FrameMeta]:
+    """None, of 150 kB, which a service refuses."""
+    return f"none, {number}".encode().ljust(150_000), known
+
+
+KINDS: dict[str, Callable[[int, FrameMeta], Any]] = {
+    "large": large, "wide": wide, "broken": broken,
+}  # fmt: skip
+
+
 def names(path: Path) -> list[str]:
     """Names of the frames that wait, oldest first."""
     with sqlite3.connect(path) as database:
@@ -230,27 +246,30 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
 from sceneprint_client.errors import StoreFull
-from test_spool import Client, Spool, depth, large, meta
+from test_spool import KINDS, Client, Spool, depth, meta
 path, taken = Path(sys.argv[1]), 0
+frame = KINDS[sys.argv[5]]
 with Spool(path) as spool:
     try:
         while taken < 10000:
-            spool.add(*large(taken, meta(name=str(taken))))
+            spool.add(*frame(taken, meta(name=str(taken))))
             taken += 1
     except StoreFull as error:
         print(error)
     print(taken, spool.status().waiting)
     with Client(sys.argv[2]) as client:
-        print(spool.sync(client, sys.argv[4]).received, spool.status().waiting)
-    print(spool.add(depth(taken), meta()))
+        report = spool.sync(client, sys.argv[4])
+    print(report.received, report.refused, spool.status().waiting)
+    print(len({one.name for one in spool.refusals() if "neither" in one.reason}))
 """
 
 
+@pytest.mark.parametrize(("kind", "most"), [("large", 600), ("wide", 160), ("broken", 160)])
 def test_a_full_file_system_is_told_and_emptied_by_sync(
-    remote: Client, service_url: str, map_name: str, tmp_path: Path
+    remote: Client, service_url: str, map_name: str, tmp_path: Path, kind: str, most: int
 ) -> None:
-    """A real file system of 5 MB, where this user may mount one."""
-    mount = f"mount -t tmpfs -o size=5m t {tmp_path} && exec"
+    """A real file system of 5 MB or 20 MB, where this user may mount one."""
+    mount = f"mount -t tmpfs -o size={'5m' if kind == 'large' else '20m'} t {tmp_path} && exec"
     may = (
         shutil.which("unshare")
         and not subprocess.run(
@@ -263,21 +282,41 @@ def test_a_full_file_system_is_told_and_emptied_by_sync(
     script = tmp_path.with_suffix(".py")
     script.write_text(FILL)
     given = [sys.executable, script, tmp_path / "spool", service_url, Path(__file__).parent]
-    command = " ".join(map(str, (*given, map_name)))
+    command = " ".join(map(str, (*given, map_name, kind)))
     ran = subprocess.run(
         ["unshare", "-rm", "sh", "-c", f"{mount} {command}"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr
-    told, counted, emptied, added = ran.stdout.splitlines()
+    told, counted, emptied, explained = ran.stdout.splitlines()
     assert told == (
         f"{tmp_path}/spool: The disk has no room for the spool (database or disk is full), and "
         "nothing was changed. Free some, or upload what waits with `sceneprint spool sync`."
     )
     taken = int(counted.split()[0])
-    assert 250 <= taken <= 600
-    assert (counted, emptied, added) == (f"{taken} {taken}", f"{taken} 0", "True")
-    assert sorted(int(one.name or "") for one in remote.frames(map_name)) == list(range(taken))
+    assert 0.4 * most <= taken <= most
+    assert counted == f"{taken} {taken}"
+    there = sorted(int(one.name or "") for one in remote.frames(map_name))
+    if kind == "broken":
+        assert (emptied, explained, there) == (f"0 {taken} 0", f"{taken}", [])
+    else:
+        assert (emptied, explained, there) == (f"{taken} 0 0", "0", [*range(taken)])
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_a_frame_larger_than_the_journal_leaves_it_as_large(tmp_path: Path, refused: bool) -> None:
+    """A full disk has no room for more."""
+    journal = tmp_path / "spool-journal"
+    with Spool(tmp_path / "spool") as spool:
+        spool.add(b"x" * (3 << 20), meta(name="a"))
+        before = journal.stat().st_size
+        assert before < 3 << 20
+        spool._settle(*(([], {1: "a reason"}) if refused else ([1], {})))
+        assert journal.stat().st_size == before
+        assert [one.reason for one in spool.refusals()] == ["a reason"] * refused
+        assert spool.status().uploaded == (not refused)
+        assert (spool.retry_refused(), spool.status().waiting) == (refused, refused)
+        assert journal.stat().st_size == before
 
 
 # Uploads.
@@ -565,8 +604,8 @@ def test_a_spool_of_before_there_were_records_is_upgraded(
     with Spool(path) as spool:
         assert (spool.status().uploaded, spool.status().queries_sent) == (1, 1)
     with closing(sqlite3.connect(path)) as database:
-        assert database.execute("PRAGMA user_version").fetchone() == (2,)
-        database.execute("PRAGMA user_version = 3")
+        assert database.execute("PRAGMA user_version").fetchone() == (3,)
+        database.execute("PRAGMA user_version = 4")
         database.commit()
     with pytest.raises(UnusableStore, match="of a later version"):
         Spool(path)
