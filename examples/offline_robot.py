@@ -22,7 +22,7 @@ from pathlib import Path
 from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint_client import Client, Spool, meta_of
 from sceneprint_client.api import FrameMeta
-from sceneprint_client.errors import Busy, RateLimited, Unreachable
+from sceneprint_client.errors import SceneprintError
 from sceneprint_client.http import DEFAULT_URL
 
 #: Frames between two tries to upload.
@@ -40,7 +40,7 @@ def upload_waiting(client: Client, spool: Spool, map_name: str) -> bool:
     """Upload what waits, as far as there is a connection; whether all went."""
     try:
         report = spool.sync(client, map_name, patience_s=30)
-    except (Unreachable, Busy, RateLimited) as error:
+    except SceneprintError as error:  # out of reach, busy, or a key or map that somebody mends
         print(f"offline, {spool.status().waiting} frames wait: {error}")
         return False
     print(f"uploaded {report.received}, already there {report.there}, refused {report.refused}")

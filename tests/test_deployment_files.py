@@ -23,6 +23,8 @@ import pytest
 from sceneprint.cli import parser
 from sceneprint.decoders import sandbox
 from sceneprint.settings import Settings
+from sceneprint_client.errors import StoreAway
+from sceneprint_client.http import error_of
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "deployment"
 UNITS = sorted(FOLDER.glob("*.service"))
@@ -198,6 +200,20 @@ def test_a_busy_map_spills_over_to_other_processes(
         assert Counter(one.result().text for one in asked) == taken
     assert len(taken) >= 2
     assert max(taken.values()) <= 16
+
+
+def test_without_a_process_that_is_ready_clients_are_told_to_come_back(
+    proxied: tuple[httpx.Client, dict[str, _Api]],
+) -> None:
+    client, apis = proxied
+    for api in apis.values():
+        api.end()
+    until(lambda: client.get("/v1/maps").status_code == 503)
+    answer = client.get("/v1/maps")
+    assert answer.headers["content-type"] == "application/problem+json"
+    error = error_of(answer)
+    assert (type(error), error.retry_after_s) == (StoreAway, 2.0)
+    assert str(error) == "No process of the service is ready. Retry later."
 
 
 def said_of_unit(text: str, name: str, folder: Path) -> str:

@@ -446,6 +446,9 @@ def _authorities(url: httpx.URL) -> ssl.SSLContext | bool:
         ) from error
 
 
+#: Statuses of a proxy that reaches nobody, where it is a proxy that answers.
+_OF_PROXY = (502, 503, 504)
+
 # Trying again where that may help: a busy service, a broken connection.
 
 
@@ -554,6 +557,11 @@ def _error_of(response: httpx.Response) -> errors.SceneprintError:
     try:
         problem = Problem.model_validate_json(response.content)
     except ValidationError:
+        if response.status_code in _OF_PROXY:
+            return errors.Unreachable(
+                f"{response.request.url} answered {response.status_code} {response.reason_phrase}: "
+                "a proxy before the service reaches no process that is ready. Try again later."
+            )
         return errors.Refused(
             f"{response.request.url} answered {response.status_code} {response.reason_phrase} "
             "without saying why, so it is hardly sceneprint. Check the address.",

@@ -334,9 +334,12 @@ class Spool:
         ------
         StoreFull : the disk has no room, and the spool is as it was.
         InvalidRequest : the frame is larger than `most_bytes`.
-        FrameError, DatasetError : as for `Client.upload`, if that can be seen without decoding.
+        FrameError, DatasetError : as for `Client.upload`, if that can be seen without decoding; the
+            frame is empty, or a PNG without intrinsics. What lies beside a file is read only where
+            `meta` is left out.
         """
         data, known = frame_bytes(frame, meta, with_pose=True, up=up)
+        _require_sendable(data, known)
         text = json.dumps(meta_json(known))
         digest = hashlib.sha256(text.encode() + b"\0" + data).hexdigest()
         size = (len(data) + len(text) + 2 * _PAGE - 1) // _PAGE * _PAGE
@@ -471,9 +474,10 @@ class Spool:
 
         Raises
         ------
-        Unreachable : still offline; what was not uploaded waits on.
-        Busy, RateLimited, QuotaExceeded : as Unreachable; the service takes no more now.
-        UnknownMap, KeyRequired, Forbidden : as Unreachable; map or key are wrong.
+        Unreachable : still offline; what was not uploaded stays in the spool, here and below.
+        Busy, RateLimited, QuotaExceeded, StoreAway, StoreLocked, StoreFull, NewerSchema, Refused :
+            the service takes no more now.
+        UnknownMap, KeyRequired, Forbidden : map or key are wrong.
         UnusableStore : the spool cannot be written.
         """
         how = {"priority": priority, "if_novel": if_novel}
@@ -739,6 +743,17 @@ class Spool:
                 f"{self._path}: The spool cannot be used ({error}), and nothing was changed. Check "
                 "the path, its permissions and the disk."
             ) from error
+
+
+def _require_sendable(data: bytes, meta: FrameMeta) -> None:
+    """See that no service would refuse a frame for what its robot can still mend; FrameError."""
+    if not data:
+        raise errors.UnreadableFrame("The frame is empty. Write it again.")
+    if data.startswith(b"\x89PNG") and meta.intrinsics is None:
+        raise errors.InvalidIntrinsics(
+            "The frame is a depth image, but its intrinsics are missing. Give `intrinsics` in "
+            "`meta`; intrinsics.json beside the file is read only where `meta` is left out."
+        )
 
 
 # What a full spool gives up.

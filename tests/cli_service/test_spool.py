@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import runpy
+import sqlite3
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,22 @@ from sceneprint_client.errors import FrameError
 
 ROOT = Path(__file__).resolve().parents[2]
 CAMERA = CameraIntrinsics(width=16, height=12, fx=14, fy=14, cx=7.5, cy=5.5)
+
+
+def test_what_was_not_tried_is_not_told_to_be_there(
+    sceneprint: Callable[..., Any], rooms: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "robot.spool"
+    sceneprint("spool", "add", path, rooms / "room-0", "--every", 3)
+    with closing(sqlite3.connect(path)) as database:  # as a disk that is full after two more
+        database.execute(
+            "CREATE TRIGGER stop BEFORE INSERT ON frames "
+            "WHEN (SELECT count(*) FROM frames) = 3 BEGIN SELECT RAISE(ABORT, 'full'); END"
+        )
+    said = sceneprint("spool", "add", path, rooms, expect=2)
+    counts = "6 frames: 2 added, 1 already there, 0 refused, 3 not added"
+    assert said.stdout == f"{counts}; 3 wait, 0 thinned\n"
+    assert "The disk has no room for the spool" in said.stderr
 
 
 def test_frames_are_spooled_and_uploaded(

@@ -74,6 +74,17 @@ def test_patience_ends(scripted: Make) -> None:
     assert len(server.asked) == http.TRIES == 8
 
 
+@pytest.mark.usefixtures("hasty")
+@pytest.mark.parametrize("status", [502, 503, 504])
+def test_a_proxy_without_a_service_is_out_of_reach(scripted: Make, status: int) -> None:
+    server = scripted([(status, {}, "<h1>Nobody is there</h1>")])
+    with (
+        Client(server.url) as client,
+        pytest.raises(errors.Unreachable, match=rf"answered {status} .*a proxy before the service"),
+    ):
+        client.maps()
+
+
 def test_other_refusals_are_not_repeated(scripted: Make) -> None:
     server = scripted([problem("internal-error", 500, instance="/requests/7")])
     with Client(server.url) as client, pytest.raises(errors.Refused, match="it is intern") as told:

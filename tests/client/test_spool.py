@@ -5,6 +5,7 @@ or doubled whatever kills it.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import random
@@ -23,6 +24,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, Spool, meta_of
@@ -32,9 +34,11 @@ from sceneprint_client.api.base import GivenPose
 from sceneprint_client.api.results import QueryRecord
 from sceneprint_client.errors import (
     FrameError,
+    InvalidIntrinsics,
     InvalidRequest,
     RateLimited,
     UnknownMap,
+    UnreadableFrame,
     UnusableStore,
 )
 from sceneprint_client.http import frame_bytes
@@ -88,11 +92,28 @@ KINDS: dict[str, Callable[[int, FrameMeta], Any]] = {
 }  # fmt: skip
 
 
+def png_of(image: np.ndarray[Any, Any]) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
 def names(path: Path) -> list[str]:
     """Names of the frames that wait, oldest first."""
     with sqlite3.connect(path) as database:
         rows = database.execute("SELECT meta FROM frames WHERE reason IS NULL ORDER BY id")
         return [json.loads(text)["name"] for (text,) in rows]
+
+
+def test_what_its_robot_can_still_mend_is_not_kept(tmp_path: Path) -> None:
+    png = png_of(depth(1))
+    with Spool(tmp_path / "spool") as spool:
+        with pytest.raises(UnreadableFrame, match="The frame is empty"):
+            spool.add(b"", meta())
+        with pytest.raises(InvalidIntrinsics, match="its intrinsics are missing"):
+            spool.add(png, FrameMeta(robot="cart"))
+        assert spool.status().waiting == 0
+        assert spool.add(png, meta())
 
 
 # What a full spool gives up.
