@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import threading
 import time
 from collections import OrderedDict, deque
@@ -39,7 +40,7 @@ from sceneprint.errors import FrameError, SceneprintError, StoreAway, StoreError
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.store.blobs.folder import Blobs, FileLocks, FolderBlobs, Locks
 from sceneprint.store.blobs.object_client import open_objects
-from sceneprint.store.blobs.object_store import ObjectBlobs
+from sceneprint.store.blobs.object_store import BucketOwner, ObjectBlobs
 from sceneprint.store.database import (
     Database,
     is_there,
@@ -459,14 +460,14 @@ def open_store(
 def _open_store(url: str, blobs: Path | str) -> Store:
     new = not is_read_only(url) and not is_there(url)
     if isinstance(blobs, Path):
-        kept = FolderBlobs(blobs, make=new)
+        FolderBlobs(blobs, make=new)
         if new:  # its folder need not be that of the blobs: `file:///folder`
             _make_folder_of(url)
     elif new:
         _make_folder_of(url)
     database = open_database(url)
     try:
-        found = kept if isinstance(blobs, Path) else open_blobs(blobs, database)
+        found = open_blobs(blobs, database)
         database.refuse_old_primaries(found)
         return Store(database, found)
     except BaseException:
@@ -486,14 +487,21 @@ def open_blobs(
     blobs : folder, or URL of an object store
     database : whose they are
     make : a folder that is missing
-    claim : mark a prefix of an object store that is nobody's yet; else it is looked at alone
+    claim : mark a prefix of an object store, or the folder of a fleet, that is nobody's yet; else
+        it is looked at alone
 
     Raises
     ------
     UnusableStore : they cannot be opened, or are another database's.
     """
+    anew = claim and not database.read_only
     if isinstance(blobs, Path):
-        return FolderBlobs(blobs, make=make)
+        folder = FolderBlobs(blobs, make=make)
+        # a folder beside a file of SQLite is that file's; hosts may name any to a server
+        if not database.is_sqlite and blobs.is_dir():
+            anew &= os.access(blobs, os.W_OK)  # who reads alone may have it mounted so
+            BucketOwner.of_folder(blobs).claim(OpaqueIds(database).owner, anew=anew)
+        return folder
     objects = open_objects(blobs)
     locks: Locks
     if database.file is not None:
@@ -504,7 +512,7 @@ def open_blobs(
         locks = SessionLocks(database)
     found = ObjectBlobs(objects, locks, lambda: OpaqueIds(database).owner)
     try:
-        found.claim(anew=claim and not database.read_only)
+        found.claim(anew=anew)
     except StoreAway as error:
         log.warning("object store unreachable", extra={"error": str(error)})
     return found

@@ -16,9 +16,9 @@ import pytest
 
 from sceneprint.errors import DamagedBlob, ReadOnlyStore, StoreFull, UnusableStore
 from sceneprint.store import Blobs, FolderBlobs
-from sceneprint.store.blobs.folder import FileLocks
+from sceneprint.store.blobs.folder import MARK, FileLocks
 from sceneprint.store.blobs.object_client import open_objects
-from sceneprint.store.blobs.object_store import MARK, ObjectBlobs
+from sceneprint.store.blobs.object_store import ObjectBlobs
 
 DIGEST = hashlib.sha256(b"depth").hexdigest()
 KEY = f"blobs/{DIGEST[:2]}/{DIGEST}"

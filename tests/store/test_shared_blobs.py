@@ -6,16 +6,19 @@ import errno
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from sqlalchemy import text
 
+from benchmarks.fleet.postgres import Server
 from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store import Store, open_blobs, open_database, open_store
+from sceneprint.store.blobs.folder import MARK
 from sceneprint.store.blobs.object_client import open_objects
-from sceneprint.store.blobs.object_store import MARK, ObjectBlobs
+from sceneprint.store.blobs.object_store import ObjectBlobs
 
 #: Seconds that a removal whose remover is gone is taken to go on.
 LONGEST = "sceneprint.store.postgres.session_locks.LONGEST_S"
@@ -57,6 +60,20 @@ def test_a_prefix_belongs_to_one_database(store_url: str, bucket: str, tmp_path:
     objects.put(MARK, b"[1]")
     with pytest.raises(UnusableStore, match="of another database"):
         open_store(store_url, f"{bucket}/mine")
+
+
+def test_a_folder_of_a_fleet_belongs_to_one_database(postgres: Server, tmp_path: Path) -> None:
+    """Hosts mount it, and another database would remove what it does not refer to."""
+    first, second = (postgres.create(f"on_a_folder_{i}") for i in range(2))
+    with closing(open_store(first, tmp_path)) as store:
+        assert (tmp_path / MARK).is_file()
+        assert list(store.blobs.digests()) == []
+    with pytest.raises(UnusableStore, match=r"of another database.*a prefix of its own"):
+        open_store(second, tmp_path)
+    with closing(open_database(second)) as database:
+        (tmp_path / MARK).unlink()
+        open_blobs(tmp_path, database, claim=False).close()
+        assert not (tmp_path / MARK).exists()
 
 
 def test_who_only_looks_marks_nothing(store_url: str, bucket: str) -> None:

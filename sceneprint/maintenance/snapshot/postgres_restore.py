@@ -361,14 +361,15 @@ def _owner_of(path: Path) -> str:
 
 @contextmanager
 def _marked(settings: Settings, database: Database, owner: str) -> Iterator[None]:
-    """Have the prefix of an object store to oneself while blobs are put there.
+    """Have the prefix of an object store, or a folder, to oneself while blobs are put there.
 
     The store that the snapshot was taken of has the same name: what it keeps must not be shared.
     """
     if isinstance(settings.blobs, Path):
-        yield
-        return
-    mark = BucketOwner(open_objects(settings.blobs))
+        make_folder(settings.blobs)
+        mark = BucketOwner.of_folder(settings.blobs)
+    else:
+        mark = BucketOwner(open_objects(settings.blobs))
     with database.read() as connection:
         check_empty(connection)  # so what a service has marked with its name is nobody's
     mark.begin(owner, OpaqueIds(database).owner)

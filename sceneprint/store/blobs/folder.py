@@ -207,6 +207,8 @@ Condition = Literal["sound", "missing", "damaged"]
 DIGEST = re.compile(r"[0-9a-f]{64}")
 #: Note of the newest timeline of a PostgreSQL database; see `postgres.timelines`.
 TIMELINE = "timeline.json"
+#: Note of whose the blobs are; see `object_store.BucketOwner`.
+MARK = "sceneprint.json"
 
 
 def is_digest(given: object) -> bool:
@@ -599,7 +601,7 @@ class FolderBlobs(Blobs):
                     if one.is_dir(follow_symlinks=False):
                         folders.append(path)
                         continue
-                    if path == self._folder / TIMELINE:
+                    if path in (self._folder / TIMELINE, self._folder / MARK):
                         continue
                     try:
                         changed_at = one.stat(follow_symlinks=False).st_mtime

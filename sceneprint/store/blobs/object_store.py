@@ -23,11 +23,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
+from urllib.parse import quote
 
 from sceneprint.atomic_files import make_folder, sync_folder
 from sceneprint.errors import DamagedBlob, UnusableStore
 from sceneprint.store.blobs.folder import (
     DIGEST,
+    MARK,
     REMOVAL_S,
     TURN_S,
     BlobEntry,
@@ -37,10 +39,11 @@ from sceneprint.store.blobs.folder import (
     Locks,
     require_digest,
 )
-from sceneprint.store.blobs.object_client import Objects
+from sceneprint.store.blobs.object_client import Objects, open_objects
 from sceneprint.store.database_errors import unusable
 
-# Whose a prefix of an object store is: two databases on one would sweep each other's blobs.
+# Whose a prefix of an object store is, or the folder of a fleet: two databases on one would sweep
+# each other's blobs.
 #
 #     PREFIX/sceneprint.json   {"store": name of the store, "restoring": while one is restored
 #     there}
@@ -48,9 +51,6 @@ from sceneprint.store.database_errors import unusable
 # The name goes with the database's secret, so a restored store has that of the one that the
 # snapshot
 # was taken of: a restore therefore takes no prefix that is in use, were it by its own name.
-
-#: Under the prefix.
-MARK = "sceneprint.json"
 
 
 class BucketOwner:
@@ -61,6 +61,11 @@ class BucketOwner:
 
     def __init__(self, objects: Objects) -> None:
         self._objects = objects
+
+    @classmethod
+    def of_folder(cls, folder: Path) -> BucketOwner:
+        """The mark of a folder of blobs."""
+        return cls(open_objects(f"file://{quote(str(folder.absolute()))}"))
 
     def claim(self, owner: str, *, anew: bool) -> bool:
         """See that the prefix is a store's; whether it is marked so now.
