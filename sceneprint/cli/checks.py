@@ -149,7 +149,8 @@ def clock_check(before: float, there: float, after: float) -> Check:
 def store_check(stats: Stats) -> Check:
     """What the service keeps, and where."""
     sizes = stats.bytes
-    place = "PostgreSQL" if sizes.database is None else f"SQLite of {sizes.database / 1e6:.1f} MB"
+    # which database it is, no answer of the service tells
+    place = "database" if sizes.database is None else f"database of {sizes.database / 1e6:.1f} MB"
     text = f"{place}, blobs of {sizes.blobs / 1e6:.1f} MB, indexes of {sizes.index / 1e6:.1f} MB"
     if stats.replica is not None and not stats.replica.used:
         return Check("note", "store", f"{text}; the replica is not in use: see the service's log")
