@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from sceneprint import __version__
-from sceneprint.atomic_files import public_mode
+from sceneprint.atomic_files import nearest_folder, public_mode
 from sceneprint.cli.checks import (
     APART_S,
     Check,
@@ -508,7 +508,7 @@ def _tables(cache_dir: Path) -> Iterator[Check]:
 def _folder(data_dir: Path) -> Iterator[Check]:
     from sceneprint.settings import default_data_dir
 
-    there = _nearest(data_dir)
+    there = nearest_folder(data_dir)
     why = _unwritable(data_dir)
     if why == errno.ENOSPC:
         text = f"{data_dir} is on a full disk. Free some space: until then, uploads fail."
@@ -564,12 +564,6 @@ def _open3d() -> Check:
     return Check("ok", "open3d libraries", "installed")
 
 
-def _nearest(folder: Path) -> Path:
-    """The folder, or the first above it that is there."""
-    folder = folder.absolute()
-    return next(one for one in (folder, *folder.parents) if one.is_dir())
-
-
 def _may_write(folder: Path) -> bool:
     """Whether a file can be made in the folder, or where the folder is missing, above it."""
     return _unwritable(folder) is None
@@ -578,7 +572,7 @@ def _may_write(folder: Path) -> bool:
 def _unwritable(folder: Path) -> int | None:
     """Why no file can be made there, as `errno`; None where one can."""
     try:  # tried, as permissions say little of read-only disks and to root; leaves no trace
-        with tempfile.TemporaryFile(dir=_nearest(folder)) as file:
+        with tempfile.TemporaryFile(dir=nearest_folder(folder)) as file:
             file.write(b"x")  # a full disk may still have room for a name
             file.flush()
         return None
