@@ -279,9 +279,14 @@ def complete_upgrade(database: Database) -> bool:
     ------
     UnusableStore : its schema is another one; nothing is changed.
     """
-    head, _ = known_revisions()
+    head, known = known_revisions()
     with database.write() as connection:
         revision = revision_of(connection)
+        if revision is not None and revision not in known:  # `migrate` changes nothing there
+            raise UnusableStore(
+                f"{database.shown} has schema {revision}, and this version of sceneprint works "
+                f"with {head}: a later one migrated it. Complete the upgrade with that version."
+            )
         if revision != head:
             raise UnusableStore(
                 f"{database.shown} has schema {revision or 'none'}, and this version of sceneprint "
