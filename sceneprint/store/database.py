@@ -375,6 +375,25 @@ class Database:
             with self.read():
                 pass
 
+    def find_old_primary(self, note: bytes | None) -> str | None:
+        """What is wrong with a host that is asked first and is an old primary, as the note beside
+        the blobs says, and what to do; None where none is. It is used no more. Nothing is noted.
+
+        Parameters
+        ----------
+        note : TIMELINE, as it was read; None where there is none
+
+        Raises
+        ------
+        StoreAway : only old primaries can be reached.
+        """
+        if self._timelines is None:
+            return None
+        self._timelines.learn(note)
+        with self.read():
+            pass
+        return self._timelines.refused
+
     @property
     def dialect(self) -> str:
         """Which database it is: `sqlite` or `postgresql`."""
