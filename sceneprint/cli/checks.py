@@ -49,7 +49,7 @@ def disk_check(subject: str, free: int) -> Check:
     subject : whose disk it is
     free : bytes left on it
     """
-    text = f"{free / 1e9:.1f} GB free; a frame takes about 0.8 MB"
+    text = f"{free / 1e9:.1f} GB free; a frame takes about 0.25 MB"
     if free < LEAST_FREE:
         return Check("WRONG", subject, f"{text}. Free some space, or uploads will be rejected.")
     return Check("note" if free < LITTLE_FREE else "ok", subject, text)
