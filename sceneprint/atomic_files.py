@@ -43,6 +43,17 @@ def public_mode(folder: Path) -> int | None:
     return mode if mode & stat.S_IRWXO else None
 
 
+def nearest_folder(folder: Path) -> Path:
+    """The folder, or the first above it that is there: both are on one disk, once it is made.
+
+    Raises
+    ------
+    OSError : a folder above it may not be entered.
+    """
+    folder = folder.absolute()
+    return next(one for one in (folder, *folder.parents) if one.is_dir())
+
+
 def warn_if_public(folder: Path) -> None:
     """Log that users outside its group may read a data folder, as one of version 0.2."""
     mode = public_mode(folder)

@@ -85,7 +85,7 @@ class Settings(BaseSettings):
     #: Seconds that an upload or a query may wait for its turn; then it is asked to come back (503).
     wait_s: float = Field(default=5.0, gt=0, le=3600)
     #: Largest body of a request, bytes.
-    upload_bytes: int = Field(default=72 << 20, ge=1024)
+    upload_bytes: int = Field(default=72 << 20, ge=1024, le=512 << 20)
     #: Largest archive that is imported, bytes; inflated it may have four times as many.
     import_bytes: int = Field(default=4 << 30, ge=1024)
     #: Seconds for a body of hardly any bytes; each MiB of it may take 4 s more.

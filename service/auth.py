@@ -251,7 +251,7 @@ async def caller(
 
     Raises
     ------
-    KeyRequired : none was shown, or an unknown one, or one that has expired.
+    KeyRequired : none was shown, or one that is unknown, revoked or expired.
     RateLimited, Busy : its tenant asks too often, or too much at once.
     """
     if not requires_key(request, here):
@@ -263,7 +263,7 @@ async def caller(
     key = await to_thread.run_sync(here.engine.find_key, given.credentials, limiter=here.lookups)
     if key is None or (key.expires_at is not None and key.expires_at <= time.time()):
         enforce_rate_limit(request, here.limits.failed_keys, network_of(address_of(request)))
-        raise KeyRequired(_why(request, here) if key is None else _EXPIRED)
+        raise KeyRequired(_REFUSED_KEY)
     request.state.caller, request.state.tenant = key.name, key.tenant
     found = Caller(
         key.name, key.grants, key.expires_at, key.id, key.tenant, created_at=key.created_at
@@ -374,7 +374,7 @@ async def guest(
 
     Raises
     ------
-    KeyRequired : an unknown one was shown, or one that has expired.
+    KeyRequired : one was shown that is unknown, revoked or expired.
     """
     if given is None and requires_key(request, here):
         return None
@@ -394,7 +394,11 @@ def address_of(request: Request) -> str:
     return "" if request.client is None else request.client.host
 
 
-_EXPIRED = "The key has expired. Ask the operator for a new one."
+#: The same of all three: who tries keys learns of none that it was one.
+_REFUSED_KEY = (
+    "The key that was sent is unknown, revoked or expired. Check that it is complete, or ask the "
+    "operator for another; `sceneprint keys --create NAME` creates one."
+)
 
 
 def _why(request: Request, here: Here) -> str:

@@ -42,12 +42,13 @@ def embedded_settings(path: Path) -> Settings:
     asks, so no key is needed and nobody is sent away. Frames are the program's own, so they are
     decoded here: no other process is started.
     """
-    return Settings(
+    settings = Settings(
         data_dir=path.absolute(), database_url=None, replica_url=None, index_dir=None,
         host="127.0.0.1", require_keys=False, cors_origins=(), requests_per_s=0,
-        waiting=_MOST_WAITING, wait_s=_LONGEST_WAIT_S, upload_bytes=_MOST_BYTES,
-        event_streams=_MOST_STREAMS, decoders=0,
+        waiting=_MOST_WAITING, wait_s=_LONGEST_WAIT_S, event_streams=_MOST_STREAMS, decoders=0,
     )  # fmt: skip
+    # more than may be set: that is what a decoder takes
+    return settings.model_copy(update={"upload_bytes": _MOST_BYTES})
 
 
 class LocalService(httpx.BaseTransport):

@@ -210,7 +210,7 @@ class Metrics:
         self._jobs = self._gauge("jobs", "Jobs in each state.", "state")
         self._maps = self._gauge("maps", "Maps.")
         self._oldest = self._gauge(
-            "oldest_waiting_seconds", "Since the job was made that waits for longest; 0: none."
+            "oldest_waiting_seconds", "Age of the oldest waiting job; 0: none waits."
         )
         self._generation = self._gauge(
             "index_generation", "Newest index; of the maps with the longest tails.", "map"
@@ -263,7 +263,7 @@ class Metrics:
         if self._replica is None:
             self._replica = (
                 self._gauge("replica_used", "1 while queries are answered from the read replica."),
-                self._gauge("replica_behind_seconds", "What is older is in the read replica."),
+                self._gauge("replica_behind_seconds", "How far the read replica is behind."),
             )
         used, behind = self._replica
         used.set(seen.used)

@@ -101,7 +101,7 @@ def test_helm_and_kubernetes_accept_it(values: dict[str, Any], tmp_path: Path) -
     [
         ({"secret": ""}, "/secret"),
         ({"database": {"url": ""}}, "/database/url"),
-        ({"database": {"url": "postgresql://sceneprint:hush@db/x"}}, "/database/url"),
+        ({"database": {"url": "mysql://db/x"}}, "database.url must be postgresql+psycopg://"),
         ({"blobs": {"url": "/mnt/blobs"}}, "/blobs/url"),
         ({"api": {"replica": 3}}, "replica"),
         ({"ingress": {"enabled": True}}, "set ingress.host"),
@@ -118,8 +118,33 @@ def test_values_that_cannot_work_are_refused(
 @pytest.mark.parametrize(
     "url",
     [
+        "postgresql://sceneprint:hush@db/x",
+        "postgresql+psycopg://sceneprint:hu/sh@db:5432/x",
+        "postgresql+psycopg://sceneprint:hu@sh@db/x",
+        "postgres://:hush@/x?host=a:5432&host=b:5432",
+        "postgresql://sceneprint@db/x?sslmode=require&password=hush",
+        "mysql://sceneprint:hush@db/x",
+    ],
+)
+@pytest.mark.parametrize("name", ["url", "replicaUrl"])
+def test_a_password_in_a_url_is_refused_and_not_repeated(
+    name: str, url: str, tmp_path: Path
+) -> None:
+    values = REQUIRED | {"database": REQUIRED["database"] | {name: url}}
+    returned, said, error = run_helm("template", "fleet", values=values, folder=tmp_path)
+    assert (returned, said) == (1, "")
+    reason = f"database.{name} must not contain a password: put PGPASSWORD into the secret"
+    assert reason in error
+    assert "sh@" not in error
+    assert "hush" not in error
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
         "postgresql+psycopg://sceneprint@/x?host=a:5432&host=b:5432&target_session_attrs=read-write",
         "postgresql://database:5432/x",
+        "postgresql://sceneprint@[2001:db8::1]:5432/x",
     ],
 )
 def test_urls_without_a_password_are_taken(url: str, tmp_path: Path) -> None:

@@ -65,8 +65,8 @@ def paper(found: Costs) -> list[str]:
         f"### On paper: {ROBOTS:,} robots in {MAPS} maps, `{found.model}`",
         "",
         f"Each robot sends a frame that is kept, and asks where it is, every {EVERY_S:g} s: "
-        f"{rate:g} frames and {rate:g} queries a second. Processors are reckoned to work for "
-        f"{USED:.0%} of the time.",
+        f"{rate:g} frames and {rate:g} queries a second. Processors are assumed to be "
+        f"{USED:.0%} busy.",
         "",
         "| | how | |",
         "|---|---|--:|",

@@ -32,7 +32,7 @@
         - AmbiguousKey          it has more than one Authorization header
         - IdempotencyConflict   its Idempotency-Key was used for something else
       x PreconditionFailed      what is to be edited has been edited meanwhile
-      x KeyRequired             the service asks for a key, and none or an unknown one was given
+      x KeyRequired             the service asks for a key, and none or a wrong one was given
       x Forbidden               the key that was shown may not do this
       x QuotaExceeded           the map holds as many frames or bytes as its quota allows
       x RateLimited             this caller asks too often; come back
@@ -234,7 +234,9 @@ class IdempotencyConflict(InvalidRequest):
 
 
 class KeyRequired(SceneprintError):
-    """The service requires a key, and the request has none or an unknown one."""
+    """The service requires a key, and the request has none, or one that is unknown, revoked or
+    expired.
+    """
 
 
 class Forbidden(SceneprintError):

@@ -319,7 +319,7 @@ def sendable(
         points.
     DatasetError : there is no intrinsics.json beside a depth image or above, or it is a folder.
     InvalidIntrinsics, InvalidPose : what is given or lies beside it is none.
-    TypeError : bytes without metadata, and of no point cloud; or no frame at all.
+    TypeError : bytes without metadata, and of no point cloud; or no frame or no metadata at all.
     """
     if isinstance(frame, np.ndarray):
         return array_sendable(frame, meta, up=up)
@@ -358,11 +358,15 @@ def _named_as(known: FrameMeta, name: str, sequence: int | None) -> FrameMeta:
 
 
 def _meta_without_array(meta: MetaInput | None) -> FrameMeta | None:
-    """What is known of a frame whose size no array tells; TypeError for four numbers alone."""
+    """What is known of a frame whose size no array tells; TypeError for four numbers alone, and
+    for what is no metadata.
+    """
     if meta is None or isinstance(meta, FrameMeta):
         return meta
     if isinstance(meta, CameraIntrinsics):
         return FrameMeta(intrinsics=meta)
+    if not isinstance(meta, np.ndarray | list | tuple):  # a matrix is one of these
+        raise TypeError(f"meta is a FrameMeta or CameraIntrinsics, not {type(meta).__name__}")
     raise TypeError(
         "a camera matrix does not say how large the image of a file is; give CameraIntrinsics or "
         "FrameMeta"

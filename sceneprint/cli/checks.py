@@ -49,7 +49,7 @@ def disk_check(subject: str, free: int) -> Check:
     subject : whose disk it is
     free : bytes left on it
     """
-    text = f"{free / 1e9:.1f} GB free; a frame takes about 0.8 MB"
+    text = f"{free / 1e9:.1f} GB free; a frame takes about 0.25 MB"
     if free < LEAST_FREE:
         return Check("WRONG", subject, f"{text}. Free some space, or uploads will be rejected.")
     return Check("note" if free < LITTLE_FREE else "ok", subject, text)
@@ -149,7 +149,8 @@ def clock_check(before: float, there: float, after: float) -> Check:
 def store_check(stats: Stats) -> Check:
     """What the service keeps, and where."""
     sizes = stats.bytes
-    place = "PostgreSQL" if sizes.database is None else f"SQLite of {sizes.database / 1e6:.1f} MB"
+    # which database it is, no answer of the service tells
+    place = "database" if sizes.database is None else f"database of {sizes.database / 1e6:.1f} MB"
     text = f"{place}, blobs of {sizes.blobs / 1e6:.1f} MB, indexes of {sizes.index / 1e6:.1f} MB"
     if stats.replica is not None and not stats.replica.used:
         return Check("note", "store", f"{text}; the replica is not in use: see the service's log")

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from sceneprint import __version__
-from sceneprint.atomic_files import public_mode
+from sceneprint.atomic_files import nearest_folder, public_mode
 from sceneprint.cli.checks import (
     APART_S,
     Check,
@@ -267,7 +267,8 @@ def server(settings: Settings) -> Iterator[Check]:
     try:
         if database.is_sqlite:
             return
-        yield from _server_settings(database, settings)
+        refused = database.find_old_primary(_timeline_note(settings))
+        yield from _server_settings(database, settings, refused)
     except SceneprintError as error:
         yield Check("WRONG", "database server", str(error))
         return
@@ -277,7 +278,25 @@ def server(settings: Settings) -> Iterator[Check]:
         yield _replica(settings.replica_url.get_secret_value(), settings)
 
 
-def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
+def _timeline_note(settings: Settings) -> bytes | None:
+    """The newest timeline, as processes have noted it beside the blobs; None where none can be
+    read: what is wrong with the blobs is a finding of its own.
+    """
+    from sceneprint.store.blobs.folder import TIMELINE
+    from sceneprint.store.blobs.object_client import open_objects
+
+    place = settings.blobs
+    try:
+        if isinstance(place, Path):
+            return (place / TIMELINE).read_bytes()
+        return open_objects(place).get(TIMELINE)
+    except (OSError, SceneprintError):
+        return None
+
+
+def _server_settings(
+    database: Database, settings: Settings, refused: str | None
+) -> Iterator[Check]:
     with database.read() as connection:
         told = dict(connection.exec_driver_sql(_ASKED).mappings().one())
         before = time.time()
@@ -290,7 +309,10 @@ def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
         text += "; it is a read-only standby. Name the primary."
         yield Check("WRONG", "database server", text)
         return
-    yield Check("ok", "database server", text)
+    if refused is None:
+        yield Check("ok", "database server", text)
+    else:  # what follows is of the host that is used
+        yield Check("WRONG", "database server", refused)
     yield _durability(told)
     yield _connections(told, settings)
     yield _vector(told, settings)
@@ -508,7 +530,7 @@ def _tables(cache_dir: Path) -> Iterator[Check]:
 def _folder(data_dir: Path) -> Iterator[Check]:
     from sceneprint.settings import default_data_dir
 
-    there = _nearest(data_dir)
+    there = nearest_folder(data_dir)
     why = _unwritable(data_dir)
     if why == errno.ENOSPC:
         text = f"{data_dir} is on a full disk. Free some space: until then, uploads fail."
@@ -564,12 +586,6 @@ def _open3d() -> Check:
     return Check("ok", "open3d libraries", "installed")
 
 
-def _nearest(folder: Path) -> Path:
-    """The folder, or the first above it that is there."""
-    folder = folder.absolute()
-    return next(one for one in (folder, *folder.parents) if one.is_dir())
-
-
 def _may_write(folder: Path) -> bool:
     """Whether a file can be made in the folder, or where the folder is missing, above it."""
     return _unwritable(folder) is None
@@ -578,7 +594,7 @@ def _may_write(folder: Path) -> bool:
 def _unwritable(folder: Path) -> int | None:
     """Why no file can be made there, as `errno`; None where one can."""
     try:  # tried, as permissions say little of read-only disks and to root; leaves no trace
-        with tempfile.TemporaryFile(dir=_nearest(folder)) as file:
+        with tempfile.TemporaryFile(dir=nearest_folder(folder)) as file:
             file.write(b"x")  # a full disk may still have room for a name
             file.flush()
         return None

@@ -279,9 +279,14 @@ def complete_upgrade(database: Database) -> bool:
     ------
     UnusableStore : its schema is another one; nothing is changed.
     """
-    head, _ = known_revisions()
+    head, known = known_revisions()
     with database.write() as connection:
         revision = revision_of(connection)
+        if revision is not None and revision not in known:  # `migrate` changes nothing there
+            raise UnusableStore(
+                f"{database.shown} has schema {revision}, and this version of sceneprint works "
+                f"with {head}: a later one migrated it. Complete the upgrade with that version."
+            )
         if revision != head:
             raise UnusableStore(
                 f"{database.shown} has schema {revision or 'none'}, and this version of sceneprint "
@@ -369,6 +374,25 @@ class Database:
             self._timelines.follow(blobs)
             with self.read():
                 pass
+
+    def find_old_primary(self, note: bytes | None) -> str | None:
+        """What is wrong with a host that is asked first and is an old primary, as the note beside
+        the blobs says, and what to do; None where none is. It is used no more. Nothing is noted.
+
+        Parameters
+        ----------
+        note : TIMELINE, as it was read; None where there is none
+
+        Raises
+        ------
+        StoreAway : only old primaries can be reached.
+        """
+        if self._timelines is None:
+            return None
+        self._timelines.learn(note)
+        with self.read():
+            pass
+        return self._timelines.refused
 
     @property
     def dialect(self) -> str:

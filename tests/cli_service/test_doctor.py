@@ -87,7 +87,7 @@ def test_a_running_service(sceneprint: Run, working: str, monkeypatch: pytest.Mo
     assert set(found.values()) <= {"ok", "note"}
     for told in (
         "takes uploads and answers queries", r"clock differs from this machine's by 0\.\d s",
-        r"SQLite of \d+\.\d MB, blobs of", "1 worker runs, ", "0 jobs waiting, 0 running",
+        r"database of \d+\.\d MB, blobs of", "1 worker runs, ", "0 jobs waiting, 0 running",
         rf"{model}: .*looked-at",
     ):  # fmt: skip
         assert re.search(told, done.stdout), told

@@ -10,8 +10,9 @@ import pytest
 from pydantic import SecretStr
 
 from benchmarks.fleet.postgres import Server
-from sceneprint.cli.checks import Check
+from sceneprint.cli.checks import Check, store_check
 from sceneprint.cli.doctor import database, object_stores, server
+from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
 from sceneprint.store.database import complete_upgrade
@@ -65,6 +66,16 @@ def test_a_user_who_may_not_make_extensions(postgres: Server) -> None:
     assert found["connections"].verdict == "note"
     assert "Raise max_connections, or run fewer" in found["connections"].text
     assert found_in(mine, search="database")["pgvector"].verdict == "WRONG"
+
+
+def test_a_service_does_not_take_the_server_for_a_file(postgres_url: str, tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path, database_url=SecretStr(postgres_url))
+    with Engine(settings) as engine:
+        stats = engine.operations.statistics.tell(1)
+    assert stats.bytes.database is not None
+    size = f"{stats.bytes.database / 1e6:.1f}"
+    text = f"database of {size} MB, blobs of 0.0 MB, indexes of 0.0 MB"
+    assert store_check(stats) == Check("ok", "store", text)
 
 
 def test_an_upgrade_that_is_not_completed(postgres_url: str) -> None:

@@ -1,4 +1,6 @@
-"""URLs among the settings: which are taken, and that none is repeated where it is refused."""
+"""Settings: which URLs are taken, that none is repeated where it is refused, and how large a body
+may be.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from sceneprint.cli.serve import settings_of
+from sceneprint.decoders.child_process import SHARED_BYTES
 from sceneprint.errors import InvalidRequest
 from sceneprint.settings import Settings
 
@@ -57,3 +60,11 @@ def test_urls_are_taken_and_hide_what_is_in_them(monkeypatch: pytest.MonkeyPatch
     assert found.blob_url.get_secret_value() == "s3://bucket/prefix"
     assert found.snapshot_url == "file:///srv/snapshots"
     assert "hunter2" not in repr(found)
+
+
+def test_bodies_may_be_as_large_as_a_decoder_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SCENEPRINT_UPLOAD_BYTES", str(SHARED_BYTES))
+    assert settings_of(argparse.Namespace()).upload_bytes == 536870912  # as the docs say
+    monkeypatch.setenv("SCENEPRINT_UPLOAD_BYTES", str(SHARED_BYTES + 1))
+    with pytest.raises(InvalidRequest, match=r"less than or equal to 536870912.*UPLOAD_BYTES\.$"):
+        settings_of(argparse.Namespace())

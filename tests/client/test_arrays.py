@@ -84,6 +84,11 @@ def test_what_is_no_frame_is_refused(references: tuple[FrameReference, ...]) -> 
         sendable(wrong, CAMERA, with_pose=False)
     with pytest.raises(TypeError, match="how large the image"):
         sendable(references[0].path, (5, 6, 1.5, 1), with_pose=False)
+    known: Any = {"robot": "a"}
+    for frame in (references[0].path, references[0], b"P5"):
+        with pytest.raises(TypeError) as caught:
+            sendable(frame, known, with_pose=False)
+        assert str(caught.value) == "meta is a FrameMeta or CameraIntrinsics, not dict"
 
 
 def test_a_path_string_and_arrays_are_one_frame(

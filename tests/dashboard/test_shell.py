@@ -80,8 +80,9 @@ def test_keys(
     assert axe(page) == []
     field = page.get_by_label("Key", exact=True)
     for wrong, told in (
-        ("", "Paste a key first"), ("sp_nonsense", "does not know this key"),
-        ("schlüssel", "contains characters that keys do not have"), (late, "has expired"),
+        ("", "Paste a key first"), ("sp_nonsense", "unknown, revoked or expired"),
+        ("schlüssel", "contains characters that keys do not have"),
+        (late, "unknown, revoked or expired"),
     ):  # fmt: skip
         field.fill(wrong)
         page.keyboard.press("Enter")

@@ -151,6 +151,16 @@ def test_indexes_and_sizes_are_told(data, make_engine):
     assert told.disk == shutil.disk_usage(data).total
 
 
+def test_the_disk_of_a_data_folder_that_is_not_made_yet(make_engine, tmp_path):
+    """Nobody makes it where no worker runs, and database and blobs are elsewhere."""
+    engine = make_engine()
+    missing = engine.settings.model_copy(update={"data_dir": tmp_path / "not" / "yet"})
+    told = measuring.sizes(missing, engine.store)
+    assert told.free == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.2)
+    assert told.disk == shutil.disk_usage(tmp_path).total
+    assert not (tmp_path / "not").exists()
+
+
 def test_of_a_large_store_what_was_counted_is_told_while_a_thread_counts_again(
     make_engine, uploads, monkeypatch
 ):

@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 
 from benchmarks.fleet.postgres import Server
+from sceneprint.cli import doctor
+from sceneprint.cli.checks import Check
 from sceneprint.engine import Engine
 from sceneprint.errors import StoreAway, UnusableStore
 from sceneprint.settings import Settings
@@ -151,6 +153,33 @@ def test_a_note_is_never_lowered(pair: tuple[Server, Server], tmp_path: Path) ->
     assert FolderBlobs(tmp_path).get_note(TIMELINE) == noted
 
 
+def test_doctor_names_it(pair: tuple[Server, Server], tmp_path: Path, until: Any) -> None:
+    old, new = pair
+
+    def found(*servers: Server) -> dict[str, Check]:
+        return {one.subject: one for one in doctor.server(settings(tmp_path, *servers))}
+
+    Engine(settings(tmp_path, old, new)).close()
+    caught_up(old, new, until)
+    noted = next(tmp_path.rglob(TIMELINE))
+    before = noted.read_bytes()
+    new.promote()
+    assert found(new)["database server"].verdict == "ok"
+    assert noted.read_bytes() == before  # looking changes nothing
+    assert found(old, new)["database server"].verdict == "ok"  # nobody has used the new one
+    Engine(settings(tmp_path, new)).close()
+    checks = found(old, new)
+    told = checks["database server"]
+    assert told.verdict == "WRONG"
+    assert f"127.0.0.1:{old.port} is an old primary: it writes timeline 1, and" in told.text
+    assert "Stop it, or make it a standby." in told.text
+    assert "durability" in checks  # of the other host
+    assert found(new)["database server"].verdict == "ok"
+    [alone] = found(old).values()
+    assert (alone.verdict, alone.subject) == ("WRONG", "database server")
+    assert f"127.0.0.1:{old.port} is an old primary" in alone.text
+
+
 def test_a_role_that_may_not_ask_for_the_system(pair: tuple[Server, Server]) -> None:
     server, _ = pair
     server.execute("REVOKE EXECUTE ON FUNCTION pg_control_system() FROM PUBLIC", "fleet")
@@ -182,9 +211,15 @@ def test_the_note_lies_in_the_object_store(postgres_url: str, bucket: str) -> No
     with closing(open_store(postgres_url, place)) as store:
         noted = store.blobs.get_note(TIMELINE)
         assert noted is not None
+        given: dict[str, Any] = {"database_url": postgres_url, "blob_url": place}
+        looked = Settings.model_validate(given)
+        assert next(doctor.server(looked)).verdict == "ok"
         found = json.loads(noted)
         assert store.database.history == f"{found['system']}/{found['number']:08X}"
         assert list(store.blobs.entries()) == []
         store.blobs.put_note(TIMELINE, json.dumps({**found, "number": 9}).encode())
     with pytest.raises(StoreAway, match=f"a standby that was promoted since writes 9.*{TIMELINE}"):
         open_store(postgres_url, place)
+    told = next(doctor.server(looked))
+    assert (told.verdict, told.subject) == ("WRONG", "database server")
+    assert "that was promoted since writes 9" in told.text

@@ -268,15 +268,31 @@ def test_a_key_is_made_shown_once_used_and_revoked(walled, refused):
     refused(again, 409, "conflict", "There is a key named")
     gone = walled.ask("boss", "DELETE", answer.headers["location"])
     assert gone.status_code == 204
-    refused(walled.ask("new", "GET", "/v1/keys/me"), 401, "key-required")
+    refused(walled.ask("new", "GET", "/v1/keys/me"), 401, "key-required", "unknown, revoked or")
     refused(walled.ask("boss", "DELETE", answer.headers["location"]), 404, "unknown-key")
 
 
-def test_a_key_that_has_expired_says_so(walled, refused):
+def test_unknown_revoked_and_expired_keys_are_answered_alike(walled, refused):
+    """Nothing tells whether there was such a key."""
     past = (datetime.now(UTC) - timedelta(seconds=1)).isoformat()
     new = {"name": "late", "grants": {"*": "admin"}, "expires_at": past}
     walled.secrets["late"] = walled.ask("boss", "POST", "/v1/keys", json=new).json()["secret"]
-    refused(walled.ask("late", "GET", "/v1/maps"), 401, "key-required", "has expired")
+    del new["expires_at"]
+    gone = {**new, "name": "gone"}
+    walled.secrets["gone"] = walled.ask("boss", "POST", "/v1/keys", json=gone).json()["secret"]
+    assert walled.ask("gone", "GET", "/v1/maps").status_code == 200
+    assert walled.ask("boss", "DELETE", "/v1/keys/gone").status_code == 204
+    walled.secrets["guess"] = "sp_" + "A" * (len(walled.secrets["late"]) - 3)
+    told = []
+    for name in ("late", "gone", "guess"):
+        answer = walled.ask(name, "GET", "/v1/maps", headers={"X-Request-Id": "alike"})
+        refused(answer, 401, "key-required")
+        alike = {key: value for key, value in answer.headers.items() if key != "date"}
+        told.append((alike, answer.content))
+    assert told[0] == told[1] == told[2]
+    assert answer.json()["detail"].startswith(
+        "The key that was sent is unknown, revoked or expired. Check that it is complete, or ask "
+    )
 
 
 @pytest.mark.parametrize(

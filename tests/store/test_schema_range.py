@@ -208,11 +208,16 @@ def test_the_command_completes_an_upgrade_once(
     assert _range(url) == (head, head)
     assert not SchemaRange(*_range(url)).allows("0020")
     assert complete() == (0, before, "")
-    for other in ("0020", "9999"):
+    for other, what in (
+        ("0020", "Run `sceneprint migrate` first"),
+        ("9999", "a later one migrated it. Complete the upgrade with that version."),
+    ):
         _migrate(url, other, "0015")
         code, said, error = complete()
         assert (code, said, len(error.splitlines())) == (2, "", 1)
         assert f"has schema {other}, and this version of sceneprint works with {head}" in error
+        assert what in error
+        assert ("Run `sceneprint migrate`" in error) == (other == "0020")
         assert _range(url) == (other, "0015")
 
 

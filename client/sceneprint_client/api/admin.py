@@ -406,7 +406,7 @@ KINDS = {
     "frame.received": "A frame is stored durably and waits for a worker, or is tried again.",
     "frame.indexed": "Queries find it from now on.",
     "frame.rejected": "Nothing in it can be signed.",
-    "frame.redundant": "It was not kept, as asked: the map has its place.",
+    "frame.redundant": "It was not kept, as asked: the map already covers its place.",
     "frame.failed": "Signing it broke down in every try, or was given up.",
     "frame.edited": "Its metadata was changed.",
     "frame.damaged": "What was made of it is damaged, and a worker signs it again from its upload; "
@@ -428,12 +428,12 @@ KINDS = {
     "`tiles`.",
     "coverage.measured": "A job that measured a map's coverage is over; `data` is its result.",
     "difference.found": "A job that compared two sessions is over; `data` is its result.",
-    "key.created": "A key was made; of no map.",
-    "key.rotated": "A key has a new secret; the one before ends soon. Of no map.",
-    "key.revoked": "A key opens nothing any more; of no map.",
+    "key.created": "A key was made; belongs to no map.",
+    "key.rotated": "A key has a new secret; the one before ends soon. Belongs to no map.",
+    "key.revoked": "A key was revoked and no longer works; belongs to no map.",
     "key.distrusted": (
-        "A signature that came with a frame was wrong, so that none of the key is used any more; "
-        "of no map. `data` has `name`, `map`, `frame_id` and `reason`."
+        "A signature that came with a frame was wrong, so no signature sent with this key is used "
+        "any more; belongs to no map. `data` has `name`, `map`, `frame_id` and `reason`."
     ),
 }
 #: Stands in a stream where events are not there any more; kept by nobody.

@@ -239,7 +239,9 @@ _OF_FRAMES = {
     FrameState.INDEXED: "Signed, and found by queries from now on.",
     FrameState.REJECTED: "Nothing in it can be signed; `reason` says why. Trying again is no use.",
     FrameState.FAILED: "Signing broke down again and again; the job has the traceback.",
-    FrameState.REDUNDANT: "Not kept, as asked: the map has this place; `reason` names the frame.",
+    FrameState.REDUNDANT: (
+        "Not kept, as asked: the map already covers this place; `reason` names the frame."
+    ),
     FrameState.DELETED: (
         "Removed on request, or as older than its map keeps frames; found by no query."
     ),

@@ -19,6 +19,7 @@ from typing import Any
 
 from sqlalchemy import Connection, func, select
 
+from sceneprint.atomic_files import nearest_folder
 from sceneprint.engine.search.local_index import index_folder, is_index_folder
 from sceneprint.engine.serializers import when
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
@@ -209,9 +210,9 @@ def _size(path: Path | os.DirEntry[str]) -> int:
 
 
 def _free_of(folder: Path) -> tuple[int, int]:
-    """Bytes left on a disk, and all that it has."""
+    """Bytes left on the disk of a folder, which need not be there yet, and all that it has."""
     try:
-        found = shutil.disk_usage(folder)
+        found = shutil.disk_usage(nearest_folder(folder))
     except OSError:
         return 0, 0
     return found.free, found.total

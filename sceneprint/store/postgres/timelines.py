@@ -77,6 +77,8 @@ class Timelines:
         self._blobs: Blobs | None = None
         self._compared = -math.inf
         self._refused: tuple[str, str] | None = None
+        #: What is wrong with the old primary that was refused last, and what to do; None: none was.
+        self.refused: str | None = None
         #: That of the last connection to a primary.
         self.current: Timeline | None = None
         event.listen(engine, "do_connect", self._connect)
@@ -111,7 +113,7 @@ class Timelines:
             connection.close()
             message = self._message(place, found)
             if self._refused != place:  # it is told once
-                self._refused = place
+                self._refused, self.refused = place, message
                 log.error("old primary refused", extra={"reason": message})
             left = [one for one in hosts if one != place]
             if len(left) in (0, len(hosts)):
@@ -129,6 +131,17 @@ class Timelines:
         self._blobs = blobs
         self._compare_note()
 
+    def learn(self, note: bytes | None) -> Timeline | None:
+        """Learn what is noted beside the blobs, and return it; None where nothing that can be read
+        is.
+        """
+        noted = None if note is None else _parsed(note)
+        if noted is not None:
+            with self._lock:
+                before = self._newest.get(noted.system, 0)
+                self._newest[noted.system] = max(before, noted.number)
+        return noted
+
     def _compare_note(self) -> None:
         """Learn what is noted beside the blobs, and note what is newer; neither where they are
         away.
@@ -137,11 +150,7 @@ class Timelines:
             return
         self._compared = time.monotonic()
         try:
-            noted = _read(self._blobs)
-            with self._lock:
-                if noted is not None:
-                    before = self._newest.get(noted.system, 0)
-                    self._newest[noted.system] = max(before, noted.number)
+            noted = self.learn(self._blobs.get_note(TIMELINE))
             current = self.current
             if current is None or not self._is_newest(current) or current == noted:
                 return
@@ -213,11 +222,8 @@ def _timeline_of(connection: psycopg.Connection[Any]) -> Timeline | None:
     return None if row is None or row[1] is None else Timeline(row[0], int(row[1], 16))
 
 
-def _read(blobs: Blobs) -> Timeline | None:
-    """What is noted; None where nothing is that can be read."""
-    data = blobs.get_note(TIMELINE)
-    if data is None:
-        return None
+def _parsed(data: bytes) -> Timeline | None:
+    """What a note says; None where it cannot be read."""
     try:
         found = json.loads(data)
         return Timeline(str(found["system"]), int(found["number"]))

@@ -26,8 +26,23 @@ app.kubernetes.io/managed-by: {{ .root.Release.Service }}
 helm.sh/chart: {{ printf "%s-%s" .root.Chart.Name .root.Chart.Version }}
 {{- end }}
 
+{{/* Refuses a URL that has a password, or is none of PostgreSQL: dict name, url. No pattern of the
+schema does, as Helm repeats a value that does not match, and with it the password. */}}
+{{- define "sceneprint.checkUrl" -}}
+{{- if regexMatch "://[^/?@]*:[^@]*@|@.*@|[?&]password=" .url -}}
+{{- fail (printf "database.%s must not contain a password: put PGPASSWORD into the secret" .name) -}}
+{{- end -}}
+{{- if not (regexMatch "^postgres(ql(\\+psycopg)?)?://" .url) -}}
+{{- fail (printf "database.%s must be postgresql+psycopg://user@host/database" .name) -}}
+{{- end -}}
+{{- end }}
+
 {{/* The environment of every pod; no ConfigMap, as the migration runs before one would be there. */}}
 {{- define "sceneprint.env" -}}
+{{- include "sceneprint.checkUrl" (dict "name" "url" "url" .Values.database.url) -}}
+{{- with .Values.database.replicaUrl -}}
+{{- include "sceneprint.checkUrl" (dict "name" "replicaUrl" "url" .) -}}
+{{- end -}}
 - name: SCENEPRINT_DATABASE_URL
   value: {{ .Values.database.url | quote }}
 {{- with .Values.database.replicaUrl }}

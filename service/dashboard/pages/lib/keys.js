@@ -4,6 +4,8 @@ import { h, put } from "./dom.js";
 import { forgetKey, identify, key, me, setKey } from "./session.js";
 
 const MAY = { read: "view and query", write: "upload and edit frames", admin: "change the map itself" };
+// what the API says is for who writes requests by hand
+const WRONG_KEY = "This key is unknown, revoked or expired. Check that you copied all of it, or ask for another.";
 
 /**
  * A field for a key, and why it is there.
@@ -17,7 +19,7 @@ export function keyPage(problem, taken) {
     id: "key", class: "mono", type: "password", autocomplete: "off", spellcheck: "false",
     placeholder: "sp_…", "aria-describedby": "key-why key-note",
   });
-  const why = h("p", { id: "key-why", class: "field-error", role: "alert" }, !refused && key() !== null && told(problem.message));
+  const why = h("p", { id: "key-why", class: "field-error", role: "alert" }, !refused && key() !== null && WRONG_KEY);
   const button = h("button", { class: "button primary", type: "submit" }, "Use this key");
   const show = h("button", { class: "button", type: "button", "aria-pressed": false, onClick: () => {
     const hidden = input.type === "password";
@@ -41,7 +43,7 @@ export function keyPage(problem, taken) {
       taken();
     } catch (error) {
       if (before === null) forgetKey(); else setKey(before);
-      tell(error.status === 401 ? told(error.message) : error.message);
+      tell(error.status === 401 ? WRONG_KEY : error.message);
     } finally {
       button.disabled = false;
     }
@@ -66,11 +68,6 @@ export function keyPage(problem, taken) {
 function heading(status) {
   if (status === 401) return "This service requires a key";
   return status === 403 ? "Your key does not allow this" : "It does not exist, or your key may not see it";
-}
-
-// what the API says is for who writes requests by hand
-function told(detail) {
-  return detail.includes("has expired") ? detail : "This service does not know this key. Check that you copied all of it, or ask for another.";
 }
 
 /** What the key of this tab may do. */
