@@ -347,9 +347,9 @@ def _connections(told: Mapping[str, object], settings: Settings) -> Check:
     from sceneprint.store.postgres.connection import MOST
 
     most, taken = int(str(told["connections"])), int(str(told["taken"]))
-    # a worker takes one for its work, one for its lease and one to be woken; a service as many as
-    # it answers at once, and one
-    wanted = 3 * settings.workers + min(settings.concurrency + settings.waiting, MOST) + 3
+    # a worker takes one for its work, one for its lease, one to be woken, and three that last for
+    # locks of blobs and indexes; a service as many as it answers at once, and those that last
+    wanted = 6 * settings.workers + min(settings.concurrency + settings.waiting, MOST) + 3
     text = (
         f"{most} connections allowed (max_connections), {taken} in use; a service and "
         f"{settings.workers} workers may use {wanted}"
