@@ -566,6 +566,8 @@ class Spool:
             database.executemany(
                 "UPDATE frames SET reason = '' WHERE id = ?", [(number,) for number in refused]
             )
+        if not refused:
+            return
         # a full disk may have no room for these: whoever reads them is told so
         with suppress(errors.StoreFull), self._transaction() as database:
             database.executemany(

@@ -340,7 +340,35 @@ def test_a_frame_larger_than_the_journal_leaves_it_as_large(tmp_path: Path, refu
         assert journal.stat().st_size == before
 
 
+def test_a_reason_without_room_is_told_to_be_missing(tmp_path: Path) -> None:
+    with Spool(tmp_path / "spool") as spool:
+        spool.add(depth(1), meta(name="a"))
+        spool._database.execute(
+            "CREATE TRIGGER stop BEFORE INSERT ON reasons BEGIN SELECT RAISE(ABORT, 'full'); END"
+        )
+        spool._settle([], {1: "a reason"})
+        assert (spool.status().waiting, spool.status().refused) == (0, 1)
+        assert [one.reason for one in spool.refusals()] == [
+            "The service refused it; the disk had no room for its reason"
+        ]
+
+
 # Uploads.
+
+
+def test_nothing_is_sent_from_a_spool_that_cannot_be_written(
+    remote: Client, map_name: str, tmp_path: Path
+) -> None:
+    remote.create_map(map_name, model="depth")
+    with Spool(tmp_path / "spool") as spool:
+        spool.add(depth(1), meta())
+        spool._database.close()  # and open it as who may only read it
+        spool._database = sqlite3.connect(
+            f"file:{tmp_path}/spool?mode=ro", uri=True, isolation_level=None
+        )
+        with pytest.raises(UnusableStore, match="readonly"):
+            spool.sync(remote, map_name)
+    assert list(remote.frames(map_name)) == []
 
 
 def test_what_waits_is_uploaded_and_refusals_are_set_aside(

@@ -117,9 +117,9 @@ def test_a_new_schema_is_looked_at_by_each_who_sent_the_one_of_before(
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
     both, look = threading.Barrier(2), postgres.KnownSchema.look
 
-    def look_together(self: Any, connection: Any) -> bool:
+    def look_together(self: Any, connection: Any) -> None:
         both.wait(60)  # both have sent the schema of before
-        return look(self, connection)
+        look(self, connection)
 
     monkeypatch.setattr(postgres.KnownSchema, "look", look_together)
     with ThreadPoolExecutor(2) as pool:

@@ -240,7 +240,7 @@ class SingleStatement:
             if self.schema is None:
                 raise
             self.schema.look(cursor.connection)
-            if self.schema.found == sent:
+            if self.schema.found == sent:  # another thread may have found the new one before
                 raise
             self._send(cursor, statement, parameters)
 
@@ -299,17 +299,16 @@ class KnownSchema:
         self._check = check
         self.found: tuple[str, str | None] | None = None
 
-    def look(self, connection: Any) -> bool:
-        """Find it again, by a connection of psycopg; whether it is another one than before.
+    def look(self, connection: Any) -> None:
+        """Find it again, by a connection of psycopg.
 
         Raises
         ------
         Exception : of `check`
         """
-        before, found = self.found, connection.execute(SCHEMA).fetchone()
+        found = connection.execute(SCHEMA).fetchone()
         self._check(found)
         self.found = found
-        return bool(found != before)
 
 
 def _execute(cursor: Any, statement: str, parameters: Any, context: Any) -> bool:
