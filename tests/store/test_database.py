@@ -89,30 +89,6 @@ def test_the_migrations_make_the_tables_that_the_code_knows(
         == sorted([*TABLES, "sqlite_sequence"])  # fmt: skip
 
 
-@pytest.mark.sqlite_only("a file")
-def test_the_migration_gives_each_key_a_tenant(
-    tmp_path: Path, bring_to: Callable[[str, str], None]
-) -> None:
-    url = f"sqlite:///{tmp_path / 'other.db'}"
-    bring_to(url, "0013")
-    with closing(sqlite3.connect(tmp_path / "other.db", isolation_level=None)) as connection:
-        connection.executemany(
-            "INSERT INTO keys (id, name, digest, grants, created_at) VALUES (?, ?, ?, '{}', ?)",
-            [("1", "robot", "a", 3.0), ("2", "screen", "b", 4.0)],
-        )
-        connection.execute(
-            "INSERT INTO jobs (id, kind, state, priority, attempts, failures, token, run_after, "
-            "created_at) VALUES ('j', 'snapshot', 'queued', 0, 0, 0, 0, 0, 0)"
-        )
-    bring_to(url, "head")
-    with closing(sqlite3.connect(tmp_path / "other.db")) as connection:
-        found = connection.execute("SELECT name, tenant FROM keys ORDER BY name").fetchall()
-        assert found == [("robot", "robot"), ("screen", "screen")]
-        found = connection.execute("SELECT * FROM tenants ORDER BY name").fetchall()
-        assert found == [("robot", 3.0, 0), ("screen", 4.0, 0)]
-        assert connection.execute("SELECT tenant, turn FROM jobs").fetchall() == [("", None)]
-
-
 def test_opening_again_changes_nothing(url: str, store: Store, hall: MapRow) -> None:
     again = open_database(url)
     with again.read() as connection:

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 SWEPT_AT_ONCE = 200
 #: The first schema whose processes wait for the end of a removal before they refer to a blob of it.
 #: Those of before look at once, so while they may write, blobs are removed in the turn.
-_WAITED_FOR = "0021"
+_WAITED_FOR = "0001"
 #: Seconds to wait for another removal.
 _PATIENCE_S = 5.0
 #: Blobs of deleted frames that are asked for at once.

@@ -168,18 +168,6 @@ def test_what_postgresql_cannot_hold_is_found_before(data, postgres, tmp_path, s
     assert not (tmp_path / "fleet" / "blobs").exists()
 
 
-def test_a_snapshot_of_an_earlier_schema(postgres, tmp_path, settings, bring_to):
-    data = tmp_path / "data"
-    (data / "blobs").mkdir(parents=True)
-    bring_to(f"sqlite:///{data}/sceneprint.db", "0001")
-    changed(data, "INSERT INTO models VALUES ('m', 'm', x'00ff', 1.5)")
-    take_snapshot(settings(data), tmp_path / "a.tar")
-    url = postgres.create("earlier")
-    restore_to_fleet(tmp_path / "a.tar", fleet_of(tmp_path / "fleet", url))
-    assert ask(url, "SELECT id, content, created_at FROM models") == [("m", b"\0\xff", 1.5)]
-    assert ask(url, "SELECT count(*) FROM secrets") == [(1,)]
-
-
 RESTORE = "import sys; from sceneprint.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
