@@ -100,7 +100,6 @@ def run_migrate(options: argparse.Namespace) -> int:
 
 def _completed(settings: Settings) -> str:
     """Let earlier versions write no more, and say so."""
-    from sceneprint.store import open_blobs
     from sceneprint.store.database import (
         complete_upgrade,
         is_there,
@@ -115,12 +114,6 @@ def _completed(settings: Settings) -> str:
                 f"{database.shown} has no schema, so there is no upgrade to complete. Name the "
                 "data folder with --data, or the database in SCENEPRINT_DATABASE_URL."
             )
-        if not database.is_sqlite:
-            blobs = open_blobs(settings.blobs, database, claim=False)
-            try:
-                database.refuse_old_primaries(blobs)
-            finally:
-                blobs.close()
         is_new = complete_upgrade(database)
     finally:
         database.close()
