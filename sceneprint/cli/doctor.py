@@ -121,7 +121,7 @@ def _database_server(settings: Settings) -> Check:
         try:
             with database.read() as connection:
                 found = schema_range_of(connection)
-            return _unfinished(found, database.shown) or _compared(found, database.shown)
+            return _compared(found, database.shown)
         finally:
             database.close()
     except SceneprintError as error:
@@ -171,20 +171,6 @@ def _compared(found: SchemaRange | None, place: str) -> Check:
         "folder."
     )
     return _wrong(text)
-
-
-def _unfinished(found: SchemaRange | None, place: str) -> Check | None:
-    """That a fleet's upgrade is not completed: a single machine gains nothing by that."""
-    from sceneprint.store.database import known_revisions
-
-    head, _ = known_revisions()
-    if found is None or found.revision != head or found.least == head:
-        return None
-    text = (
-        f"{place}, schema {head}: earlier versions may still write. Run `sceneprint migrate "
-        "--complete` once every process runs this version."
-    )
-    return Check("note", "database", text)
 
 
 def _wrong(text: str) -> Check:

@@ -34,7 +34,7 @@ from functools import cache
 from secrets import token_bytes
 from typing import TYPE_CHECKING
 
-from sqlalchemy import URL, func, insert, inspect, make_url, select, update
+from sqlalchemy import URL, insert, inspect, make_url, select, update
 from sqlalchemy.exc import ArgumentError
 
 import migrations
@@ -64,6 +64,7 @@ def migration_config() -> Config:
 
     config = Config()
     config.set_main_option("script_location", str(_FOLDER))
+    config.attributes["metadata"] = metadata
     return config
 
 
@@ -91,44 +92,35 @@ def revision_of(connection: Connection) -> str | None:
 
 @dataclass(frozen=True)
 class SchemaRange:
-    """Which processes may use a store.
+    """The processes that may use a store.
 
     Parameters
     ----------
-    revision : of its schema
-    least : the oldest revision whose processes may write to it; None: a store of before 0015
+    revision : the schema of the store
+    least : the oldest revision whose processes may write to it
     """
 
     revision: str
-    least: str | None
+    least: str
 
     def allows(self, own: str) -> bool:
-        """Whether a process that works with a revision may use the store as it is.
+        """Return whether a process that works with the revision `own` may use the store as it is.
 
-        Revisions are numbers of four digits, so that their order is that of the texts; what is
-        none is of nobody that is known.
+        Revisions are numbers of four digits, so that they sort as texts.
         """
         return self.revision == own or (
-            self.revision.isdecimal()
-            and self.least is not None
-            and self.least <= own < self.revision
+            self.revision.isdecimal() and self.least <= own < self.revision
         )
 
 
 def schema_range_of(connection: Connection) -> SchemaRange | None:
-    """Which processes may use a database; None: nobody has made a schema in it."""
+    """Return which processes may use a database; None if it has no schema yet."""
     revision = revision_of(connection)
     if revision is None:
         return None
-    if not inspect(connection).has_table(schema_range.name):
-        return SchemaRange(revision, None)
-    return SchemaRange(revision, connection.execute(select(schema_range)).scalar())
-
-
-def least_revision(connection: Connection) -> str:
-    """The oldest revision whose processes may write to a store of the schema of this version."""
-    found: str = connection.execute(select(func.max(schema_range.c.least_revision))).scalar_one()
-    return found
+    if not inspect(connection).has_table(schema_range.name):  # another program's database
+        return SchemaRange(revision, revision)
+    return SchemaRange(revision, connection.execute(select(schema_range)).scalar_one())
 
 
 def require_schema(connection: Connection) -> None:
@@ -264,39 +256,6 @@ def migrate(database: Database) -> None:
                     "not brought to the schema of this version, and nothing was changed. Run "
                     "`sceneprint fsck` of the version that wrote it."
                 )
-
-
-def complete_upgrade(database: Database) -> bool:
-    """Let only processes that work with this version's schema write from now on.
-
-    Returns
-    -------
-    whether earlier ones might write until now
-
-    Raises
-    ------
-    UnusableStore : its schema is another one; nothing is changed.
-    """
-    head, known = known_revisions()
-    with database.write() as connection:
-        revision = revision_of(connection)
-        if revision is not None and revision not in known:  # `migrate` changes nothing there
-            raise UnusableStore(
-                f"{database.shown} has schema {revision}, and this version of sceneprint works "
-                f"with {head}: a later one migrated it. Complete the upgrade with that version."
-            )
-        if revision != head:
-            raise UnusableStore(
-                f"{database.shown} has schema {revision or 'none'}, and this version of sceneprint "
-                f"works with {head}, so its upgrade cannot be completed. Run `sceneprint migrate` "
-                "first, and complete it with the version that all processes run."
-            )
-        if not database.is_sqlite:  # who writes out of turn ends first
-            connection.exec_driver_sql("SELECT version_num FROM alembic_version FOR UPDATE")
-        if least_revision(connection) == head:
-            return False
-        connection.execute(update(schema_range).values(least_revision=head))
-        return True
 
 
 def current_revision(connection: Connection) -> str | None:
