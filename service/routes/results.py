@@ -346,6 +346,7 @@ def delete_queries(
 ) -> None:
     """Remove the records of all queries of a map, for good. Needs `admin` of the map."""
     asking.require(map_name, "admin")
+    here.engine.audit.record("queries.removed", map_name)
     here.engine.history.remove_of_map(map_name)
 
 
@@ -372,7 +373,6 @@ async def add_query_records(
     records may be sent again. It takes the scope `write`: the service cannot check what they say.
     """
     given = await read_record(request, NewQueryRecords, "The list of records")
-    request.state.audited = {"records": len(given.records)}
     async with here.uploads.place():
         return await here.uploads.run(
             partial(here.engine.history.add_offline, map_name, given, asking.key_id)

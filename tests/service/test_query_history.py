@@ -205,8 +205,8 @@ def test_who_may_write_to_a_map_may_send_records_of_it(house, refused):
     large = [offline(i, reason="\u00e9" * 1000) for i in range(300)]
     refused(send("robot", *large), 413, "too-large")
     audit = house.ask("boss", "GET", "/v1/audit", params={"limit": 9}).json()["items"]
-    noted = [one["data"] for one in audit if one["action"] == "add_query_records"]
-    assert [one["records"] for one in noted if one["status"] == 200] == [2, 100]
+    noted = [one["data"] for one in audit if one["action"] == "queries.added"]
+    assert [one["received"] for one in noted] == [100]
 
 
 @pytest.mark.parametrize(

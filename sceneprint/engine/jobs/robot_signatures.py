@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,6 @@ from sceneprint.process import span
 from sceneprint.settings import Settings
 from sceneprint.signing import SIGNING_VERSION, Signature
 from sceneprint.store import Store, sender_rows
-from sceneprint.store.audit_chain import KeyChange, note
 from sceneprint.store.events import record_event
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import enqueue
@@ -168,14 +168,11 @@ class RobotSignatures:
         with self._store.database.write() as connection:
             if not sender_rows.distrust_sender(connection, sender, map_name, frame_id):
                 return
-            name, tenant = sender_rows.key_of(connection, sender) or ("", "")
-            told = {"name": name, "map": map_name, "frame_id": frame_id, "reason": why}
+            name, _ = sender_rows.key_of(connection, sender) or ("", "")
+            told: dict[str, Any] = {
+                "name": name, "map": map_name, "frame_id": frame_id, "reason": why
+            }  # fmt: skip
             record_event(connection, "key.distrusted", **told)
-            data = {"key_id": sender, "frame_id": frame_id, "reason": why}
-            change = KeyChange(
-                "distrust_key", "", map=map_name, target=name, data=data, tenant=tenant
-            )
-            note(connection, change)
         log.error(
             "robot's signature is wrong; its key is trusted no more",
             extra=about(work, key=name, reason=why),

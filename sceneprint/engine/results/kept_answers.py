@@ -46,6 +46,7 @@ from sceneprint.store.answer_rows import (
     remove_answers,
     spent_answers,
 )
+from sceneprint.store.audit_log import record_change
 from sceneprint.store.deletion import BLOCK, doom
 from sceneprint.store.frame_queries import QueryOrigin
 from sceneprint.store.maps import find_map, find_maps, list_maps, map_of
@@ -115,6 +116,8 @@ class KeptAnswers:
                     )
                     new = self._described(connection, found, blob, len(data))
                     row = keep_answer(connection, new, options.title, until)
+                if row is not None:
+                    record_change(connection, "answer.kept", None, query_id)
             if row is not None:
                 return _retention(row)
 
@@ -165,6 +168,7 @@ class KeptAnswers:
                 raise unknown_query(query_id)
             blobs = remove_answers(connection, [row.number])
             doom(connection, blobs)
+            record_change(connection, "answer.released", None, query_id)
         collect_deleted_blobs(self._store, blobs)
 
     def page(

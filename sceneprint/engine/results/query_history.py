@@ -25,6 +25,7 @@ from sceneprint.errors import ReadOnlyStore, SceneprintError
 from sceneprint.settings import Settings
 from sceneprint.store import Store
 from sceneprint.store.answer_rows import KeptRow, kept_among
+from sceneprint.store.audit_log import record_change
 from sceneprint.store.deletion import DAY_S, remove_in_blocks
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.query_records import (
@@ -315,6 +316,8 @@ class QueryHistory:
             done = add_offline_records(
                 connection, row, new, kept_s, self._settings.history_queries
             )  # fmt: skip
+            if done.received:
+                record_change(connection, "queries.added", map_name, received=done.received)
         refused = [RefusedRecord(query_id=one, reason=why) for one, why in done.refused.items()]
         return QueryRecordsAdded(
             received=done.received, there=done.there, expired=done.expired, refused=refused
