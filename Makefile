@@ -16,8 +16,8 @@ unexport PYTHONDONTWRITEBYTECODE
 export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
 	'import os; print(2 * len(os.sched_getaffinity(0)))')
 
-.PHONY: help demo test pytest test-thorough test-postgres lint kernels bytecode format bench screenshots docs docs-serve soak siege \
-	fleet models lock sbom advisories dist clean
+.PHONY: help demo test pytest test-thorough test-postgres lint kernels bytecode goldens format bench screenshots docs \
+	docs-serve soak siege fleet models lock sbom advisories dist clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
@@ -86,6 +86,10 @@ test-postgres: $(STAMP) kernels
 	SCENEPRINT_TEST_DATABASE=postgresql PYTHONPATH=$(CURDIR)/tests/on_postgres \
 		$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder \
 		$(addprefix tests/,store engine service client worker cli_service maintenance dashboard)
+
+# What tests/test_golden.py compares with, after an intended change: read the diff.
+goldens: $(STAMP) kernels
+	SCENEPRINT_UPDATE_GOLDEN=1 $(BIN)/python -m pytest -q tests/test_golden.py
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
