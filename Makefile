@@ -24,6 +24,7 @@ help:
 	@echo "make test    lint, types, import contracts and the tests"
 	@echo "make test-thorough  tests that make test leaves out, as they take minutes or seldom fail"
 	@echo "make test-postgres  the tests of what stands on the database, on PostgreSQL"
+	@echo "make goldens  what tests/golden freezes, after an intended change; read the diff"
 	@echo "make lint    lint, types and import contracts only, of the dashboard's JavaScript too"
 	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
 	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
@@ -121,7 +122,7 @@ fleet: $(STAMP) kernels
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --asynchronous
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --objects --delays --freezes 2
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --objects --delays --signed \
-		--robots 1000 --rate 0.006 --seconds 200 --kills 12 --promotions 1 --returns --freezes 1 \
+		--robots 1000 --rate 0.006 --seconds 200 --kills 12 --promotions 1 --freezes 1 \
 		--partitions 2 --retention-s 40 --offline 360
 
 models: $(STAMP)
