@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy import Connection, Engine, event
 
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
-from sceneprint.store.blobs.folder import Blobs
 from sceneprint.store.database_errors import database_label
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.postgres.timelines import Timelines
 from sceneprint.store.sqlite import (
     BUSY_S,
     HELD_S,
@@ -310,48 +308,15 @@ class Database:
         self._held = False  # by another process, for longer than anybody should wait
         self._guarded = False
         self._schema = postgres.KnownSchema(self._check_schema)
-        self._timelines = None if self.is_sqlite else Timelines(engine)
+        #: Timeline that the PostgreSQL server writes, as of the last connection: a promoted standby
+        #: begins another, and may lack what was committed last. What is held in memory of the one
+        #: before must then be given up. None of SQLite.
+        self.history: str | None = None
+        if not self.is_sqlite:
+            event.listen(engine, "connect", self._note_history)
 
-    @property
-    def history(self) -> str | None:
-        """Which line of history a server writes, as of the last connection to it: another where a
-        standby was promoted, which may lack what was committed last. Then nothing that is held in
-        memory can be taken to be a part of it.
-        """
-        found = None if self._timelines is None else self._timelines.current
-        return None if found is None else str(found)
-
-    def refuse_old_primaries(self, blobs: Blobs) -> None:
-        """Use no primary that a promoted standby has replaced, as a note beside the blobs says; and
-        keep that note for other processes.
-
-        Raises
-        ------
-        StoreAway : only old primaries can be reached.
-        """
-        if self._timelines is not None:
-            self._timelines.follow(blobs)
-            with self.read():
-                pass
-
-    def find_old_primary(self, note: bytes | None) -> str | None:
-        """What is wrong with a host that is asked first and is an old primary, as the note beside
-        the blobs says, and what to do; None where none is. It is used no more. Nothing is noted.
-
-        Parameters
-        ----------
-        note : TIMELINE, as it was read; None where there is none
-
-        Raises
-        ------
-        StoreAway : only old primaries can be reached.
-        """
-        if self._timelines is None:
-            return None
-        self._timelines.learn(note)
-        with self.read():
-            pass
-        return self._timelines.refused
+    def _note_history(self, connection: Any, _record: object) -> None:
+        self.history = postgres.timeline_of(connection) or self.history
 
     @property
     def dialect(self) -> str:
@@ -604,12 +569,14 @@ class Database:
         ------
         UnusableStore : the server cannot be reached.
         """
-        if self._timelines is None:
+        if self.is_sqlite:
             raise ValueError(f"{self.shown} has no connections but those of its file")
+        import psycopg
+
         with self.explained():
             args, given = self._engine.dialect.create_connect_args(self._engine.url)
             options = {**postgres.connect_options(self._engine.url), **given}
-            found, _ = self._timelines.connect(*args, **options, autocommit=True)
+            found = psycopg.connect(*args, **options, autocommit=True)
             try:
                 postgres.configure(found)
             except BaseException:

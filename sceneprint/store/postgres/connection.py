@@ -142,6 +142,17 @@ def configure(connection: Any, _record: object = None) -> None:
     connection.autocommit = before
 
 
+def timeline_of(connection: Any) -> str | None:
+    """Return the timeline that the server of a psycopg connection writes; None of a standby."""
+    before, connection.autocommit = connection.autocommit, True
+    row = connection.execute(
+        "SELECT CASE WHEN pg_is_in_recovery() THEN NULL"
+        " ELSE left(pg_walfile_name(pg_current_wal_lsn()), 8) END"
+    ).fetchone()
+    connection.autocommit = before
+    return None if row is None else row[0]
+
+
 @cache
 def _texts() -> type[Any]:
     """How texts are handed over: PostgreSQL has none with NUL, and nothing is found by such a one.
