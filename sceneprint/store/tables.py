@@ -278,6 +278,8 @@ job_files = Table(
 
 #: Name of the file of a job that is what a robot made of its frame, until it is signed.
 PACKAGE = "signed"
+#: Name of the file of an import that is its archive; it counts against the quota of the map.
+ARCHIVE = "archive"
 
 keys = Table(
     "keys",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import threading
 import uuid
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -27,7 +28,7 @@ from sceneprint.formats.signature_package import read_package
 from sceneprint.signing import SIGNING_VERSION
 from sceneprint.store import Store
 from sceneprint.store.events import record_event
-from sceneprint.store.frames import loosen, renew_frame, write_frame
+from sceneprint.store.frames import loosen, renew_frame
 from sceneprint.store.keys import IdempotentRequest, Overtaken
 from sceneprint.store.maps import (
     add_frame,
@@ -118,17 +119,6 @@ def _given_value(name: str, value: Any) -> Any:
     Its viewpoint is part of its content.
     """
     return value["units_per_metre"] if name == "cloud" and value is not None else value
-
-
-def _missing_labels(frame: FrameRow, known: dict[str, Any]) -> dict[str, Any]:
-    """Name and sequence of an upload, as far as the frame that is there has none: one of before
-    there were names gets them when its file is sent again.
-    """
-    return {
-        name: known[name]
-        for name in _LABELS
-        if known[name] is not None and getattr(frame, name) is None
-    }
 
 
 def is_retried(state: FrameState) -> bool:
@@ -324,6 +314,19 @@ class _Request:
         return alone and self.fence is None and len(self.blobs) == 1
 
 
+class IncomingBytes:
+    """Bytes of archives that this process is receiving for each map; no row counts them yet."""
+
+    def __init__(self) -> None:
+        self._sizes, self._guard = Counter[int](), threading.Lock()
+
+    def add(self, map_number: int, size: int) -> int:
+        """Add bytes, or remove them, and return how many the map has now."""
+        with self._guard:
+            self._sizes[map_number] += size
+            return self._sizes[map_number]
+
+
 class Uploads:
     """Takes frames into maps; safe to share between threads.
 
@@ -339,6 +342,7 @@ class Uploads:
         self._writes = WeakValueDictionary[int | None, Grouping]()
         self._guard = threading.Lock()
         self._new_frames = NewFrames(store.database)
+        self.incoming = IncomingBytes()
 
     def add(
         self, map_name: str, upload: Upload, once: IdempotentRequest | None = None
@@ -468,14 +472,12 @@ class Uploads:
                     connection, row, ready.content, ready.known, ready.upload.frame_id
                 )
                 if frame is None:  # what has no room is not even written to the disk
-                    require_room(connection, row, ready.size)
+                    require_room(connection, row, ready.size + self.incoming.add(row.number, 0))
                 if frame is None or is_retried(frame.state):
                     return None
                 waits = frame.state in (FrameState.RECEIVED, FrameState.SIGNING)
                 if waits and frame.novelty is not None:
                     return None  # its condition may have to be loosened
-                if _missing_labels(frame, ready.known):
-                    return None
                 there = upload_response(connection, frame)
         except (errors.StoreError, errors.UnknownMap):
             raise
@@ -661,7 +663,6 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
         return UploadResult(None, error=error)
     if frame is not None and not is_retried(frame.state):
         loosen(connection, frame.number, upload.if_novel)
-        frame = write_frame(connection, row, frame, _missing_labels(frame, ready.known))
         left.extend(ready.blobs)
         there = upload_response(connection, frame)
         return UploadResult(there.model_copy(update={"signed": _known(ready)}))
@@ -677,8 +678,7 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
         frame = add_frame(connection, row.number, ready.columns, upload.frame_id)
     else:  # it was given up, and somebody asks for another try
         left.append(frame.blob)  # it was packed otherwise
-        labels = _missing_labels(frame, ready.known)
-        frame = renew_frame(connection, frame.number, {**ready.of_blob, **labels})
+        frame = renew_frame(connection, frame.number, ready.of_blob)
     job = enqueue(connection, "sign", frame.number, upload.priority, data=ready.of_job)
     if ready.package is not None:
         blob, data = ready.package
