@@ -39,10 +39,10 @@ from sceneprint_client import Client
 
 #: At reduced size.
 SMALL = Plan(seconds=6, robots=2, rate=2, kills=2, promotions=1, seed=1, workers=1)
-#: The same with robots that sign their frames, one that is offline, and all kinds of faults.
+#: The same with a robot that is offline, and all kinds of faults.
 HARD = replace(
     SMALL, robots=6, rate=1, kills=1, partitions=1, returns=True, offline=5, retention_s=2.0,
-    signed=True, objects=True, delays=True,
+    objects=True, delays=True,
 )  # fmt: skip
 
 
@@ -335,13 +335,13 @@ def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
 
 
 def test_a_crowd_tells_what_it_met_with() -> None:
-    plan = Plan(robots=1000, signed=True, partitions=2, offline=360, retention_s=40.0)
+    plan = Plan(robots=1000, partitions=2, offline=360, retention_s=40.0)
     found = Found(acknowledged=9, indexed=6, looked_for=5, found=5, aged=3)
     back = [Promotion(None, 1.0, 2.0, {"a": 0.5}, frozenset(), frozenset({"a", "b"}))]
     kills = Counter({"service": 2, PRIMARY: 1, CUT_OFF: 2})
     more = {"kills": kills, "promotions": back, "spooled": 360, "spooled_twice": 4}
     told = "\n".join(table(figures(found, plan=plan, **more)))
-    assert "1,000 robots send 1 frames a second each, and send their signatures along" in told
+    assert "1,000 robots send 1 frames a second each. " in told
     assert "A host was cut off twice from its servers for 12 s." in told
     assert "SIGKILL of 1 of primary, 2 of service." in told
     assert "keep a frame for 40 s" in told

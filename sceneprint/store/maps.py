@@ -30,7 +30,6 @@ from sceneprint.store.events import inherited, record_event
 from sceneprint.store.tables import (
     FRAME_COLUMNS,
     MAP_COLUMNS,
-    PACKAGE,
     TEXT,
     FrameRow,
     MapRow,
@@ -39,8 +38,6 @@ from sceneprint.store.tables import (
     frame_rows,
     frame_tags,
     frames,
-    job_files,
-    jobs,
     map_row,
     maps,
     models,
@@ -207,12 +204,7 @@ def counted_usage(connection: Connection, map_number: int) -> MapUsage:
         frames.c.map_number == map_number, frames.c.state.not_in(ROOMLESS)
     )
     n, size = connection.execute(asked).one()
-    sent = (
-        select(func.coalesce(func.sum(job_files.c.bytes), 0))
-        .join(jobs, jobs.c.number == job_files.c.job_number)
-        .where(job_files.c.name == PACKAGE, jobs.c.map_number == map_number)
-    )
-    return MapUsage(int(n), int(size) + int(connection.execute(sent).scalar_one()))
+    return MapUsage(int(n), int(size))
 
 
 def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> None:
