@@ -114,11 +114,6 @@ def table(figures: FleetFigures) -> list[str]:
             f"Primary dead for {one.promoted - one.killed:.1f} s until the standby was promoted; "
             f"each service answered {back} s after that."
         )
-        if one.astray is not None:
-            lines.append(
-                "Then the old primary came back as it was, and a service and a worker began anew: "
-                f"frames that came to it: **{len(one.astray)}**."
-            )
     return [*lines, ""]
 
 
@@ -162,7 +157,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--workers", type=int, default=plan.workers)
     parser.add_argument("--freezes", type=int, default=plan.freezes, help="of the primary")
     parser.add_argument("--partitions", type=int, default=plan.partitions, help="of a host")
-    parser.add_argument("--returns", action="store_true", help="old primaries come back")
     parser.add_argument("--offline", type=int, default=plan.offline, help="frames of a spool")
     parser.add_argument("--retention-s", type=float, help="of maps of single robots")
     parser.add_argument("--objects", action="store_true", help="blobs in an object store")

@@ -64,7 +64,6 @@ class Plan:
     rate : frames a second of each
     kills, promotions : of services and workers, and of the primary
     freezes, partitions : of the primary, and of a host, for some seconds
-    returns : whether an old primary comes back as it was
     offline : frames that one more robot spools before it has a network; 0: there is none
     retention_s : for which maps of single robots keep a frame, while the shared one keeps all;
         None: they do too
@@ -90,7 +89,6 @@ class Plan:
     promotions: int = 2
     freezes: int = 0
     partitions: int = 0
-    returns: bool = False
     offline: int = 0
     retention_s: float | None = None
     most_turn_ms: float = 25.0
@@ -200,11 +198,10 @@ class FleetFigures:
         """Whether nothing was lost, doubled, half there or wrong, and the bounds hold."""
         found = self.found
         there = found.acknowledged - len(found.missing) - found.aged
-        astray = sum(len(one.astray or ()) for one in self.promotions)
         wrong = (
             self.lost, found.stuck, found.doubled, found.strangers, found.heard_twice,
             found.disagreeing, self.damaged, len(self.faults), found.looked_for - found.found,
-            there - found.indexed - found.stated, astray, len(self.exceeded),
+            there - found.indexed - found.stated, len(self.exceeded),
         )  # fmt: skip
         tried = found.acknowledged > 0 and self.window == len(found.missing)
         # a server that fell, or was frozen, is not sampled
@@ -257,7 +254,7 @@ class _Run:
                 listeners.append(self._listener(clients[0], OFFLINE_MAP))
             injector = FaultInjector(
                 fleet, partial(_answers, key=key, shot=self._walked[0][0]), self._rng,
-                plan.asynchronous, plan.returns,
+                plan.asynchronous,
             )  # fmt: skip
             self._walk(robots, [*listeners, *offline], injector)
             for one in offline:

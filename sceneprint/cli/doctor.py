@@ -121,7 +121,7 @@ def _database_server(settings: Settings) -> Check:
         try:
             with database.read() as connection:
                 found = schema_range_of(connection)
-            return _unfinished(found, database.shown) or _compared(found, database.shown)
+            return _compared(found, database.shown)
         finally:
             database.close()
     except SceneprintError as error:
@@ -171,20 +171,6 @@ def _compared(found: SchemaRange | None, place: str) -> Check:
         "folder."
     )
     return _wrong(text)
-
-
-def _unfinished(found: SchemaRange | None, place: str) -> Check | None:
-    """That a fleet's upgrade is not completed: a single machine gains nothing by that."""
-    from sceneprint.store.database import known_revisions
-
-    head, _ = known_revisions()
-    if found is None or found.revision != head or found.least == head:
-        return None
-    text = (
-        f"{place}, schema {head}: earlier versions may still write. Run `sceneprint migrate "
-        "--complete` once every process runs this version."
-    )
-    return Check("note", "database", text)
 
 
 def _wrong(text: str) -> Check:
@@ -267,8 +253,7 @@ def server(settings: Settings) -> Iterator[Check]:
     try:
         if database.is_sqlite:
             return
-        refused = database.find_old_primary(_timeline_note(settings))
-        yield from _server_settings(database, settings, refused)
+        yield from _server_settings(database, settings)
     except SceneprintError as error:
         yield Check("WRONG", "database server", str(error))
         return
@@ -278,25 +263,7 @@ def server(settings: Settings) -> Iterator[Check]:
         yield _replica(settings.replica_url.get_secret_value(), settings)
 
 
-def _timeline_note(settings: Settings) -> bytes | None:
-    """The newest timeline, as processes have noted it beside the blobs; None where none can be
-    read: what is wrong with the blobs is a finding of its own.
-    """
-    from sceneprint.store.blobs.folder import TIMELINE
-    from sceneprint.store.blobs.object_client import open_objects
-
-    place = settings.blobs
-    try:
-        if isinstance(place, Path):
-            return (place / TIMELINE).read_bytes()
-        return open_objects(place).get(TIMELINE)
-    except (OSError, SceneprintError):
-        return None
-
-
-def _server_settings(
-    database: Database, settings: Settings, refused: str | None
-) -> Iterator[Check]:
+def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
     with database.read() as connection:
         told = dict(connection.exec_driver_sql(_ASKED).mappings().one())
         before = time.time()
@@ -309,10 +276,7 @@ def _server_settings(
         text += "; it is a read-only standby. Name the primary."
         yield Check("WRONG", "database server", text)
         return
-    if refused is None:
-        yield Check("ok", "database server", text)
-    else:  # what follows is of the host that is used
-        yield Check("WRONG", "database server", refused)
+    yield Check("ok", "database server", text)
     yield _durability(told)
     yield _connections(told, settings)
     yield _vector(told, settings)

@@ -28,7 +28,7 @@ from sceneprint.cli.options import (
     require_database,
 )
 from sceneprint.cli.serve import add_data_option, settings_of
-from sceneprint.errors import InvalidRequest, UnusableStore
+from sceneprint.errors import InvalidRequest
 
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
@@ -59,17 +59,10 @@ def add_migrate(commands: Any) -> None:
         "reached.",
     )
     add_data_option(command)
-    either = command.add_mutually_exclusive_group()
-    either.add_argument(
+    command.add_argument(
         "--check",
         action="store_true",
         help="change nothing; exit code 1 if the schema must first be created or upgraded",
-    )
-    either.add_argument(
-        "--complete",
-        action="store_true",
-        help="complete the upgrade of a fleet once every process runs this version: earlier ones "
-        "may write no more; exit code 2 if the schema is not this version's",
     )
     command.set_defaults(run=run_migrate)
 
@@ -80,9 +73,6 @@ def run_migrate(options: argparse.Namespace) -> int:
     from sceneprint.store.database import is_there, reach_database
 
     settings = settings_of(options)
-    if options.complete:
-        print(_completed(settings))
-        return 0
     database = reach_database(settings.database)
     try:
         before, usable = _revisions(database) if is_there(settings.database) else (None, False)
@@ -96,37 +86,6 @@ def run_migrate(options: argparse.Namespace) -> int:
         database.close()
     print(shown if before == after else f"{shown} -> {after}")
     return 0
-
-
-def _completed(settings: Settings) -> str:
-    """Let earlier versions write no more, and say so."""
-    from sceneprint.store import open_blobs
-    from sceneprint.store.database import (
-        complete_upgrade,
-        is_there,
-        known_revisions,
-        reach_database,
-    )
-
-    database = reach_database(settings.database)
-    try:
-        if not is_there(settings.database):
-            raise UnusableStore(
-                f"{database.shown} has no schema, so there is no upgrade to complete. Name the "
-                "data folder with --data, or the database in SCENEPRINT_DATABASE_URL."
-            )
-        if not database.is_sqlite:
-            blobs = open_blobs(settings.blobs, database, claim=False)
-            try:
-                database.refuse_old_primaries(blobs)
-            finally:
-                blobs.close()
-        is_new = complete_upgrade(database)
-    finally:
-        database.close()
-    state = "completed" if is_new else "was completed before"
-    head = known_revisions()[0]
-    return f"{database.shown}: upgrade to schema {head} {state}; earlier versions may not write"
 
 
 def _revisions(database: Database) -> tuple[str | None, bool]:

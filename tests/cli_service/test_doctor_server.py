@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,6 @@ from sceneprint.cli.doctor import database, object_stores, server
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
-from sceneprint.store.database import complete_upgrade
 
 
 def found_in(url: str, **other: object) -> dict[str, Check]:
@@ -76,18 +74,6 @@ def test_a_service_does_not_take_the_server_for_a_file(postgres_url: str, tmp_pa
     size = f"{stats.bytes.database / 1e6:.1f}"
     text = f"database of {size} MB, blobs of 0.0 MB, indexes of 0.0 MB"
     assert store_check(stats) == Check("ok", "store", text)
-
-
-def test_an_upgrade_that_is_not_completed(postgres_url: str) -> None:
-    assert found_in(postgres_url)["database"].verdict == "ok"
-    with closing(open_database(postgres_url)) as store, store.write() as connection:
-        connection.exec_driver_sql("UPDATE schema_range SET least_revision = '0020'")
-    found = found_in(postgres_url)["database"]
-    assert found.verdict == "note"
-    assert "earlier versions may still write. Run `sceneprint migrate --complete`" in found.text
-    with closing(open_database(postgres_url)) as store:
-        assert complete_upgrade(store)
-    assert found_in(postgres_url)["database"].verdict == "ok"
 
 
 @pytest.mark.parametrize(

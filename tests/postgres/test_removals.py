@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -222,18 +222,6 @@ def grow_old(engine: Engine) -> None:
     """Let the time pass after which no removal of before goes on."""
     with engine.store.database.write() as connection:
         connection.execute(update(doomed).values(at=doomed.c.at - LONGEST_S))
-
-
-@contextmanager
-def least(engine: Engine, revision: str) -> Iterator[None]:
-    """The oldest version that may write, and later the one that may now."""
-    change = text("UPDATE schema_range SET least_revision = :v")
-    with engine.store.database.write() as connection:
-        before = connection.execute(text("SELECT least_revision FROM schema_range")).scalar_one()
-        connection.execute(change, {"v": revision})
-    yield
-    with engine.store.database.write() as connection:
-        connection.execute(change, {"v": before})
 
 
 def alone(engine: Engine, small: Any) -> Any:
@@ -452,24 +440,6 @@ def test_what_is_removed_one_by_one_ends_in_time(tmp_path: Path) -> None:
         objects.delete("missing", "a", "c", seconds=-1.0)
     objects.delete("missing", "a", "c", seconds=60.0)
     assert [one.key for one in objects.list("")] == []
-
-
-@pytest.mark.parametrize("revision", ["0015", "0020"])
-def test_writers_wait_while_earlier_versions_may_write(
-    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
-    until: Until, revision: str,
-) -> None:  # fmt: skip
-    digest = engine.store.blobs.put(b"of another frame")
-    with least(engine, revision):
-        removing = removal(digest)
-        adding = Background(lambda: alone(engine, small))
-        until(lambda: waiting(engine) == 1 or not adding.is_alive())
-        assert adding.is_alive()
-        held.release()
-        removing.result()
-        adding.result()
-        assert not engine.store.blobs.holds(digest)
-    assert engine.get_map("hall").frames == {"received": 1}
 
 
 def test_a_snapshot_defers_a_removal(engine: Engine) -> None:

@@ -11,8 +11,6 @@ from pathlib import Path
 import httpx
 import pytest
 
-from sceneprint.store.blobs.folder import TIMELINE
-
 LIMIT = 100_000
 
 
@@ -122,8 +120,7 @@ def test_a_form_that_is_none_is_refused(narrow, refused, name):
 
 
 def kept(folder: Path) -> list[Path]:
-    found = (path for path in (folder / "blobs").rglob("*") if path.is_file())
-    return [path for path in found if path.name != TIMELINE]
+    return [path for path in (folder / "blobs").rglob("*") if path.is_file()]
 
 
 def test_the_length_is_believed_before_a_byte_is_read(wire):
