@@ -291,8 +291,7 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         ({}, {"locks": LockShares(5_000, 59.0, 0.0, 0.0)}, False),  # half of 120 s is too few
         ({}, {"plan": Plan(offline=9), "spooled": 9}, True),
         ({}, {"plan": Plan(offline=9), "spooled": 8}, False),
-        ({}, {"promotions": [Promotion(None, 1.0, 2.0, {}, frozenset(), frozenset())]}, True),
-        ({}, {"promotions": [Promotion(None, 1.0, 2.0, {}, frozenset(), frozenset("a"))]}, False),
+        ({}, {"promotions": [Promotion(None, 1.0, 2.0, {}, frozenset())]}, True),
         ({"acknowledged": 0, "indexed": 0, "found": 0}, {}, False),
         ({"found": 8}, {}, False),
         ({"indexed": 8, "looked_for": 8, "found": 8}, {}, False),
@@ -335,9 +334,8 @@ def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
 def test_a_crowd_tells_what_it_met_with() -> None:
     plan = Plan(robots=1000, partitions=2, offline=360, retention_s=40.0)
     found = Found(acknowledged=9, indexed=6, looked_for=5, found=5, aged=3)
-    back = [Promotion(None, 1.0, 2.0, {"a": 0.5}, frozenset(), frozenset({"a", "b"}))]
     kills = Counter({"service": 2, PRIMARY: 1, CUT_OFF: 2})
-    more = {"kills": kills, "promotions": back, "spooled": 360, "spooled_twice": 4}
+    more = {"kills": kills, "spooled": 360, "spooled_twice": 4}
     told = "\n".join(table(figures(found, plan=plan, **more)))
     assert "1,000 robots send 1 frames a second each. " in told
     assert "A host was cut off twice from its servers for 12 s." in told
@@ -347,7 +345,6 @@ def test_a_crowd_tells_what_it_met_with() -> None:
     assert (
         "| frames spooled by the robot that was offline, sent again, doubled | 360, 4, 0 |" in told
     )
-    assert "frames that came to it: **2**." in told
     assert marks(plan)[0] == "<!-- fleet-crowd:begin -->"
 
 

@@ -181,7 +181,7 @@ class UploadMethods(ServiceConnection):
 
 
 def upload_fields(priority: int, if_novel: float | bool | None) -> dict[str, str]:
-    """Fields of an upload beside the frame; a service of before knows of none."""
+    """Return the fields of an upload beside the frame, those with other values than the default."""
     if abs(priority) > MOST_PRIORITY:
         raise InvalidRequest(
             f"The priority is {priority}. Give one from {-MOST_PRIORITY} to {MOST_PRIORITY}.",

@@ -41,7 +41,6 @@ from sceneprint_client.errors import (
     UnreadableFrame,
     UnusableStore,
 )
-from sceneprint_client.http import frame_bytes
 from sceneprint_client.spool import SpoolPlace, pose_matrix, separation
 
 START = datetime(2026, 11, 26, 9, 0, tzinfo=UTC)
@@ -629,35 +628,16 @@ def test_records_of_queries_reach_the_service_each_once(
         assert (now.queries, now.queries_sent, now.queries_discarded, now.bytes) == (0, 3, 0, 0)
 
 
-def test_a_spool_of_before_there_were_records_is_upgraded(
-    remote: Client, copy: Client, map_name: str, tmp_path: Path
-) -> None:
+def test_a_spool_of_another_version_is_left_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / "spool"
+    Spool(path).close()
     with closing(sqlite3.connect(path)) as database:
-        database.executescript(module._TABLES)
-        database.execute("INSERT INTO counters (most_bytes) VALUES (?)", (10 * CHARGE,))
-        text = meta(0, name="a").model_dump_json(exclude_defaults=True)
-        database.execute(
-            "INSERT INTO frames (digest, run, stamp, bytes, meta, data) VALUES (?, ?, ?, ?, ?, ?)",
-            ("d", "r", 0.0, CHARGE, text, frame_bytes(depth(1), meta(0), with_pose=True)[0]),
-        )
-        database.execute(f"PRAGMA application_id = {0x53705370}")
-        database.execute("PRAGMA user_version = 1")
+        database.execute("PRAGMA user_version = 2")
         database.commit()
-    ask(copy, map_name, 1)
-    with Spool(path) as spool:
-        assert (spool.status().waiting, spool.status().most_bytes) == (1, 10 * CHARGE)
-        assert spool.add_queries(copy) == 1
-        report = spool.sync(remote, map_name)
-        assert (report.received, report.queries) == (1, 1)
-    with Spool(path) as spool:
-        assert (spool.status().uploaded, spool.status().queries_sent) == (1, 1)
-    with closing(sqlite3.connect(path)) as database:
-        assert database.execute("PRAGMA user_version").fetchone() == (3,)
-        database.execute("PRAGMA user_version = 4")
-        database.commit()
-    with pytest.raises(UnusableStore, match="of a later version"):
+    before = path.read_bytes()
+    with pytest.raises(UnusableStore, match="of another version"):
         Spool(path)
+    assert path.read_bytes() == before
 
 
 def test_records_go_before_frames_and_the_oldest_first(
@@ -758,23 +738,6 @@ def record_text(path: Path, query_id: str) -> str:
         query = "SELECT record FROM queries WHERE query_id = ?"
         text: str = database.execute(query, (query_id,)).fetchone()[0]
         return text
-
-
-def test_records_wait_for_a_service_that_takes_them(
-    scripted: Callable[..., Any], copy: Client, map_name: str, tmp_path: Path
-) -> None:
-    """A service of before has no such route: frames go on, and records wait."""
-    problem = {"type": "/problems/not-found", "title": "", "status": 404, "detail": "No."}
-    frame = {"frame_id": "f", "job_id": "j", "state": "received"}
-    done = {"items": [{"status": 202, "frame": frame, "problem": None}]}
-    server = scripted([(404, {}, problem), (200, {}, done)])
-    ask(copy, map_name, 3)
-    with Client(server.url) as client, Spool(tmp_path / "spool") as spool:
-        spool.add(depth(1), meta())
-        spool.add_queries(copy)
-        assert spool.sync(client, map_name).received == 1
-        assert (spool.status().queries, spool.status().queries_refused) == (3, 0)
-    assert len(server.asked) == 2
 
 
 def test_a_clock_that_is_set_back_costs_no_record(

@@ -25,7 +25,7 @@ from sceneprint.engine.ingest.write_groups import Grouping, NewFrames
 from sceneprint.engine.upkeep import garbage_collection, repair
 from sceneprint.store import Store
 from sceneprint.store.events import record_event
-from sceneprint.store.frames import loosen, renew_frame, write_frame
+from sceneprint.store.frames import loosen, renew_frame
 from sceneprint.store.keys import IdempotentRequest, Overtaken
 from sceneprint.store.maps import (
     add_frame,
@@ -114,17 +114,6 @@ def _given_value(name: str, value: Any) -> Any:
     Its viewpoint is part of its content.
     """
     return value["units_per_metre"] if name == "cloud" and value is not None else value
-
-
-def _missing_labels(frame: FrameRow, known: dict[str, Any]) -> dict[str, Any]:
-    """Name and sequence of an upload, as far as the frame that is there has none: one of before
-    there were names gets them when its file is sent again.
-    """
-    return {
-        name: known[name]
-        for name in _LABELS
-        if known[name] is not None and getattr(frame, name) is None
-    }
 
 
 def is_retried(state: FrameState) -> bool:
@@ -399,8 +388,6 @@ class Uploads:
                 waits = frame.state in (FrameState.RECEIVED, FrameState.SIGNING)
                 if waits and frame.novelty is not None:
                     return None  # its condition may have to be loosened
-                if _missing_labels(frame, ready.known):
-                    return None
                 there = upload_response(connection, frame)
         except (errors.StoreError, errors.UnknownMap):
             raise
@@ -569,7 +556,6 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
         return UploadResult(None, error=error)
     if frame is not None and not is_retried(frame.state):
         loosen(connection, frame.number, upload.if_novel)
-        frame = write_frame(connection, row, frame, _missing_labels(frame, ready.known))
         left.append(ready.blob)
         return UploadResult(upload_response(connection, frame))
     new = frame is None or frame.state == FrameState.REDUNDANT
@@ -584,8 +570,7 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
         frame = add_frame(connection, row.number, ready.columns, upload.frame_id)
     else:  # it was given up, and somebody asks for another try
         left.append(frame.blob)  # it was packed otherwise
-        labels = _missing_labels(frame, ready.known)
-        frame = renew_frame(connection, frame.number, {**ready.of_blob, **labels})
+        frame = renew_frame(connection, frame.number, ready.of_blob)
     job = enqueue(connection, "sign", frame.number, upload.priority)
     record_event(connection, "frame.received", row.name, frame.id, job.id)
     added = Added(frame_id=frame.id, job_id=job.id, state=frame.state, reason=None)
