@@ -258,6 +258,9 @@ job_files = Table(
     Index(None, "blob"),
 )
 
+#: Name of the file of an import that is its archive; it counts against the quota of the map.
+ARCHIVE = "archive"
+
 keys = Table(
     "keys",
     metadata,

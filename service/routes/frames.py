@@ -340,8 +340,9 @@ async def add_import(
             f"{', '.join(TYPES)}."
         )
     options = _options(request)
-    async with here.uploads.place():
-        archive = await _received(map_name, request, here)
+    receiving = contextmanager_in_threadpool(here.engine.imports.receive(map_name))
+    async with here.uploads.place(), receiving as receiver:
+        archive = await _received(receiver, request, here)
         once = guarded(asking, key, "import", map_name, archive.blob, options)
         job, replayed = await here.uploads.run(
             lambda: here.engine.imports.begin(map_name, archive, options, once), patient=True
@@ -371,21 +372,20 @@ def list_import_items(
     return here.engine.imports.items(map_name, job_id, cursor, limit)
 
 
-async def _received(map_name: str, request: Request, here: Context) -> JobFile:
-    """The archive as it came, durable."""
-    async with contextmanager_in_threadpool(here.engine.imports.receive(map_name)) as receiver:
-        waiting = bytearray()
-        async for chunk in request.stream():
-            waiting += chunk
-            if len(waiting) >= _CHUNK:
-                await _written(here, receiver, bytes(waiting))
-                waiting.clear()
+async def _received(receiver: Receiver, request: Request, here: Context) -> JobFile:
+    """Store the archive durably as it comes."""
+    waiting = bytearray()
+    async for chunk in request.stream():
+        waiting += chunk
+        if len(waiting) >= _CHUNK:
+            await _written(here, receiver, bytes(waiting))
+            waiting.clear()
 
-        def end() -> JobFile:
-            receiver.write(bytes(waiting))
-            return receiver.end()
+    def end() -> JobFile:
+        receiver.write(bytes(waiting))
+        return receiver.end()
 
-        return await here.uploads.run(end, patient=True)
+    return await here.uploads.run(end, patient=True)
 
 
 async def _written(here: Context, receiver: Receiver, data: bytes) -> None:

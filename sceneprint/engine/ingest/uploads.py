@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import threading
 import uuid
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -274,6 +275,19 @@ class _Request:
         return len(self.known) == len(self.todo) == 1 and self.fence is None
 
 
+class IncomingBytes:
+    """Bytes of archives that this process is receiving for each map; no row counts them yet."""
+
+    def __init__(self) -> None:
+        self._sizes, self._guard = Counter[int](), threading.Lock()
+
+    def add(self, map_number: int, size: int) -> int:
+        """Add bytes, or remove them, and return how many the map has now."""
+        with self._guard:
+            self._sizes[map_number] += size
+            return self._sizes[map_number]
+
+
 class Uploads:
     """Takes frames into maps; safe to share between threads.
 
@@ -288,6 +302,7 @@ class Uploads:
         self._writes = WeakValueDictionary[int | None, Grouping]()
         self._guard = threading.Lock()
         self._new_frames = NewFrames(store.database)
+        self.incoming = IncomingBytes()
 
     def add(
         self, map_name: str, upload: Upload, once: IdempotentRequest | None = None
@@ -382,7 +397,7 @@ class Uploads:
                     connection, row, ready.content, ready.known, ready.upload.frame_id
                 )
                 if frame is None:  # what has no room is not even written to the disk
-                    require_room(connection, row, ready.size)
+                    require_room(connection, row, ready.size + self.incoming.add(row.number, 0))
                 if frame is None or is_retried(frame.state):
                     return None
                 waits = frame.state in (FrameState.RECEIVED, FrameState.SIGNING)

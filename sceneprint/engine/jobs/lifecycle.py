@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from sqlalchemy import Connection
 
 from sceneprint.engine.serializers import job_record
+from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError, UnknownJob
 from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
@@ -21,7 +22,7 @@ from sceneprint.store.maps import frame_of, map_of
 from sceneprint.store.queue import fail_of_dead
 from sceneprint.store.queue import list_jobs as list_stored
 from sceneprint.store.reencoding_rows import REENCODE
-from sceneprint.store.tables import FrameRow, JobRow, MapRow
+from sceneprint.store.tables import ARCHIVE, FrameRow, JobRow, MapRow
 from sceneprint_client.api import FrameState, Job, JobState, Page
 from sceneprint_client.api.admin import RefusedRetry, RetriedJobs
 
@@ -204,9 +205,10 @@ def get_job(store: Store, job_id: str) -> Job:
 
 
 def cancel(store: Store, job_id: str) -> Job:
-    """Give a job up that is not over; of one that is cancelled already nothing changes.
+    """Cancel a job that is not over; of one that is cancelled already nothing changes.
 
-    A worker that is at it goes on to the end, and what it brings is refused.
+    A worker that holds it goes on to the end, and its result is refused. The archive of an import
+    is removed at once.
 
     Raises
     ------
@@ -215,10 +217,14 @@ def cancel(store: Store, job_id: str) -> Job:
     """
     with store.database.write() as connection:
         job = queue.find_job(connection, job_id)
+        gone: list[str] = []
         if job.state != JobState.CANCELLED:
             queue.cancel(connection, job)
             fail_frame(connection, job, CANCELLED)
-        return _job_record(connection, queue.find_job(connection, job_id))
+            gone = queue.remove_parts(connection, job.number, items=False, files=[ARCHIVE])
+        cancelled = _job_record(connection, queue.find_job(connection, job_id))
+    collect_deleted_blobs(store, gone)
+    return cancelled
 
 
 def retry(store: Store, job_id: str) -> tuple[Job, bool]:
