@@ -30,10 +30,10 @@ from sceneprint_client import Client
 
 #: At reduced size.
 SMALL = Plan(seconds=6, robots=2, rate=2, kills=2, promotions=1, seed=1, workers=1)
-#: The same with robots that sign their frames, one that is offline, and all kinds of faults.
+#: The same with a robot that is offline, and all kinds of faults.
 HARD = replace(
     SMALL, robots=6, rate=1, kills=1, partitions=1, offline=5, retention_s=2.0,
-    signed=True, objects=True, delays=True,
+    objects=True, delays=True,
 )  # fmt: skip
 
 
