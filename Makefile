@@ -16,14 +16,15 @@ unexport PYTHONDONTWRITEBYTECODE
 export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
 	'import os; print(2 * len(os.sched_getaffinity(0)))')
 
-.PHONY: help demo test pytest test-thorough test-postgres lint kernels bytecode format bench screenshots docs docs-serve soak siege \
-	fleet models lock sbom advisories dist clean
+.PHONY: help demo test pytest test-thorough test-postgres lint kernels bytecode goldens format bench screenshots docs \
+	docs-serve soak siege fleet models lock sbom advisories dist clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
 	@echo "make test    lint, types, import contracts and the tests"
 	@echo "make test-thorough  tests that make test leaves out, as they take minutes or seldom fail"
 	@echo "make test-postgres  the tests of what stands on the database, on PostgreSQL"
+	@echo "make goldens  what tests/golden freezes, after an intended change; read the diff"
 	@echo "make lint    lint, types and import contracts only, of the dashboard's JavaScript too"
 	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
 	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
@@ -87,6 +88,10 @@ test-postgres: $(STAMP) kernels
 		$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder \
 		$(addprefix tests/,store engine service client worker cli_service maintenance dashboard)
 
+# What tests/test_golden.py compares with, after an intended change: read the diff.
+goldens: $(STAMP) kernels
+	SCENEPRINT_UPDATE_GOLDEN=1 $(BIN)/python -m pytest -q tests/test_golden.py
+
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -116,8 +121,8 @@ fleet: $(STAMP) kernels
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --asynchronous
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --objects --delays --freezes 2
-	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --objects --delays --signed \
-		--robots 1000 --rate 0.006 --seconds 200 --kills 12 --promotions 1 --freezes 1 \
+	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --objects --delays \
+		--robots 1000 --rate 0.003 --seconds 200 --kills 12 --promotions 1 --freezes 1 \
 		--partitions 2 --retention-s 40 --offline 360
 
 models: $(STAMP)

@@ -66,10 +66,12 @@ _PAGE = 4096
 #: full: one request's frames change fewer, as their own pages are not written for that.
 _RESERVE = 512
 #: Marks the file as a spool, and its schema.
-_APPLICATION, _SCHEMA = 0x53705370, 3
+_APPLICATION, _SCHEMA = 0x53705370, 1
 
-# Schema 1. `reason` is null while a frame waits. `data` is last, so that other columns are read
-# without it.
+# `frames.reason` is null while a frame waits, and '' once it was refused: as long as null, so that
+# a frame is set aside without being written again, for which a full disk has no room. The text is
+# in `reasons`. `data` is last, so that other columns are read without it. `known_queries` has the
+# records of the last minute, which are read again.
 _TABLES = """
 CREATE TABLE frames (
     id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -93,7 +95,12 @@ CREATE TABLE counters (
     refused INTEGER NOT NULL DEFAULT 0,
     uploaded INTEGER NOT NULL DEFAULT 0,
     thinned INTEGER NOT NULL DEFAULT 0,
-    discarded INTEGER NOT NULL DEFAULT 0
+    discarded INTEGER NOT NULL DEFAULT 0,
+    queries INTEGER NOT NULL DEFAULT 0,
+    queries_refused INTEGER NOT NULL DEFAULT 0,
+    queries_sent INTEGER NOT NULL DEFAULT 0,
+    queries_discarded INTEGER NOT NULL DEFAULT 0,
+    queries_until REAL
 );
 CREATE TRIGGER added AFTER INSERT ON frames BEGIN
     UPDATE counters SET bytes = bytes + NEW.bytes, waiting = waiting + 1;
@@ -106,10 +113,6 @@ CREATE TRIGGER moved AFTER UPDATE OF reason ON frames BEGIN
     UPDATE counters SET waiting = waiting + (NEW.reason IS NULL) - (OLD.reason IS NULL),
         refused = refused + (NEW.reason IS NOT NULL) - (OLD.reason IS NOT NULL);
 END;
-"""
-
-# Schema 2: records of queries. `known_queries` has those of the last minute: they are read again.
-_QUERY_TABLES = """
 CREATE TABLE queries (
     id INTEGER PRIMARY KEY AUTOINCREMENT,
     query_id TEXT NOT NULL UNIQUE,
@@ -122,11 +125,6 @@ CREATE TABLE queries (
 CREATE INDEX waiting_queries ON queries (at, id) WHERE reason IS NULL;
 CREATE INDEX refused_queries ON queries (id) WHERE reason IS NOT NULL;
 CREATE TABLE known_queries (query_id TEXT PRIMARY KEY, at REAL NOT NULL) WITHOUT ROWID;
-ALTER TABLE counters ADD COLUMN queries INTEGER NOT NULL DEFAULT 0;
-ALTER TABLE counters ADD COLUMN queries_refused INTEGER NOT NULL DEFAULT 0;
-ALTER TABLE counters ADD COLUMN queries_sent INTEGER NOT NULL DEFAULT 0;
-ALTER TABLE counters ADD COLUMN queries_discarded INTEGER NOT NULL DEFAULT 0;
-ALTER TABLE counters ADD COLUMN queries_until REAL;
 CREATE TRIGGER query_added AFTER INSERT ON queries BEGIN
     UPDATE counters SET bytes = bytes + NEW.bytes, queries = queries + 1;
 END;
@@ -138,11 +136,6 @@ CREATE TRIGGER query_moved AFTER UPDATE OF reason ON queries BEGIN
     UPDATE counters SET queries = queries + (NEW.reason IS NULL) - (OLD.reason IS NULL),
         queries_refused = queries_refused + (NEW.reason IS NOT NULL) - (OLD.reason IS NOT NULL);
 END;
-"""
-
-# Schema 3: why frames were refused. `frames.reason` is '' then: as long as null, so that a frame is
-# set aside without being written again, for which a full disk has no room.
-_REASON_TABLES = """
 CREATE TABLE reasons (frame INTEGER PRIMARY KEY, reason TEXT NOT NULL);
 CREATE TRIGGER reason_removed AFTER DELETE ON frames WHEN OLD.reason IS NOT NULL BEGIN
     DELETE FROM reasons WHERE frame = OLD.id;
@@ -151,8 +144,6 @@ CREATE TRIGGER reason_retried AFTER UPDATE OF reason ON frames WHEN NEW.reason I
     DELETE FROM reasons WHERE frame = NEW.id;
 END;
 """
-#: Tables of later schemas than the first, by which.
-_LATER = ((2, _QUERY_TABLES), (3, _REASON_TABLES))
 #: What is told of a frame whose reason was not kept.
 _NO_REASON = "The service refused it; the disk had no room for its reason"
 
@@ -426,7 +417,7 @@ class Spool:
         """Frames that the service refused, oldest first, and then records of queries."""
         with self._transaction(write=False) as database:
             rows = database.execute(
-                "SELECT meta, coalesce(nullif(frames.reason, ''), reasons.reason, ?) FROM frames "
+                "SELECT meta, coalesce(reasons.reason, ?) FROM frames "
                 "LEFT JOIN reasons ON frame = id WHERE frames.reason IS NOT NULL ORDER BY id",
                 (_NO_REASON,),
             ).fetchall()
@@ -462,7 +453,7 @@ class Spool:
         413, 415, 422) is set aside with its reason, and the next one follows.
 
         Records of queries are sent first, each to the map that was asked; the service recognises
-        their ids. They wait on where the service is of a version that does not take them.
+        their ids.
 
         Parameters
         ----------
@@ -583,12 +574,8 @@ class Spool:
         with self._transaction(write=False) as database:
             query = "SELECT max(id) FROM queries WHERE reason IS NULL"
             last = database.execute(query).fetchone()[0]
-        try:
-            while last is not None and (found := self._oldest_queries(last)) is not None:
-                self._send_queries(target, *found, report)
-        except errors.SceneprintError as error:
-            if not _is_of_before(error):
-                raise
+        while last is not None and (found := self._oldest_queries(last)) is not None:
+            self._send_queries(target, *found, report)
 
     def _oldest_queries(self, last: int) -> tuple[str, list[_WaitingQuery]] | None:
         """A map, and the first records of it that wait, up to an id: as many as fit one request."""
@@ -673,25 +660,21 @@ class Spool:
             mark = database.execute("PRAGMA application_id").fetchone()[0]
             schema = database.execute("PRAGMA user_version").fetchone()[0]
             tables = database.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
-            if tables and not (mark == _APPLICATION and 1 <= schema <= _SCHEMA):
+            if tables and (mark, schema) != (_APPLICATION, _SCHEMA):
                 raise errors.UnusableStore(
-                    f"{self._path}: This is not a spool, or one of a later version. Name another "
-                    "file, or upgrade sceneprint-client."
+                    f"{self._path}: This is not a spool, or one of another version of "
+                    "sceneprint-client. Name another file, or use that version."
                 )
             if not tables:
                 for statement in _statements(_TABLES):
                     database.execute(statement)
                 database.execute(f"PRAGMA application_id = {_APPLICATION}")
+                database.execute(f"PRAGMA user_version = {_SCHEMA}")
                 database.execute(
                     "INSERT INTO counters (most_bytes) VALUES (?)", (most_bytes or MOST_BYTES,)
                 )
             elif most_bytes is not None:
                 database.execute("UPDATE counters SET most_bytes = ?", (most_bytes,))
-            missing = [one for first, one in _LATER if not tables or schema < first]
-            for statement in _statements("".join(missing)):
-                database.execute(statement)
-            if missing:
-                database.execute(f"PRAGMA user_version = {_SCHEMA}")
         self._reserve()
 
     def _reserve(self) -> None:
@@ -926,13 +909,6 @@ def _is_about_content(error: errors.SceneprintError) -> bool:
     if isinstance(error, errors.Refused):  # a proxy before the service, or a problem we do not know
         return error.status in (409, 413, 415, 422)
     return isinstance(error, (errors.FrameError, errors.Conflict, errors.InvalidRequest))
-
-
-def _is_of_before(error: errors.SceneprintError) -> bool:
-    """Whether a service says that it has no such route: it is of an earlier version."""
-    if isinstance(error, errors.Refused):
-        return error.status in (404, 405)
-    return type(error) is errors.NotFound
 
 
 def _persist(target: _Target, send: Callable[[], T]) -> T:

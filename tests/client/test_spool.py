@@ -26,6 +26,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, Spool, meta_of
 from sceneprint_client import spool as module
@@ -41,7 +42,6 @@ from sceneprint_client.errors import (
     UnreadableFrame,
     UnusableStore,
 )
-from sceneprint_client.http import frame_bytes
 from sceneprint_client.spool import SpoolPlace, pose_matrix, separation
 
 START = datetime(2026, 11, 26, 9, 0, tzinfo=UTC)
@@ -555,7 +555,7 @@ def test_kills_while_frames_are_added_and_uploaded_lose_and_double_nothing(
     assert waiting[:acknowledged] == said
     assert len(waiting) <= acknowledged + 1  # one may have been durable, and not acknowledged
     with child("sync", path, service_url, map_name, 1) as process:
-        out, _ = process.communicate(timeout=60)
+        out, _ = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, out) == (-signal.SIGKILL, b"")
     assert len(list(remote.frames(map_name))) == 64
     assert names(path) == waiting
@@ -602,7 +602,7 @@ def test_records_of_queries_reach_the_service_each_once(
     known = CameraIntrinsics(
         width=lens.width, height=lens.height, fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy
     )
-    copy.upload(map_name, references[0], meta_of(references[0]), wait_s=300)
+    copy.upload(map_name, references[0], meta_of(references[0]), wait_s=PATIENCE_S)
     asked = FrameMeta(intrinsics=known, robot="cart", session="monday")
     found = copy.query(map_name, references[0], asked)
     assert found.location is not None
@@ -629,35 +629,16 @@ def test_records_of_queries_reach_the_service_each_once(
         assert (now.queries, now.queries_sent, now.queries_discarded, now.bytes) == (0, 3, 0, 0)
 
 
-def test_a_spool_of_before_there_were_records_is_upgraded(
-    remote: Client, copy: Client, map_name: str, tmp_path: Path
-) -> None:
+def test_a_spool_of_another_version_is_left_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / "spool"
+    Spool(path).close()
     with closing(sqlite3.connect(path)) as database:
-        database.executescript(module._TABLES)
-        database.execute("INSERT INTO counters (most_bytes) VALUES (?)", (10 * CHARGE,))
-        text = meta(0, name="a").model_dump_json(exclude_defaults=True)
-        database.execute(
-            "INSERT INTO frames (digest, run, stamp, bytes, meta, data) VALUES (?, ?, ?, ?, ?, ?)",
-            ("d", "r", 0.0, CHARGE, text, frame_bytes(depth(1), meta(0), with_pose=True)[0]),
-        )
-        database.execute(f"PRAGMA application_id = {0x53705370}")
-        database.execute("PRAGMA user_version = 1")
+        database.execute("PRAGMA user_version = 2")
         database.commit()
-    ask(copy, map_name, 1)
-    with Spool(path) as spool:
-        assert (spool.status().waiting, spool.status().most_bytes) == (1, 10 * CHARGE)
-        assert spool.add_queries(copy) == 1
-        report = spool.sync(remote, map_name)
-        assert (report.received, report.queries) == (1, 1)
-    with Spool(path) as spool:
-        assert (spool.status().uploaded, spool.status().queries_sent) == (1, 1)
-    with closing(sqlite3.connect(path)) as database:
-        assert database.execute("PRAGMA user_version").fetchone() == (3,)
-        database.execute("PRAGMA user_version = 4")
-        database.commit()
-    with pytest.raises(UnusableStore, match="of a later version"):
+    before = path.read_bytes()
+    with pytest.raises(UnusableStore, match="of another version"):
         Spool(path)
+    assert path.read_bytes() == before
 
 
 def test_records_go_before_frames_and_the_oldest_first(
@@ -760,23 +741,6 @@ def record_text(path: Path, query_id: str) -> str:
         return text
 
 
-def test_records_wait_for_a_service_that_takes_them(
-    scripted: Callable[..., Any], copy: Client, map_name: str, tmp_path: Path
-) -> None:
-    """A service of before has no such route: frames go on, and records wait."""
-    problem = {"type": "/problems/not-found", "title": "", "status": 404, "detail": "No."}
-    frame = {"frame_id": "f", "job_id": "j", "state": "received"}
-    done = {"items": [{"status": 202, "frame": frame, "problem": None}]}
-    server = scripted([(404, {}, problem), (200, {}, done)])
-    ask(copy, map_name, 3)
-    with Client(server.url) as client, Spool(tmp_path / "spool") as spool:
-        spool.add(depth(1), meta())
-        spool.add_queries(copy)
-        assert spool.sync(client, map_name).received == 1
-        assert (spool.status().queries, spool.status().queries_refused) == (3, 0)
-    assert len(server.asked) == 2
-
-
 def test_a_clock_that_is_set_back_costs_no_record(
     remote: Client, copy: Client, map_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -812,14 +776,14 @@ def test_kills_and_a_full_disk_lose_and_double_no_record(
         assert spool.status().waiting == before.waiting
     for most in (0, 120, 249):
         with child("queries", path, folder, most) as process:
-            process.communicate(timeout=120)
+            process.communicate(timeout=PATIENCE_S)
         assert process.returncode == -signal.SIGKILL
     with Spool(path) as spool:
         spool.add_queries(copy)
         assert held(path) == ids
         assert spool.add_queries(copy) == 0
     with child("sync", path, service_url, map_name, 2) as process:
-        process.communicate(timeout=120)
+        process.communicate(timeout=PATIENCE_S)
     assert process.returncode == -signal.SIGKILL
     assert sum(1 for _ in remote.queries(map_name)) == 200
     assert held(path) == ids[100:]
@@ -852,7 +816,7 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
         first += len(numbers)  # one more may be durable: it is added again
     for _ in range(12):
         with child("queries", path, folder, chance.randrange(1200)) as process:
-            process.communicate(timeout=120)
+            process.communicate(timeout=PATIENCE_S)
         assert process.returncode == -signal.SIGKILL
     with Client.embedded(folder) as copy, Spool(path) as spool:
         spool.add_queries(copy)
@@ -884,7 +848,7 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
             records = [one.query_id for one in client.queries("hall")]
     finally:
         os.killpg(service.pid, signal.SIGTERM)
-        service.communicate(timeout=30)
+        service.communicate(timeout=PATIENCE_S)
     with Spool(path) as spool:
         now = spool.status()
     sys.stdout.write(f"{count} frames: {kills} kills, {full} full disks, {syncs} kills of sync\n")

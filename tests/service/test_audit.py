@@ -12,7 +12,7 @@ import pytest
 
 #: Operations that store nothing but an answer.
 READING = {
-    "ask", "ask_several", "ask_again", "localize", "localize_sequence", "compare", "sign_frame",
+    "ask", "ask_several", "ask_again", "localize", "localize_sequence", "compare",
 }  # fmt: skip
 
 
