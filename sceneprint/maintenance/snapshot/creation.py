@@ -224,6 +224,7 @@ def _create(
             progress(done, max(2 * source.bytes, done))
 
         source.copy(database, written)
+        database_copy.forget_answers(database)
         with database_copy.open_copy(database) as copy:
             draft = _draft(copy, source.place, begun, database.stat().st_size)
             if bases.known:

@@ -11,7 +11,7 @@ import hashlib
 import json
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -343,14 +343,13 @@ _USES_OF_SURFACES = " UNION ALL ".join(
     f" WHERE {column} IS NOT NULL"
     for column in ("blob", "draft")
 )
-#: Those of jobs, surfaces, deleted frames that can be restored and kept answers, by the tables that
-#: have them: an older database has none of these.
+#: Those of jobs, surfaces and deleted frames that can be restored, by the tables that have them: an
+#: older database has none of these.
 _MORE_USES = {
     "job_files": _USES_OF_JOBS,
     "surface_tiles": _USES_OF_SURFACES,
     "deleted_frames": "SELECT blob AS digest, frame_number AS number, 'deleted' AS role"
     " FROM deleted_frames WHERE blob IS NOT NULL",
-    "kept_answers": "SELECT blob AS digest, number, 'answer' AS role FROM kept_answers",
 }
 
 
@@ -440,6 +439,18 @@ def copy_database(source: Path, to: Path) -> None:
         ) from error
     if sealed is not None:
         sealed.check(before)
+
+
+def forget_answers(path: Path) -> None:
+    """Let no query of a copy have an answer in a file, as the archive has none of these.
+
+    Where the copy is damaged, whoever reads it says so.
+    """
+    with suppress(sqlite3.Error), closing(_connect(path, "mode=rw")) as file:
+        file.execute("DELETE FROM queries WHERE NOT listed AND kept_at IS NULL")
+        file.execute(
+            "UPDATE queries SET bytes = 0, shown = NULL WHERE bytes > 0 AND kept_at IS NULL"
+        )
 
 
 @contextmanager
@@ -589,15 +600,6 @@ def uses(connection: sqlite3.Connection, digest: str) -> tuple[BlobUse, ...]:
             (digest,),
         )
         found += [BlobUse(map=name, role="surface") for (name,) in rows]
-    if "kept_answers" in more:
-        rows = connection.execute(
-            "SELECT maps.name, kept_answers.id FROM kept_answers JOIN kept_answer_maps AS of"
-            " ON of.kept_number = kept_answers.number"
-            " JOIN maps ON maps.number = of.map_number WHERE CAST(blob AS TEXT) = ?"
-            " ORDER BY kept_answers.number, maps.number",
-            (digest,),
-        )
-        found += [BlobUse(map=name, query=query, role="answer") for name, query in rows]
     return tuple(found)
 
 
