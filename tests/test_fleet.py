@@ -265,7 +265,7 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         "plan": Plan(), "kills": Counter(service=2, primary=1),
         "outages": {"service": [1.25, 0.0], PRIMARY: [3.0]},
         "promotions": [Promotion(None, 10.0, 11.5, {"a": 0.5, "b": 2.0}, frozenset())],
-        "steps": (), "refused": Counter(), "waits_ms": {"query": (90.0, 1200.0)},
+        "waits_ms": {"query": (90.0, 1200.0)},
         "memory": (200_000_000, 100_000_000),
         "answers": Counter(found=3), "repeated": 4, "faults": [], "damaged": 0, "leftovers": 0,
         "lost": 0, "window": 0, "seconds": 99.0, "spooled": 0, "spooled_twice": 0,
@@ -349,19 +349,6 @@ def test_a_crowd_tells_what_it_met_with() -> None:
     )
     assert "frames that came to it: **2**." in told
     assert marks(plan)[0] == "<!-- fleet-crowd:begin -->"
-
-
-def test_an_upgrade_tells_its_steps_and_what_was_refused(tmp_path: Path) -> None:
-    plan = Plan(seconds=60.0, before=tmp_path)
-    found = Found(acknowledged=9, indexed=9, found=9)
-    told = "\n".join(table(figures(found, plan=plan, steps=["the database", "worker-1"])))
-    assert "### 8 robots for 60 s, the version before replaced" in told
-    assert "in this order: the database, worker-1.\n" in told
-    assert told.endswith("Requests refused (429, 503): none.\n")
-    refused = Counter({"upload 503": 2})
-    told = "\n".join(table(figures(found, plan=plan, refused=refused)))
-    assert told.endswith("Requests refused (429, 503): 2 of upload 503.\n")
-    assert marks(plan)[0] != marks(Plan())[0]
 
 
 def test_what_is_on_paper_is_multiplied_right() -> None:
