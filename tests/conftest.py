@@ -60,7 +60,7 @@ LONG = (
     "test_qdrant_search.py", "test_commands.py", "test_surfaces.py", "test_quality.py",
     "test_lookalikes.py", "test_stored_search.py", "test_lifecycle.py", "test_tracing.py",
     "test_hostile.py", "test_pulled_copies.py", "test_fleets.py", "test_fuzz.py",
-    "test_training.py", "test_survival.py", "test_robot_signatures.py", "test_work.py",
+    "test_training.py", "test_survival.py", "test_work.py",
     "test_recovery.py", "test_siege.py", "test_cli.py", "test_map_copy.py", "test_failover.py",
     "test_connections.py", "test_kill.py", "test_tracker.py", "test_purging.py",
     "test_associations.py", "test_evaluate.py", "test_equal_rooms.py", "test_shared_rates.py",

@@ -2,7 +2,7 @@
 
 Three ways: hadolint and the Compose schema read the files as they are written; rules of our own
 read what those do not know; and the steps of the image are run, each in turn, in a folder that
-stands for its file system. Every rule is shown a file that breaks it.
+stands for its file system.
 """
 
 from __future__ import annotations
@@ -128,19 +128,9 @@ def image_problems(text: str) -> list[str]:
         r"\b(apt-get|pip|gcc|make)\b", " ".join(s.rest for s in final(steps) if s.name == "RUN")
     ):
         found.append("the last stage installs or builds")
-    for step in steps:
-        if step.name == "FROM" and not re.fullmatch(
-            r"\S+:\d+\.\d+\S*-slim\S*( AS \w+)?", step.rest
-        ):
-            found.append(f"no slim base with its version: {step.rest}")
-        if step.name == "ADD":
-            found.append(f"ADD: {step.rest}")
-        if (
-            step.name == "RUN"
-            and "apt-get install" in step.rest
-            and "rm -rf /var/lib/apt/lists" not in step.rest
-        ):
-            found.append("lists of apt are left behind")
+    slim = r"\S+:\d+\.\d+\S*-slim\S*( AS \w+)?"
+    bases = [step.rest for step in steps if step.name == "FROM"]
+    found += [f"no slim base with its version: {x}" for x in bases if not re.fullmatch(slim, x)]
     uncached = {s.stage for s in steps if s.name == "ENV" and "PIP_NO_CACHE_DIR=1" in s.rest}
     if not {s.stage for s in steps if s.name == "RUN" and "pip" in s.rest} <= uncached:
         found.append("pip keeps its cache in a layer")
@@ -189,55 +179,8 @@ def test_hadolint_has_nothing_against_the_dockerfile() -> None:
     assert hadolint(DOCKERFILE) == []
 
 
-LAST_FROM = "\n\nFROM python:3.11-slim-bookworm\n"
-
-
-@pytest.mark.parametrize(
-    ("code", "old", "new"),
-    [
-        ("DL3007", LAST_FROM, "\n\nFROM python:latest\n"),
-        ("DL3006", LAST_FROM, "\n\nFROM python\n"),
-        ("DL3020", "COPY migrations", "ADD migrations"),
-        ("DL3025", 'CMD ["serve"]', "CMD serve"),
-        ("DL3009", "VOLUME", "RUN apt-get update\nVOLUME"),
-        ("DL3002", "USER 10001:10001", "USER root"),
-    ],
-)
-def test_hadolint_would_find(code: str, old: str, new: str) -> None:
-    assert code in hadolint(changed(DOCKERFILE, old, new))
-
-
 def test_our_rules_have_nothing_against_the_dockerfile() -> None:
     assert image_problems(DOCKERFILE) == []
-
-
-@pytest.mark.parametrize(
-    ("problem", "old", "new"),
-    [
-        ("ENTRYPOINT is not in exec form", 'ENTRYPOINT ["sceneprint"]', "ENTRYPOINT sceneprint"),
-        ("CMD is not in exec form", 'CMD ["serve"]', "CMD serve"),
-        ("0 CMD in the last stage", 'CMD ["serve"]', ""),
-        ("HEALTHCHECK is not in exec form", 'CMD ["python", "-c"', 'CMD python -c "'),
-        ("0 HEALTHCHECK in the last stage", "HEALTHCHECK", "LABEL"),
-        ("0 STOPSIGNAL in the last stage", "STOPSIGNAL SIGTERM", ""),
-        ("the image does not run as", "USER 10001:10001", "USER root"),
-        ("the image does not run as", "USER 10001:10001", "USER sceneprint"),
-        ("the image does not run as", "USER 10001:10001\n", ""),
-        ("what the last RUN makes", 'USER 10001:10001\n\n', ""),
-        ("the last stage installs or builds", "VOLUME", "RUN apt-get update\nVOLUME"),
-        ("no slim base with its version", LAST_FROM, "\n\nFROM python:latest\n"),
-        ("no slim base with its version", LAST_FROM, "\n\nFROM python:3.11\n"),
-        ("ADD:", "COPY migrations", "ADD migrations"),
-        ("lists of apt are left behind", "WORKDIR", "RUN apt-get install x\nWORKDIR"),
-        ("pip keeps its cache", "PIP_NO_CACHE_DIR=1", "PIP_NO_INPUT=1"),
-        ("ENV sets what nothing reads", "SCENEPRINT_PORT=8008", "SCENEPRINT_PROT=8008"),
-    ],
-)  # fmt: skip
-def test_our_rules_would_find(problem: str, old: str, new: str) -> None:
-    text = changed(DOCKERFILE, old, new)
-    if problem == "what the last RUN makes":  # USER after the last RUN
-        text = changed(text, "VOLUME", "USER 10001:10001\nVOLUME")
-    assert [found for found in image_problems(text) if found.startswith(problem)] != []
 
 
 def test_the_image_says_what_it_is() -> None:
@@ -404,49 +347,10 @@ def parses(code: str) -> bool:
     return True
 
 
-PUBLISHED = "127.0.0.1:${SCENEPRINT_PUBLISHED_PORT:-8008}"
-
-
 def test_our_rules_have_nothing_against_the_composition() -> None:
     assert compose_problems(COMPOSE) == []
     fleet = {"database", "objects", "bucket", "api", "signer", "proxy"}
     assert set(composed()["services"]) == {"service", "worker", *fleet}
-
-
-@pytest.mark.parametrize(
-    ("problem", "old", "new"),
-    [
-        ("service: volume date is not declared", "- data:/data", "- date:/data"),
-        ("worker: volume cache is not declared", "\n  cache:\n", "\n"),
-        ("worker: nothing reads SCENEPRINT_WORKER", 'PRINT_WORKERS: "1"', 'PRINT_WORKER: "1"'),
-        ("worker: 1 validation error", 'SCENEPRINT_WORKERS: "1"', 'SCENEPRINT_WORKERS: "many"'),
-        ("service: 8008:8008 is not published to", PUBLISHED, "8008"),
-        ("service: 0.0.0.0:8008:8008 is not", PUBLISHED, "0.0.0.0:8008"),
-        ("worker: does not wait until service", "service_healthy", "service_started"),
-        ("service: read_only is False", "read_only: true", "read_only: false"),
-        ("worker: init is None", "init: true", "x-init: true"),
-        ("service: cap_drop is ['NET_RAW']", "- ALL", "- NET_RAW"),
-        ("service: security_opt is ['no-new", "privileges:true", "privileges:false"),
-        ("worker: restart is 'no'", "restart: unless-stopped", 'restart: "no"'),
-        ("service: limits only ['cpus', 'memory']", "          pids: 256\n", ""),
-        ("worker: the health check is no Python", "sys.exit(not any(", "sys.exit(not any"),
-        ("database: POSTGRES_PASSWORD_FILE names no", "/run/secrets/database_password  #", "/x  #"),
-        ("api: PGPASSWORD_FILE names no secret", "    - database_password\n  depends", "  depends"),
-        ("api: nothing reads PGPASS_FILE", "PGPASSWORD_FILE", "PGPASS_FILE"),
-        ("objects: ROOT_SECRET_KEY has a default", "SCENEPRINT_OBJECTS_SECRET:-", "X:-secret"),
-        ("database: pgvector/pgvector has no version", ":0.8.6-pg18-trixie", ""),
-        ("objects: no health check in exec form", '["CMD", "wget"', '["wget"'),
-        ("objects: does not wait until bucket", "service_completed_successf", "service_f"),
-        ("api: does not wait until objects", "service_healthy", "service_started"),
-        ("signer: is of no profile", "profiles: [fleet]", "profiles: [robots]"),
-        ("proxy: ./docs/haproxy.cfg:", "./docs/deployment/haproxy", "./docs/haproxy"),
-        ("proxy: ./docs/deployment/haproxy.cfg:", "haproxy.cfg:ro", "haproxy.cfg"),
-        ("api: nothing reads SCENEPRINT_BLOBS", "SCENEPRINT_BLOB_URL", "SCENEPRINT_BLOBS"),
-    ],
-)  # fmt: skip
-def test_our_rules_would_find_in_a_composition(problem: str, old: str, new: str) -> None:
-    found = compose_problems(changed_all(COMPOSE, old, new))
-    assert [one for one in found if one.startswith(problem)] != [], found
 
 
 def by_schema(path: Path) -> subprocess.CompletedProcess[str]:
@@ -535,10 +439,6 @@ def parts_of(shell: str) -> list[str]:
     for word in words:
         parts.append([]) if word == "&&" else parts[-1].append(word)
     return [" ".join(part) for part in parts]
-
-
-def test_commands_are_parted_where_the_shell_parts_them() -> None:
-    assert parts_of("a -b 'c && d' > e && f") == ["a -b 'c && d' > e", "f"]
 
 
 def base_environment(folder: Path) -> dict[str, str]:

@@ -20,7 +20,6 @@ from typing import cast
 import httpx
 import pytest
 
-from sceneprint.cli import parser
 from sceneprint.decoders import sandbox
 from sceneprint.settings import Settings
 from sceneprint_client.errors import StoreAway
@@ -296,22 +295,6 @@ def test_a_shell_reads_the_environment_as_systemd_does() -> None:
     assert sourced.items() >= settings_of("\n".join(expected)).items()
     url = "postgresql+psycopg://sceneprint@/sceneprint?host=db1.example:5432&host=db2.example:5432"
     assert sourced["SCENEPRINT_DATABASE_URL"] == f"{url}&target_session_attrs=read-write"
-
-
-def test_units_are_alike_but_for_what_they_run() -> None:
-    api, worker = (path.read_text().splitlines() for path in UNITS)
-    assert set(api) ^ set(worker) == {
-        api[0],
-        worker[0],
-        "Description=sceneprint: place recognition over HTTP",
-        "Description=sceneprint: workers that sign frames",
-        "Environment=SCENEPRINT_WORKERS=0",
-        "ExecStart=/opt/sceneprint/bin/sceneprint serve",
-        "ExecStart=/opt/sceneprint/bin/sceneprint work",
-    }
-    known = parser().format_help()
-    assert re.search(r"^ +serve ", known, re.MULTILINE)
-    assert re.search(r"^ +work ", known, re.MULTILINE)
 
 
 def test_the_page_names_every_file() -> None:

@@ -25,7 +25,7 @@ def marks(plan: Plan) -> tuple[str, str]:
     name = "fleet-asynchronous" if plan.asynchronous else "fleet"
     if plan.delays:
         name = "fleet-delays"
-    if plan.signed:
+    if plan.is_crowd:
         name = "fleet-crowd"
     return f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
 
@@ -41,7 +41,6 @@ def table(figures: FleetFigures) -> list[str]:
             f" (a message to the database takes {1e3 * DATABASE_S:g} ms, one to the store "
             f"{1e3 * STORE_S:g} ms)"
         )
-    sent = "send their signatures along, as recorded" if plan.signed else "leave signing to workers"
     killed = {name: n for name, n in figures.kills.items() if name not in (FROZEN, CUT_OFF)}
     done = "SIGKILL of " + ", ".join(f"{n} of {name}" for name, n in sorted(killed.items()))
     lines = [
@@ -49,7 +48,7 @@ def table(figures: FleetFigures) -> list[str]:
         "",
         f"PostgreSQL with {standby} standby, {plan.services} services, {plan.workers} workers, "
         f"blobs in {blobs}{delayed}; {plan.robots:,} robots send {plan.rate:g} frames a second "
-        f"each, and {sent}. {done}.",
+        f"each. {done}.",
         *_more(plan),
         "",
         "| | |",
@@ -151,7 +150,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--partitions", type=int, default=plan.partitions, help="of a host")
     parser.add_argument("--offline", type=int, default=plan.offline, help="frames of a spool")
     parser.add_argument("--retention-s", type=float, help="of maps of single robots")
-    parser.add_argument("--signed", action="store_true", help="robots sign their frames")
     parser.add_argument("--objects", action="store_true", help="blobs in an object store")
     parser.add_argument("--delays", action="store_true", help="messages to the servers take time")
     parser.add_argument(

@@ -9,7 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 
@@ -20,12 +20,8 @@ from benchmarks.fleet.failover_client import PAUSE_S
 from benchmarks.fleet.postgres_pair import Pair
 from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.soak.load import Part, free_port
-from sceneprint.engine.jobs.robot_signatures import FIRST
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
-from sceneprint.store.database import reach_database
-from sceneprint.store.keys import find_named_key
-from sceneprint.store.sender_rows import add_verified
 
 #: Seconds for all service processes to begin, on a machine that is busy with much else.
 PATIENCE_S = 180.0
@@ -52,16 +48,15 @@ class Fleet:
     objects : keep blobs in an object store, and not in a folder that all hosts share
     delays : let messages to the database take DATABASE_S, and those to the object store STORE_S
     partitions : whether `partitioned` is asked for
-    trusting : whether signatures of robots are used
+    surfaces : whether maps get surfaces
     """
 
     def __init__(
         self, folder: Path, services: int, workers: int, *, synchronous: bool, objects: bool,
-        delays: bool = False, partitions: bool = False,
-        trusting: bool = False,
+        delays: bool = False, partitions: bool = False, surfaces: bool = True,
     ) -> None:  # fmt: skip
         self.folder = folder
-        self._delays, self._partitions, self._trusting = delays, partitions, trusting
+        self._delays, self._partitions, self._surfaces = delays, partitions, surfaces
         #: By which each host reaches the servers, where it does not reach them itself.
         self._networks: list[list[DelayProxy]] = []
         (folder / "database").mkdir()
@@ -85,8 +80,8 @@ class Fleet:
         self._shared |= SETTINGS | {
             "SCENEPRINT_DATABASE_URL": self.pair.url, "SCENEPRINT_BLOB_URL": blobs
         }  # fmt: skip
-        if self._trusting:  # of many walks in one map nobody wants a surface
-            self._shared |= {"SCENEPRINT_TRUST_SIGNATURES": "1", "SCENEPRINT_SURFACES": "asked"}
+        if not self._surfaces:
+            self._shared |= {"SCENEPRINT_SURFACES": "asked"}
         made = subprocess.run(
             [sys.executable, "-c", _MAKE_KEY, str(self.host)], check=True, text=True,
             env=self.environment(), stdout=subprocess.PIPE,
@@ -137,14 +132,6 @@ class Fleet:
         finally:
             for proxy in self._networks[host]:
                 proxy.thaw()
-
-    def trust(self, keys: Sequence[str]) -> None:
-        """Let workers take the signatures of keys unseen, as after many that were right."""
-        with closing(reach_database(self.pair.url)) as database:
-            for name in keys:
-                with database.write() as connection:
-                    for _ in range(FIRST):
-                        add_verified(connection, find_named_key(connection, name).id)
 
     def memory(self) -> tuple[int, int]:
         """Most bytes that a process of the services, and one of the workers, ever had."""

@@ -166,8 +166,6 @@ class Crowd:
         shot = robot.walk[number]
         meta = shot.meta.model_copy(update={"robot": robot.name, "session": robot.name})
         sent, begun = frame_form(shot.png, meta), time.monotonic()
-        if shot.signed is not None:
-            sent["files"]["signed"] = ("signed", shot.signed, "application/octet-stream")
         response = client.ask(
             "upload", "POST", f"/v1/maps/{robot.map_name}/frames",
             headers=bearer(robot.key) | {"Idempotency-Key": f"{robot.name}-{number}"}, **sent,

@@ -6,7 +6,6 @@ drive(folder, Plan)  -->  FleetFigures
 from __future__ import annotations
 
 import random
-import tempfile
 import threading
 import time
 from collections import Counter
@@ -26,7 +25,7 @@ from benchmarks.fleet.faults import CUT_OFF_S, FaultInjector, Kill, Promotion, s
 from benchmarks.fleet.fleet import Fleet, await_service
 from benchmarks.fleet.lock_samples import LockSampler, LockShares
 from benchmarks.fleet.postgres_pair import DATABASE
-from benchmarks.fleet.recordings import Shot, recordings, sign, walks
+from benchmarks.fleet.recordings import Shot, recordings, walks
 from benchmarks.fleet.robots import (
     OFFLINE_PATIENCE_S,
     Crowd,
@@ -47,6 +46,8 @@ OFFLINE_MAP, OFFLINE = "fleet-offline", 0.4
 PATIENCE_S = 240.0
 #: Least part of the time for which locks have to be sampled.
 SAMPLED = 0.5
+#: Robots of a crowd, at least.
+CROWD = 100
 #: Threads that drive the robots.
 DRIVERS = 32
 
@@ -65,7 +66,6 @@ class Plan:
     offline : frames that one more robot spools before it has a network; 0: there is none
     retention_s : for which maps of single robots keep a frame, while the shared one keeps all;
         None: they do too
-    signed : whether robots send what signing made of their frames, which workers then take
     seed : of victims and moments
     services, workers : processes
     asynchronous : the standby does not have to have received what is acknowledged
@@ -88,7 +88,6 @@ class Plan:
     partitions: int = 0
     offline: int = 0
     retention_s: float | None = None
-    signed: bool = False
     most_turn_ms: float = 25.0
     most_query_ms: float = 1e3 * (SILENCE_S + 5)
     most_bytes: int = 1 << 30
@@ -99,6 +98,11 @@ class Plan:
     objects: bool = False
     delays: bool = False
     data: Path | None = None
+
+    @property
+    def is_crowd(self) -> bool:
+        """Whether so many robots walk that no map of theirs is to have a surface."""
+        return self.robots >= CROWD
 
     @property
     def frames(self) -> int:
@@ -206,13 +210,10 @@ def drive(folder: Path, plan: Plan) -> FleetFigures:
         walked = walks(data, plan.robots + extra, plan.frames)
     spooled = [shot for walk in walked[plan.robots :] for shot in walk][: plan.offline]
     walked = walked[: plan.robots]
-    if plan.signed:
-        with tempfile.TemporaryDirectory() as signing:
-            walked = sign(walked, MODEL, Path(signing))
     fleet = Fleet(
         folder, plan.services, plan.workers, synchronous=not plan.asynchronous,
         objects=plan.objects, delays=plan.delays,
-        partitions=plan.partitions > 0, trusting=plan.signed,
+        partitions=plan.partitions > 0, surfaces=not plan.is_crowd,
     )  # fmt: skip
     try:
         return _Run(fleet, plan, walked, spooled, begun).figures()
@@ -242,8 +243,6 @@ class _Run:
             offline = self._offline_robot(clients[0])
             if offline:
                 listeners.append(self._listener(clients[0], OFFLINE_MAP))
-            if plan.signed:
-                fleet.trust([robot.name for robot in robots])
             injector = FaultInjector(
                 fleet, partial(_answers, key=key, shot=self._walked[0][0]), self._rng,
                 plan.asynchronous,

@@ -81,7 +81,7 @@ def test_frames_of_several_maps_are_taken_in_their_order(
     server_store: Store, rows: list[MapRow]
 ) -> None:
     database, (a, b, c) = server_store.database, rows
-    given = [new(c, 5), new(a, 9), new(b, 9, bytes=70, more_bytes=7), new(a, 1), new(c, 4)]
+    given = [new(c, 5), new(a, 9), new(b, 9, bytes=77), new(a, 1), new(c, 4)]
     assert receive(database, *given) == [True] * 5
     assert content_of(database) == [
         (one.row.number, one.values["content_id"], one.job_id) for one in given

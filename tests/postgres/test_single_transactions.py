@@ -6,7 +6,6 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,6 @@ from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import add_map, find_map, frame_of, keep_model
 from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.sender_rows import distrust_sender
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame
 from sceneprint.store.tables import (
     FrameRow,
@@ -170,23 +168,6 @@ def test_an_upload_and_a_signature_take_one_round_trip_each(
     with database.read() as connection:
         counts = select(frames.c.state, func.count()).group_by(frames.c.state)
         assert [tuple(one) for one in connection.execute(counts)] == [("indexed", 9)]
-
-
-def test_a_signature_of_a_distrusted_sender_is_not_taken(server_store: Store, row: MapRow) -> None:
-    """As where the sender is found to be wrong between a worker's look and its commit."""
-    database = server_store.database
-    upload(database, row, 1)
-    job, frame = claimed(database)
-    made = StoredSignature(MODEL, bytes(400), "00" * 32, [1], [1], sender="ab" * 16)
-    with database.write() as connection:
-        distrust_sender(connection, "ab" * 16, "hall", "x")
-    with database.write(map_number=frame.map_number, single=True) as connection:
-        assert not index_claimed_frame(connection, job, frame, "hall", made, single=True)
-    with database.read() as connection:
-        assert connection.execute(select(func.count()).select_from(signatures)).scalar_one() == 0
-    other = replace(made, sender="cd" * 16)
-    with database.write(map_number=frame.map_number, single=True) as connection:
-        assert index_claimed_frame(connection, job, frame, "hall", other, single=True)
 
 
 def test_it_is_committed_with_its_answer_and_keeps_no_turn(

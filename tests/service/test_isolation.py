@@ -97,7 +97,6 @@ OF_A_MAP = {
     ),
     "POST /v1/maps/{map_name}/localize": Case(body={"frame_id": "{frame}"}),
     "POST /v1/maps/{map_name}/localize/sequence": Case(),
-    "POST /v1/maps/{map_name}/signatures": Case(),
     "POST /v1/queries": Case(body={"maps": [OWN, "{map}"], "frame": FRAME}),
     "POST /v1/similarity": Case(body={"frame_a": FRAME, "frame_b": FRAME}),
     "GET /v1/queries": Case(query={"map": "{map}"}),
