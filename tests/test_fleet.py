@@ -21,6 +21,7 @@ from benchmarks.fleet.qdrant_search import measure as measure_qdrant
 from benchmarks.fleet.recordings import GRIDS, walks
 from benchmarks.fleet.robots import Kept, Listener
 from benchmarks.fleet.run import FleetFigures, Plan, drive
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
 from sceneprint.store import open_store
@@ -152,7 +153,7 @@ def test_what_is_not_there_is_seen(
     [walk] = walks(recording, 1, 5)
     with Client.embedded(tmp_path) as client:
         client.create_map("fleet", model="depth")
-        added = [client.upload("fleet", one.png, one.meta, wait_s=60) for one in walk[:4]]
+        added = [client.upload("fleet", one.png, one.meta, wait_s=PATIENCE_S) for one in walk[:4]]
         waiting = client.upload("fleet", walk[4].png, walk[4].meta)
         kept = [
             Kept(one.frame_id, "fleet", shot, 0.0)
