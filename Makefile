@@ -122,8 +122,8 @@ fleet: $(STAMP) kernels
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --asynchronous
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --objects --delays --freezes 2
-	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --objects --delays --signed \
-		--robots 1000 --rate 0.006 --seconds 200 --kills 12 --promotions 1 --freezes 1 \
+	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --objects --delays \
+		--robots 1000 --rate 0.003 --seconds 200 --kills 12 --promotions 1 --freezes 1 \
 		--partitions 2 --retention-s 40 --offline 360
 
 models: $(STAMP)

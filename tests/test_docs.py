@@ -311,26 +311,6 @@ def definitions(path: Path) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize(
-    ("walk", "first", "last", "steps"),
-    [
-        ("upload", "service/middleware.py", "sceneprint/store/signatures.py", 17),
-        ("query", "service/routes/queries.py", "sceneprint/engine/results/query_history.py", 12),
-        ("deletion", "service/routes/frames.py", "sceneprint/engine/upkeep/purge.py", 6),
-        ("re-encoding", "service/routes/admin.py", "sceneprint/store/signatures.py", 4),
-    ],
-)
-def test_requests_are_walked_through_step_by_step(
-    walk: str, first: str, last: str, steps: int
-) -> None:
-    (part,) = re.findall(rf"^## One {walk}\n(.*?)(?=^## )", ARCHITECTURE, re.M | re.S)
-    rows = re.findall(r"^\| (\d+) \|.*$", part, re.MULTILINE)
-    assert [int(one) for one in rows] == list(range(1, steps + 1))
-    files = re.findall(r"`((?:sceneprint|service|worker)/[\w/]+\.py):", part)
-    assert first in files
-    assert last in files
-
-
 def test_documented_camera_is_valid_json() -> None:
     from sceneprint.formats.dataset import Camera
     from sceneprint.types import Intrinsics

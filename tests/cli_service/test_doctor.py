@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from pydantic import SecretStr
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint import __version__
 from sceneprint.cli import checks, doctor
 from sceneprint.cli.checks import (
@@ -50,7 +51,7 @@ def verdicts(text: str) -> dict[str, str]:
 def working(service_url: str) -> str:
     """The service, whose worker has begun: that is a while after it answers."""
     with Client(service_url) as client:
-        until = time.monotonic() + 300
+        until = time.monotonic() + PATIENCE_S
         while not client.stats(minutes=1).workers:
             assert time.monotonic() < until
             time.sleep(0.1)
