@@ -1,7 +1,7 @@
-"""Behaviour frozen in tests/golden: the API, the options of every command, signatures, an answer.
+"""Behaviour frozen in tests/golden: the API, the help of every command, signatures, an answer.
 
-What moves files or names must change none of it. Where a change is wanted, write the files again
-with SCENEPRINT_UPDATE_GOLDEN=1, and say in CHANGELOG.md what users will see.
+Moving files or renaming code must change none of it. After an intended change, write the files
+again with `make goldens`, read their diff, and say in CHANGELOG.md what users will see.
 """
 
 from __future__ import annotations
@@ -9,6 +9,11 @@ from __future__ import annotations
 import argparse
 import json
 import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from copy import deepcopy
+from difflib import unified_diff
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +28,12 @@ from sceneprint.types import DepthFrame, Floats, Intrinsics
 from service.app import create_app
 
 GOLDEN = Path(__file__).parent / "golden"
+UPDATE = os.environ.get("SCENEPRINT_UPDATE_GOLDEN") == "1"
+
+#: Parts of an OpenAPI document of which each member has a line of its own.
+LISTED = {"shared", "paths", "parameters", "responses", "schemas", "properties"}
+#: Characters up to which a part stays on one line.
+LINE = 400
 
 #: Lower and upper corners of boxes in a room of 6 x 5 x 2.7 m, metres; z is up.
 BOXES = (
@@ -40,14 +51,188 @@ VIEWS = {
     "window again": (3.7, 1.4, 1.45, 2.35),
     "door": (1.2, 3.9, 1.5, -0.7),
 }
+PRESETS = ("depth", "lidar", "paper")
+#: Bytes of a signature that are frozen: all of `depth` and `lidar`, the first of `paper`.
+FROZEN = 2048
+#: Bytes of a signature on one line.
+ROW = 64
 
 
-def golden(name: str, value: Any) -> Any:
-    """What tests/golden holds; with SCENEPRINT_UPDATE_GOLDEN=1 it holds `value` from now on."""
-    path = GOLDEN / f"{name}.json"
-    if os.environ.get("SCENEPRINT_UPDATE_GOLDEN") == "1":
-        path.write_text(json.dumps(value, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    return json.loads(path.read_text(encoding="utf-8"))
+def golden(name: str, lines: Sequence[str]) -> list[str]:
+    """Return the lines of a file of tests/golden, after writing them if an update is wanted."""
+    path = GOLDEN / name
+    if UPDATE:
+        path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    return path.read_text(encoding="utf-8").splitlines()
+
+
+def assert_golden(name: str, lines: Sequence[str]) -> None:
+    """Assert that a file of tests/golden has exactly these lines."""
+    kept = golden(name, lines)
+    assert kept == lines, "\n".join(unified_diff(kept, lines, name, "now", n=0, lineterm=""))
+
+
+# The document of the API ------------------------------------------------------------------------
+
+
+def shortened(document: dict[str, Any]) -> dict[str, Any]:
+    """Return a document in which parameters and responses that operations share stand once.
+
+    An operation names a shared parameter in place of describing it, and lists the statuses of its
+    shared responses under `shared`.
+    """
+    document = deepcopy(document)
+    operations = [one for methods in document["paths"].values() for one in methods.values()]
+    shared: dict[str, dict[str, Any]] = {"parameters": {}, "responses": {}}
+    parameters = Counter(
+        (one["name"], json.dumps(one, sort_keys=True))
+        for operation in operations
+        for one in operation.get("parameters", ())
+    )
+    responses = Counter(
+        (status, json.dumps(one, sort_keys=True))
+        for operation in operations
+        for status, one in operation["responses"].items()
+        if status[0] != "2"  # what an operation is for is read with it
+    )
+    for part, found in (("parameters", parameters), ("responses", responses)):
+        for (name, text), count in sorted(found.items(), key=lambda item: (-item[1], item[0])):
+            if count > 1:
+                shared[part].setdefault(name, json.loads(text))
+    for operation in operations:
+        if "parameters" in operation:
+            operation["parameters"] = [
+                one["name"] if shared["parameters"].get(one["name"]) == one else one
+                for one in operation["parameters"]
+            ]
+        answers = operation["responses"]
+        same = [status for status in answers if shared["responses"].get(status) == answers[status]]
+        operation["responses"] = {
+            **{status: one for status, one in answers.items() if status not in same},
+            "shared": sorted(same),
+        }
+    return {"shared": shared, **document}
+
+
+def expanded(document: dict[str, Any]) -> dict[str, Any]:
+    """Return the document that `shortened` shortened."""
+    shared = document["shared"]
+    expanded = {key: value for key, value in deepcopy(document).items() if key != "shared"}
+    for methods in expanded["paths"].values():
+        for operation in methods.values():
+            if "parameters" in operation:
+                operation["parameters"] = [
+                    shared["parameters"][one] if isinstance(one, str) else one
+                    for one in operation["parameters"]
+                ]
+            for status in operation["responses"].pop("shared"):
+                operation["responses"][status] = shared["responses"][status]
+    return expanded
+
+
+def json_text(value: Any, key: str = "", depth: int = 0) -> str:
+    """Return a JSON value as lines that can be read and compared.
+
+    A value has one line if that is short, or if nothing within it is listed (`LISTED`). Any other
+    has one for all its short members, and one or more for each of the rest.
+    """
+    start = " " * depth + (f"{json.dumps(key)}: " if key else "")
+    flat = start + json.dumps(value, sort_keys=True, ensure_ascii=False)
+    if depth and (len(flat) <= LINE or not (key in LISTED or holds_list(value))):
+        return flat
+    if isinstance(value, list):
+        opening, closing = "[]"
+        members = [json_text(one, "", depth + 1) for one in value]
+        short = [isinstance(one, str) for one in value]
+    else:
+        opening, closing = "{}"
+        members = [json_text(value[name], name, depth + 1) for name in sorted(value)]
+        if depth and key not in LISTED:
+            members.sort(key=lambda text: "\n" in text)
+        short = [depth > 0 and key not in LISTED and "\n" not in text for text in members]
+    parts: list[str] = []
+    for together, group in groupby(zip(short, members, strict=True), key=lambda pair: pair[0]):
+        texts = [text for _, text in group]
+        first = " " * (depth + 1) + ", ".join(text.strip() for text in texts)
+        parts += [first] if together else texts
+    return start + opening + ",\n".join(parts).lstrip() + closing
+
+
+def holds_list(value: Any) -> bool:
+    """Return whether something within a JSON value is listed."""
+    if isinstance(value, dict):
+        return any(key in LISTED or holds_list(one) for key, one in value.items())
+    return isinstance(value, list) and any(holds_list(one) for one in value)
+
+
+def test_the_document_of_the_api(tmp_path: Path) -> None:
+    document = create_app(Settings(data_dir=tmp_path)).openapi()
+    document["info"].pop("version")
+    text = json_text(shortened(document))
+    # the shorter form loses nothing
+    assert expanded(json.loads(text)) == json.loads(json.dumps(document))
+    assert_golden("openapi.json", text.splitlines())
+
+
+# The command line -------------------------------------------------------------------------------
+
+
+def help_lines(command: argparse.ArgumentParser) -> Iterator[str]:
+    """Yield the help of a command and its subcommands.
+
+    Not as argparse writes it, which differs between versions of Python.
+    """
+    yield f"{command.prog}: {' '.join((command.description or '').split())}".rstrip(": ")
+    for exclusive in command._mutually_exclusive_groups:
+        names = " | ".join(option_name(action) for action in exclusive._group_actions)
+        yield f"  {'exactly' if exclusive.required else 'at most'} one of {names}"
+    for section in command._action_groups:
+        if section.description:
+            yield f"  {section.title}: {section.description}"
+        yield from (f"  {option_line(action)}" for action in section._group_actions)
+    yield from (f"  | {line}" for line in (command.epilog or "").splitlines())
+    subcommands = [one for one in command._actions if isinstance(one, argparse._SubParsersAction)]
+    for one in subcommands:
+        yield from (f"    {option_line(choice)}" for choice in one._choices_actions)
+        for subcommand in one.choices.values():
+            yield ""
+            yield from help_lines(subcommand)
+
+
+def option_name(action: argparse.Action) -> str:
+    return ", ".join(action.option_strings) or str(action.metavar or action.dest)
+
+
+def option_line(action: argparse.Action) -> str:
+    """Return an option with its value, how often it may be there, its default and its help."""
+    words = [option_name(action)]
+    if action.option_strings and isinstance(action.metavar, str):
+        words.append(action.metavar)
+    if action.choices is not None and not isinstance(action, argparse._SubParsersAction):
+        words.append("{" + ",".join(str(one) for one in action.choices) + "}")
+    if action.nargs not in (0, None, argparse.PARSER):
+        words.append(f"[nargs {action.nargs}]")
+    if action.required and action.option_strings:
+        words.append("[required]")
+    if isinstance(action, argparse._AppendAction):
+        words.append("[repeatable]")
+    if action.default not in (None, False, [], argparse.SUPPRESS):
+        words.append(f"[default {action.default}]")
+    help_text = "[hidden]" if action.help == argparse.SUPPRESS else action.help or ""
+    return f"{' '.join(words)}: {help_text}".rstrip(": ")
+
+
+def test_the_help_of_every_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: None)  # some defaults depend on this machine
+    for variable in ("SCENEPRINT_URL", "SCENEPRINT_KEY"):
+        monkeypatch.delenv(variable, raising=False)
+    top = parser()
+    (commands,) = (a for a in top._actions if isinstance(a, argparse._SubParsersAction))
+    assert list(commands.choices) == list(COMMANDS)
+    assert_golden("commands.txt", [*help_lines(top)])
+
+
+# Signatures and an answer -----------------------------------------------------------------------
 
 
 def pose_of(x: float, y: float, z: float, yaw: float) -> Floats:
@@ -77,44 +262,14 @@ def view(name: str) -> DepthFrame:
     return make_frame(samples, k, name=name, pose=T)
 
 
-def options_of(command: argparse.ArgumentParser) -> list[dict[str, Any]]:
-    return [
-        {
-            "flags": list(action.option_strings),
-            "name": action.metavar if isinstance(action.metavar, str) else action.dest,
-            "choices": None if action.choices is None else [str(one) for one in action.choices],
-            "nargs": action.nargs,
-            "required": action.required,
-            "help": action.help,
-        }
-        for action in command._actions
-    ]
-
-
-def test_the_document_of_the_api(tmp_path: Path) -> None:
-    document = create_app(Settings(data_dir=tmp_path)).openapi()
-    document["info"].pop("version")
-    assert json.loads(json.dumps(document)) == golden("openapi", document)
-
-
-def test_the_options_of_every_command() -> None:
-    top = parser()
-    (commands,) = (a for a in top._actions if isinstance(a, argparse._SubParsersAction))
-    found = {name: options_of(command) for name, command in commands.choices.items()}
-    assert sorted(found) == sorted(COMMANDS)
-    assert found == golden("commands", found)
-
-
-@pytest.mark.parametrize("preset", ["depth", "lidar", "paper"])
+@pytest.mark.parametrize("preset", PRESETS)
 def test_signatures(preset: str) -> None:
     signer = pipeline.open_signer(preset)
-    made = {name: pipeline.sign(view(name), signer).vector for name in VIEWS}
-    kept = golden(
-        f"signatures-{preset}",
-        {name: [int(x) for x in vector[:2048]] for name, vector in made.items()},
-    )
-    for name, vector in made.items():
-        off = np.abs(vector[:2048].astype(int) - np.array(kept[name]))
+    for name in VIEWS:
+        made = pipeline.sign(view(name), signer).vector[:FROZEN]
+        rows = [made[i : i + ROW].tobytes().hex() for i in range(0, len(made), ROW)]
+        kept = golden(f"signatures/{preset}-{name.replace(' ', '-')}.hex", rows)
+        off = np.abs(made.astype(int) - np.frombuffer(bytes.fromhex("".join(kept)), np.uint8))
         # floating sums differ between processors: a component in a hundred may round otherwise
         assert off.max() <= 1, name
         assert (off == 0).mean() >= 0.99, name
@@ -135,7 +290,7 @@ def test_an_answer() -> None:
             "plane_overlap": round(one.plane_overlap, 6),
             "T": None if one.T_match_query is None else one.T_match_query.round(6).tolist(),
         }
-    kept = golden("answer", found)
+    kept = json.loads("\n".join(golden("answer.json", json_text(found).splitlines())))
     assert {n: (f["status"], f["strength"]) for n, f in found.items()} == {
         n: (f["status"], f["strength"]) for n, f in kept.items()
     }

@@ -25,8 +25,6 @@ PRIMARY, FROZEN, CUT_OFF = "primary", "frozen primary", "network of a host"
 FROZEN_S = 5.0
 #: Seconds for which a host does not reach the servers: longer than workers have a job for.
 CUT_OFF_S = 12.0
-#: Seconds for which an old primary is back: a service and a worker begin anew meanwhile.
-BACK_S = 10.0
 #: Part of the time before the first and after the last kill.
 CALM = 0.1
 #: Seconds until a killed part begins again; and until somebody promotes the standby.
@@ -55,7 +53,6 @@ class Promotion:
     killed, promoted : when
     resumed : by address of a service, seconds until it answered a query again
     unreceived : ids of the frames that the standby had not received
-    astray : ids of the frames that came to the old primary when it was back; None: it was not
     """
 
     stalled: float | None
@@ -63,7 +60,6 @@ class Promotion:
     promoted: float
     resumed: dict[str, float]
     unreceived: frozenset[str]
-    astray: frozenset[str] | None = None
 
 
 def schedule(
@@ -91,14 +87,12 @@ class FaultInjector:
     asked : a query that any service must answer
     rng : of the victims
     asynchronous : whether a standby is first cut off from its primary
-    returns : whether the old primary comes back as it was, before it follows the new one
     """
 
     fleet: Fleet
     asked: Callable[[str], bool]
     rng: random.Random
     asynchronous: bool = False
-    returns: bool = False
     kills: list[Kill] = field(default_factory=list)
     promotions: list[Promotion] = field(default_factory=list)
 
@@ -165,22 +159,8 @@ class FaultInjector:
         unreceived = pair.unreceived()
         for one in watching:
             one.join()
-        astray = self._bring_back(unreceived) if self.returns else None
-        self.promotions.append(
-            Promotion(stalled, killed, promoted, resumed, frozenset(unreceived), astray)
-        )
+        self.promotions.append(Promotion(stalled, killed, promoted, resumed, frozenset(unreceived)))
         pair.renew()
-
-    def _bring_back(self, unreceived: set[str]) -> frozenset[str]:
-        """Let the old primary be there for a while, and let processes begin that never knew
-        another; ids of the frames that came to it.
-        """
-        with self.fleet.pair.old_primary_back() as only_there:
-            until = time.monotonic() + BACK_S
-            self._again(self.rng.choice(self.fleet.services), "service")
-            self._again(self.rng.choice(self.fleet.workers), "worker")
-            time.sleep(max(until - time.monotonic(), 0.0))
-            return frozenset(only_there() - unreceived)
 
     def _watch(self, url: str, promoted: float, resumed: dict[str, float]) -> None:
         """Note when a service answers a query again."""

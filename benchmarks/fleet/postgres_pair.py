@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
@@ -95,26 +95,6 @@ class Pair:
             return _frames(alone) - _frames(self.primary)
         finally:
             alone.stop()
-
-    @contextmanager
-    def old_primary_back(self) -> Iterator[Callable[[], set[str]]]:
-        """Let the dead primary run meanwhile as it was, at its address: it takes writes, and waits
-        for no standby.
-
-        Yields
-        ------
-        asked : tells the ids of the frames that it has, and the promoted one has not
-        """
-        dead = self._dead
-        assert dead is not None
-        old = Server(
-            dead.folder, dead.port, durable=True, options={"synchronous_standby_names": ""}
-        )
-        old.start()
-        try:
-            yield lambda: _frames(old) - _frames(self.primary)
-        finally:
-            old.stop()
 
     def renew(self) -> None:
         """Let a new standby follow the new primary, on the address of the dead one."""

@@ -245,10 +245,8 @@ def compared_frame(
 
 
 def query_json(query: Query) -> dict[str, Any]:
-    """A query as JSON; a service of before knows no more than what is not the default."""
-    told = query.model_dump(mode="json", exclude_defaults=True)
-    always = {"k": query.k, "stages": list(query.stages), "exact": query.exact, "seed": query.seed}
-    return told | always
+    """Return the fields of a query that are not the default, as JSON."""
+    return query.model_dump(mode="json", exclude_defaults=True)
 
 
 def query_form(data: bytes, meta: FrameMeta, query: Query) -> dict[str, Any]:

@@ -84,7 +84,12 @@ CREATE TABLE counters (
     refused INTEGER NOT NULL DEFAULT 0,
     uploaded INTEGER NOT NULL DEFAULT 0,
     thinned INTEGER NOT NULL DEFAULT 0,
-    discarded INTEGER NOT NULL DEFAULT 0
+    discarded INTEGER NOT NULL DEFAULT 0,
+    queries INTEGER NOT NULL DEFAULT 0,
+    queries_refused INTEGER NOT NULL DEFAULT 0,
+    queries_sent INTEGER NOT NULL DEFAULT 0,
+    queries_discarded INTEGER NOT NULL DEFAULT 0,
+    queries_until REAL
 );
 CREATE TRIGGER added AFTER INSERT ON frames BEGIN
     UPDATE counters SET bytes = bytes + NEW.bytes, waiting = waiting + 1;
@@ -316,7 +321,7 @@ class Spool:
         """Frames that the service refused, oldest first."""
         with self._transaction(write=False) as database:
             rows = database.execute(
-                "SELECT meta, coalesce(nullif(frames.reason, ''), reasons.reason, ?) FROM frames "
+                "SELECT meta, coalesce(reasons.reason, ?) FROM frames "
                 "LEFT JOIN reasons ON frame = id WHERE frames.reason IS NOT NULL ORDER BY id",
                 (_NO_REASON,),
             ).fetchall()
@@ -470,8 +475,8 @@ class Spool:
             tables = database.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
             if tables and (mark, schema) != (_APPLICATION, _SCHEMA):
                 raise errors.UnusableStore(
-                    f"{self._path}: This is not a spool, or one of a later version. Name another "
-                    "file, or upgrade sceneprint-client."
+                    f"{self._path}: This is not a spool, or one of another version of "
+                    "sceneprint-client. Name another file, or use that version."
                 )
             if not tables:
                 for statement in _statements(_TABLES):

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import secrets
 
-from alembic import op
-from sqlalchemy import insert
-
-from sceneprint.store import tables
+from alembic import context, op
+from sqlalchemy import text
 
 revision = "0001"
 down_revision = None
@@ -46,9 +44,12 @@ EXECUTE FUNCTION number_pending_events_first()
 def upgrade() -> None:
     """Create the tables, and on PostgreSQL the trigger that numbers pending events."""
     connection = op.get_bind()
-    tables.metadata.create_all(connection, checkfirst=False)
-    connection.execute(insert(tables.schema_range).values(least_revision=revision))
-    connection.execute(insert(tables.secrets).values(name="seals", value=secrets.token_bytes(32)))
+    context.config.attributes["metadata"].create_all(connection, checkfirst=False)
+    connection.execute(text("INSERT INTO schema_range VALUES (:least)"), {"least": revision})
+    connection.execute(
+        text("INSERT INTO secrets (name, value) VALUES ('seals', :value)"),
+        {"value": secrets.token_bytes(32)},
+    )
     if connection.dialect.name == "postgresql":
         for statement in (_NUMBER, _BEFORE, _TRIGGER):
             op.execute(statement)

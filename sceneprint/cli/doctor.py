@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
@@ -121,7 +122,7 @@ def _database_server(settings: Settings) -> Check:
         try:
             with database.read() as connection:
                 found = schema_range_of(connection)
-            return _unfinished(found, database.shown) or _compared(found, database.shown)
+            return _compared(found, database.shown)
         finally:
             database.close()
     except SceneprintError as error:
@@ -171,20 +172,6 @@ def _compared(found: SchemaRange | None, place: str) -> Check:
         "folder."
     )
     return _wrong(text)
-
-
-def _unfinished(found: SchemaRange | None, place: str) -> Check | None:
-    """That a fleet's upgrade is not completed: a single machine gains nothing by that."""
-    from sceneprint.store.database import known_revisions
-
-    head, _ = known_revisions()
-    if found is None or found.revision != head or found.least == head:
-        return None
-    text = (
-        f"{place}, schema {head}: earlier versions may still write. Run `sceneprint migrate "
-        "--complete` once every process runs this version."
-    )
-    return Check("note", "database", text)
 
 
 def _wrong(text: str) -> Check:
@@ -267,8 +254,7 @@ def server(settings: Settings) -> Iterator[Check]:
     try:
         if database.is_sqlite:
             return
-        refused = database.find_old_primary(_timeline_note(settings))
-        yield from _server_settings(database, settings, refused)
+        yield from _server_settings(database, settings)
     except SceneprintError as error:
         yield Check("WRONG", "database server", str(error))
         return
@@ -278,25 +264,7 @@ def server(settings: Settings) -> Iterator[Check]:
         yield _replica(settings.replica_url.get_secret_value(), settings)
 
 
-def _timeline_note(settings: Settings) -> bytes | None:
-    """The newest timeline, as processes have noted it beside the blobs; None where none can be
-    read: what is wrong with the blobs is a finding of its own.
-    """
-    from sceneprint.store.blobs.folder import TIMELINE
-    from sceneprint.store.blobs.object_client import open_objects
-
-    place = settings.blobs
-    try:
-        if isinstance(place, Path):
-            return (place / TIMELINE).read_bytes()
-        return open_objects(place).get(TIMELINE)
-    except (OSError, SceneprintError):
-        return None
-
-
-def _server_settings(
-    database: Database, settings: Settings, refused: str | None
-) -> Iterator[Check]:
+def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
     with database.read() as connection:
         told = dict(connection.exec_driver_sql(_ASKED).mappings().one())
         before = time.time()
@@ -309,10 +277,7 @@ def _server_settings(
         text += "; it is a read-only standby. Name the primary."
         yield Check("WRONG", "database server", text)
         return
-    if refused is None:
-        yield Check("ok", "database server", text)
-    else:  # what follows is of the host that is used
-        yield Check("WRONG", "database server", refused)
+    yield Check("ok", "database server", text)
     yield _durability(told)
     yield _connections(told, settings)
     yield _vector(told, settings)
@@ -424,7 +389,7 @@ def _replica(url: str, settings: Settings) -> Check:
 
 #: The oldest SQLite with all that the store asks for (UPDATE ... RETURNING).
 OLDEST_SQLITE = (3, 35, 0)
-#: What open3d loads of the system, and the Debian packages that bring it.
+#: System libraries that open3d loads, and the Debian packages that contain them.
 OPEN3D_LIBRARIES = {
     "libGL.so.1": "libgl1",
     "libEGL.so.1": "libegl1",
@@ -573,6 +538,9 @@ def _embree() -> Check:
 
 
 def _open3d() -> Check:
+    needed = "only reconstructions and baselines need it"
+    if find_spec("open3d") is None:
+        return Check("note", "open3d", f"not installed; {needed}: pip install open3d")
     missing = []
     for library, package in OPEN3D_LIBRARIES.items():
         try:
@@ -581,9 +549,9 @@ def _open3d() -> Check:
             missing.append(package)
     if missing:
         packages = " ".join(missing)
-        text = f"only reconstructions and benchmarks need them: apt-get install {packages}"
-        return Check("note", "open3d libraries", text)
-    return Check("ok", "open3d libraries", "installed")
+        text = f"lacks system libraries; {needed}: apt-get install {packages}"
+        return Check("note", "open3d", text)
+    return Check("ok", "open3d", "installed, with its system libraries")
 
 
 def _may_write(folder: Path) -> bool:

@@ -28,7 +28,7 @@ from sceneprint.cli.options import (
     require_database,
 )
 from sceneprint.cli.serve import add_data_option, settings_of
-from sceneprint.errors import InvalidRequest, UnusableStore
+from sceneprint.errors import InvalidRequest
 
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
@@ -59,17 +59,10 @@ def add_migrate(commands: Any) -> None:
         "reached.",
     )
     add_data_option(command)
-    either = command.add_mutually_exclusive_group()
-    either.add_argument(
+    command.add_argument(
         "--check",
         action="store_true",
         help="change nothing; exit code 1 if the schema must first be created or upgraded",
-    )
-    either.add_argument(
-        "--complete",
-        action="store_true",
-        help="complete the upgrade of a fleet once every process runs this version: earlier ones "
-        "may write no more; exit code 2 if the schema is not this version's",
     )
     command.set_defaults(run=run_migrate)
 
@@ -80,9 +73,6 @@ def run_migrate(options: argparse.Namespace) -> int:
     from sceneprint.store.database import is_there, reach_database
 
     settings = settings_of(options)
-    if options.complete:
-        print(_completed(settings))
-        return 0
     database = reach_database(settings.database)
     try:
         before, usable = _revisions(database) if is_there(settings.database) else (None, False)
@@ -96,37 +86,6 @@ def run_migrate(options: argparse.Namespace) -> int:
         database.close()
     print(shown if before == after else f"{shown} -> {after}")
     return 0
-
-
-def _completed(settings: Settings) -> str:
-    """Let earlier versions write no more, and say so."""
-    from sceneprint.store import open_blobs
-    from sceneprint.store.database import (
-        complete_upgrade,
-        is_there,
-        known_revisions,
-        reach_database,
-    )
-
-    database = reach_database(settings.database)
-    try:
-        if not is_there(settings.database):
-            raise UnusableStore(
-                f"{database.shown} has no schema, so there is no upgrade to complete. Name the "
-                "data folder with --data, or the database in SCENEPRINT_DATABASE_URL."
-            )
-        if not database.is_sqlite:
-            blobs = open_blobs(settings.blobs, database, claim=False)
-            try:
-                database.refuse_old_primaries(blobs)
-            finally:
-                blobs.close()
-        is_new = complete_upgrade(database)
-    finally:
-        database.close()
-    state = "completed" if is_new else "was completed before"
-    head = known_revisions()[0]
-    return f"{database.shown}: upgrade to schema {head} {state}; earlier versions may not write"
 
 
 def _revisions(database: Database) -> tuple[str | None, bool]:
@@ -410,8 +369,6 @@ def add_snapshot(commands: Any) -> None:
         help="archive to write, or its folder (default: SCENEPRINT_SNAPSHOT_URL, else "
         "sceneprint-TIME.tar here)",
     )
-    add_since_option(command, "leave out the blobs that this earlier archive holds, which is "
-                     "needed to restore the new one; may be repeated")  # fmt: skip
     command.add_argument(
         "--url",
         metavar="URL",
@@ -428,22 +385,10 @@ def add_snapshot(commands: Any) -> None:
     command.set_defaults(run=run_snapshot)
 
 
-def add_since_option(command: argparse.ArgumentParser, told: str) -> None:
-    """`--since`."""
-    command.add_argument(
-        "--since", type=Path, action="append", default=[], metavar="ARCHIVE", help=told
-    )
-
-
 def run_snapshot(options: argparse.Namespace) -> int:
     """Take a snapshot; returns 1 where something could not be taken along."""
     from sceneprint.maintenance.snapshot.creation import take_snapshot
 
-    if options.since and options.url is not None:
-        raise InvalidRequest(
-            "--since is for archives of this machine, and a service takes full snapshots. Leave "
-            "out --url or --since."
-        )
     name = f"sceneprint-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tar"
     path = Path(name) if options.out is None else options.out
     if path.is_dir():
@@ -453,14 +398,9 @@ def run_snapshot(options: argparse.Namespace) -> int:
         return _fetched(options, path)
     settings = named_database(options)
     if options.out is None and settings.snapshot_url is not None:
-        if options.since:
-            raise InvalidRequest(
-                "SCENEPRINT_SNAPSHOT_URL is set, and full snapshots alone are kept there. Name the "
-                "archive with --out."
-            )
         return _shelved(settings)
     with ended_by_signals(), byte_progress("snapshot") as progress:
-        taken = take_snapshot(settings, path, progress, options.since)
+        taken = take_snapshot(settings, path, progress)
     print(f"{one_line(str(path))}: {contents(taken)} in {time.perf_counter() - start:.1f} s")
     return 1 if name_damaged(taken, "Run `sceneprint fsck` to see what can be repaired.") else 0
 
@@ -608,7 +548,6 @@ def add_restore(commands: Any) -> None:
         metavar="ARCHIVE",
         help="archive of `sceneprint snapshot`, or the id of a snapshot that a service has taken",
     )
-    add_since_option(command, "an earlier archive that this one was taken since; may be repeated")
     add_data_option(command)
     add_database_option(command)
     choice = command.add_mutually_exclusive_group()
@@ -626,7 +565,7 @@ def run_restore(options: argparse.Namespace) -> int:
     settings, start = named_database(options), time.perf_counter()
     with ended_by_signals(), _archive(options, settings) as archive:
         if options.verify_only:
-            snapshot, done, aside = *_verified(archive, options), None
+            snapshot, done, aside = *_verified(archive), None
         elif settings.database_url is not None:
             snapshot, done, aside = *_filled(archive, settings, options), None
         else:
@@ -660,11 +599,11 @@ def _archive(options: argparse.Namespace, settings: Settings) -> Iterator[Path]:
         yield archive
 
 
-def _verified(archive: Path, options: argparse.Namespace) -> tuple[Snapshot, str]:
+def _verified(archive: Path) -> tuple[Snapshot, str]:
     from sceneprint.maintenance.snapshot.restoration import verify_snapshot
 
     with byte_progress("verify") as progress:
-        return verify_snapshot(archive, progress, options.since), "is complete"
+        return verify_snapshot(archive, progress), "is complete"
 
 
 def _filled(archive: Path, settings: Settings, options: argparse.Namespace) -> tuple[Snapshot, str]:
@@ -686,7 +625,7 @@ def _filled(archive: Path, settings: Settings, options: argparse.Namespace) -> t
             "database (CREATE DATABASE), and name that."
         )
     with byte_progress("restore") as progress:
-        snapshot = restore_to_fleet(archive, settings, progress, options.since)
+        snapshot = restore_to_fleet(archive, settings, progress)
     return snapshot, f"is restored to {one_line(database.shown)}"
 
 
@@ -704,9 +643,8 @@ def _restore_to_folder(
         )
     with byte_progress("restore") as progress:
         snapshot, aside = restore_snapshot(
-            archive, settings.data_dir, replace=options.replace, progress=progress,
-            since=options.since,
-        )  # fmt: skip
+            archive, settings.data_dir, replace=options.replace, progress=progress
+        )
     return snapshot, f"is restored to {one_line(str(settings.data_dir))}", aside
 
 

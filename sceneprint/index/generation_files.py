@@ -344,15 +344,15 @@ def draw(n: int, limit: int, seed: int) -> NDArray[np.int64]:
 
 # Manifests: what a generation consists of. It exists from the moment its manifest has its name.
 #
-# A manifest is JSON, called by the number of the generation, the SHA-256 of its own bytes, and its
-# schema. Each schema has folders of its own, here and in an object store: two versions of the
-# product beside each other neither read nor remove what the other made.
+# A manifest is JSON, called by the number of the generation and the SHA-256 of its own bytes. Each
+# schema has folders of its own, here and in an object store: two versions of the product beside
+# each other neither read nor remove what the other made.
 
 #: Of the files of a generation and of what they mean. Raise it when either changes.
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 1
 #: A manifest names five files of each segment at most; a larger file is refused unread.
 MAXIMUM_BYTES = 1 << 16
-_MANIFEST = re.compile(rf"(\d{{10}})-([0-9a-f]{{32}})\.{SCHEMA_VERSION}\.json")
+_MANIFEST = re.compile(r"(\d{10})-([0-9a-f]{32})\.json")
 
 
 @dataclass(frozen=True)
@@ -491,7 +491,7 @@ def encode_manifest(manifest: GenerationManifest) -> bytes:
 def manifest_name(manifest: GenerationManifest) -> str:
     """The name of a manifest in a folder."""
     digest = hashlib.sha256(encode_manifest(manifest)).hexdigest()[:32]
-    return f"{manifest.number:010d}-{digest}.{SCHEMA_VERSION}.json"
+    return f"{manifest.number:010d}-{digest}.json"
 
 
 def read_manifest(path: Path) -> GenerationManifest:

@@ -468,7 +468,6 @@ def _open_store(url: str, blobs: Path | str) -> Store:
     database = open_database(url)
     try:
         found = open_blobs(blobs, database)
-        database.refuse_old_primaries(found)
         return Store(database, found)
     except BaseException:
         database.close()

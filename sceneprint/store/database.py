@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy import Connection, Engine, event
 
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
-from sceneprint.store.blobs.folder import Blobs
 from sceneprint.store.database_errors import database_label
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.postgres.timelines import Timelines
 from sceneprint.store.sqlite import (
     BUSY_S,
     HELD_S,
@@ -36,7 +34,7 @@ from functools import cache
 from secrets import token_bytes
 from typing import TYPE_CHECKING
 
-from sqlalchemy import URL, func, insert, inspect, make_url, select, update
+from sqlalchemy import URL, insert, inspect, make_url, select, update
 from sqlalchemy.exc import ArgumentError
 
 import migrations
@@ -66,6 +64,7 @@ def migration_config() -> Config:
 
     config = Config()
     config.set_main_option("script_location", str(_FOLDER))
+    config.attributes["metadata"] = metadata
     return config
 
 
@@ -93,44 +92,35 @@ def revision_of(connection: Connection) -> str | None:
 
 @dataclass(frozen=True)
 class SchemaRange:
-    """Which processes may use a store.
+    """The processes that may use a store.
 
     Parameters
     ----------
-    revision : of its schema
-    least : the oldest revision whose processes may write to it; None: a store of before 0015
+    revision : the schema of the store
+    least : the oldest revision whose processes may write to it
     """
 
     revision: str
-    least: str | None
+    least: str
 
     def allows(self, own: str) -> bool:
-        """Whether a process that works with a revision may use the store as it is.
+        """Return whether a process that works with the revision `own` may use the store as it is.
 
-        Revisions are numbers of four digits, so that their order is that of the texts; what is
-        none is of nobody that is known.
+        Revisions are numbers of four digits, so that they sort as texts.
         """
         return self.revision == own or (
-            self.revision.isdecimal()
-            and self.least is not None
-            and self.least <= own < self.revision
+            self.revision.isdecimal() and self.least <= own < self.revision
         )
 
 
 def schema_range_of(connection: Connection) -> SchemaRange | None:
-    """Which processes may use a database; None: nobody has made a schema in it."""
+    """Return which processes may use a database; None if it has no schema yet."""
     revision = revision_of(connection)
     if revision is None:
         return None
-    if not inspect(connection).has_table(schema_range.name):
-        return SchemaRange(revision, None)
-    return SchemaRange(revision, connection.execute(select(schema_range)).scalar())
-
-
-def least_revision(connection: Connection) -> str:
-    """The oldest revision whose processes may write to a store of the schema of this version."""
-    found: str = connection.execute(select(func.max(schema_range.c.least_revision))).scalar_one()
-    return found
+    if not inspect(connection).has_table(schema_range.name):  # another program's database
+        return SchemaRange(revision, revision)
+    return SchemaRange(revision, connection.execute(select(schema_range)).scalar_one())
 
 
 def require_schema(connection: Connection) -> None:
@@ -268,39 +258,6 @@ def migrate(database: Database) -> None:
                 )
 
 
-def complete_upgrade(database: Database) -> bool:
-    """Let only processes that work with this version's schema write from now on.
-
-    Returns
-    -------
-    whether earlier ones might write until now
-
-    Raises
-    ------
-    UnusableStore : its schema is another one; nothing is changed.
-    """
-    head, known = known_revisions()
-    with database.write() as connection:
-        revision = revision_of(connection)
-        if revision is not None and revision not in known:  # `migrate` changes nothing there
-            raise UnusableStore(
-                f"{database.shown} has schema {revision}, and this version of sceneprint works "
-                f"with {head}: a later one migrated it. Complete the upgrade with that version."
-            )
-        if revision != head:
-            raise UnusableStore(
-                f"{database.shown} has schema {revision or 'none'}, and this version of sceneprint "
-                f"works with {head}, so its upgrade cannot be completed. Run `sceneprint migrate` "
-                "first, and complete it with the version that all processes run."
-            )
-        if not database.is_sqlite:  # who writes out of turn ends first
-            connection.exec_driver_sql("SELECT version_num FROM alembic_version FOR UPDATE")
-        if least_revision(connection) == head:
-            return False
-        connection.execute(update(schema_range).values(least_revision=head))
-        return True
-
-
 def current_revision(connection: Connection) -> str | None:
     """Revision of a database that this version knows; None: nobody has made a schema in it.
 
@@ -351,48 +308,15 @@ class Database:
         self._held = False  # by another process, for longer than anybody should wait
         self._guarded = False
         self._schema = postgres.KnownSchema(self._check_schema)
-        self._timelines = None if self.is_sqlite else Timelines(engine)
+        #: Timeline that the PostgreSQL server writes, as of the last connection: a promoted standby
+        #: begins another, and may lack what was committed last. What is held in memory of the one
+        #: before must then be given up. None of SQLite.
+        self.history: str | None = None
+        if not self.is_sqlite:
+            event.listen(engine, "connect", self._note_history)
 
-    @property
-    def history(self) -> str | None:
-        """Which line of history a server writes, as of the last connection to it: another where a
-        standby was promoted, which may lack what was committed last. Then nothing that is held in
-        memory can be taken to be a part of it.
-        """
-        found = None if self._timelines is None else self._timelines.current
-        return None if found is None else str(found)
-
-    def refuse_old_primaries(self, blobs: Blobs) -> None:
-        """Use no primary that a promoted standby has replaced, as a note beside the blobs says; and
-        keep that note for other processes.
-
-        Raises
-        ------
-        StoreAway : only old primaries can be reached.
-        """
-        if self._timelines is not None:
-            self._timelines.follow(blobs)
-            with self.read():
-                pass
-
-    def find_old_primary(self, note: bytes | None) -> str | None:
-        """What is wrong with a host that is asked first and is an old primary, as the note beside
-        the blobs says, and what to do; None where none is. It is used no more. Nothing is noted.
-
-        Parameters
-        ----------
-        note : TIMELINE, as it was read; None where there is none
-
-        Raises
-        ------
-        StoreAway : only old primaries can be reached.
-        """
-        if self._timelines is None:
-            return None
-        self._timelines.learn(note)
-        with self.read():
-            pass
-        return self._timelines.refused
+    def _note_history(self, connection: Any, _record: object) -> None:
+        self.history = postgres.timeline_of(connection) or self.history
 
     @property
     def dialect(self) -> str:
@@ -645,12 +569,14 @@ class Database:
         ------
         UnusableStore : the server cannot be reached.
         """
-        if self._timelines is None:
+        if self.is_sqlite:
             raise ValueError(f"{self.shown} has no connections but those of its file")
+        import psycopg
+
         with self.explained():
             args, given = self._engine.dialect.create_connect_args(self._engine.url)
             options = {**postgres.connect_options(self._engine.url), **given}
-            found, _ = self._timelines.connect(*args, **options, autocommit=True)
+            found = psycopg.connect(*args, **options, autocommit=True)
             try:
                 postgres.configure(found)
             except BaseException:

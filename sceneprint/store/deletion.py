@@ -309,30 +309,12 @@ def _old(map_number: int, before: float) -> ColumnElement[bool]:
 
 
 def maps_with_ended(connection: Connection, before: float) -> list[MapRow]:
-    """Maps with frames that ended before a time, or of which nobody knows when."""
+    """Return the maps that have frames which ended before a time."""
     spent = (
-        select(frames.c.number)
-        .where(_ended(maps.c.number, state), or_(frames.c.ended_at.is_(None), _before(before)))
-        .exists()
+        select(frames.c.number).where(_ended(maps.c.number, state), _before(before)).exists()
         for state in ROOMLESS
     )
     return [map_row(one) for one in connection.execute(select(maps).where(or_(*spent))).mappings()]
-
-
-def date_ended(connection: Connection, map_number: int, limit: int) -> int:
-    """Give frames of a map that ended before this was noted the time of now, at most so many of
-    each state; returns how many.
-    """
-    dated = 0
-    for state in ROOMLESS:
-        asked = select(frames.c.number).where(
-            _ended(map_number, state), frames.c.ended_at.is_(None)
-        )
-        numbers = list(connection.execute(asked.limit(limit)).scalars())
-        change = update(frames).where(frames.c.number.in_(numbers))
-        connection.execute(change.values(ended_at=now(connection)))
-        dated += len(numbers)
-    return dated
 
 
 def remove_ended(connection: Connection, map_number: int, before: float, limit: int) -> int:

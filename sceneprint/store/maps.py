@@ -28,9 +28,9 @@ from sqlalchemy import (
 from sceneprint.errors import QuotaExceeded, UnknownFrame, UnknownMap
 from sceneprint.store.events import inherited, record_event
 from sceneprint.store.tables import (
+    ARCHIVE,
     FRAME_COLUMNS,
     MAP_COLUMNS,
-    PACKAGE,
     TEXT,
     FrameRow,
     MapRow,
@@ -169,8 +169,8 @@ def model_names(connection: Connection) -> dict[str, str]:
 # What a map holds and may hold: frames, and bytes of their uploads.
 #
 # Counted are frames that are neither deleted nor redundant, whatever else became of them, and their
-# uploads as they were sent, with what robots made of them while that waits. Not counted is what we
-# make of them: signatures, artifacts, indexes.
+# uploads as they were sent, with what robots made of them while that waits, and the archives of
+# imports until these end. Not counted is what we make of them: signatures, artifacts, indexes.
 # Two columns of the map count on in the transaction that changes it; writers take turns, so that a
 # quota holds to the frame whoever sends at once.
 
@@ -207,12 +207,12 @@ def counted_usage(connection: Connection, map_number: int) -> MapUsage:
         frames.c.map_number == map_number, frames.c.state.not_in(ROOMLESS)
     )
     n, size = connection.execute(asked).one()
-    sent = (
+    archives = (
         select(func.coalesce(func.sum(job_files.c.bytes), 0))
         .join(jobs, jobs.c.number == job_files.c.job_number)
-        .where(job_files.c.name == PACKAGE, jobs.c.map_number == map_number)
+        .where(job_files.c.name == ARCHIVE, jobs.c.map_number == map_number)
     )
-    return MapUsage(int(n), int(size) + int(connection.execute(sent).scalar_one()))
+    return MapUsage(int(n), int(size) + int(connection.execute(archives).scalar_one()))
 
 
 def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> None:
@@ -237,10 +237,20 @@ def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = 
             f"Map {row.name!r} holds {use.frames} frames of the {row.quota_frames} that its quota "
             f"allows, so the frame was not taken. {_todo(row.name)}"
         )
-    if size > 0 and row.quota_bytes is not None and use.bytes + size > row.quota_bytes:
+    require_bytes(row, use.bytes, size)
+
+
+def require_bytes(row: MapRow, used: int, size: int) -> None:
+    """Check that the quota of a map allows `size` bytes beside the `used` ones.
+
+    Raises
+    ------
+    QuotaExceeded : it does not.
+    """
+    if size > 0 and row.quota_bytes is not None and used + size > row.quota_bytes:
         raise QuotaExceeded(
-            f"Map {row.name!r} holds {use.bytes} bytes of uploads of the {row.quota_bytes} that "
-            f"its quota allows, so {size} bytes more were not taken. {_todo(row.name)}"
+            f"Map {row.name!r} holds {used} bytes of uploads of the {row.quota_bytes} that its "
+            f"quota allows, so {size} bytes more were not stored. {_todo(row.name)}"
         )
 
 

@@ -52,7 +52,9 @@ from sqlalchemy import (
 
 from sceneprint.errors import JobOver, LostLease, UnknownJob
 from sceneprint.process import NOBODY
+from sceneprint.store.maps import count_on
 from sceneprint.store.tables import (
+    ARCHIVE,
     JOB_COLUMNS,
     JobRow,
     count_rows,
@@ -732,6 +734,14 @@ def add_files(connection: Connection, job_number: int, files: Iterable[JobFile])
         own = (job_files.c.job_number == job_number) & (job_files.c.name == one.name)
         connection.execute(delete(job_files).where(own))
         connection.execute(insert(job_files).values(job_number=job_number, **asdict(one)))
+        if one.name == ARCHIVE:
+            _count_archive(connection, job_number, one.bytes)
+
+
+def _count_archive(connection: Connection, job_number: int, size: int) -> None:
+    """Add the bytes of an archive to those that the map of its import holds."""
+    of_map: Any = select(jobs.c.map_number).where(jobs.c.number == job_number).scalar_subquery()
+    count_on(connection, of_map, 0, size)
 
 
 def files_of(connection: Connection, job_number: int) -> dict[str, JobFile]:
@@ -748,16 +758,14 @@ def jobs_with_files(connection: Connection, kind: str) -> list[JobRow]:
     return [job_row(row) for row in connection.execute(asked.order_by(jobs.c.number)).mappings()]
 
 
-def finished_with_file(connection: Connection, kind: str, name: str, before: float) -> list[int]:
-    """Numbers of the jobs of a kind that were over by a time, and still have a file of a name."""
+def finished_with_file(connection: Connection, name: str) -> list[int]:
+    """Return the numbers of the jobs that are over and still have a file of this name."""
     asked = (
         select(jobs.c.number)
         .join(job_files, job_files.c.job_number == jobs.c.number)
         .where(
             job_files.c.name == name,
-            jobs.c.kind == kind,
             jobs.c.state.in_([state for state in JobState if state.over]),
-            jobs.c.finished_at < before,
         )
     )
     return list(connection.execute(asked).scalars())
@@ -785,9 +793,13 @@ def remove_parts(
     own = job_files.c.job_number == job_number
     if files is not None:
         own &= job_files.c.name.in_(list(files))
-    blobs = list(connection.execute(select(job_files.c.blob).where(own)).scalars())
+    c = job_files.c
+    found = connection.execute(select(c.name, c.blob, c.bytes).where(own)).all()
     connection.execute(delete(job_files).where(own))
-    return blobs
+    for one in found:
+        if one.name == ARCHIVE:
+            _count_archive(connection, job_number, -one.bytes)
+    return [one.blob for one in found]
 
 
 def remove_job(connection: Connection, job: JobRow) -> list[str]:

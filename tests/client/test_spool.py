@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, Spool, meta_of
 from sceneprint_client.api import CameraIntrinsics, FrameMeta
@@ -538,7 +539,7 @@ def test_kills_while_frames_are_added_and_uploaded_lose_and_double_nothing(
     assert waiting[:acknowledged] == said
     assert len(waiting) <= acknowledged + 1  # one may have been durable, and not acknowledged
     with child("sync", path, service_url, map_name, 1) as process:
-        out, _ = process.communicate(timeout=60)
+        out, _ = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, out) == (-signal.SIGKILL, b"")
     assert len(list(remote.frames(map_name))) == 64
     assert names(path) == waiting
@@ -547,6 +548,18 @@ def test_kills_while_frames_are_added_and_uploaded_lose_and_double_nothing(
         assert (report.there, report.received) == (64, len(waiting) - 64)
         assert (spool.status().waiting, spool.status().uploaded) == (0, len(waiting))
     assert [one.name for one in remote.frames(map_name)] == waiting
+
+
+def test_a_spool_of_another_version_is_left_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "spool"
+    Spool(path).close()
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("PRAGMA user_version = 2")
+        database.commit()
+    before = path.read_bytes()
+    with pytest.raises(UnusableStore, match="of another version"):
+        Spool(path)
+    assert path.read_bytes() == before
 
 
 @pytest.mark.thorough
@@ -591,7 +604,7 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
             contents = {one.content_id for one in client.frames("hall")}
     finally:
         os.killpg(service.pid, signal.SIGTERM)
-        service.communicate(timeout=30)
+        service.communicate(timeout=PATIENCE_S)
     with Spool(path) as spool:
         now = spool.status()
     sys.stdout.write(f"{count} frames: {kills} kills, {full} full disks, {syncs} kills of sync\n")

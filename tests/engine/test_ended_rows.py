@@ -14,7 +14,6 @@ from sqlalchemy import event, insert, select, update
 from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index
 from sceneprint.engine.search.local_index import index_folder
-from sceneprint.engine.upkeep import purge
 from sceneprint.engine.upkeep.purge import Retention
 from sceneprint.errors import UnknownFrame, UnknownJob
 from sceneprint.store.deletion import DAY_S, maps_with_ended
@@ -144,27 +143,6 @@ def test_a_redundant_frame_goes_and_is_judged_anew_when_it_comes_again(
     second, new = full.add_frame("hall", uploads[0].data, meta)
     assert new
     assert second.frame_id != first.frame_id
-
-
-def test_frames_of_the_version_before_have_their_days_from_now_on(
-    full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(purge, "BLOCK", 2)
-    full.undo_limits = NO_UNDO
-    for name in ids(full)[:5]:
-        full.delete_frame("hall", name)
-    with full.store.database.write() as connection:
-        connection.execute(update(frames).values(ended_at=None))
-    assert after(full, 2 * DAYS) == 5  # given the time of now, which is long before then
-    with full.store.database.write() as connection:
-        connection.execute(update(frames).values(ended_at=None))
-    full.delete_frame("hall", ids(full)[0])
-    with full.store.database.write() as connection:
-        connection.execute(update(frames).values(ended_at=None))
-    assert after(full, 0) == 0
-    with full.store.database.read() as connection:
-        dated = connection.execute(select(frames.c.ended_at).where(frames.c.state == "deleted"))
-        assert dated.scalar_one() == pytest.approx(time.time(), abs=60)
 
 
 @pytest.mark.parametrize("tail_frames", [3, 100], ids=["index", "no index"])

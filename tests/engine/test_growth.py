@@ -82,7 +82,6 @@ def test_a_map_is_weighed(full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatc
             .order_by(frames.c.number)
         ).all()
     folder = full.settings.data_dir
-    # in folders of their own: beside them may be a note of the newest timeline
     on_disk = sum(p.stat().st_size for p in (folder / "blobs").glob("*/*"))
     told = full.operations.statistics.tell(1, "hall").bytes
     assert told.blobs == on_disk

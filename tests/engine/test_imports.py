@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import tarfile
-import time
 from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import update
 
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest import archive_import
 from sceneprint.engine.ingest import uploads as uploading
-from sceneprint.engine.jobs.lifecycle import cancel, list_jobs
+from sceneprint.engine.jobs.lifecycle import cancel, list_jobs, worker_died
 from sceneprint.engine.jobs.tasks import LongJob
+from sceneprint.engine.maps.map_lifecycle import edit_map
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
-from sceneprint.errors import Conflict, LostLease, UnknownMap
+from sceneprint.errors import Conflict, LostLease, QuotaExceeded, UnknownMap
 from sceneprint.formats.archive import Archive
-from sceneprint.store.queue import files_of
-from sceneprint.store.tables import jobs
+from sceneprint.store.maps import MapUsage, counted_usage, find_map
+from sceneprint.store.queue import MAXIMUM_FAILURES, files_of
 from sceneprint_client.api import Job, JobState, NewMap
 from sceneprint_client.api.frames import ImportOptions
 
@@ -145,7 +147,7 @@ def test_a_cancelled_import_takes_no_frame_more(
     with pytest.raises(LostLease):
         empty.imports.handle(claimed(empty), between)
     assert len(empty.list_frames("hall").items) == 2
-    assert len(list(empty.store.blobs.digests())) == 3  # theirs, and the archive
+    assert len(list(empty.store.blobs.digests())) == 2  # theirs; the archive is gone
 
 
 def test_a_map_that_is_made_anew_takes_nothing_of_an_import_into_the_one_before(
@@ -165,28 +167,119 @@ def test_a_map_that_is_made_anew_takes_nothing_of_an_import_into_the_one_before(
     assert list(empty.store.blobs.digests()) == []
 
 
-def test_the_archive_of_an_import_that_was_given_up_is_kept_for_a_day(
-    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
+def zeros(megabytes: int, name: str) -> bytes:
+    """Return a compressed archive of a few kilobytes with a member of zeros."""
+    made = io.BytesIO()
+    with tarfile.open(fileobj=made, mode="w:gz", compresslevel=1) as archive:
+        info = tarfile.TarInfo(f"{name}/0.png")
+        info.size = megabytes << 20
+        archive.addfile(info, io.BytesIO(bytes(info.size)))
+    return made.getvalue()
+
+
+def bytes_on_disk(engine: Engine) -> int:
+    """Return the size of all files below the folder of blobs, unfinished ones too."""
+    return sum(
+        os.lstat(Path(folder, name)).st_size
+        for folder, _, names in os.walk(engine.settings.blob_dir)
+        for name in names
+    )
+
+
+def counted(engine: Engine, map_name: str = "hall") -> int:
+    """Return the bytes that a map is counted to hold, which a count over its rows confirms."""
+    with engine.store.database.read() as connection:
+        row = find_map(connection, map_name)
+        assert counted_usage(connection, row.number) == MapUsage(row.used_frames, row.used_bytes)
+    return row.used_bytes
+
+
+QUOTA = 8 << 20
+
+
+def test_archives_take_no_more_disk_than_the_quota_of_their_map(
+    empty: Engine, uploads: Any
+) -> None:
+    """Archives of compressed zeros, sent one after another and all at once."""
+    edit_map(empty.store, "hall", {"quota_bytes": QUOTA})
+    most = QUOTA * 11 // 10
+    job = begun(empty, zeros(5, "first"))
+    assert QUOTA // 2 < bytes_on_disk(empty) <= most
+    assert counted(empty) == bytes_on_disk(empty)
+    for name in ("second", "third"):
+        with pytest.raises(QuotaExceeded, match=rf"quota .*{QUOTA}|{QUOTA} .*quota"):
+            begun(empty, zeros(5, name))
+        assert bytes_on_disk(empty) <= most
+    cancel(empty.store, job.job_id)
+    assert (bytes_on_disk(empty), counted(empty)) == (0, 0)  # at once, without any upkeep
+    with ExitStack() as open_ones:
+        receivers = [open_ones.enter_context(empty.imports.receive("hall")) for _ in range(3)]
+        refused = 0
+        for i, receiver in enumerate(receivers):
+            try:
+                receiver.write(zeros(5, f"at-once-{i}"))
+            except QuotaExceeded:
+                refused += 1
+            assert bytes_on_disk(empty) <= most
+        assert refused == 2
+        edit_map(empty.store, "hall", {"quota_bytes": bytes_on_disk(empty) + 10})
+        with pytest.raises(QuotaExceeded):  # a frame does not get the room of an archive
+            empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+        edit_map(empty.store, "hall", {"quota_bytes": QUOTA})
+    assert (bytes_on_disk(empty), counted(empty)) == (0, 0)
+    begun(empty, zeros(7, "last"))  # what was refused or not kept takes no room
+
+
+def test_two_services_do_not_share_the_room_of_one_archive(
+    empty: Engine, make_engine: Callable[..., Engine]
+) -> None:
+    """Neither sees what the other is receiving: the second import is refused when it begins."""
+    edit_map(empty.store, "hall", {"quota_bytes": QUOTA})
+    with ExitStack() as both:
+        engines = (empty, make_engine())
+        receivers = [both.enter_context(one.imports.receive("hall")) for one in engines]
+        files = []
+        for i, receiver in enumerate(receivers):
+            receiver.write(zeros(5, f"service-{i}"))
+            files.append(receiver.end())
+        engines[0].imports.begin("hall", files[0], ImportOptions())
+        with pytest.raises(QuotaExceeded):
+            engines[1].imports.begin("hall", files[1], ImportOptions())
+    assert counted(empty) == bytes_on_disk(empty) == files[0].bytes
+
+
+def test_an_archive_counts_until_its_import_is_over(empty: Engine, uploads: Any) -> None:
+    edit_map(empty.store, "hall", {"quota_bytes": QUOTA})
+    begun(empty, packed(uploads[:2]))
+    [archive] = empty.store.blobs.digests()
+    size = empty.store.blobs.size(archive)
+    assert counted(empty) == size
+    assert empty.run(claimed(empty)) == JobState.SUCCEEDED
+    assert counted(empty) == sum(len(one.data) for one in uploads[:2]) == bytes_on_disk(empty)
+    begun(empty, packed(uploads[2:4]))
+    empty.delete_map("hall")
+    assert bytes_on_disk(empty) == 0
+
+
+def test_the_archive_of_an_import_whose_worker_died_goes_at_the_next_upkeep(
+    empty: Engine, uploads: Any, due_now: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(archive_import, "TIDY_S", 0.0)
     job = begun(empty, packed(uploads[:1]))
-    waiting = begun(empty, packed(uploads[:2]))
-    cancel(empty.store, job.job_id)
-    empty.publish_due()
+    for _ in range(MAXIMUM_FAILURES):
+        due_now(empty)
+        token = claimed(empty).job.token
+        worker_died(empty.store, job.job_id, token, "killed", "", counts=True)
+    assert empty.get_job(job.job_id).state == JobState.DEAD
+    begun(empty, packed(uploads[1:3]))
     assert len(list(empty.store.blobs.digests())) == 2
-    with empty.store.database.write() as connection:
-        long_ago = time.time() - archive_import.KEPT_S - 1
-        connection.execute(update(jobs).values(created_at=long_ago))
-        connection.execute(
-            update(jobs).where(jobs.c.finished_at.is_not(None)).values(finished_at=long_ago)
-        )
     empty.publish_due()
-    assert len(list(empty.store.blobs.digests())) == 1
+    [left] = empty.store.blobs.digests()  # that of the import that waits
+    assert counted(empty) == empty.store.blobs.size(left)
     empty.retry_job(job.job_id)
-    assert empty.run(claimed(empty)) == JobState.FAILED
-    assert "cancelled too long ago" in str(empty.get_job(job.job_id).error)
-    assert empty.run(claimed(empty)) == JobState.SUCCEEDED
-    assert empty.get_job(waiting.job_id).state == JobState.SUCCEEDED
+    states = {empty.run(claimed(empty)), empty.run(claimed(empty))}
+    assert states == {JobState.FAILED, JobState.SUCCEEDED}
+    assert "Send it again" in str(empty.get_job(job.job_id).error)
 
 
 def test_an_archive_that_was_swept_before_its_job_was_there_is_not_acknowledged(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import time
 from collections import Counter
@@ -21,7 +20,7 @@ from sqlalchemy import select
 from benchmarks.fleet.s3 import ObjectServer
 from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index, shared_index
-from sceneprint.engine.search.local_index import earlier_folder, index_folder
+from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.search.shared_index import IN_USE_S, SharedIndexes
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import BusyIndex, DamagedIndex, UnusableStore
@@ -303,37 +302,6 @@ def test_files_of_a_generation_stay_while_somebody_may_fetch_it(
         shared(other)._get(folder_of(built), name, size)
     shared(built).tidy(row, clean=True)
     assert set(keys(objects)) == files[2] | {f"{third.number:010d}.json"}
-
-
-def test_the_version_before_neither_sees_nor_loses_anything(
-    built: Engine, host: Callable[..., Engine], ids: Any, uploads: Any, place: str
-) -> None:
-    """It runs beside this one while a fleet is upgraded: each has folders of its own."""
-    objects, name = open_objects(place), folder_of(built).name
-    before = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}-\d+-[0-9a-f]+(-[0-9a-f]{12})?")
-    assert not before.fullmatch(name)  # it removes nothing that it does not know
-    theirs = earlier_folder(built.settings.indexes, row_of(built))
-    assert before.fullmatch(theirs.name)
-    assert not name.startswith(f"{theirs.name}/")
-    left = {f"{'a' * 64}.faiss", f"{'b' * 64}.keys", "0000000009.json"}
-    for file in left:
-        objects.put(f"index/{theirs.name}/{file}", b"of schema 2")
-    theirs.mkdir()
-    (theirs / f"0000000009-{'c' * 32}.2.json").write_bytes(b"of schema 2")
-    (theirs / f"{'a' * 64}.faiss").write_bytes(b"signatures")
-    other = host("two")
-    ask(other, uploads)
-    shared(other).finish()
-    assert numbers(other) == [1]
-    assert (built.publish_due(), other.publish_due()) == (0, 0)
-    assert len(list(theirs.iterdir())) == 2
-    assert {one.key.rpartition("/")[2] for one in objects.list(f"index/{theirs.name}/")} == left
-    # of what is deleted nothing may be left, whoever made it
-    built.delete_frame("hall", ids(built)[0])
-    assert built.purging.now().indexes == 1
-    assert not theirs.exists()
-    assert list(objects.list(f"index/{theirs.name}/")) == []
-    assert numbers(built) == [2]
 
 
 def test_a_purge_writes_the_segment_that_held_the_frame(

@@ -156,7 +156,7 @@ def test_a_damaged_file_is_written_again_when_its_content_is(
 @pytest.mark.parametrize(
     "change",
     [
-        {"schema_version": 3},
+        {"schema_version": 2},
         {"segments": [{"files": [], "recall": RECALL}]},
         {"segments": [{"files": [["../../etc/passwd", 1]], "recall": RECALL}]},
         {"segments": [{"files": [[f"{'0' * 64}.keys", 8]], "recall": RECALL}]},
@@ -174,7 +174,7 @@ def test_a_manifest_that_means_something_else_is_refused(
 
     path = own_files(folder)["json"]
     data = json.dumps(json.loads(path.read_bytes()) | change).encode()
-    other = path.with_name(f"0000000009-{hashlib.sha256(data).hexdigest()[:32]}.4.json")
+    other = path.with_name(f"0000000009-{hashlib.sha256(data).hexdigest()[:32]}.json")
     other.write_bytes(data)
     with pytest.raises(DamagedIndex):
         read_manifest(other)

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from sqlalchemy import select, text, update
 
 from benchmarks.fleet.postgres import Server
 from benchmarks.fleet.s3 import ObjectServer
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs, collect_doomed_blobs
@@ -96,7 +97,7 @@ class HeldDeletes:
             with suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)
         for thread in self._threads:
-            thread.join(60)
+            thread.join(PATIENCE_S)
         self._listener.close()
 
     def _accept(self) -> None:
@@ -147,7 +148,7 @@ class Background(threading.Thread):
 
     def result(self) -> Any:
         """What it returned."""
-        self.join(60)
+        self.join(PATIENCE_S)
         assert not self.is_alive()
         if self._error is not None:
             raise self._error
@@ -192,13 +193,13 @@ def removal(remover: Store, held: HeldDeletes) -> Iterator[Callable[..., Backgro
 
     def begin(*blobs: str) -> Background:
         begun.append(Background(lambda: collect_blobs(remover, blobs)))
-        assert held.arrived.wait(60)
+        assert held.arrived.wait(PATIENCE_S)
         return begun[-1]
 
     yield begin
     held.release()
     for one in begun:
-        one.join(60)
+        one.join(PATIENCE_S)
 
 
 def waiting(engine: Engine) -> int:
@@ -222,18 +223,6 @@ def grow_old(engine: Engine) -> None:
     """Let the time pass after which no removal of before goes on."""
     with engine.store.database.write() as connection:
         connection.execute(update(doomed).values(at=doomed.c.at - LONGEST_S))
-
-
-@contextmanager
-def least(engine: Engine, revision: str) -> Iterator[None]:
-    """The oldest version that may write, and later the one that may now."""
-    change = text("UPDATE schema_range SET least_revision = :v")
-    with engine.store.database.write() as connection:
-        before = connection.execute(text("SELECT least_revision FROM schema_range")).scalar_one()
-        connection.execute(change, {"v": revision})
-    yield
-    with engine.store.database.write() as connection:
-        connection.execute(change, {"v": before})
 
 
 def alone(engine: Engine, small: Any) -> Any:
@@ -398,7 +387,7 @@ def test_what_a_killed_remover_leaves(
         [sys.executable, "-c", REMOVER, postgres_url, bucket, dies, digest, OTHER]
     ) as process:
         if dies == "before":
-            assert held.arrived.wait(60)
+            assert held.arrived.wait(PATIENCE_S)
             process.kill()
     assert process.returncode == -9
     assert doomed_in(engine) == sorted([digest, OTHER])
@@ -452,24 +441,6 @@ def test_what_is_removed_one_by_one_ends_in_time(tmp_path: Path) -> None:
         objects.delete("missing", "a", "c", seconds=-1.0)
     objects.delete("missing", "a", "c", seconds=60.0)
     assert [one.key for one in objects.list("")] == []
-
-
-@pytest.mark.parametrize("revision", ["0015", "0020"])
-def test_writers_wait_while_earlier_versions_may_write(
-    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
-    until: Until, revision: str,
-) -> None:  # fmt: skip
-    digest = engine.store.blobs.put(b"of another frame")
-    with least(engine, revision):
-        removing = removal(digest)
-        adding = Background(lambda: alone(engine, small))
-        until(lambda: waiting(engine) == 1 or not adding.is_alive())
-        assert adding.is_alive()
-        held.release()
-        removing.result()
-        adding.result()
-        assert not engine.store.blobs.holds(digest)
-    assert engine.get_map("hall").frames == {"received": 1}
 
 
 def test_a_snapshot_defers_a_removal(engine: Engine) -> None:
@@ -559,7 +530,7 @@ def test_who_lost_its_turn_while_it_removes_files_is_waited_for(
         digest = engine.store.blobs.put(small[0].png)
         monkeypatch.setattr(FolderBlobs, "remove", stall)
         removing = Background(lambda: collect_blobs(remover, [digest]))
-        assert arrived.wait(60)
+        assert arrived.wait(PATIENCE_S)
         end_sessions(engine, "objid = 1 AND mode = 'ExclusiveLock'")
         adding = Background(lambda: alone(engine, small))
         until(lambda: not adding.is_alive() or engine.get_map("hall").frames == {"received": 1})

@@ -29,7 +29,7 @@ TABLES = [
     "audit", "audit_chains", "deleted_frames", "deletions", "doomed", "events", "former_maps",
     "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs", "keys", "maps",
     "models", "pending_events", "queries", "samples", "schema_range",
-    "scrubs", "secrets", "signature_senders", "signatures", "surface_frames",
+    "scrubs", "secrets", "signatures", "surface_frames",
     "surface_tiles", "surface_touches", "surfaces", "tenants",
 ]  # fmt: skip
 

@@ -166,20 +166,11 @@ except SceneprintError as error:
 """
 
 
-@pytest.mark.parametrize(
-    ("schema", "said"),
-    [
-        ("0001", "ReadOnlyStore: sqlite:///{folder}/a.db has schema 0001, this version needs"),
-        ("9999", "NewerSchema: sqlite:///{folder}/a.db has schema 9999, which this version"),
-    ],
-)
-def test_another_schema_on_a_read_only_folder_is_left_alone(
-    folder: Path, schema: str, said: str
-) -> None:
+def test_a_later_schema_on_a_read_only_folder_is_left_alone(folder: Path) -> None:
     folder.chmod(0o755)
     with closing(sqlite3.connect(folder / "a.db")) as connection:
-        connection.execute("UPDATE alembic_version SET version_num = ?", (schema,))
-        connection.execute("UPDATE schema_range SET least_revision = ?", (schema,))
+        connection.execute("UPDATE alembic_version SET version_num = '9999'")
+        connection.execute("UPDATE schema_range SET least_revision = '9999'")
         connection.commit()
     folder.chmod(0o555)
     before = (folder / "a.db").read_bytes()
@@ -187,7 +178,8 @@ def test_another_schema_on_a_read_only_folder_is_left_alone(
         [sys.executable, "-c", OPENS, str(folder)], capture_output=True, text=True, check=True,
         preexec_fn=without_rights if os.getuid() == 0 else None,
     )  # fmt: skip
-    assert done.stdout.startswith(said.format(folder=folder)), done.stdout
+    said = f"NewerSchema: sqlite:///{folder}/a.db has schema 9999, which this version"
+    assert done.stdout.startswith(said)
     assert (folder / "a.db").read_bytes() == before
     assert [path.name for path in folder.iterdir()] == ["a.db"]
 

@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
-from sqlalchemy import create_engine, insert, select, text
+from sqlalchemy import insert, select, text
 
 from benchmarks.fleet.postgres import Server
 from sceneprint.errors import StoreAway, StoreLocked, UnusableStore
 from sceneprint.store import Database, Store, database, open_database, open_store
 from sceneprint.store.audit_chain import KeyChange, list_changes, note
-from sceneprint.store.database import is_there, known_revisions, migration_config, reach_database
+from sceneprint.store.database import is_there, known_revisions, reach_database
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import create_key, list_keys
 from sceneprint.store.maps import (
@@ -31,7 +30,6 @@ from sceneprint.store.maps import (
     frames_of,
     keep_model,
     list_maps,
-    map_of,
 )
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.tables import MapRow, events, maps, metadata
@@ -97,38 +95,11 @@ def test_two_processes_may_open_an_empty_database_at_once(
     made.close()
 
 
-def test_what_an_earlier_version_stored_is_brought_along(empty_url: str) -> None:
-    engine, config = create_engine(empty_url), migration_config()
-    with engine.begin() as connection:
-        config.attributes["connection"] = connection
-        command.upgrade(config, "0005")
-        connection.execute(text("INSERT INTO models VALUES ('m', 'compact', 'x', 1.0)"))
-        for number, name in enumerate("ab", 1):
-            connection.execute(
-                text(
-                    "INSERT INTO maps (name, model_id, revision, created_at) VALUES (:n, 'm', 7, 1)"
-                ),
-                {"n": name},
-            )
-            connection.execute(
-                text("INSERT INTO events (at, kind, map, data) VALUES (1, 'x', :n, '{}')"),
-                {"n": name},
-            )
-            assert connection.execute(text("SELECT max(number) FROM maps")).scalar() == number
-        secret = connection.execute(text("SELECT value FROM secrets")).scalar_one()
-    engine.dispose()
-    opened = open_database(empty_url)
-    with opened.write() as connection:
-        assert [(row.number, row.name, row.revision) for row in list_maps(connection)] \
-            == [(1, "a", 7), (2, "b", 7)]  # fmt: skip
-        assert map_of(connection, 1).retention_days is None
-        assert add_map(connection, "c", None, "m").number == 3
-        assert connection.execute(text("SELECT value FROM secrets")).scalar_one() == secret
-        # as after billions of events
+def test_events_are_numbered_beyond_32_bits(served: Database) -> None:
+    with served.write() as connection:
         connection.execute(text("SELECT setval('events_number_seq', 3000000000)"))
         record_event(connection, "key.created")
         assert connection.execute(text("SELECT max(number) FROM events")).scalar() == 3_000_000_001
-    opened.close()
 
 
 def test_the_blobs_of_a_database_that_is_there_are_not_made_up_for(

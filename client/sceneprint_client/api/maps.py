@@ -58,7 +58,8 @@ class NewMap(Given):
     )
     quota_bytes: Quota | None = Field(
         default=None,
-        description="Most bytes of uploads that it may hold, as they were sent; as `quota_frames`.",
+        description="Maximum bytes of uploads: frames as they were sent, and archives until their "
+        "imports end; as `quota_frames`.",
     )
     retention_days: Days | None = Field(
         default=None,
@@ -106,7 +107,8 @@ class Map(ApiRecord):
     )
     used_bytes: int = Field(
         default=0,
-        description="Bytes of their uploads, as they were sent; not what is made of them.",
+        description="Bytes of their uploads as they were sent, and of archives that are being "
+        "imported; not of signatures, artifacts and indexes.",
     )
     quota_frames: int | None = Field(default=None, description="Null: no quota.")
     quota_bytes: int | None = Field(default=None, description="Null: no quota.")

@@ -33,8 +33,9 @@ from sceneprint.store import Store, queue
 from sceneprint.store.blobs.folder import IncomingBlob
 from sceneprint.store.database_errors import unusable
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import find_map
+from sceneprint.store.maps import find_map, living_map, require_bytes
 from sceneprint.store.opaque_ids import row_of
+from sceneprint.store.tables import ARCHIVE, MapRow
 from sceneprint_client.api import Job, Page
 from sceneprint_client.api.frames import ImportItem, ImportOptions
 from sceneprint_client.frame_files import meta_of
@@ -161,10 +162,9 @@ def _item(name: str, outcome: UploadOutcome) -> ImportItem:
     )
 
 
-KIND, FILE = "import", "archive"
-#: Seconds for which the archive of an import that was given up is kept for another try, and
-#: between two looks for those.
-KEPT_S, TIDY_S = 86_400.0, 60.0
+KIND = "import"
+#: Seconds between two searches for archives of imports that have ended.
+TIDY_S = 5.0
 #: How much more a compressed tar may hold than the largest archive that is taken.
 _UNPACKED = 4
 
@@ -176,10 +176,11 @@ class Receiver:
     ----------
     blob : that it becomes, compressed tars inflated
     most_bytes : that it may have
+    reserve : counts a number of bytes against the quota of the map before they are written
     """
 
-    def __init__(self, blob: IncomingBlob, most_bytes: int) -> None:
-        self._blob, self._inflater = blob, Inflater(most_bytes)
+    def __init__(self, blob: IncomingBlob, most_bytes: int, reserve: Callable[[int], None]) -> None:
+        self._blob, self._inflater, self._reserve = blob, Inflater(most_bytes), reserve
 
     def write(self, chunk: bytes) -> None:
         """Take the next part.
@@ -187,16 +188,22 @@ class Receiver:
         Raises
         ------
         UnreadableArchive : it is no archive, is damaged, or holds more than it may.
+        QuotaExceeded : the map has no room for it.
         StoreFull, UnusableStore : it cannot be written.
         """
-        for piece in self._inflater.pieces(chunk):
-            self._blob.write(piece)
+        self._write(self._inflater.pieces(chunk))
 
     def end(self) -> queue.JobFile:
         """Keep it, durable; raises as `write`."""
-        for piece in self._inflater.end():
+        self._write(self._inflater.end())
+        return queue.JobFile(
+            ARCHIVE, self._blob.keep(), self._blob.size, "application/octet-stream"
+        )
+
+    def _write(self, pieces: Iterator[bytes]) -> None:
+        for piece in pieces:
+            self._reserve(len(piece))
             self._blob.write(piece)
-        return queue.JobFile(FILE, self._blob.keep(), self._blob.size, "application/octet-stream")
 
 
 class Imports:
@@ -218,16 +225,35 @@ class Imports:
     def receive(self, map_name: str) -> Iterator[Receiver]:
         """Take an archive in parts; what is not kept by `Receiver.end` is removed.
 
+        Its bytes count against the quota of the map as they come, until this ends: call `begin`
+        before.
+
         Raises
         ------
         UnknownMap : no such map.
         ReadOnlyStore, StoreFull, UnusableStore : nothing can be kept.
         """
         with self._store.database.read() as connection:
-            find_map(connection, map_name)
+            row = find_map(connection, map_name)
         self._store.database.require_writable()
-        with self._store.blobs.incoming() as blob:
-            yield Receiver(blob, _UNPACKED * self._most)
+        incoming, reserved = self._uploads.incoming, 0
+
+        def reserve(size: int) -> None:
+            nonlocal reserved
+            reserved += size
+            self._require_room(row, incoming.add(row.number, size), size)
+
+        try:
+            with self._store.blobs.incoming() as blob:
+                yield Receiver(blob, _UNPACKED * self._most, reserve)
+        finally:
+            incoming.add(row.number, -reserved)
+
+    def _require_room(self, row: MapRow, incoming: int, size: int) -> None:
+        """Check that the last `size` of the bytes that come in have room in a map."""
+        with self._store.database.read() as connection:
+            row = living_map(connection, row)
+        require_bytes(row, row.used_bytes + incoming - size, size)
 
     def begin(
         self,
@@ -245,7 +271,7 @@ class Imports:
 
         Raises
         ------
-        UnknownMap, IdempotencyConflict : see `Tasks.begin`; the archive is removed.
+        UnknownMap, IdempotencyConflict, QuotaExceeded : see `Tasks.begin`; the archive is removed.
         Conflict : an import of the same archive has just ended, and removed it.
         """
         data = options.model_dump(mode="json")
@@ -296,11 +322,10 @@ class Imports:
         """Import a part of an archive: frames until the slice is over, at least some."""
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
-            file = queue.files_of(connection, task.job.number).get(FILE)
+            file = queue.files_of(connection, task.job.number).get(ARCHIVE)
         if file is None:
             raise errors.UnreadableArchive(
-                "The archive was removed because its import failed or was cancelled too long "
-                "ago. Send it again."
+                "The archive was removed when its import failed or was cancelled. Send it again."
             )
         try:
             with self._opened(file, options.name) as archive:
@@ -308,12 +333,12 @@ class Imports:
         except errors.UnreadableArchive:  # trying again cannot help, and it may be large
             with self._store.database.write() as connection:
                 number = task.job.number
-                gone = queue.remove_parts(connection, number, items=False, files=[FILE])
+                gone = queue.remove_parts(connection, number, items=False, files=[ARCHIVE])
             collect_deleted_blobs(self._store, gone)
             raise
 
     def tidy(self) -> int:
-        """Remove archives of imports that were given up long ago, if it is time; returns how many.
+        """Remove archives of imports that failed, if it is time; return how many.
 
         Raises
         ------
@@ -322,15 +347,14 @@ class Imports:
         if time.monotonic() - self._tidied < TIDY_S:
             return 0
         self._tidied = time.monotonic()
-        long_ago = time.time() - KEPT_S
         with self._store.database.read() as connection:  # most often there is none: no lock
-            if not queue.finished_with_file(connection, KIND, FILE, long_ago):
+            if not queue.finished_with_file(connection, ARCHIVE):
                 return 0
         with self._store.database.write() as connection:
             gone = [
                 blob
-                for number in queue.finished_with_file(connection, KIND, FILE, long_ago)
-                for blob in queue.remove_parts(connection, number, items=False, files=[FILE])
+                for number in queue.finished_with_file(connection, ARCHIVE)
+                for blob in queue.remove_parts(connection, number, items=False, files=[ARCHIVE])
             ]
         collect_deleted_blobs(self._store, gone)
         return len(gone)
@@ -369,6 +393,6 @@ class Imports:
         counts = {name: progress[name] for name in ("received", "there", "refused")}
         result = {"sequences": len(archive.sequences), **counts, "ignored": archive.ignored}
         return SliceResult(
-            over, progress, items, drop=[FILE] if over else (), result=result if over else None,
+            over, progress, items, drop=[ARCHIVE] if over else (), result=result if over else None,
             event="import.done" if over else None,
         )  # fmt: skip

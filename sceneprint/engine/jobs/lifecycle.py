@@ -13,18 +13,16 @@ from dataclasses import dataclass
 from sqlalchemy import Connection
 
 from sceneprint.engine.serializers import job_record
+from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError, UnknownJob
 from sceneprint.store import Store, queue
-from sceneprint.store.deletion import doom
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import frame_of, map_of
 from sceneprint.store.queue import fail_of_dead
 from sceneprint.store.queue import list_jobs as list_stored
-from sceneprint.store.reencoding_rows import REENCODE, touch
-from sceneprint.store.sender_rows import senders_of
-from sceneprint.store.signatures import remove_signature
-from sceneprint.store.tables import FrameRow, JobRow, MapRow
+from sceneprint.store.reencoding_rows import REENCODE
+from sceneprint.store.tables import ARCHIVE, FrameRow, JobRow, MapRow
 from sceneprint_client.api import FrameState, Job, JobState, Page
 from sceneprint_client.api.admin import RefusedRetry, RetriedJobs
 
@@ -96,31 +94,16 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
     try:
         with store.database.write(map_number=work.map.number) as connection:
             queue.finish(connection, work.job, JobState.FAILED, reason)
-            is_searched = map_of(connection, work.frame.map_number).model_id == work.model_id
-            number = work.frame.number
             if not work.again:
-                if not is_searched:
+                if map_of(connection, work.frame.map_number).model_id != work.model_id:
                     raise Outdated
-                set_state(connection, number, FrameState.REJECTED, reason)
-                record_job_event(connection, "frame.rejected", work)
-            elif is_searched and _is_sent(connection, work):
-                # a robot made something of what holds nothing: readers learn that it is gone
-                set_state(connection, number, FrameState.REJECTED, reason)
-                doom(connection, remove_signature(connection, number, work.model_id))
-                touch(connection, work.map, [number])
+                set_state(connection, work.frame.number, FrameState.REJECTED, reason)
                 record_job_event(connection, "frame.rejected", work)
     except LostLease:
         return None
     except Outdated:
         return restart_jobs(store, work)
     return JobState.FAILED
-
-
-def _is_sent(connection: Connection, work: Work) -> bool:
-    """Whether a frame is found by a signature that a robot sent."""
-    number = work.frame.number
-    found = senders_of(connection, [number], work.model_id).get(number) is not None
-    return found and frame_of(connection, number).state == FrameState.INDEXED
 
 
 def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
@@ -222,9 +205,10 @@ def get_job(store: Store, job_id: str) -> Job:
 
 
 def cancel(store: Store, job_id: str) -> Job:
-    """Give a job up that is not over; of one that is cancelled already nothing changes.
+    """Cancel a job that is not over; of one that is cancelled already nothing changes.
 
-    A worker that is at it goes on to the end, and what it brings is refused.
+    A worker that holds it goes on to the end, and its result is refused. The archive of an import
+    is removed at once.
 
     Raises
     ------
@@ -233,10 +217,14 @@ def cancel(store: Store, job_id: str) -> Job:
     """
     with store.database.write() as connection:
         job = queue.find_job(connection, job_id)
+        gone: list[str] = []
         if job.state != JobState.CANCELLED:
             queue.cancel(connection, job)
             fail_frame(connection, job, CANCELLED)
-        return _job_record(connection, queue.find_job(connection, job_id))
+            gone = queue.remove_parts(connection, job.number, items=False, files=[ARCHIVE])
+        cancelled = _job_record(connection, queue.find_job(connection, job_id))
+    collect_deleted_blobs(store, gone)
+    return cancelled
 
 
 def retry(store: Store, job_id: str) -> tuple[Job, bool]:

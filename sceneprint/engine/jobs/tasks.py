@@ -37,9 +37,9 @@ from sceneprint.errors import (
 from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import find_map, map_of
+from sceneprint.store.maps import find_map, map_of, require_bytes
 from sceneprint.store.queue import find_job, list_jobs, remove_job
-from sceneprint.store.tables import JobRow, MapRow
+from sceneprint.store.tables import ARCHIVE, JobRow, MapRow
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Job, JobState
 
@@ -177,6 +177,7 @@ class Tasks:
         UnknownMap : no such map.
         Swept : a file is gone; put it once more.
         IdempotencyConflict : something else was asked with the key of `once`.
+        QuotaExceeded : the map has no room for an archive among the files.
         """
         with self._store.database.write() as connection:
             row = None if map_name is None else find_map(connection, map_name)
@@ -186,6 +187,9 @@ class Tasks:
                     there = queue.find_job(connection, before["job_id"])
                     return job_record(there, None, map_name), True
             self._check(files)
+            if row is not None:
+                size = sum(one.bytes for one in files if one.name == ARCHIVE)
+                require_bytes(row, row.used_bytes, size)
             number = None if row is None else row.number
             job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
             queue.add_files(connection, job.number, files)

@@ -283,22 +283,18 @@ _LOOK_S, _AGAIN_S = 1.0, 60.0
 
 
 def index_folder(indexes: Path, row: MapRow) -> Path:
-    """Where the index of a map is: never that of another map, which may have had its name.
+    """Return the folder of the index of a map.
 
-    And never that of another model, whose signatures are not comparable, nor of another schema: a
-    version of the product that runs beside this one has a folder of its own.
+    No other map has it, even one that had the same name, and no other model, whose signatures are
+    not comparable. No other schema has it: a version of the product that runs beside this one has
+    a folder of its own.
     """
-    return indexes / f"{earlier_folder(indexes, row).name}.{SCHEMA_VERSION}"
-
-
-def earlier_folder(indexes: Path, row: MapRow) -> Path:
-    """Where versions before schema 3 have the index of a map."""
-    made = f"{row.number}-{round(1e6 * row.created_at):x}"
-    return indexes / f"{row.name}-{made}-{row.model_id[:12]}"
+    created = f"{row.number}-{round(1e6 * row.created_at):x}"
+    return indexes / f"{row.name}-{created}-{row.model_id[:12]}.{SCHEMA_VERSION}"
 
 
 _FOLDER_NAME = re.compile(
-    rf"[a-z0-9][a-z0-9_-]{{0,62}}-\d+-[0-9a-f]+(-[0-9a-f]{{12}}(\.{SCHEMA_VERSION})?)?"
+    rf"[a-z0-9][a-z0-9_-]{{0,62}}-\d+-[0-9a-f]+-[0-9a-f]{{12}}\.{SCHEMA_VERSION}"
 )
 
 
@@ -315,7 +311,7 @@ def qdrant_metric(model: Model, wanted: bool) -> Metric | None:
 
 
 def is_index_folder(name: str) -> bool:
-    """Whether a folder is called as `index_folder` calls them, or `earlier_folder`."""
+    """Return whether a name is one of `index_folder`."""
     return _FOLDER_NAME.fullmatch(name) is not None
 
 

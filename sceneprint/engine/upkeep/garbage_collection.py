@@ -19,7 +19,6 @@ from contextlib import ExitStack, suppress
 from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store import Store
 from sceneprint.store.blobs.folder import LONGEST_S
-from sceneprint.store.database import least_revision
 from sceneprint.store.deletion import doom, doomed_blobs, settle
 from sceneprint.store.frames import referred_blobs
 
@@ -28,9 +27,6 @@ log = logging.getLogger(__name__)
 #: Blobs that are found and removed at once, of a store of objects by one request: writers wait
 #: while they are found, and in a folder while they are removed.
 SWEPT_AT_ONCE = 200
-#: The first schema whose processes wait for the end of a removal before they refer to a blob of it.
-#: Those of before look at once, so while they may write, blobs are removed in the turn.
-_WAITED_FOR = "0001"
 #: Seconds to wait for another removal.
 _PATIENCE_S = 5.0
 #: Blobs of deleted frames that are asked for at once.
@@ -51,18 +47,10 @@ def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
     store.geometries.forget(blobs)
     if not blobs:
         return
-    remove = _remove_after_turn if _outlasts_turn(store) else _remove_in_turn
+    remove = _remove_after_turn if store.blobs.outlast_turns else _remove_in_turn
     for first in range(0, len(blobs), SWEPT_AT_ONCE):
         if not remove(store, blobs[first : first + SWEPT_AT_ONCE]):
             log.info("blob removal deferred", extra={"blobs": len(blobs)})
-
-
-def _outlasts_turn(store: Store) -> bool:
-    """Whether blobs may be removed after the turn: whoever may write waits for that."""
-    if not store.blobs.outlast_turns:
-        return False
-    with store.database.read() as connection:  # it only ever becomes greater
-        return least_revision(connection) >= _WAITED_FOR
 
 
 def _remove_in_turn(store: Store, block: Sequence[str]) -> bool:

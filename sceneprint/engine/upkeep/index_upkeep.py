@@ -22,7 +22,6 @@ from sqlalchemy.exc import SQLAlchemyError
 from sceneprint.atomic_files import PRIVATE_FILE, make_folder
 from sceneprint.engine.search.local_index import (
     READ_MOST,
-    earlier_folder,
     index_folder,
     is_index_folder,
     qdrant_metric,
@@ -315,27 +314,22 @@ class Upkeep:
         """Leave no byte of a deleted frame in the index of a map, be it here or shared; whether
         anything was done.
 
-        Also removed is the index of an earlier schema. Another version of the product that still
-        runs here makes it again, and searches meanwhile what it has open.
-
         Raises
         ------
         UnknownMap : the map is gone, and with it soon its index.
         BusyIndex : another process is building it, and may not know of the latest deletions.
         OSError, UnusableStore : it cannot be written; what was there stays.
         """
-        model, earlier = self._model(row.model_id), earlier_folder(self._indexes, row)
+        model = self._model(row.model_id)
         if model is None:  # of another version's model, which says so where there is an index
             return self._purge_own(row)
-        left = any(earlier.glob("*.json"))
-        shutil.rmtree(earlier, ignore_errors=True)
         if not self._is_indexed(model):  # Qdrant may have searched it before
             folder = index_folder(self._indexes, row)
-            left |= any(folder.glob("*.json"))
+            left = any(folder.glob("*.json"))
             shutil.rmtree(folder, ignore_errors=True)
             return left
         own = self._purge_own if self._shared is None else self._purge_shared
-        return own(row) or left
+        return own(row)
 
     def _purge_own(self, row: MapRow) -> bool:
         """As `purge`: of what is here alone."""
@@ -548,22 +542,20 @@ class Upkeep:
         """Remove the indexes of maps that are no more, of models that they had, and of psi."""
         if not self._indexes.is_dir():
             return
-        kept = self._known_folders(rows, earlier_folder) | self._known_folders(rows)
+        kept = self._known_folders(rows)
         for folder in self._indexes.iterdir():
             if is_index_folder(folder.name) and folder.name not in kept:
                 shutil.rmtree(folder, ignore_errors=True)
                 log.info("index removed", extra={"folder": folder.name})
 
-    def _known_folders(
-        self, rows: Sequence[MapRow], folder_of: Callable[[Path, MapRow], Path] = index_folder
-    ) -> set[str]:
+    def _known_folders(self, rows: Sequence[MapRow]) -> set[str]:
         """Names of the folders of indexes of these maps, and of those that there are now."""
         with self._store.database.read() as connection:  # a map may have been made since
             known = [*rows, *list_maps(connection)]
         known += [_coming(row) for row in known if row.next_model_id is not None]
         # a model of another version is another's concern
         known = [r for r in known if self._model(r.model_id) is None or self._has_index(r.model_id)]
-        return {folder_of(self._indexes, row).name for row in known}
+        return {index_folder(self._indexes, row).name for row in known}
 
 
 def _lacks_shard(previous: Generation | None, metric: Metric | None) -> bool:

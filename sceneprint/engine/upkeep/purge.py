@@ -32,7 +32,6 @@ from sceneprint.store.deletion import (
     BLOCK,
     DAY_S,
     aging_maps,
-    date_ended,
     delete_frames,
     maps_with_ended,
     old_frames,
@@ -107,8 +106,6 @@ class Retention:
             before = (read_clock(connection) if at is None else at) - self._rows_s
             rows = maps_with_ended(connection, before)
         for row in rows:
-            while self._write(row, lambda c, of: date_ended(c, of, BLOCK)):
-                yield 0  # frames of the version before: their days begin now
             while found := self._write(row, lambda c, of: remove_ended(c, of, before, BLOCK)):
                 log.info("ended rows removed", extra={"map": row.name, "frames": found})
                 yield found

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 
 from sceneprint.engine.search.local_index import (
-    earlier_folder,
     index_folder,
     is_index_folder,
     trusted,
@@ -401,10 +400,9 @@ def _of_no_map(folder: Folder) -> Iterator[Finding]:
         rows = list_maps(connection)
     models = {row.number: (row.model_id, row.next_model_id or row.model_id) for row in rows}
     own = {
-        folder_of(place, replace(row, model_id=model_id)).name
+        index_folder(place, replace(row, model_id=model_id)).name
         for row in rows
         for model_id in models[row.number]
-        for folder_of in (index_folder, earlier_folder)  # workers remove what is of before
     }
     for path in found:
         if path.is_dir() and is_index_folder(path.name) and path.name not in own:

@@ -205,8 +205,6 @@ class IncomingBlob:
 #: What a blob is found to be.
 Condition = Literal["sound", "missing", "damaged"]
 DIGEST = re.compile(r"[0-9a-f]{64}")
-#: Note of the newest timeline of a PostgreSQL database; see `postgres.timelines`.
-TIMELINE = "timeline.json"
 #: Note of whose the blobs are; see `object_store.BucketOwner`.
 MARK = "sceneprint.json"
 
@@ -396,24 +394,6 @@ class Blobs(ABC):
         """Whether blobs may be read alone, as far as that can be seen without writing."""
         return False
 
-    @abstractmethod
-    def get_note(self, name: str) -> bytes | None:
-        """A small file that is kept beside the blobs; None where there is none.
-
-        Raises
-        ------
-        UnusableStore : it cannot be read, or the store is away.
-        """
-
-    @abstractmethod
-    def put_note(self, name: str, data: bytes) -> None:
-        """Keep a small file beside the blobs, in place of the one that is there.
-
-        Raises
-        ------
-        StoreFull, UnusableStore : as `put`.
-        """
-
     def check(self) -> None:  # noqa: B027
         """See that a store on the network answers, or did two seconds ago; a folder has nothing
         to be asked.
@@ -601,7 +581,7 @@ class FolderBlobs(Blobs):
                     if one.is_dir(follow_symlinks=False):
                         folders.append(path)
                         continue
-                    if path in (self._folder / TIMELINE, self._folder / MARK):
+                    if path == self._folder / MARK:
                         continue
                     try:
                         changed_at = one.stat(follow_symlinks=False).st_mtime
@@ -610,22 +590,6 @@ class FolderBlobs(Blobs):
                     own = DIGEST.fullmatch(one.name) and self.path(one.name) == path
                     part = PART.fullmatch(one.name) is not None
                     yield BlobEntry(one.path, one.name if own else None, changed_at, part)
-
-    def get_note(self, name: str) -> bytes | None:
-        """A small file beside the blobs; see `Blobs.get_note`."""
-        try:
-            return (self._folder / name).read_bytes()
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            raise unusable(f"{self._folder / name}: it cannot be read", error) from error
-
-    def put_note(self, name: str, data: bytes) -> None:
-        """Keep a small file beside the blobs; see `Blobs.put_note`."""
-        try:
-            write_durable(self._folder / name, data, folder_is_new=False)
-        except OSError as error:
-            raise unusable(f"{self._folder / name}: it cannot be written", error) from error
 
     def path(self, digest: str) -> Path:
         """Where a blob lies; ValueError for what is no digest."""

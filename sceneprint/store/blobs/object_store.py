@@ -2,7 +2,6 @@
 
     PREFIX/blobs/ab/abcdef...   a blob under its digest
     PREFIX/sceneprint.json      the database they belong to
-    PREFIX/timeline.json        a note of its newest timeline
 
 A blob is put in one step, or in parts that are not there before the last: what was not
 acknowledged leaves nothing behind that could be read. It is put also where one is there, which may
@@ -333,18 +332,6 @@ class ObjectBlobs(Blobs):
             own = DIGEST.fullmatch(name) and one.key == _key(name)
             place = f"{self.objects.url}/{one.key}"
             yield BlobEntry(place, name if own else None, one.changed_at)
-
-    def get_note(self, name: str) -> bytes | None:
-        """A small object beside the blobs; see `Blobs.get_note`."""
-        try:
-            return self.objects.get(name)
-        except FileNotFoundError:
-            return None
-
-    def put_note(self, name: str, data: bytes) -> None:
-        """Keep a small object beside the blobs; see `Blobs.put_note`."""
-        self.claim()
-        self.objects.put(name, data)
 
     def check(self) -> None:
         """See that the store answers; see `Blobs.check`."""

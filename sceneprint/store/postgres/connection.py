@@ -142,6 +142,17 @@ def configure(connection: Any, _record: object = None) -> None:
     connection.autocommit = before
 
 
+def timeline_of(connection: Any) -> str | None:
+    """Return the timeline that the server of a psycopg connection writes; None of a standby."""
+    before, connection.autocommit = connection.autocommit, True
+    row = connection.execute(
+        "SELECT CASE WHEN pg_is_in_recovery() THEN NULL"
+        " ELSE left(pg_walfile_name(pg_current_wal_lsn()), 8) END"
+    ).fetchone()
+    connection.autocommit = before
+    return None if row is None else row[0]
+
+
 @cache
 def _texts() -> type[Any]:
     """How texts are handed over: PostgreSQL has none with NUL, and nothing is found by such a one.
@@ -275,15 +286,15 @@ class SingleStatement:
             raise MapsInUse from error
 
 
-#: The schema that a process may write to, as it found it last.
-SCHEMA = "SELECT version_num, (SELECT max(least_revision) FROM schema_range) FROM alembic_version"
+#: The schema of a store, and the oldest one whose processes may write to it.
+SCHEMA = "SELECT version_num, least_revision FROM alembic_version, schema_range"
 #: The locks of maps, one after the other.
 _MAPS, _NUMBERS = "SELECT pg_advisory_xact_lock(%s, number)", "FROM unnest(%s::integer[]) AS number"
-#: Fails, too, where the schema is another one, so that what follows in the transaction is not
-#: executed. It stays the same while this has its turn.
+#: Divides by zero if the schema is another one, so that the rest of the transaction fails. The
+#: schema stays the same while this process has its turn.
 _MAPS_AND_SCHEMA = (
-    f"{_MAPS}, (SELECT 1 / cast(version_num = %s AND (SELECT max(least_revision) FROM schema_range)"
-    f" IS NOT DISTINCT FROM %s AS integer) FROM alembic_version) {_NUMBERS}"
+    f"{_MAPS}, (SELECT 1 / count(*) FROM alembic_version, schema_range"
+    f" WHERE version_num = %s AND least_revision = %s) {_NUMBERS}"
 )
 
 
@@ -297,7 +308,7 @@ class KnownSchema:
 
     def __init__(self, check: Callable[[Any], None]) -> None:
         self._check = check
-        self.found: tuple[str, str | None] | None = None
+        self.found: tuple[str, str] | None = None
 
     def look(self, connection: Any) -> None:
         """Find it again, by a connection of psycopg.

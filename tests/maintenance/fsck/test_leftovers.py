@@ -69,9 +69,9 @@ def test_foreign_files_are_noted_and_left(house: Any) -> None:
 
 def test_the_index_of_a_map_that_is_no_more(house: Any) -> None:
     index = house.data / "index"
-    (index / "gone-7-61cbf3f4-0123456789ab").mkdir()
+    (index / "gone-7-61cbf3f4-0123456789ab.1").mkdir()
     (index / "mine").mkdir()
-    assert kinds(house.look()) == [("index-of-no-map", "gone-7-61cbf3f4-0123456789ab", True)]
+    assert kinds(house.look()) == [("index-of-no-map", "gone-7-61cbf3f4-0123456789ab.1", True)]
     assert [one.left for one in house.look(repair=True)] == [False]
     assert sorted(path.name for path in index.iterdir() if path.is_dir())[-1] == "mine"
     assert house.look() == []

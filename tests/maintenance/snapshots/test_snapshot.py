@@ -240,21 +240,6 @@ def test_a_database_that_could_not_be_restored_is_not_taken(data, tmp_path, sett
     assert names_in(tmp_path) == ["data"]
 
 
-@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
-def test_a_database_of_an_earlier_schema_is_taken_as_it_is(tmp_path, settings, bring_to):
-    """Before an upgrade is when one wants a snapshot."""
-    data = tmp_path / "data"
-    (data / "blobs").mkdir(parents=True)
-    bring_to(f"sqlite:///{data}/sceneprint.db", "0001")
-    before = (data / "sceneprint.db").read_bytes()
-    taken = take_snapshot(settings(data), tmp_path / "a.tar")
-    assert taken.manifest.schema_revision == "0001"
-    assert (data / "sceneprint.db").read_bytes() == before
-    restore_snapshot(tmp_path / "a.tar", tmp_path / "new")
-    with Engine(settings(tmp_path / "new")) as opened:
-        assert opened.list_maps().items == []
-
-
 AS_NOBODY = """
 import os, sys
 from pathlib import Path
