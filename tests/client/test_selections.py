@@ -56,7 +56,7 @@ def test_an_answer_is_kept_and_released(
     answer = client.query(map_name, frame_id=added.frame_id, robot="cart")
     (record,) = client.queries(map_name)
     told = client.stored_query(answer.query_id)
-    assert (told.kept_at, told.title, told.options["k"]) == (None, None, 5)
+    assert (told.kept_at, told.title, told.model) == (None, None, answer.model)
     assert told.expires_at is not None
     kept = client.keep_answer(answer.query_id, "by the door")
     assert (kept.title, kept.expires_at) == ("by the door", None)

@@ -261,7 +261,7 @@ def test_a_full_disk_leaves_the_spool_as_it_was(tmp_path: Path) -> None:
 FILL = """
 import sys
 from pathlib import Path
-sys.path.insert(0, sys.argv[3])
+sys.path[:0] = [sys.argv[3], str(Path(sys.argv[3]).parents[1])]
 from sceneprint_client.errors import StoreFull
 from test_spool import KINDS, Client, Spool, depth, meta
 path, taken = Path(sys.argv[1]), 0
@@ -465,7 +465,7 @@ def test_a_service_that_asks_to_come_back_is_waited_for(
 
 CHILD = """
 import os, resource, signal, sys
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = [sys.argv[1], os.path.join(sys.argv[1], "..", "..")]
 from test_spool import Client, Spool, UnusableStore, drive_meta, large
 what, path, *rest = sys.argv[2:]
 with Spool(path) as spool:
