@@ -105,11 +105,6 @@ class Settings(BaseSettings):
     lease_s: float = Field(default=60.0, ge=0.1, le=3600)
     #: Longest time for one job, seconds; a worker that takes longer hangs, and is ended.
     job_s: float = Field(default=120.0, ge=1, le=3600)
-    #: Whether signatures that robots send with their frames are used: workers sign a sample of
-    #: these frames all the same, and compare. Needs keys.
-    trust_signatures: bool = False
-    #: Share of these frames that workers sign all the same; the first 16 of a key always.
-    signed_sample: float = Field(default=0.0625, gt=0, le=1)
     #: Memory that a worker may take for its work, bytes, beyond what it has when it is ready;
     #: 0 for no limit. What needs more fails, and no other process is killed for it.
     worker_bytes: int = Field(default=2 << 30, ge=0)

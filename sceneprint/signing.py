@@ -48,10 +48,6 @@ from sceneprint.models import (
 )
 from sceneprint.types import AnyFrame, Bytes, Cloud, Floats, Hierarchy, Patches, Surface
 
-#: Of what signing makes of a frame: signatures and artifacts of two versions are not expected to be
-#: equal. Raise it when they change, such as with the files of tests/golden.
-SIGNING_VERSION = 1
-
 
 @dataclass(frozen=True, eq=False)
 class Signature:

@@ -124,7 +124,7 @@ log = logging.getLogger(__name__)
 ROUTERS = (
     maps.router, frames.router, selections.router, frame_data.router, frame_data.points_router,
     maps.edits_router, copies.router,
-    sessions.router, frames.imports_router, frames.signatures_router, queries.router,
+    sessions.router, frames.imports_router, queries.router,
     results.history_router, results.offline_router,
     results.router,
     queries.similarity_router, sessions.associations_router, coverage.router, differences.router,

@@ -459,7 +459,7 @@ _READING = frozenset(("GET", "HEAD", "OPTIONS"))
 #: them.
 UNNOTED = frozenset(
     ("add_frame", "put_frame", "add_batch", "ask", "ask_several", "ask_again", "localize",
-     "localize_sequence", "compare", "sign_frame")
+     "localize_sequence", "compare")
 )  # fmt: skip
 
 

@@ -30,7 +30,6 @@ from sceneprint.errors import (
     UnusableStore,
 )
 from sceneprint.formats.depth_file import size_of
-from sceneprint.formats.signature_package import MAXIMUM_PACKAGE
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint_client.api import FrameMeta
 from sceneprint_client.api.base import CloudFormat, novelty_of
@@ -287,9 +286,6 @@ def _transform(name: str, text: str) -> dict[str, Any]:
 #: Most bytes of a form field that is no file, and of a JSON body.
 FIELD_BYTES = 1 << 18
 FORM = "multipart/form-data"
-#: Part of a form that is what a robot made of the frame, and all parts that are files.
-SIGNED = "signed"
-FILES = ("frame", SIGNED)
 #: Charsets a form may name: those whose text is UTF-8 as well.
 _CHARSETS = ("utf-8", "utf8", "us-ascii", "ascii")
 
@@ -328,13 +324,11 @@ class FormUpload:
     file : its bytes, large ones on disk until they are read
     meta : what is known of it
     fields : what else the form or the query string says
-    signed : what a robot made of it; None where it sent nothing
     """
 
     file: BinaryIO
     meta: FrameMeta
     fields: dict[str, str]
-    signed: BinaryIO | None = None
 
 
 def media_type(request: Request) -> str:
@@ -349,9 +343,7 @@ def _charset(request: Request) -> str:
 
 
 @asynccontextmanager
-async def uploaded(
-    request: Request, *fields: str, signed: bool = False
-) -> AsyncIterator[FormUpload]:
+async def uploaded(request: Request, *fields: str) -> AsyncIterator[FormUpload]:
     """Read a frame: a form with a file part `frame`, a field `meta`, and others that are named; or
     the frame alone, with the same in the query string.
 
@@ -359,7 +351,6 @@ async def uploaded(
     ----------
     request : with the body
     fields : names of the other fields that it may have
-    signed : whether the form may have a file part `signed`
 
     Raises
     ------
@@ -375,9 +366,8 @@ async def uploaded(
         finally:
             await file.close()
         return
-    async with form_of(request, most_files=1 + signed) as form:
-        known = {"frame", "meta", *fields, *([SIGNED] if signed else [])}
-        check_parts(form, known)
+    async with form_of(request, most_files=1) as form:
+        check_parts(form, {"frame", "meta", *fields})
         frame = form.get("frame")
         if not isinstance(frame, UploadFile) or len(form.getlist("frame")) != 1:
             raise InvalidRequest(
@@ -385,9 +375,8 @@ async def uploaded(
                 "depth image or point cloud in it, with a file name.",
                 (("frame", "not one file"),),
             )
-        package = _package(form) if signed else None
         texts = texts_of(form)
-        yield FormUpload(frame.file, _meta(texts.pop("meta", None)), texts, package)
+        yield FormUpload(frame.file, _meta(texts.pop("meta", None)), texts)
 
 
 @asynccontextmanager
@@ -438,27 +427,7 @@ def check_parts(form: FormData, known: Collection[str]) -> None:
 
 def texts_of(form: FormData) -> dict[str, str]:
     """The parts of a form that are no files, each once; InvalidRequest."""
-    return {name: _text(form.getlist(name), name) for name in form if name not in FILES}
-
-
-def _package(form: FormData) -> BinaryIO | None:
-    """The file part `signed` of a form; None where it has none."""
-    found = form.getlist(SIGNED)
-    if not found:
-        return None
-    if len(found) != 1 or not isinstance(found[0], UploadFile):
-        raise InvalidRequest(
-            "The form has the part `signed` more than once, or as text. Send the signature package "
-            "in it once, with a file name.",
-            ((SIGNED, "not one file"),),
-        )
-    if (found[0].size or 0) > MAXIMUM_PACKAGE:
-        raise InvalidRequest(
-            f"The part `signed` has {found[0].size} bytes, and the limit is {MAXIMUM_PACKAGE}. "
-            "Send the frame without it.",
-            ((SIGNED, "too large"),),
-        )
-    return found[0].file
+    return {name: _text(form.getlist(name), name) for name in form if name != "frame"}
 
 
 def priority_of(fields: Mapping[str, str]) -> int:

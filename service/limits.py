@@ -252,9 +252,7 @@ def too_many_requests(most: int) -> RateLimited:
 QUERY_COST, ROWS_PER_COST = 5.0, 50
 #: Rows of a list that is asked for without a limit.
 _USUAL_ROWS = 100
-_QUERIES = re.compile(
-    r"/(queries|queries/records|localize|localize/sequence|similarity|signatures)$"
-)
+_QUERIES = re.compile(r"/(queries|queries/records|localize|localize/sequence|similarity)$")
 
 
 @dataclass(frozen=True)

@@ -124,13 +124,6 @@ MOST_MAPS = 20
 MOST_TENANTS, OTHERS = 50, "(others)"
 
 
-#: What is told of signatures that robots sent: names and texts of gauges.
-_ROBOTS = (
-    ("robot_signatures_verified", "Robots' signatures that workers made too, and agree."),
-    ("robot_keys_distrusted", "Keys of which a signature was wrong; none is used any more."),
-)
-
-
 class TenantMetrics:
     """What the tenants of keys ask of one service process, and have waiting in the store."""
 
@@ -227,7 +220,6 @@ class Metrics:
         self._disk = self._gauge("disk_bytes", "Disk space taken by each part.", "part")
         self._scrubbed = self._gauge("scrub_bytes", "Stored bytes that this scrub has read.")
         self._damaged = self._gauge("scrub_damaged", "What this scrub found lost or damaged.")
-        self._robots = [self._gauge(*one) for one in _ROBOTS]
         self._replica: tuple[Gauge, Gauge] | None = None  # told where there is one
         self._free = self._gauge("disk_free_bytes", "Left on the disk of the data folder.")
         self._gauge("build_info", "Version of the service.", "version", "python").labels(
@@ -305,8 +297,6 @@ class Metrics:
         self._workers.labels("idle").set(len(workers) - busy)
         self._began.set(figures.began)
         self._events.set(figures.events)
-        for gauge, number in zip(self._robots, (figures.verified, figures.distrusted), strict=True):
-            gauge.set(number)
         if stats.replica is not None:
             self._tell_replica(stats.replica)
         self._disk.labels("database").set(stats.bytes.database or 0)

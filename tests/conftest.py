@@ -26,6 +26,7 @@ from xdist.scheduler import LoadFileScheduling
 
 from benchmarks.fleet.postgres import NoServer, Server
 from benchmarks.fleet.s3 import ObjectServer
+from benchmarks.waiting import until as wait_until
 from sceneprint.cli.demo import write_building
 from sceneprint.geometry.registration.patch_descriptors import (
     Compression,
@@ -60,7 +61,7 @@ LONG = (
     "test_qdrant_search.py", "test_commands.py", "test_surfaces.py", "test_quality.py",
     "test_lookalikes.py", "test_stored_search.py", "test_lifecycle.py", "test_tracing.py",
     "test_hostile.py", "test_pulled_copies.py", "test_fleets.py", "test_fuzz.py",
-    "test_training.py", "test_survival.py", "test_robot_signatures.py", "test_work.py",
+    "test_training.py", "test_survival.py", "test_work.py",
     "test_recovery.py", "test_siege.py", "test_cli.py", "test_map_copy.py", "test_failover.py",
     "test_connections.py", "test_kill.py", "test_tracker.py", "test_purging.py",
     "test_associations.py", "test_evaluate.py", "test_equal_rooms.py", "test_shared_rates.py",
@@ -186,6 +187,12 @@ def _databases_go(request: pytest.FixtureRequest) -> Iterator[None]:
         asked = "DELETE FROM folders WHERE place = %s OR starts_with(place, %s) RETURNING name"
         for (name,) in connection.execute(asked, (place, f"{place}/")).fetchall():
             connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)'.encode())
+
+
+@pytest.fixture(scope="session")
+def until() -> Callable[..., Any]:
+    """Wait for the first true value of a condition, as `benchmarks.waiting.until` does."""
+    return wait_until
 
 
 @pytest.fixture(scope="session")

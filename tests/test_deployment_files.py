@@ -20,7 +20,7 @@ from typing import cast
 import httpx
 import pytest
 
-from sceneprint.cli import parser
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.decoders import sandbox
 from sceneprint.settings import Settings
 from sceneprint_client.errors import StoreAway
@@ -45,7 +45,8 @@ def said_by_haproxy(text: str, folder: Path) -> tuple[int, str]:
     path.write_text(text)
     done = subprocess.run(
         [tool("haproxy", "haproxy"), "-c", "-f", str(path)],
-        env={**os.environ, "API_HOST": "localhost"}, capture_output=True, text=True, timeout=60,
+        env={**os.environ, "API_HOST": "localhost"}, capture_output=True, text=True,
+        timeout=PATIENCE_S,
     )  # fmt: skip
     return done.returncode, done.stdout + done.stderr
 
@@ -81,7 +82,7 @@ class _Answer(BaseHTTPRequestHandler):
         api = cast(_Api, self.server)
         if self.path.endswith("/hold"):
             api.held.release()
-            api.release.wait(30)
+            api.release.wait(PATIENCE_S)
         body = api.name.encode()
         self.send_response(200)
         self.send_header("Content-Length", str(len(body)))
@@ -129,7 +130,7 @@ def proxied(tmp_path: Path) -> Iterator[tuple[httpx.Client, dict[str, _Api]]]:
 
 def until(holds: Callable[[], bool]) -> None:
     """Ask until it holds, at most for some seconds."""
-    end = time.monotonic() + 20
+    end = time.monotonic() + PATIENCE_S
     while not holds():
         assert time.monotonic() < end
 
@@ -222,7 +223,8 @@ def said_of_unit(text: str, name: str, folder: Path) -> str:
     path.write_text(text.replace("/opt/sceneprint/bin/sceneprint", "/bin/true"))
     done = subprocess.run(
         [tool("systemd-analyze", "systemd"), "verify", "--man=no", str(path)],
-        capture_output=True, text=True, timeout=60,
+        capture_output=True, text=True,
+        timeout=PATIENCE_S,
     )  # fmt: skip
     return done.stdout + done.stderr
 
@@ -296,22 +298,6 @@ def test_a_shell_reads_the_environment_as_systemd_does() -> None:
     assert sourced.items() >= settings_of("\n".join(expected)).items()
     url = "postgresql+psycopg://sceneprint@/sceneprint?host=db1.example:5432&host=db2.example:5432"
     assert sourced["SCENEPRINT_DATABASE_URL"] == f"{url}&target_session_attrs=read-write"
-
-
-def test_units_are_alike_but_for_what_they_run() -> None:
-    api, worker = (path.read_text().splitlines() for path in UNITS)
-    assert set(api) ^ set(worker) == {
-        api[0],
-        worker[0],
-        "Description=sceneprint: place recognition over HTTP",
-        "Description=sceneprint: workers that sign frames",
-        "Environment=SCENEPRINT_WORKERS=0",
-        "ExecStart=/opt/sceneprint/bin/sceneprint serve",
-        "ExecStart=/opt/sceneprint/bin/sceneprint work",
-    }
-    known = parser().format_help()
-    assert re.search(r"^ +serve ", known, re.MULTILINE)
-    assert re.search(r"^ +work ", known, re.MULTILINE)
 
 
 def test_the_page_names_every_file() -> None:

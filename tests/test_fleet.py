@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 import random
-import threading
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import replace
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks.fleet import audit, failover_client, faults
-from benchmarks.fleet.__main__ import marks, table
+from benchmarks.fleet import audit, faults
 from benchmarks.fleet.audit import Found, check
-from benchmarks.fleet.failover_client import FailoverClient, RequestLog, Unreachable, Wait
-from benchmarks.fleet.faults import CUT_OFF, FROZEN, PRIMARY, Kill, Promotion, schedule
+from benchmarks.fleet.failover_client import FailoverClient, RequestLog
+from benchmarks.fleet.faults import CUT_OFF, FROZEN, PRIMARY, Promotion, schedule
 from benchmarks.fleet.lock_samples import LockSampler, LockShares
-from benchmarks.fleet.paper import Costs, paper
 from benchmarks.fleet.postgres import NoServer, binaries
-from benchmarks.fleet.qdrant_search import Compared, Searched
 from benchmarks.fleet.qdrant_search import measure as measure_qdrant
-from benchmarks.fleet.qdrant_search import table as qdrant_table
 from benchmarks.fleet.recordings import GRIDS, walks
-from benchmarks.fleet.resource_usage import Work
 from benchmarks.fleet.robots import Kept, Listener
-from benchmarks.fleet.run import FleetFigures, Plan, drive, outages
-from benchmarks.pages import put_between
-from benchmarks.soak.load import free_port
+from benchmarks.fleet.run import FleetFigures, Plan, drive
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
 from sceneprint.store import open_store
@@ -39,10 +30,10 @@ from sceneprint_client import Client
 
 #: At reduced size.
 SMALL = Plan(seconds=6, robots=2, rate=2, kills=2, promotions=1, seed=1, workers=1)
-#: The same with robots that sign their frames, one that is offline, and all kinds of faults.
+#: The same with a robot that is offline, and all kinds of faults.
 HARD = replace(
     SMALL, robots=6, rate=1, kills=1, partitions=1, offline=5, retention_s=2.0,
-    signed=True, objects=True, delays=True,
+    objects=True, delays=True,
 )  # fmt: skip
 
 
@@ -133,17 +124,6 @@ def test_walks_have_nothing_in_common(recording: Path) -> None:
         walks(recording, 1, 850)
 
 
-@pytest.mark.parametrize(("retention_s", "shared"), [(None, [0, 1, 2, 4, 5, 6]), (9.0, [3, 7])])
-def test_robots_share_a_map_or_have_one_of_few(
-    retention_s: float | None, shared: list[int]
-) -> None:
-    plan = Plan(robots=1000, retention_s=retention_s)
-    maps = [plan.map_of(i) for i in range(1000)]
-    assert [i for i in range(8) if maps[i] == "fleet"] == shared
-    assert 19 <= len(set(maps)) <= 58
-    assert maps[5 if retention_s else 7] == ("fleet-5" if retention_s else "fleet-7")
-
-
 def test_locks_are_sampled(postgres_url: str, tmp_path: Path) -> None:
     with closing(open_store(postgres_url, tmp_path)) as store:
         with store.database.write():  # everybody waits
@@ -166,69 +146,6 @@ def sampled(url: str) -> LockShares:
     return sampler.shares
 
 
-@pytest.mark.parametrize(
-    ("waits", "told"),
-    [
-        ([], [0.0, 0.0, 0.0]),
-        ([Wait("upload", 9.0, 12.0)], [2.0, 0.0, 0.0]),  # from the kill on
-        ([Wait("upload", 11.0, 12.5), Wait("query", 11.5, 12.0)], [1.5, 0.0, 0.0]),
-        ([Wait("upload", 9.0, 22.0)], [12.0, 0.0, 0.0]),  # not back at the second
-        ([Wait("upload", 31.0, 34.0), Wait("upload", 19.0, 21.0)], [0.0, 1.0, 3.0]),
-        ([Wait("upload", 1.0, 2.0)], [0.0, 0.0, 0.0]),  # before anything was killed
-    ],
-)
-def test_a_wait_is_put_down_to_one_kill(waits: list[Wait], told: list[float]) -> None:
-    kills = [Kill("service", 10.0), Kill(PRIMARY, 20.0), Kill("service", 30.0)]
-    first, second, third = told
-    assert outages(kills, waits) == {"service": [first, third], PRIMARY: [second]}
-
-
-@contextmanager
-def answering(*statuses: int) -> Iterator[str]:
-    """A server that gives these answers, one after the other, and its address."""
-    left = list(statuses)
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(left.pop(0))
-            self.send_header("Retry-After", "0")
-            self.send_header("Content-Length", "0")
-            self.end_headers()
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with HTTPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_address[1]}"
-        finally:
-            server.shutdown()
-            thread.join()
-
-
-def test_a_robot_asks_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(failover_client, "PAUSE_S", 0.01)
-    log = RequestLog()
-    with answering(503, 200, 500, 404) as url:
-        dead = f"http://127.0.0.1:{free_port()}"
-        with FailoverClient([dead, url], log) as asked:
-            assert asked.ask("upload", "GET", "/").status_code == 200
-            assert asked.ask("query", "GET", "/").status_code == 404
-    assert log.repeated == 3 + 2  # dead, 503, dead, 200; 500, dead, 404
-    assert [wait.kind for wait in log.waits] == ["upload", "query"]
-    assert [line[:10] for line in log.faults] == ["query: 500"]  # to be retried, and a fault
-
-
-def test_a_robot_gives_up_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(failover_client, "PAUSE_S", 0.01)
-    monkeypatch.setattr(failover_client, "PATIENCE_S", 0.1)
-    nobody = [f"http://127.0.0.1:{free_port()}"]
-    with FailoverClient(nobody, RequestLog()) as asked, pytest.raises(Unreachable):
-        asked.ask("upload", "GET", "/")
-
-
 def test_what_is_not_there_is_seen(
     tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -236,7 +153,7 @@ def test_what_is_not_there_is_seen(
     [walk] = walks(recording, 1, 5)
     with Client.embedded(tmp_path) as client:
         client.create_map("fleet", model="depth")
-        added = [client.upload("fleet", one.png, one.meta, wait_s=60) for one in walk[:4]]
+        added = [client.upload("fleet", one.png, one.meta, wait_s=PATIENCE_S) for one in walk[:4]]
         waiting = client.upload("fleet", walk[4].png, walk[4].meta)
         kept = [
             Kept(one.frame_id, "fleet", shot, 0.0)
@@ -265,7 +182,7 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         "plan": Plan(), "kills": Counter(service=2, primary=1),
         "outages": {"service": [1.25, 0.0], PRIMARY: [3.0]},
         "promotions": [Promotion(None, 10.0, 11.5, {"a": 0.5, "b": 2.0}, frozenset())],
-        "steps": (), "refused": Counter(), "waits_ms": {"query": (90.0, 1200.0)},
+        "waits_ms": {"query": (90.0, 1200.0)},
         "memory": (200_000_000, 100_000_000),
         "answers": Counter(found=3), "repeated": 4, "faults": [], "damaged": 0, "leftovers": 0,
         "lost": 0, "window": 0, "seconds": 99.0, "spooled": 0, "spooled_twice": 0,
@@ -291,8 +208,6 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         ({}, {"locks": LockShares(5_000, 59.0, 0.0, 0.0)}, False),  # half of 120 s is too few
         ({}, {"plan": Plan(offline=9), "spooled": 9}, True),
         ({}, {"plan": Plan(offline=9), "spooled": 8}, False),
-        ({}, {"promotions": [Promotion(None, 1.0, 2.0, {}, frozenset(), frozenset())]}, True),
-        ({}, {"promotions": [Promotion(None, 1.0, 2.0, {}, frozenset(), frozenset("a"))]}, False),
         ({"acknowledged": 0, "indexed": 0, "found": 0}, {}, False),
         ({"found": 8}, {}, False),
         ({"indexed": 8, "looked_for": 8, "found": 8}, {}, False),
@@ -313,104 +228,6 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
 def test_what_is_wrong_fails(found: dict[str, Any], changed: dict[str, Any], sound: bool) -> None:
     whole: dict[str, Any] = {"acknowledged": 9, "indexed": 9, "looked_for": 9, "found": 9}
     assert figures(Found(**whole | found), **changed).sound is sound
-
-
-def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
-    page, (begin, end) = tmp_path / "page.md", marks(Plan())
-    page.write_text(f"before\n{begin}\nold\n{end}\nafter\n")
-    put_between(page, begin, end, table(figures(Found(acknowledged=9, indexed=9, found=9))))
-    text = page.read_text()
-    assert text.startswith(f"before\n{begin}\n### 8 robots for 120 s, a synchronous standby\n")
-    assert text.endswith(f"{end}\nafter\n")
-    assert "SIGKILL of 1 of primary, 2 of service." in text
-    assert "| **lost** | **0** |" in text
-    assert "| query: median, p99 | 90, 1,200 ms |" in text
-    assert "| of a frame, all writers wait for one; those of its map do | 10.0, 100.0 ms |" in text
-    assert "of a worker's | 200, 100 MB |" in text
-    assert "| service | 0.0, 1.2 |" in text
-    assert "each service answered 0.5, 2.0 s after that" in text
-    assert "came back" not in text
-
-
-def test_a_crowd_tells_what_it_met_with() -> None:
-    plan = Plan(robots=1000, signed=True, partitions=2, offline=360, retention_s=40.0)
-    found = Found(acknowledged=9, indexed=6, looked_for=5, found=5, aged=3)
-    back = [Promotion(None, 1.0, 2.0, {"a": 0.5}, frozenset(), frozenset({"a", "b"}))]
-    kills = Counter({"service": 2, PRIMARY: 1, CUT_OFF: 2})
-    more = {"kills": kills, "promotions": back, "spooled": 360, "spooled_twice": 4}
-    told = "\n".join(table(figures(found, plan=plan, **more)))
-    assert "1,000 robots send 1 frames a second each, and send their signatures along" in told
-    assert "A host was cut off twice from its servers for 12 s." in told
-    assert "SIGKILL of 1 of primary, 2 of service." in told
-    assert "keep a frame for 40 s" in told
-    assert "| deleted as they were too old, and told to have been | 3 |" in told
-    assert (
-        "| frames spooled by the robot that was offline, sent again, doubled | 360, 4, 0 |" in told
-    )
-    assert "frames that came to it: **2**." in told
-    assert marks(plan)[0] == "<!-- fleet-crowd:begin -->"
-
-
-def test_an_upgrade_tells_its_steps_and_what_was_refused(tmp_path: Path) -> None:
-    plan = Plan(seconds=60.0, before=tmp_path)
-    found = Found(acknowledged=9, indexed=9, found=9)
-    told = "\n".join(table(figures(found, plan=plan, steps=["the database", "worker-1"])))
-    assert "### 8 robots for 60 s, the version before replaced" in told
-    assert "in this order: the database, worker-1.\n" in told
-    assert told.endswith("Requests refused (429, 503): none.\n")
-    refused = Counter({"upload 503": 2})
-    told = "\n".join(table(figures(found, plan=plan, refused=refused)))
-    assert told.endswith("Requests refused (429, 503): 2 of upload 503.\n")
-    assert marks(plan)[0] != marks(Plan())[0]
-
-
-def test_what_is_on_paper_is_multiplied_right() -> None:
-    costs = Costs(
-        model="depth", signature_bytes=12_800, frames=50,
-        upload=Work(30.0, 12.0, 2.0, 3.0, (1.0, 0.0), 3_000.0, {"PUT": 1.0}),
-        sign=Work(90.0, 60.0, 3.0, 5.0, (1.0, 1.0), 27_000.0, {"GET": 1.0, "PUT": 1.0}),
-        query=Work(200.0, 180.0, 1.0, 0.0, (0.0, 0.0), 0.0, {"HEAD": 1.0, "POST": 0.5}),
-        tables={"signatures": 14_000.0, "frames": 2_000.0}, blobs=(76_000.0, 174_000.0),
-        commit_ms={"alone": (4.0, 9.0)}, linked=(2_000.0, 340.0, 560.0), memory={"worker": 10**8},
-    )  # fmt: skip
-    lines = paper(costs)
-    more = lines.index("### On paper: 100,000,000 frames in 50 maps, `depth`")
-    told, tenfold = (
-        {line.split(" | ")[0]: line.split(" | ")[-1] for line in some}
-        for some in (lines[:more], lines[more:])
-    )
-    assert told["| processors for signing"] == "10 |"  # 100 a second x 60 ms / 0.6
-    assert told["| processors for queries"] == "30 |"
-    assert told["| processors of the database"] == "1.0 |"
-    assert told["| a map's turn is full at"] == "125 frames a second |"
-    assert (
-        told["| log of the database (WAL), and to each standby"]
-        == "3.0 MB a second, 259 GB a day |"
-    )
-    # 100 a second x 30 days = 259 million, x 2.5 x 5 and x 2 x 0.4 dollars a million
-    assert told["| requests of objects that write"] == "$3,240 a month |"
-    assert told["| that read"] == "$207 a month |"
-    assert told["| rows of the database"] == "160 GB |"
-    assert tenfold["| rows of the database"] == "1,600 GB |"
-    assert told["| blobs"] == "2.5 TB |"
-    assert tenfold["| keeping them"] == "$575 a month |"
-    assert told["| vectors and their graph in the database, to be held in its memory"] == "9 GB |"
-    assert told["| linking all of them anew, one processor"] == "1.4 h |"
-    assert told["| of one that asks all maps"] == "160 MB, 144.1 GB |"  # 12,800 + 1,600 + 8
-    assert tenfold["| reading all blobs, at 100 MB/s"] == "69 h |"
-
-
-def test_figures_of_qdrant_beside_our_own_search() -> None:
-    own, other = Searched(0.0, 1234.5, 14.04, 0.0), Searched(12.34, 987.0, 58.06, 250_180.4)
-    told = qdrant_table([Compared("paper", 3000, 125_000, (own, other), 4.14)])
-    assert told[0] == "| | 3,000 x 125,000 B, own | 3,000 x 125,000 B, Qdrant |"
-    assert told[2:6] == [
-        "| publish the index, CPU s | none | 12.3 |",
-        "| first query after a start, CPU ms | 1,234 | 987 |",
-        "| later queries, median, CPU ms | 14.0 | 58.1 |",
-        "| index on the disk, bytes a frame | 0 | 250,180 |",
-    ]
-    assert "4.1 times as long by the clock" in told[7]
 
 
 @pytest.mark.thorough

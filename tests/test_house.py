@@ -7,6 +7,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator
 from functools import cache
+from graphlib import TopologicalSorter
 from itertools import combinations
 from pathlib import Path
 
@@ -61,44 +62,6 @@ def test_no_file_and_no_definition_has_a_retired_name() -> None:
         found += [f"{path}:{one.name}" for one in definitions(tree) if one.name in RETIRED]
     furniture = "sceneprint/lab/synth/furniture.py:shelf"  # a shelf, for once
     assert [one for one in found if one != furniture] == []
-
-
-def names_in(tree: ast.Module) -> Iterator[str]:
-    """Functions, classes, methods and fields of a module, and what it imports."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            yield node.name
-        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            yield node.target.id
-        elif isinstance(node, ast.Import | ast.ImportFrom):
-            yield from (one.asname or one.name.rpartition(".")[2] for one in node.names)
-
-
-def arrow_names(text: str) -> Iterator[str]:
-    """Names above the arrows of a text; what is said beside them, after a comma, is prose."""
-    for label in re.findall(r"--([^-<>\n]+)-->", text):
-        parts = re.split(r"\s*[|,]\s*", label.strip())
-        yield from (one for one in parts if re.fullmatch(r"[A-Za-z_]\w*(\.\w+)?", one))
-
-
-def test_the_names_above_arrows_are_read() -> None:
-    found = arrow_names("a  --take | give, at once-->  b --Queue.end--> c  -->  d <-- e")
-    assert list(found) == ["take", "give", "Queue.end"]
-
-
-def test_what_an_arrow_names_is_there() -> None:
-    known = defaultdict(set)
-    for path, tree in modules().items():
-        known[Path(path).parent] |= set(names_in(tree))
-    anywhere = set().union(*known.values())
-    found = [
-        f"{path}: {one}"
-        for path in modules()
-        for one in arrow_names((ROOT / path).read_text())
-        if one.partition(".")[0] not in known[Path(path).parent]
-        or one.rpartition(".")[2] not in anywhere
-    ]
-    assert found == []
 
 
 def distance(a: Path, b: Path) -> int:
@@ -174,39 +137,6 @@ def imports(tree: ast.Module, known: Collection[str]) -> Iterator[str]:
             yield from (one if one in known else node.module for one in whole)
 
 
-def circles(graph: dict[str, set[str]]) -> list[list[str]]:
-    """Strongly connected components of more than one node, after Tarjan."""
-    order: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-    found = []
-
-    def visit(node: str) -> None:
-        order[node] = low[node] = len(order)
-        stack.append(node)
-        for other in graph[node]:
-            if other not in order:
-                visit(other)
-                low[node] = min(low[node], low[other])
-            elif other in stack:
-                low[node] = min(low[node], order[other])
-        if low[node] == order[node]:
-            part = stack[stack.index(node) :]
-            del stack[stack.index(node) :]
-            if len(part) > 1:
-                found.append(sorted(part))
-
-    for node in graph:
-        if node not in order:
-            visit(node)
-    return found
-
-
-def test_circles_are_found() -> None:
-    graph = {"a": {"b"}, "b": {"c"}, "c": {"b", "d"}, "d": set[str](), "e": {"a"}}
-    assert circles(graph) == [["b", "c"]]
-
-
 def test_no_modules_import_each_other_in_a_circle() -> None:
     names = {
         path.removesuffix(".py").removesuffix("/__init__").replace("/", "."): tree
@@ -214,4 +144,5 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     }
     graph = {name: set(imports(tree, names)) - {name} for name, tree in names.items()}
     assert len(graph) > 200
-    assert circles(graph) == []
+    order = TopologicalSorter(graph).static_order()  # CycleError names a circle
+    assert set(order) == set(graph)

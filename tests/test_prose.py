@@ -77,18 +77,6 @@ def words(sentence: str) -> int:
     return len([word for word in sentence.split() if re.search(r"\w", word)])
 
 
-def test_sentences_are_found_as_a_reader_sees_them() -> None:
-    page = (
-        "# Head\n\n<!-- a:begin -->\nMade by a machine.\n<!-- a:end -->\n"
-        "One `a. B` here. Two\nlines, 0.3 m.\n\n| a | b |\n\n```sh\nno. No.\n```\n"
-        "* item [link](a.md). [b.md](b.md) too\n* next. *Third* one\n"
-    )
-    assert sentences(page) == [
-        "One code here.", "Two lines, 0.3 m.", "item link.", "code too", "next.", "*Third* one",
-    ]  # fmt: skip
-    assert words("Two lines, 0.3 m - here.") == 5
-
-
 @pytest.mark.parametrize("name", EDITED)
 def test_edited_pages_are_in_short_sentences(name: str) -> None:
     found = sentences((ROOT / name).read_text())

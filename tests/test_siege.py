@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from benchmarks.pages import put_between
 from benchmarks.siege import decoders
 from benchmarks.siege.__main__ import (
-    ASKED_OF,
-    BEGIN,
-    END,
     besieged,
     known_of,
     neighbours,
-    table,
 )
 from benchmarks.siege.attacks import ATTACKS
-from benchmarks.siege.contract import ContractFigures, read_report, try_contract
-from benchmarks.siege.fuzz import Fuzzed, decoder_table, http_table
-from benchmarks.siege.mutations import MutationFigures, besiege, mutated
-from benchmarks.siege.neighbours import (
-    NeighbourFigures,
-    VictimFigures,
-    neighbour_table,
-)
-from benchmarks.siege.overload import OverloadFigures, overload
+from benchmarks.siege.contract import read_report, try_contract
+from benchmarks.siege.mutations import besiege, mutated
+from benchmarks.siege.overload import overload
 from benchmarks.siege.sound_files import FILES
 from benchmarks.soak.load import Shot, shots
 from sceneprint.errors import UnreadableModel
@@ -76,14 +64,6 @@ def test_a_tenant_is_refused_nothing_while_another_does_its_worst(
     assert refused["event streams"] > 0
 
 
-def test_the_table_of_neighbours_tells_the_99th_percentile() -> None:
-    calm = VictimFigures([0.01] * 99 + [0.02], [0.5])
-    found = [NeighbourFigures("x", 2, calm, VictimFigures([0.03], [1.5], 4), 9, 7)]
-    assert neighbour_table(found)[2] == (
-        "| x | 2 | 10 ms | 30 ms | 3.0 | 500 ms | 1500 ms | 3.0 | **4** | 9 | 7 |"
-    )
-
-
 @pytest.mark.thorough
 def test_too_many_requests_are_sent_away_and_nothing_is_lost(
     every: list[Shot], tmp_path: Path
@@ -122,38 +102,6 @@ def test_what_schemathesis_counted(
     assert (found.requests, found.passed, found.sound) == (*figures, sound)
 
 
-def test_the_page_tells_what_was_measured(tmp_path: Path) -> None:
-    mutations = MutationFigures(
-        {"png": 3, "tar": 1}, {202: 1, 422: 3}, ["x"], 2, 3 << 20, 5 << 20, 6, 7.0
-    )
-    contract = ContractFigures(41, 10, 9, "")
-    overloaded = OverloadFigures(
-        50.0, 500.0, 4.0, {200: 3, 503: 9}, 1, (10.0, 20.0), (1.0, 2.0), 5, 1, 0.5
-    )
-    lines = table(mutations, [contract] * len(ASKED_OF), overloaded)
-    page = tmp_path / "page.md"
-    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    put_between(page, BEGIN, END, lines)
-    text = page.read_text()
-    assert text.startswith("before")
-    assert text.endswith("after\n")
-    assert "old" not in text
-    for part in (
-        "4 broken uploads within 7 s", "3 png, 1 tar", "1 of 202, 3 of 422", "| **1** |",
-        "| **2** |", "3 MiB", "5 MiB", "replaced | 6 |", "(41)", "| no key | 9 of 10 |",
-        "500 requests a second where 50", "5, **1**", "0.5 s",
-    ):  # fmt: skip
-        assert part in text, part
-
-
-@pytest.mark.parametrize(
-    ("changed", "sound"),
-    [({}, True), ({"passed": 9}, False), ({"requests": 0, "passed": 0}, False)],
-)
-def test_a_contract_that_was_not_tried_is_not_kept(changed: dict[str, int], sound: bool) -> None:
-    assert replace(ContractFigures(3, 10, 10, ""), **changed).sound is sound
-
-
 @pytest.mark.parametrize("name", decoders.TARGETS)
 def test_what_a_fuzzer_begins_with_is_sound(name: str, tmp_path: Path) -> None:
     """So that mutations go deep; of a model and a sidecar the first is not whole on purpose."""
@@ -187,12 +135,3 @@ def test_a_fuzzers_findings_are_noted_once_a_place(tmp_path: Path) -> None:
     told = sorted(one.read_text().partition(":")[0] for one in files if one.suffix == ".txt")
     assert told == ["IndexError in test_siege.py", "ZeroDivisionError in test_siege.py"]
     assert sorted(one.read_bytes() for one in files if not one.suffix) == [b"", b"short"]
-
-
-def test_the_tables_of_fuzzers() -> None:
-    found = [Fuzzed("ply", 70, 5.4, ["x"], {"edges": 9, "s": 0.126, "bytes": 3 << 20})]
-    assert decoder_table(found)[-1] == "| ply | 70 | 5 | 9 | 0.13 | 3.0 | **1** |"
-    assert http_table(found)[-1] == "| ply | 70 | 5 | **1** |"
-    assert not found[0].sound
-    assert not Fuzzed("ply", 0, 5.0, []).sound
-    assert Fuzzed("ply", 1, 5.0, []).sound

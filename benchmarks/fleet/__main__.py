@@ -25,10 +25,8 @@ def marks(plan: Plan) -> tuple[str, str]:
     name = "fleet-asynchronous" if plan.asynchronous else "fleet"
     if plan.delays:
         name = "fleet-delays"
-    if plan.signed:
+    if plan.is_crowd:
         name = "fleet-crowd"
-    if plan.before is not None:
-        name = "fleet-upgrade"
     return f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
 
 
@@ -43,19 +41,14 @@ def table(figures: FleetFigures) -> list[str]:
             f" (a message to the database takes {1e3 * DATABASE_S:g} ms, one to the store "
             f"{1e3 * STORE_S:g} ms)"
         )
-    what = f"{standby} standby"
-    sent = "send their signatures along, as recorded" if plan.signed else "leave signing to workers"
     killed = {name: n for name, n in figures.kills.items() if name not in (FROZEN, CUT_OFF)}
     done = "SIGKILL of " + ", ".join(f"{n} of {name}" for name, n in sorted(killed.items()))
-    if plan.before is not None:
-        what = "the version before replaced"
-        done = "Replaced by this version, in this order: " + ", ".join(figures.steps)
     lines = [
-        f"### {plan.robots} robots for {plan.seconds:.0f} s, {what}",
+        f"### {plan.robots} robots for {plan.seconds:.0f} s, {standby} standby",
         "",
         f"PostgreSQL with {standby} standby, {plan.services} services, {plan.workers} workers, "
         f"blobs in {blobs}{delayed}; {plan.robots:,} robots send {plan.rate:g} frames a second "
-        f"each, and {sent}. {done}.",
+        f"each. {done}.",
         *_more(plan),
         "",
         "| | |",
@@ -97,9 +90,6 @@ def table(figures: FleetFigures) -> list[str]:
         f"{figures.memory[1] / 1e6:,.0f} MB |",
         "",
     ]
-    if plan.before is not None:
-        refused = ", ".join(f"{n} of {name}" for name, n in sorted(figures.refused.items()))
-        return [*lines, f"Requests refused (429, 503): {refused or 'none'}.", ""]
     lines += [
         "| killed | longest that a robot had no answer, s |",
         "|---|--:|",
@@ -160,7 +150,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--partitions", type=int, default=plan.partitions, help="of a host")
     parser.add_argument("--offline", type=int, default=plan.offline, help="frames of a spool")
     parser.add_argument("--retention-s", type=float, help="of maps of single robots")
-    parser.add_argument("--signed", action="store_true", help="robots sign their frames")
     parser.add_argument("--objects", action="store_true", help="blobs in an object store")
     parser.add_argument("--delays", action="store_true", help="messages to the servers take time")
     parser.add_argument(
@@ -168,10 +157,6 @@ def main(arguments: list[str] | None = None) -> int:
         help="the standby need not have what is acknowledged, and is cut off for a while first",
     )  # fmt: skip
     parser.add_argument("--data", type=Path, help="folder of recordings; default: synthetic rooms")
-    parser.add_argument(
-        "--before", type=Path,
-        help="checkout of the version before: upgrade such a fleet while the robots go on",
-    )  # fmt: skip
     parser.add_argument("--page", type=Path, help="whose figures to replace")
     parser.add_argument("--keep", type=Path, help="new folder for data and logs, left there")
     options = vars(parser.parse_args(arguments))

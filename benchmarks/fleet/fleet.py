@@ -9,7 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 
@@ -20,12 +20,8 @@ from benchmarks.fleet.failover_client import PAUSE_S
 from benchmarks.fleet.postgres_pair import Pair
 from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.soak.load import Part, free_port
-from sceneprint.engine.jobs.robot_signatures import FIRST
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
-from sceneprint.store.database import reach_database
-from sceneprint.store.keys import find_named_key
-from sceneprint.store.sender_rows import add_verified
 
 #: Seconds for all service processes to begin, on a machine that is busy with much else.
 PATIENCE_S = 180.0
@@ -50,19 +46,17 @@ class Fleet:
     services, workers : how many processes of each
     synchronous : whether the database waits for its standby
     objects : keep blobs in an object store, and not in a folder that all hosts share
-    before : checkout of another version, which all processes begin as; None: of this one
     delays : let messages to the database take DATABASE_S, and those to the object store STORE_S
     partitions : whether `partitioned` is asked for
-    trusting : whether signatures of robots are used
+    surfaces : whether maps get surfaces
     """
 
     def __init__(
         self, folder: Path, services: int, workers: int, *, synchronous: bool, objects: bool,
-        before: Path | None = None, delays: bool = False, partitions: bool = False,
-        trusting: bool = False,
+        delays: bool = False, partitions: bool = False, surfaces: bool = True,
     ) -> None:  # fmt: skip
-        self.folder, self._before = folder, before
-        self._delays, self._partitions, self._trusting = delays, partitions, trusting
+        self.folder = folder
+        self._delays, self._partitions, self._surfaces = delays, partitions, surfaces
         #: By which each host reaches the servers, where it does not reach them itself.
         self._networks: list[list[DelayProxy]] = []
         (folder / "database").mkdir()
@@ -86,11 +80,11 @@ class Fleet:
         self._shared |= SETTINGS | {
             "SCENEPRINT_DATABASE_URL": self.pair.url, "SCENEPRINT_BLOB_URL": blobs
         }  # fmt: skip
-        if self._trusting:  # of many walks in one map nobody wants a surface
-            self._shared |= {"SCENEPRINT_TRUST_SIGNATURES": "1", "SCENEPRINT_SURFACES": "asked"}
+        if not self._surfaces:
+            self._shared |= {"SCENEPRINT_SURFACES": "asked"}
         made = subprocess.run(
             [sys.executable, "-c", _MAKE_KEY, str(self.host)], check=True, text=True,
-            env=self.environment() | _path_of(self._before), stdout=subprocess.PIPE,
+            env=self.environment(), stdout=subprocess.PIPE,
         )  # fmt: skip
         secret = made.stdout.strip()
         hosts = [self._host_environment() for _ in range(n_services)]
@@ -139,14 +133,6 @@ class Fleet:
             for proxy in self._networks[host]:
                 proxy.thaw()
 
-    def trust(self, keys: Sequence[str]) -> None:
-        """Let workers take the signatures of keys unseen, as after many that were right."""
-        with closing(reach_database(self.pair.url)) as database:
-            for name in keys:
-                with database.write() as connection:
-                    for _ in range(FIRST):
-                        add_verified(connection, find_named_key(connection, name).id)
-
     def memory(self) -> tuple[int, int]:
         """Most bytes that a process of the services, and one of the workers, ever had."""
         return _most_memory(self.services), _most_memory(self.workers)
@@ -186,7 +172,7 @@ class Fleet:
     ) -> Process:
         arguments = ["sceneprint", *command, "--data", str(self.folder / f"host-{host + 1}")]
         log = self.folder / f"{name}.log"
-        return Process(name, arguments, log, environment, self._before)
+        return Process(name, arguments, log, environment)
 
     @contextmanager
     def _here(self) -> Iterator[Settings]:
@@ -215,7 +201,7 @@ def _most_memory(parts: Sequence[Process]) -> int:
     return most
 
 
-#: Makes the key of who may do everything, as any version does.
+#: Creates a key that may do everything.
 _MAKE_KEY = """
 import sys
 from sceneprint.engine import Engine
@@ -226,16 +212,6 @@ with Engine(Settings(data_dir=sys.argv[1])) as engine:
 """
 
 
-def _path_of(checkout: Path | None) -> dict[str, str]:
-    """What lets a process import the packages of a checkout, and not those that are installed or of
-    the folder that it begins in.
-    """
-    if checkout is None:
-        return {}
-    path = os.pathsep.join(map(str, (checkout.absolute(), checkout.absolute() / "client")))
-    return {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
-
-
 class Process(Part):
     """A part whose environment has more than settings.
 
@@ -243,20 +219,13 @@ class Process(Part):
     ----------
     name, arguments, log : see Part
     environment : beside this process's
-    before : see Fleet
     """
 
     def __init__(
-        self, name: str, arguments: list[str], log: Path, environment: Mapping[str, str],
-        before: Path | None = None,
-    ) -> None:  # fmt: skip
+        self, name: str, arguments: list[str], log: Path, environment: Mapping[str, str]
+    ) -> None:
         super().__init__(name, arguments, log)
-        self._present = {**self._environment, **environment}
-        self._environment = {**self._present, **_path_of(before)}
-
-    def take_present(self) -> None:
-        """From the next beginning on, be of this version."""
-        self._environment = self._present
+        self._environment = {**self._environment, **environment}
 
 
 def await_service(url: str) -> None:

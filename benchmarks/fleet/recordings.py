@@ -6,26 +6,20 @@ folder of recordings  --walks-->  Walk, ... : one a sequence and grid of samples
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from sceneprint.cli.demo import write_building
-from sceneprint.engine import Engine
 from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import FrameReference, find_sequences, write_depth_png
-from sceneprint.settings import Settings
 from sceneprint.types import DepthFrame
-from sceneprint_client.api import CameraIntrinsics, FrameMeta, NewMap
-from sceneprint_client.api.maps import Preset
+from sceneprint_client.api import CameraIntrinsics, FrameMeta
 from sceneprint_client.frame_files import meta_of
-
-MAP = "robot"
 
 #: Every so many samples of a frame, so that signing costs little; there are as many walks in a
 #: recording as such grids, and no two of their frames have the same content.
@@ -42,12 +36,10 @@ class Shot:
     ----------
     png : its file
     meta : its camera and its pose
-    signed : what signing made of it, where the robot sends that as well
     """
 
     png: bytes
     meta: FrameMeta
-    signed: bytes | None = None
 
 
 @contextmanager
@@ -97,30 +89,6 @@ def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
             if len(sequence) > room:  # another robot goes on there, once all have begun
                 places.append((sequence[room:], grid))
     return [[thinned(*one) for one in walk] for walk in found]
-
-
-def sign(walked: Sequence[Sequence[Shot]], model: Preset, folder: Path) -> list[list[Shot]]:
-    """The same walks, as robots send them that sign their frames themselves.
-
-    Parameters
-    ----------
-    walked : their frames
-    model : of the maps that they are sent to
-    folder : empty, for a store that keeps none of them
-    """
-    total = sum(map(len, walked))
-    with (
-        Engine(Settings(data_dir=folder, decoders=0)) as engine,
-        tqdm(total=total, desc="signatures of robots", disable=None, leave=False) as bar,
-    ):
-        engine.create_map(NewMap(name=MAP, model=model))
-        found = []
-        for walk in walked:
-            found.append(
-                [replace(one, signed=engine.sign_frame(MAP, one.png, one.meta)) for one in walk]
-            )
-            bar.update(len(walk))
-    return found
 
 
 def thinned(frame: FrameReference, grid: int) -> Shot:

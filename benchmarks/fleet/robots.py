@@ -166,8 +166,6 @@ class Crowd:
         shot = robot.walk[number]
         meta = shot.meta.model_copy(update={"robot": robot.name, "session": robot.name})
         sent, begun = frame_form(shot.png, meta), time.monotonic()
-        if shot.signed is not None:
-            sent["files"]["signed"] = ("signed", shot.signed, "application/octet-stream")
         response = client.ask(
             "upload", "POST", f"/v1/maps/{robot.map_name}/frames",
             headers=bearer(robot.key) | {"Idempotency-Key": f"{robot.name}-{number}"}, **sent,
@@ -242,8 +240,7 @@ class OfflineRobot(threading.Thread):
             with Client(url, self._robot.key, timeout_s=SILENCE_S) as client:
                 try:
                     self.there += spool.sync(client, self._robot.map_name).there
-                except (errors.Unreachable, errors.Busy, errors.RateLimited) as error:
-                    self._log.refuse(f"spool {type(error).__name__}")
+                except (errors.Unreachable, errors.Busy, errors.RateLimited):
                     time.sleep(PAUSE_S)
 
     def _learn(self) -> None:

@@ -6,7 +6,6 @@ drive(folder, Plan)  -->  FleetFigures
 from __future__ import annotations
 
 import random
-import tempfile
 import threading
 import time
 from collections import Counter
@@ -26,7 +25,7 @@ from benchmarks.fleet.faults import CUT_OFF_S, FaultInjector, Kill, Promotion, s
 from benchmarks.fleet.fleet import Fleet, await_service
 from benchmarks.fleet.lock_samples import LockSampler, LockShares
 from benchmarks.fleet.postgres_pair import DATABASE
-from benchmarks.fleet.recordings import Shot, recordings, sign, walks
+from benchmarks.fleet.recordings import Shot, recordings, walks
 from benchmarks.fleet.robots import (
     OFFLINE_PATIENCE_S,
     Crowd,
@@ -36,7 +35,6 @@ from benchmarks.fleet.robots import (
     Robot,
     asked,
 )
-from benchmarks.fleet.rolling_upgrade import upgrade
 from sceneprint.store.deletion import DAY_S
 from sceneprint_client import Client
 
@@ -48,6 +46,8 @@ OFFLINE_MAP, OFFLINE = "fleet-offline", 0.4
 PATIENCE_S = 240.0
 #: Least part of the time for which locks have to be sampled.
 SAMPLED = 0.5
+#: Robots of a crowd, at least.
+CROWD = 100
 #: Threads that drive the robots.
 DRIVERS = 32
 
@@ -66,15 +66,12 @@ class Plan:
     offline : frames that one more robot spools before it has a network; 0: there is none
     retention_s : for which maps of single robots keep a frame, while the shared one keeps all;
         None: they do too
-    signed : whether robots send what signing made of their frames, which workers then take
     seed : of victims and moments
     services, workers : processes
     asynchronous : the standby does not have to have received what is acknowledged
     objects : blobs are in an object store
     delays : messages to the database and to the object store take their time
     data : folder of recordings; None: synthetic rooms
-    before : checkout of the version before, which the fleet begins as: instead of being killed,
-        its parts are replaced by this version
     most_turn_ms : of a frame, for which all writers may have to wait for one, beside the time for
         which hosts are cut off
     most_query_ms : 99 of 100 queries are answered within: little later than a robot gives up an
@@ -91,7 +88,6 @@ class Plan:
     partitions: int = 0
     offline: int = 0
     retention_s: float | None = None
-    signed: bool = False
     most_turn_ms: float = 25.0
     most_query_ms: float = 1e3 * (SILENCE_S + 5)
     most_bytes: int = 1 << 30
@@ -102,7 +98,11 @@ class Plan:
     objects: bool = False
     delays: bool = False
     data: Path | None = None
-    before: Path | None = None
+
+    @property
+    def is_crowd(self) -> bool:
+        """Whether so many robots walk that no map of theirs is to have a surface."""
+        return self.robots >= CROWD
 
     @property
     def frames(self) -> int:
@@ -128,8 +128,6 @@ class FleetFigures:
     kills : by victim
     outages : see `outages`
     promotions : of the standby
-    steps : of the upgrade
-    refused : answers that asked to come back, by request and status
     waits_ms : milliseconds of uploads and of queries until they were answered: median, p99
     memory : most bytes of a process of the services, and of the workers
     answers : queries by status
@@ -149,8 +147,6 @@ class FleetFigures:
     kills: Counter[str]
     outages: dict[str, list[float]]
     promotions: Sequence[Promotion]
-    steps: Sequence[str]
-    refused: Counter[str]
     waits_ms: Mapping[str, tuple[float, float]]
     memory: tuple[int, int]
     answers: Counter[str]
@@ -214,13 +210,10 @@ def drive(folder: Path, plan: Plan) -> FleetFigures:
         walked = walks(data, plan.robots + extra, plan.frames)
     spooled = [shot for walk in walked[plan.robots :] for shot in walk][: plan.offline]
     walked = walked[: plan.robots]
-    if plan.signed:
-        with tempfile.TemporaryDirectory() as signing:
-            walked = sign(walked, MODEL, Path(signing))
     fleet = Fleet(
         folder, plan.services, plan.workers, synchronous=not plan.asynchronous,
-        objects=plan.objects, before=plan.before, delays=plan.delays,
-        partitions=plan.partitions > 0, trusting=plan.signed,
+        objects=plan.objects, delays=plan.delays,
+        partitions=plan.partitions > 0, surfaces=not plan.is_crowd,
     )  # fmt: skip
     try:
         return _Run(fleet, plan, walked, spooled, begun).figures()
@@ -239,7 +232,6 @@ class _Run:
         self._ledger, self._log, self._stop = Ledger(), RequestLog(), threading.Event()
         self._rng = random.Random(plan.seed)
         self._locks = LockSampler(lambda: fleet.pair.primary.url(DATABASE).replace("+psycopg", ""))
-        self._steps: list[str] = []
 
     def figures(self) -> FleetFigures:
         """Run it to its end."""
@@ -251,8 +243,6 @@ class _Run:
             offline = self._offline_robot(clients[0])
             if offline:
                 listeners.append(self._listener(clients[0], OFFLINE_MAP))
-            if plan.signed:
-                fleet.trust([robot.name for robot in robots])
             injector = FaultInjector(
                 fleet, partial(_answers, key=key, shot=self._walked[0][0]), self._rng,
                 plan.asynchronous,
@@ -280,8 +270,6 @@ class _Run:
             kills=Counter(one.victim for one in injector.kills),
             outages=outages(injector.kills, log.waits),
             promotions=injector.promotions,
-            steps=self._steps,
-            refused=log.refused,
             waits_ms={
                 kind: (1e3 * float(np.quantile(of, 0.5)), 1e3 * float(np.quantile(of, 0.99)))
                 for kind, of in sorted(log.seconds.items())
@@ -326,14 +314,11 @@ class _Run:
             for one in (*others, crowd, telling, self._locks):
                 one.start()
             try:
-                if plan.before is not None:
-                    self._steps = upgrade(fleet, plan.seconds, bar.set_postfix_str)
-                else:
-                    due = schedule(
-                        plan.seconds, plan.kills, plan.promotions, self._rng, plan.freezes,
-                        plan.partitions,
-                    )  # fmt: skip
-                    injector.run(due, bar.set_postfix_str)
+                due = schedule(
+                    plan.seconds, plan.kills, plan.promotions, self._rng, plan.freezes,
+                    plan.partitions,
+                )  # fmt: skip
+                injector.run(due, bar.set_postfix_str)
                 stop.wait(max(walking + plan.seconds - time.monotonic(), 0.0))
             finally:
                 stop.set()

@@ -41,7 +41,6 @@ class UploadMethods(ServiceConnection):
         self, map_name: str, frame: FrameInput, meta: MetaInput | None = None,
         *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
-        signed: bytes | None = None,
     ) -> Added:  # fmt: skip
         """Upload a frame into a map. It is durable when this returns, and signed soon after.
 
@@ -59,25 +58,21 @@ class UploadMethods(ServiceConnection):
             this share of the distance between unrelated frames (True: 0.3);
             else the frame becomes `redundant`, and `reason` names the near frame
         up : unit vector in the sensor's axes, from an IMU; default: from `meta` or a sidecar
-        signed : what `sign` of the robot's own service made of this frame: a service that trusts
-            robots then does not sign it again, but for a sample
 
         Returns
         -------
-        added : its state says whether it is signed yet, `signed` what became of `signed`
+        added : its state says whether it is signed yet
 
         Raises
         ------
         UnknownMap : no such map.
         FrameError, DatasetError : the frame cannot be read, or its camera or pose is invalid.
         FrameConflict : the map has the same content with other metadata.
-        InvalidRequest : a priority or `if_novel` out of range; `signed` is of another frame, of
-            another model, or damaged.
+        InvalidRequest : a priority or `if_novel` out of range.
         """
         until = time.monotonic() + (wait_s or 0.0)
         added, _ = self.add(
-            map_name, frame, meta, wait_s=wait_s, priority=priority, if_novel=if_novel, up=up,
-            signed=signed,
+            map_name, frame, meta, wait_s=wait_s, priority=priority, if_novel=if_novel, up=up
         )  # fmt: skip
         return self._settled(map_name, added, until)
 
@@ -85,7 +80,6 @@ class UploadMethods(ServiceConnection):
         self, map_name: str, frame: FrameInput, meta: MetaInput | None = None,
         *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
-        signed: bytes | None = None,
     ) -> tuple[Added, bool]:  # fmt: skip
         """Like `upload`, with a flag: False if the map already had the frame.
 
@@ -93,14 +87,13 @@ class UploadMethods(ServiceConnection):
         """
         return self._upload(
             "POST", f"{map_path(map_name)}/frames", frame, meta, wait_s or 0.0,
-            upload_fields(priority, if_novel), up, signed,
+            upload_fields(priority, if_novel), up,
         )  # fmt: skip
 
     def put_frame(
         self, map_name: str, frame_id: str, frame: FrameInput,
         meta: MetaInput | None = None, *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
-        signed: bytes | None = None,
     ) -> Added:  # fmt: skip
         """Upload a frame under an id of your own; sending it again has no further effect.
 
@@ -109,7 +102,7 @@ class UploadMethods(ServiceConnection):
         map_name : of the map
         frame_id : up to 64 letters, digits, dots, hyphens and underscores, the first a letter or
             digit
-        frame, meta, wait_s, priority, if_novel, up, signed : as for `upload`
+        frame, meta, wait_s, priority, if_novel, up : as for `upload`
 
         Raises
         ------
@@ -121,7 +114,7 @@ class UploadMethods(ServiceConnection):
         until = time.monotonic() + (wait_s or 0.0)
         added, _ = self._upload(
             "PUT", frame_path(map_name, frame_id), frame, meta, wait_s or 0.0,
-            upload_fields(priority, if_novel), up, signed,
+            upload_fields(priority, if_novel), up,
         )  # fmt: skip
         return self._settled(map_name, added, until)
 
@@ -161,38 +154,13 @@ class UploadMethods(ServiceConnection):
         request["data"] |= upload_fields(priority, if_novel)
         return self._ask(Batch, "POST", f"{map_path(map_name)}/frames/batch", **request).items
 
-    def sign(self, map_name: str, frame: FrameInput, meta: MetaInput | None = None) -> bytes:
-        """Sign a frame with a map's model; the map does not change.
-
-        Ask the robot's own service, such as `Client.embedded` on a copy of the fleet's maps, and
-        give the result to `upload` of the fleet's, with the same frame and metadata.
-
-        Parameters
-        ----------
-        map_name : of a map that has the model of the map that the frame is for
-        frame, meta : as for `upload`
-
-        Returns
-        -------
-        package : signature and geometry of the frame, 0.2 MB of a depth image
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        FrameError, DatasetError : the frame cannot be read, or shows nothing that can be signed.
-        """
-        sent = frame_form(*frame_bytes(frame, meta, with_pose=True))
-        return self._send("POST", f"{map_path(map_name)}/signatures", **sent).content
-
     def _upload(
         self, method: str, path: str, frame: FrameInput, meta: MetaInput | None,
-        wait_s: float, fields: dict[str, str], up: Sequence[float] | None, signed: bytes | None,
+        wait_s: float, fields: dict[str, str], up: Sequence[float] | None,
     ) -> tuple[Added, bool]:  # fmt: skip
         """Send a frame; the service does not wait for one it had already."""
         sent = frame_form(*frame_bytes(frame, meta, with_pose=True, up=up))
         sent["data"] |= fields
-        if signed is not None:
-            sent["files"]["signed"] = ("signed", signed, "application/octet-stream")
         # where this process is the worker, nobody would sign it meanwhile
         wait = 0 if self._worker is not None else min(int(wait_s), _LONGEST_WAIT_S)
         response = self._send(

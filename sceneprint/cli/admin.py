@@ -147,8 +147,6 @@ def _key_line(key: Key) -> str:
     if key.expires_at is not None:
         ends = "expired" if key.expires_at <= datetime.now(UTC) else "until"
         text += f", {ends} {key.expires_at:%Y-%m-%dT%H:%M:%SZ}"
-    if key.signatures_distrusted_at is not None:
-        text += f", its signatures not used since {key.signatures_distrusted_at:%Y-%m-%dT%H:%M:%SZ}"
     if key.previous_until is not None:
         text += f", old secret until {key.previous_until:%Y-%m-%dT%H:%M:%SZ}"
     if key.last_used_at is not None:

@@ -18,7 +18,6 @@ from sceneprint.engine.ingest.uploads import Upload, Uploads
 from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.jobs.lifecycle import Work, put_back
-from sceneprint.engine.jobs.robot_signatures import RobotSignatures, make_package
 from sceneprint.engine.jobs.tasks import LongJob, Tasks
 from sceneprint.engine.maps import map_lifecycle
 from sceneprint.engine.maps.map_copy import MapCopies
@@ -132,8 +131,7 @@ class Engine:
         self._limits = threadpool_limits(1)
         server = not self.store.database.is_sqlite
         self.bell = Notices(self.store.database) if server else Wakeup(settings.bell_dir)
-        self.uploads = Uploads(self.store, self.bell, trusts=settings.trust_signatures)
-        self.robot_signatures = RobotSignatures(self.store, settings)
+        self.uploads = Uploads(self.store, self.bell)
         self.tasks = Tasks(self.store, self.bell)
         self.imports = Imports(self.store, self.tasks, self.uploads, settings.import_bytes)
         self.associations = AssociationJobs(self.store, self.tasks)
@@ -304,10 +302,6 @@ class Engine:
         outcome, _ = self.uploads.add(map_name, upload)
         return outcome.taken, outcome.new
 
-    def sign_frame(self, map_name: str, data: bytes, meta: FrameMeta) -> bytes:
-        """What signing makes of a frame that is not kept; see `make_package`."""
-        return make_package(self.store, self.signers, map_name, data, meta)
-
     def list_frames(
         self, map_name: str, cursor: str | None = None, limit: int = 100,
         state: FrameState | None = None, wanted: FrameListing | None = None,
@@ -378,8 +372,8 @@ class Engine:
             if isinstance(work, LongJob):
                 return self.tasks.run(work, self.settings.lease_s, self.settings.job_s, broke)
             return working.run(
-                self.store, self.signers, self._readers, self.robot_signatures, work,
-                self.settings.lease_s, self.settings.job_s, broke,
+                self.store, self.signers, self._readers, work, self.settings.lease_s,
+                self.settings.job_s, broke,
             )  # fmt: skip
 
     def put_back(self, work: Work | LongJob) -> None:
@@ -403,8 +397,6 @@ class Engine:
         """
         number_events(self.store.database)  # where nobody reads them
         self._reencoding.run()
-        if self.robot_signatures.tidy():
-            self.bell.ring()
         self.retiring.run()
         published = self._upkeep.run()
         self._vector_tables.run()

@@ -18,14 +18,12 @@ from sceneprint.store.frames import count_states
 from sceneprint.store.maps import model_names
 from sceneprint.store.queue import job_ids_of
 from sceneprint.store.reencoding_rows import switch_progress
-from sceneprint.store.sender_rows import senders_of
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
 from sceneprint.types import Floats
 from sceneprint_client.api import (
     CameraIntrinsics,
     Frame,
     FrameName,
-    FrameState,
     Job,
     Map,
     Progress,
@@ -35,7 +33,7 @@ from sceneprint_client.api import (
     Vector,
 )
 from sceneprint_client.api.base import Direction
-from sceneprint_client.api.frames import Kind, SignedBy
+from sceneprint_client.api.frames import Kind
 from sceneprint_client.poses import quaternion_of
 
 # Entity tags: short texts that change when what they stand for does.
@@ -156,12 +154,7 @@ def map_record(connection: Connection, row: MapRow) -> Map:
 def frame_records(connection: Connection, row: MapRow, found: list[FrameRow]) -> list[Frame]:
     """Frames of one map."""
     jobs = job_ids_of(connection, [frame.number for frame in found])
-    indexed = [frame.number for frame in found if frame.state == FrameState.INDEXED]
-    senders = senders_of(connection, indexed, row.model_id) if indexed else {}
-    signers: dict[int, SignedBy] = {
-        number: "service" if sender is None else "robot" for number, sender in senders.items()
-    }
-    return [_frame(row, frame, jobs[frame.number], signers.get(frame.number)) for frame in found]
+    return [_frame(row, frame, jobs[frame.number]) for frame in found]
 
 
 def job_progress(job: JobRow) -> Progress | None:
@@ -194,7 +187,7 @@ def job_record(
     )
 
 
-def _frame(row: MapRow, frame: FrameRow, job_id: str, signed_by: SignedBy | None) -> Frame:
+def _frame(row: MapRow, frame: FrameRow, job_id: str) -> Frame:
     pose = None
     if frame.pose is not None and frame.pose_parent is not None:
         pose = transform(np.array(frame.pose), frame.pose_parent, sensor_of(frame))
@@ -217,7 +210,6 @@ def _frame(row: MapRow, frame: FrameRow, job_id: str, signed_by: SignedBy | None
         captured_at=when(frame.captured_at),
         received_at=when(frame.received_at),
         indexed_at=when(frame.indexed_at),
-        signed_by=signed_by,
         pose=pose,
         base_frame=frame.base_frame,
         T_base_sensor=base,

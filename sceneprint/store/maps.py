@@ -31,7 +31,6 @@ from sceneprint.store.tables import (
     ARCHIVE,
     FRAME_COLUMNS,
     MAP_COLUMNS,
-    PACKAGE,
     TEXT,
     FrameRow,
     MapRow,
@@ -208,12 +207,12 @@ def counted_usage(connection: Connection, map_number: int) -> MapUsage:
         frames.c.map_number == map_number, frames.c.state.not_in(ROOMLESS)
     )
     n, size = connection.execute(asked).one()
-    sent = (
+    archives = (
         select(func.coalesce(func.sum(job_files.c.bytes), 0))
         .join(jobs, jobs.c.number == job_files.c.job_number)
-        .where(job_files.c.name.in_((PACKAGE, ARCHIVE)), jobs.c.map_number == map_number)
+        .where(job_files.c.name == ARCHIVE, jobs.c.map_number == map_number)
     )
-    return MapUsage(int(n), int(size) + int(connection.execute(sent).scalar_one()))
+    return MapUsage(int(n), int(size) + int(connection.execute(archives).scalar_one()))
 
 
 def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> None:

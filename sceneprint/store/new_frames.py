@@ -71,8 +71,7 @@ class NewFrame:
     ----------
     row : of the map, as it was when somebody looked
     values : see `add_frame`
-    priority, data : of the job that signs it
-    more_bytes : that its map counts beside the upload
+    priority : of the job that signs it
     kept : columns of `idempotency`, PostgreSQL
     frame_id, job_id : that they get
     context : of the request that it came with, whoever writes it
@@ -81,8 +80,6 @@ class NewFrame:
     row: MapRow
     values: dict[str, Any]
     priority: int = 0
-    data: dict[str, Any] | None = None
-    more_bytes: int = 0
     kept: dict[str, Any] | None = None
     frame_id: str = field(default_factory=lambda: uuid.uuid4().hex)
     job_id: str = field(default_factory=lambda: uuid.uuid4().hex)
@@ -102,13 +99,12 @@ class NewFrame:
     def room(self) -> dict[str, Any]:
         """What `_room_taken` asks for."""
         return {"map_number": self.row.number, "map_name": self.row.name,
-                "size": self.values["bytes"] + self.more_bytes,
-                "content": self.values["content_id"]}  # fmt: skip
+                "size": self.values["bytes"], "content": self.values["content_id"]}  # fmt: skip
 
     def rows(self, connection: Connection) -> dict[str, dict[str, Any]]:
         """What is inserted of it: columns of a frame, a job and an event, and of what is kept."""
         number = self.row.number
-        job = self.context.run(job_values, connection, "sign", self.priority, data=self.data)
+        job = self.context.run(job_values, connection, "sign", self.priority)
         told = event_values("frame.received", self.row.name, self.frame_id, self.job_id, {})
         rows = {
             "frame": received_values(connection, number, self.frame_id, self.values),

@@ -123,13 +123,6 @@ class OpaqueIds:
         """32 digits that stand for the store itself, and tell nothing of its secret."""
         return hmac.digest(self._secret, b"store", "sha256")[:16].hex()
 
-    def lot(self, name: str) -> float:
-        """A number in [0, 1), like chance to whoever does not know the store's secret: the same for
-        the same name.
-        """
-        digest = hmac.digest(self._secret, b"lot " + name.encode(), "sha256")
-        return int.from_bytes(digest[:6], "big") / 2**48
-
     @cached_property
     def _cipher(self) -> AESSIV:
         return AESSIV(self._secret)

@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 from zlib import crc32
 
 from sqlalchemy import (
@@ -54,7 +53,6 @@ class StoredSignature:
     vector : the signature's bytes
     geometry : blob of the artifact
     n_patches, n_pairs : of each level
-    sender : id of the key that sent it with the frame; None: it was made here
     """
 
     model_id: str
@@ -62,7 +60,6 @@ class StoredSignature:
     geometry: str
     n_patches: Sequence[int]
     n_pairs: Sequence[int]
-    sender: str | None = None
 
 
 @dataclass(frozen=True)
@@ -95,7 +92,7 @@ def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) 
 
 def index_claimed_frame(
     connection: Connection, job: JobRow, frame: FrameRow, map_name: str, made: StoredSignature,
-    result: dict[str, Any] | None = None, *, single: bool = False,
+    *, single: bool = False,
 ) -> bool:  # fmt: skip
     """End a job and index its frame in one statement, as most signatures are on PostgreSQL: the
     map's other writers wait for each round trip.
@@ -106,15 +103,13 @@ def index_claimed_frame(
     job : as it was claimed, of that frame
     frame, made : see `index_frame`
     map_name : of the frame's map
-    result : of the job
     single : whether the transaction has no room for another statement
 
     Returns
     -------
     done : False, and nothing was written, on SQLite; where the job is not held any more; where
-        the map has another model, or is to have one, or the signature's sender is trusted no more:
-        then what else has to be done must be found; and where another statement would be needed, as
-        pgvector searches the map
+        the map has another model, or is to have one: then what else has to be done must be found;
+        and where another statement would be needed, as pgvector searches the map
     """
     if connection.dialect.name == "sqlite":
         return False
@@ -125,7 +120,6 @@ def index_claimed_frame(
         "checksum": crc32(made.vector), "geometry": made.geometry,
         "n_patches": json.dumps(list(made.n_patches)), "n_pairs": json.dumps(list(made.n_pairs)),
         "vectors": vectors.table_of(len(made.vector)), "indexed_at": time.time(), **told,
-        "sender": made.sender, "result": None if result is None else json.dumps(result),
         "data": json.dumps(told["data"]), "single": single,
     }  # fmt: skip
     found = connection.execute(_index_claimed(events_table(connection).name), values).first()
@@ -142,28 +136,24 @@ def _index_claimed(events_name: str) -> TextClause:
         f"""
         WITH ended AS (
             UPDATE jobs SET state = '{JobState.SUCCEEDED}', error = NULL, traceback = NULL,
-                leased_until = NULL, finished_at = extract(epoch FROM statement_timestamp()),
-                result = cast(:result AS json)
+                leased_until = NULL, finished_at = extract(epoch FROM statement_timestamp())
             WHERE number = :job AND token = :token AND worker = :worker
                 AND state = '{JobState.RUNNING}'
                 AND NOT (:single AND to_regclass(:vectors) IS NOT NULL) AND EXISTS (
                     SELECT FROM maps WHERE number = :map_number AND model_id = :model
-                        AND next_model_id IS NULL) AND NOT EXISTS (
-                    SELECT FROM signature_senders
-                    WHERE key_id = :sender AND distrusted_at IS NOT NULL)
+                        AND next_model_id IS NULL)
             RETURNING number
         ), revised AS (
             UPDATE maps SET revision = revision + 1
             WHERE number = :map_number AND EXISTS (SELECT FROM ended) RETURNING revision
         ), signed AS (
             INSERT INTO signatures (frame_number, model_id, vector, checksum, geometry, n_patches,
-                n_pairs, sender)
+                n_pairs)
             SELECT :frame, :model, :vector, :checksum, :geometry, cast(:n_patches AS json),
-                cast(:n_pairs AS json), :sender FROM revised
+                cast(:n_pairs AS json) FROM revised
             ON CONFLICT (frame_number, model_id) DO UPDATE SET vector = EXCLUDED.vector,
                 checksum = EXCLUDED.checksum, geometry = EXCLUDED.geometry,
-                n_patches = EXCLUDED.n_patches, n_pairs = EXCLUDED.n_pairs,
-                sender = EXCLUDED.sender
+                n_patches = EXCLUDED.n_patches, n_pairs = EXCLUDED.n_pairs
         ), edited AS (
             UPDATE surface_frames SET changed = true FROM revised WHERE frame_number = :frame
         ), found AS (
@@ -221,7 +211,7 @@ def put_signatures(connection: Connection, made: Sequence[tuple[int, StoredSigna
         {
             "frame_number": number, "model_id": one.model_id, "vector": one.vector,
             "checksum": crc32(one.vector), "geometry": one.geometry,
-            "n_patches": list(one.n_patches), "n_pairs": list(one.n_pairs), "sender": one.sender,
+            "n_patches": list(one.n_patches), "n_pairs": list(one.n_pairs),
         }
         for number, one in made
     ]  # fmt: skip

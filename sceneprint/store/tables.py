@@ -194,25 +194,7 @@ signatures = Table(
     Column("geometry", _string(64), nullable=False),  # blob of the artifact
     Column("n_patches", JSON, nullable=False),
     Column("n_pairs", JSON, nullable=False),
-    Column("sender", _string(32)),  # id of the key that sent it with the frame; null: made here
     Index(None, "geometry"),
-)
-#: Signatures that were sent, by who sent them.
-_SENT: ColumnElement[bool] = signatures.c.sender.is_not(None)
-Index(
-    "ix_signatures_sender", signatures.c.sender, signatures.c.frame_number,
-    sqlite_where=_SENT, postgresql_where=_SENT,
-)  # fmt: skip
-
-#: Keys that sent signatures with their frames.
-signature_senders = Table(
-    "signature_senders",
-    metadata,
-    Column("key_id", _string(32), primary_key=True),  # the key may be revoked since
-    Column("verified", WHOLE, nullable=False),  # signatures that were made here as well, and agree
-    Column("distrusted_at", Float),  # since one did not agree; null: it is trusted
-    Column("map", _string(63)),  # of the frame for which it did not
-    Column("frame_id", _string(64)),
 )
 
 jobs = Table(
@@ -276,8 +258,6 @@ job_files = Table(
     Index(None, "blob"),
 )
 
-#: Name of the file of a job that is what a robot made of its frame, until it is signed.
-PACKAGE = "signed"
 #: Name of the file of an import that is its archive; it counts against the quota of the map.
 ARCHIVE = "archive"
 

@@ -13,9 +13,7 @@ from pydantic_core import from_json
 
 from sceneprint.engine.ingest.archive_import import Receiver
 from sceneprint.engine.ingest.uploads import Upload
-from sceneprint.engine.maps.map_frames import BYTES
 from sceneprint.errors import InvalidRequest, MalformedBody, UnsupportedType
-from sceneprint.formats.signature_package import MAXIMUM_PACKAGE
 from sceneprint.store.queue import JobFile
 from sceneprint_client.api import Added, Frame, FrameState, Job, Page
 from sceneprint_client.api.base import NOVEL, novelty_of
@@ -33,7 +31,6 @@ from service.auth import Asking, Caller, Context, Here, may_read, may_write, v1_
 from service.bodies import (
     FORM,
     FRAME_BODY,
-    SIGNED,
     IdempotencyKey,
     frames_of,
     guarded,
@@ -97,13 +94,6 @@ _IF_NOVEL = {
     "`redundant`, and its upload is removed.",
 }
 OPTIONS = {"priority": _PRIORITY, "if_novel": _IF_NOVEL}
-_SIGNED = {
-    "type": "string", "format": "binary",
-    "description": "What the robot made of this frame itself: a signature package, of "
-    "POST /v1/maps/{map_name}/signatures of the robot's own service. Where the operator trusts "
-    "robots (SCENEPRINT_TRUST_SIGNATURES), no worker signs the frame again, but for a sample. "
-    f"At most {MAXIMUM_PACKAGE >> 20} MiB.",
-}  # fmt: skip
 _SAID: dict[int | str, dict[str, Any]] = {
     200: {"model": Added, "description": "The map has this frame already."},
     201: {"model": Added, "description": "Waited for: indexed, redundant, rejected or failed."},
@@ -126,7 +116,7 @@ def in_query(options: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
 def _described_upload() -> dict[str, Any]:
     """What an upload may be, and say beside what a query says."""
     form = FRAME_BODY["content"][FORM]
-    properties = {**form["schema"]["properties"], **OPTIONS, SIGNED: _SIGNED}
+    properties = {**form["schema"]["properties"], **OPTIONS}
     schema = {**form["schema"], "properties": properties}
     return {
         "parameters": [*bodies.parameters(), *in_query(OPTIONS)],
@@ -236,18 +226,14 @@ async def _taken(
     response: Response, prefer: str | None, key: str | None,
 ) -> Added:  # fmt: skip
     options = ("priority", "if_novel")
-    async with here.uploads.place(), uploaded(request, *options, signed=True) as form:
+    async with here.uploads.place(), uploaded(request, *options) as form:
         priority = priority_of(form.fields)
         if_novel = novelty_of(form.fields.get("if_novel"))
 
         def take() -> tuple[Added, bool, bool]:
-            signed = None if form.signed is None else form.signed.read()
-            upload = Upload(
-                form.file.read(), form.meta, priority, if_novel, frame_id, signed, asking.key_id
-            )
+            upload = Upload(form.file.read(), form.meta, priority, if_novel, frame_id)
             parts = ("frame", map_name, upload.data, form.meta, priority, if_novel)
-            # as before where there is none: a request may be sent again after an upgrade
-            once = guarded(asking, key, *parts, *([] if signed is None else [signed]))
+            once = guarded(asking, key, *parts)
             outcome, replayed = here.engine.uploads.add(map_name, upload, once)
             return outcome.taken, outcome.new, replayed
 
@@ -286,41 +272,6 @@ async def _settled(
         frame = await here.run(here.engine.get_frame, map_name, added.frame_id)
         added = added.model_copy(update={"state": frame.state, "reason": frame.reason})
     return added
-
-
-# What signing makes of a frame, for a robot that signs with a service of its own.
-
-signatures_router = v1_router("/maps/{map_name}/signatures", "frames")
-
-_PACKAGE: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "A signature package, for the part `signed` of an upload of the same frame.",
-        "content": {BYTES: {"schema": {"type": "string", "format": "binary"}}},
-    },
-    **declared(404, 409, 413, 415, 422),
-}
-
-
-@signatures_router.post(
-    "", response_class=Response, responses=_PACKAGE, dependencies=[Depends(may_read)],
-    openapi_extra={
-        "parameters": bodies.parameters(),
-        "requestBody": {
-            **FRAME_BODY, "content": {**FRAME_BODY["content"], **bodies.content()},
-        },
-    },
-)  # fmt: skip
-async def sign_frame(map_name: str, request: Request, here: Here) -> Response:
-    """Sign a frame with a map's model, and store nothing.
-
-    A robot asks its own service, such as one on a copy of the fleet's maps, and sends what it gets
-    in the part `signed` of its upload: then no worker of the fleet has to sign the frame.
-    """
-    async with here.gate.place(), uploaded(request) as form:
-        package = await here.gate.run(
-            lambda: here.engine.sign_frame(map_name, form.file.read(), form.meta)
-        )
-    return Response(package, media_type=BYTES)
 
 
 # Archives of sequences into a map.

@@ -61,9 +61,3 @@ def test_pages_are_timed_and_weighed(browser, station, settle, open_page, monkey
         dashboard._figures(
             1, first, slow, both, {**drawn, "size": [1, 1]}, (places, surface), 60, gallery, shown
         )
-
-
-def test_without_a_browser_one_line_says_so(monkeypatch):
-    monkeypatch.setattr(dashboard, "installed", lambda: None)
-    assert dashboard.measure() is None
-    assert dashboard.table(None)[-2] == "Not measured: no Chromium is installed."

@@ -169,7 +169,7 @@ def test_two_sessions_are_compared_in_3(
         operator.click(page.get_by_role("link", name="Compare session second"))
         operator.click(page.get_by_role("button", name="Compare"))
         legend = page.get_by_role("list", name="Legend")
-        expect(legend.locator("[data-kind=same]")).to_contain_text("in both", timeout=60_000)
+        expect(legend.locator("[data-kind=same]")).to_contain_text("in both")
 
 
 def test_an_answer_is_kept_and_shared_in_2(

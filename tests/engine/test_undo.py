@@ -27,7 +27,7 @@ from sceneprint_client.api import Frame, FrameMeta, FrameState, Query
 from sceneprint_client.api.listing import FrameListing, FrameSelection, RestoreOptions
 
 #: What a restored frame has anew.
-FRESH = {"revision", "job_id", "indexed_at", "signed_by", "state"}
+FRESH = {"revision", "job_id", "indexed_at", "state"}
 
 
 def frames(engine: Engine) -> dict[str, Any]:

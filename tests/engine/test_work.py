@@ -194,15 +194,15 @@ def test_an_artifact_swept_before_its_commit_is_not_referred_to(
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     claimed = empty.claim("w")
     assert claimed is not None
-    put = working._put
+    make = working._make
 
     def slowly(*given: Any) -> Any:
-        made = put(*given)
+        made = make(*given)
         empty.delete_frame("other", other.frame_id)
         return made
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(working, "_put", slowly)
+        patch.setattr(working, "_make", slowly)
         empty.run(claimed)
     due_now(empty)
     work_off(empty)

@@ -16,18 +16,14 @@ from sqlalchemy import event, text
 
 from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import next_events
-from sceneprint.engine.ingest.uploads import Upload
-from sceneprint.engine.jobs.robot_signatures import EVERY_S, FIRST
 from sceneprint.engine.jobs.tasks import SliceResult
 from sceneprint.engine.upkeep.purge import Retention
 from sceneprint.settings import Settings
 from sceneprint.store import open_store
 from sceneprint.store.deletion import DAY_S, doom, doomed_blobs
 from sceneprint.store.events import Wanted
-from sceneprint.store.keys import find_named_key
 from sceneprint.store.maps import find_map, use_of
 from sceneprint.store.postgres.connection import LOCKS, TURN
-from sceneprint.store.sender_rows import add_verified
 from sceneprint_client.api import JobState, NewMap
 
 _ALL = re.compile(rf"pg_advisory_xact_lock\({LOCKS}, {TURN}\)")
@@ -38,10 +34,7 @@ _ONE = "pg_advisory_xact_lock_shared("
 @pytest.fixture
 def engine(postgres_url: str, tmp_path: Path) -> Iterator[Engine]:
     (tmp_path / "blobs").mkdir()  # its database is there: it is made by nobody
-    values = {
-        "database_url": postgres_url, "data_dir": tmp_path, "trust_signatures": True,
-        "signed_sample": 1e-12, "decoders": 0,
-    }  # fmt: skip
+    values = {"database_url": postgres_url, "data_dir": tmp_path, "decoders": 0}
     with Engine(Settings.model_validate(values)) as opened:
         opened.create_map(NewMap(name="hall", model="depth", retention_days=1.0))
         yield opened
@@ -120,29 +113,3 @@ def test_a_slice_takes_the_turn_of_its_map(engine: Engine) -> None:
     assert taken == {"one": 1, "all": 0}
     told = next_events(engine.store.database, Wanted(), 0, 100).found
     assert [one.kind for one in told].count("counted") == 1
-
-
-def test_packages_of_robots_are_removed_together(
-    engine: Engine, small: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    engine.create_key("robot")
-    with engine.store.database.write() as connection:
-        sender = find_named_key(connection, "robot").id
-        for _ in range(FIRST):
-            add_verified(connection, sender)
-    for frame in small[:3]:
-        signed = engine.sign_frame("hall", *frame)
-        engine.uploads.add("hall", Upload(frame.png, frame.meta, signed=signed, sender=sender))
-    works = [engine.claim("w") for _ in range(3)]
-    with turns(engine) as taken:
-        for work in works:
-            assert work is not None
-            assert engine.run(work) == JobState.SUCCEEDED
-    assert taken == {"one": 0, "all": 0}  # each took its turn in its only message
-    assert engine.get_map("hall").frames == {"indexed": 3}
-    monkeypatch.setattr(engine.robot_signatures, "_tidied", -EVERY_S)
-    before = used_bytes(engine)
-    with turns(engine) as taken:
-        engine.robot_signatures.tidy()
-    assert taken == {"one": 1, "all": 1}
-    assert used_bytes(engine) == sum(len(one.png) for one in small[:3]) < before

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs import lifecycle
 from sceneprint.errors import NewerSchema, UnusableStore
@@ -219,7 +220,7 @@ def test_the_folder_of_a_later_version_is_left_alone(command, folder, truth):
         connection.exec_driver_sql("UPDATE schema_range SET least_revision = '9999'")
     before = contents(folder)
     start = [BIN / "sceneprint", command, "--data", folder]
-    done = subprocess.run(start, capture_output=True, text=True, timeout=90, check=False)
+    done = subprocess.run(start, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"sceneprint {command}: ")

@@ -15,6 +15,7 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint import __version__
 from sceneprint.errors import UnusableStore
 from sceneprint.settings import Settings
@@ -45,7 +46,7 @@ def slow(tmp_path: Path) -> tuple[Front, threading.Event]:
     settings, go = Settings(data_dir=tmp_path), threading.Event()
 
     def load() -> FastAPI:
-        assert go.wait(60)
+        assert go.wait(PATIENCE_S)
         return create_app(settings)
 
     return Front(settings, load, lambda: None), go
@@ -110,7 +111,7 @@ def test_a_service_that_cannot_be_loaded_ends_with_the_error(
     settings = {"SCENEPRINT_DATA_DIR": f"{tmp_path}", "SCENEPRINT_PORT": "0"}
     done = subprocess.run(
         [sys.executable, "-c", code], env=os.environ | settings, capture_output=True, text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.returncode == 1
     assert "ModuleNotFoundError: import of service.app halted" in done.stderr

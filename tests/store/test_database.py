@@ -30,7 +30,7 @@ TABLES = [
     "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs", "kept_answer_frames",
     "kept_answer_maps", "kept_answers", "keys", "maps", "models", "pending_events",
     "query_records", "samples",
-    "schema_range", "scrubs", "secrets", "signature_senders", "signatures", "surface_frames",
+    "schema_range", "scrubs", "secrets", "signatures", "surface_frames",
     "surface_tiles", "surface_touches", "surfaces", "tenants",
 ]  # fmt: skip
 

@@ -56,11 +56,6 @@ class Key(ApiRecord):
     last_used_at: datetime | None = Field(
         default=None, description="To about an hour; null: it was never used."
     )
-    signatures_distrusted_at: datetime | None = Field(
-        default=None,
-        description="Since when signatures that it sends with frames are not used, as one was "
-        "wrong; null: none was.",
-    )
 
 
 class MadeKey(Key):
@@ -368,8 +363,7 @@ class Job(ApiRecord):
     )
     result: dict[str, Any] | None = Field(
         default=None,
-        description="What a long job came to, in short, when it has succeeded. Of `sign`, where a "
-        "signature came with the frame: `signed_by`, and in `sent` what became of it.",
+        description="What a long job came to, in short, when it has succeeded.",
     )
     followed_by: str | None = Field(
         default=None,
@@ -431,10 +425,6 @@ KINDS = {
     "key.created": "A key was made; belongs to no map.",
     "key.rotated": "A key has a new secret; the one before ends soon. Belongs to no map.",
     "key.revoked": "A key was revoked and no longer works; belongs to no map.",
-    "key.distrusted": (
-        "A signature that came with a frame was wrong, so no signature sent with this key is used "
-        "any more; belongs to no map. `data` has `name`, `map`, `frame_id` and `reason`."
-    ),
 }
 #: Stands in a stream where events are not there any more; kept by nobody.
 MISSED = "events.missed"

@@ -37,13 +37,6 @@ MOST_PRIORITY = 10
 Kind = Literal["depth", "cloud"]
 
 
-#: What became of a signature that a robot sent with its frame.
-SentSignature = Literal["kept", "off", "keyless", "distrusted", "other_version", "known"]
-
-#: Who made the signature that a frame is found by.
-SignedBy = Literal["robot", "service"]
-
-
 class Added(ApiRecord):
     """What has become of an upload."""
 
@@ -52,14 +45,6 @@ class Added(ApiRecord):
     state: FrameState
     reason: str | None = Field(
         default=None, description="Why it was rejected, or failed, or was not kept."
-    )
-    signed: SentSignature | None = Field(
-        default=None,
-        description="What became of the part `signed`; null: there was none. `kept`: a worker "
-        "looks at it. Any other: it was not kept, and a worker signs the frame. `off`: this "
-        "service trusts no signatures of robots; `keyless`: it asks for no keys; `distrusted`: an "
-        "earlier one of this key was wrong; `other_version`: made by other signing code than this "
-        "service's; `known`: the map has the frame already.",
     )
 
 
@@ -94,11 +79,6 @@ class Frame(ApiRecord):
     captured_at: datetime | None
     received_at: datetime
     indexed_at: datetime | None
-    signed_by: SignedBy | None = Field(
-        default=None,
-        description="`robot`: the signature that came with the upload is used, and no worker made "
-        "it again; null before it is indexed.",
-    )
     pose: Transform | None
     base_frame: str | None = Field(default=None, description="Frame of the robot's base.")
     T_base_sensor: Transform | None = Field(

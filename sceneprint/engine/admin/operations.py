@@ -37,7 +37,6 @@ from sceneprint.store.events import (
 from sceneprint.store.maps import find_map
 from sceneprint.store.opaque_ids import OpaqueIds, invalid_cursor
 from sceneprint.store.queue import read_clock
-from sceneprint.store.sender_rows import SenderRow, distrusted_senders
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Page
 from sceneprint_client.api.admin import (
@@ -448,8 +447,7 @@ def rotate_key(store: Store, name: str, overlap_s: float = OVERLAP_S) -> MadeKey
     with store.database.write() as connection:
         secret = stored.rotate_key(connection, name, overlap_s)
         row = stored.find_named_key(connection, name)
-        distrusted = distrusted_senders(connection).get(row.id)
-    return MadeKey(secret=secret, **_key_record(row, distrusted).model_dump())
+    return MadeKey(secret=secret, **_key_record(row).model_dump())
 
 
 def list_keys(store: Store, cursor: str | None = None, limit: int = 100) -> Page[Key]:
@@ -462,10 +460,9 @@ def list_keys(store: Store, cursor: str | None = None, limit: int = 100) -> Page
     after = None if cursor is None else _name_of(cursor)
     with store.database.read() as connection:
         found = stored.list_keys(connection, after, limit + 1)
-        distrusted = distrusted_senders(connection)
     last = found[limit - 1].name.encode() if len(found) > limit else None
     more = None if last is None else base64.urlsafe_b64encode(last).decode()
-    items = [_key_record(row, distrusted.get(row.id)) for row in found[:limit]]
+    items = [_key_record(row) for row in found[:limit]]
     return Page[Key](items=items, next_cursor=more)
 
 
@@ -483,7 +480,7 @@ def _until(expires_at: datetime) -> float:
     return seconds
 
 
-def _key_record(row: stored.KeyRow, distrusted: SenderRow | None = None) -> Key:
+def _key_record(row: stored.KeyRow) -> Key:
     now = time.time()
     return Key(
         name=row.name,
@@ -494,7 +491,6 @@ def _key_record(row: stored.KeyRow, distrusted: SenderRow | None = None) -> Key:
         # when it has passed, it is of no more interest
         previous_until=_time(row.previous_until) if (row.previous_until or 0) > now else None,
         last_used_at=_time(row.last_used_at),
-        signatures_distrusted_at=None if distrusted is None else _time(distrusted.distrusted_at),
     )
 
 

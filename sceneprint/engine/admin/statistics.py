@@ -37,7 +37,6 @@ from sceneprint.store.frames import count_states
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.queue import PENDING, count_jobs, read_clock, waiting_by_tenant
 from sceneprint.store.scrub_rows import ScrubRow, read_scrub
-from sceneprint.store.sender_rows import count_verified, distrusted_senders
 from sceneprint.store.signatures import count_indexed
 from sceneprint.store.tables import MapRow
 from sceneprint.store.wakeup import Wakeup
@@ -232,16 +231,13 @@ SERVICE, WORKER = "service", "worker"
 @dataclass(frozen=True)
 class Figures:
     """How the whole store is: its statistics, workers that began in the last hour, the number of
-    the newest event, and the jobs that wait by tenant; signatures of robots that were verified, and
-    keys whose signatures are not used any more.
+    the newest event, and the jobs that wait by tenant.
     """
 
     stats: Stats
     began: int
     events: int
     waiting: Mapping[str, int]
-    verified: int
-    distrusted: int
 
 
 @dataclass(frozen=True)
@@ -411,9 +407,8 @@ class Statistics:
         with self._store.database.read() as connection:
             began = store_counts.count_samples(connection, WORKER, time.time() - HOUR_S)
             waiting = waiting_by_tenant(connection)
-            verified, distrusted = count_verified(connection), len(distrusted_senders(connection))
             newest = newest_number(connection)
-            return Figures(stats, began, newest, waiting, verified, distrusted)
+            return Figures(stats, began, newest, waiting)
 
     def workers(self, connection: Connection) -> list[WorkerSeen]:
         """Processes that wait for jobs, with SQLite on this machine, and those that have one."""

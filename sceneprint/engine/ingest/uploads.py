@@ -24,8 +24,6 @@ from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upload
 from sceneprint.engine.ingest.write_groups import Grouping, NewFrames
 from sceneprint.engine.upkeep import garbage_collection, repair
-from sceneprint.formats.signature_package import read_package
-from sceneprint.signing import SIGNING_VERSION
 from sceneprint.store import Store
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import loosen, renew_frame
@@ -39,13 +37,11 @@ from sceneprint.store.maps import (
 )
 from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.queue import enqueue, job_ids_of
-from sceneprint.store.sender_rows import add_package, find_sender
-from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames, request_data
+from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Added, FrameMeta, FrameState
 from sceneprint_client.api.frames import (
     BatchItem,
-    SentSignature,
     check_frame_id,
     problem_of,
 )
@@ -184,24 +180,17 @@ def replayed(
         frame = connection.execute(asked).mappings().first()
         if frame is None:
             return None
-        there = upload_response(connection, frame_row(frame))
-        there = there.model_copy(update={"signed": one.get("signed")})
-        found.append(UploadResult(there, one["new"]))
+        found.append(UploadResult(upload_response(connection, frame_row(frame)), one["new"]))
     return found
 
 
 def _stored_outcome(outcome: UploadResult) -> dict[str, Any]:
     """What came of an upload, as JSON that is remembered."""
     if outcome.added is not None:
-        return _told_of(outcome.added.frame_id, outcome.added.signed, new=outcome.new)
+        return {"frame_id": outcome.added.frame_id, "new": outcome.new}
     error = outcome.error
     fields = error.fields if isinstance(error, errors.InvalidRequest) else ()
     return {"error": type(error).__name__, "detail": str(error), "fields": fields}
-
-
-def _told_of(frame_id: str, signed: SentSignature | None, *, new: bool) -> dict[str, Any]:
-    told = {"frame_id": frame_id, "new": new}
-    return told if signed is None else {**told, "signed": signed}
 
 
 def _error(kept: dict[str, Any]) -> errors.SceneprintError:
@@ -224,8 +213,6 @@ class Upload:
         of unrelated frames; None to keep it anyway. Of one that is not signed yet, the weaker
         condition counts
     frame_id : that it is to have; None: one of ours, and none where the map has its content
-    signed : what a robot made of it; see `sceneprint.formats.signature_package`
-    sender : id of the key that was shown; None: none was
     """
 
     data: bytes
@@ -233,8 +220,6 @@ class Upload:
     priority: int = 0
     if_novel: float | None = None
     frame_id: str | None = None
-    signed: bytes | None = None
-    sender: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,39 +230,16 @@ class _Prepared:
     blob: str
     content: str
     known: dict[str, Any]
-    signed: SentSignature | None = None
-
-    @property
-    def package(self) -> tuple[str, bytes] | None:
-        """Blob and bytes of what a robot made of it, where that is kept."""
-        data = self.upload.signed
-        if data is None or self.signed != "kept":
-            return None
-        return hashlib.sha256(data).hexdigest(), data
-
-    @property
-    def blobs(self) -> dict[str, bytes]:
-        """What has to be durable before a row refers to it."""
-        package = self.package
-        return {self.blob: self.upload.data} | ({} if package is None else dict([package]))
 
     @property
     def size(self) -> int:
-        """Bytes that its map counts for it."""
-        return sum(map(len, self.blobs.values()))
-
-    @property
-    def of_job(self) -> dict[str, Any] | None:
-        """What its job keeps of how it was sent; None: nothing but what any job does."""
-        if self.package is None:
-            return None
-        return {**(request_data() or {}), "sender": self.upload.sender}
+        """Bytes of the upload."""
+        return len(self.upload.data)
 
     @property
     def of_blob(self) -> dict[str, Any]:
         """Columns that follow from the bytes and from how they were sent."""
-        size, novelty = len(self.upload.data), self.upload.if_novel
-        return {"blob": self.blob, "bytes": size, "novelty": novelty}
+        return {"blob": self.blob, "bytes": self.size, "novelty": self.upload.if_novel}
 
     @property
     def columns(self) -> dict[str, Any]:
@@ -305,13 +267,12 @@ class _Request:
     @cached_property
     def blobs(self) -> dict[str, bytes]:
         """What has to be durable first."""
-        return {blob: data for one in self.todo.values() for blob, data in one.blobs.items()}
+        return {one.blob: one.upload.data for one in self.todo.values()}
 
     @property
     def is_single(self) -> bool:
         """Whether it is one upload, of which nothing but the frame is to be written."""
-        alone = len(self.known) == len(self.todo) == 1
-        return alone and self.fence is None and len(self.blobs) == 1
+        return len(self.known) == len(self.todo) == 1 and self.fence is None
 
 
 class IncomingBytes:
@@ -333,11 +294,10 @@ class Uploads:
     Parameters
     ----------
     store, bell : see there
-    trusts : whether what robots made of their frames is kept for workers to use
     """
 
-    def __init__(self, store: Store, bell: Wakeup, *, trusts: bool = False) -> None:
-        self._store, self._bell, self._trusts = store, bell, trusts
+    def __init__(self, store: Store, bell: Wakeup) -> None:
+        self._store, self._bell = store, bell
         # of each map that is written to, as long as somebody writes to it
         self._writes = WeakValueDictionary[int | None, Grouping]()
         self._guard = threading.Lock()
@@ -361,8 +321,7 @@ class Uploads:
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : a frame id that is none; `signed` is of another frame or model, or
-            damaged; or see `read_upload`.
+        InvalidRequest : a frame id that is none; or see `read_upload`.
         FrameError : see `read_upload`.
         FrameConflict : the frame is there with other content or metadata.
         QuotaExceeded : the map's quota has no room for one more; nothing was taken.
@@ -402,7 +361,7 @@ class Uploads:
         ready: dict[int, _Prepared] = {}
         for i, upload in enumerate(uploads):
             try:
-                ready[i] = self._prepared(row, upload)
+                ready[i] = self._prepared(upload)
             except errors.StoreError:
                 raise
             except errors.SceneprintError as error:
@@ -420,48 +379,14 @@ class Uploads:
             self._bell.ring()
         return [one for one in outcomes if one is not None], again
 
-    def _prepared(self, row: MapRow, upload: Upload) -> _Prepared:
+    def _prepared(self, upload: Upload) -> _Prepared:
         if upload.frame_id is not None:
             check_frame_id(upload.frame_id)
         read = read_upload(upload.data, upload.meta, self._store.decoders)
         content = content_id(read)
         blob = hashlib.sha256(upload.data).hexdigest()
         known = {**columns(upload.meta, read.frame.pose, read.base), "cloud": read.cloud}
-        return _Prepared(upload, blob, content, known, self._sent(row, upload, content))
-
-    def _sent(self, row: MapRow, upload: Upload, content: str) -> SentSignature | None:
-        """What becomes of what a robot made of its frame, unless the map has the frame already.
-
-        Raises
-        ------
-        InvalidRequest : it is no package, or is of another frame or another model.
-        """
-        if upload.signed is None:
-            return None
-        if not self._trusts:
-            return "off"
-        if upload.sender is None:
-            return "keyless"
-        package = read_package(upload.signed)
-        if package.content_id != content:
-            raise errors.InvalidRequest(
-                f"The part `signed` is of content {package.content_id[:12]}, and the frame has "
-                f"{content[:12]}: samples, camera or viewpoint differ. Send both as they were "
-                "when the frame was signed.",
-                (("signed", "of another frame"),),
-            )
-        if package.model_id != row.model_id:
-            raise errors.InvalidRequest(
-                f"The part `signed` was made with model {package.model_id[:12]}, and map "
-                f"{row.name!r} has {row.model_id[:12]}. Sign the frame with the map's model, or "
-                "send it without that part.",
-                (("signed", "of another model"),),
-            )
-        if package.signing_version != SIGNING_VERSION:
-            return "other_version"
-        with self._store.database.read() as connection:
-            distrusted = find_sender(connection, upload.sender).distrusted_at is not None
-        return "distrusted" if distrusted else "kept"
+        return _Prepared(upload, blob, content, known)
 
     def _settled(self, map_name: str, ready: _Prepared) -> UploadResult | None:
         """What comes of an upload for which nothing has to be written; None: it has to be."""
@@ -484,8 +409,8 @@ class Uploads:
         except errors.SceneprintError as error:
             return UploadResult(None, error=error)
         self._renew(map_name, there.frame_id, ready.upload)
-        told = {"reason": repair.without_loss(there.reason), "signed": _known(ready)}
-        return UploadResult(there.model_copy(update=told))
+        reason = repair.without_loss(there.reason)
+        return UploadResult(there.model_copy(update={"reason": reason}))
 
     def _renew(self, map_name: str, frame_id: str, upload: Upload) -> None:
         """Let what came take the place of an upload that was lost."""
@@ -553,7 +478,7 @@ class Uploads:
         # a deletion may have removed it before the commit, and from now on none does; a worker
         # that missed it meanwhile tries again
         self._store.blobs.ensure(one.blob, one.upload.data)
-        return _new_result(new, one)
+        return _new_result(new)
 
     def _store_all(
         self, row: MapRow, request: _Request, connection: Connection
@@ -614,19 +539,17 @@ def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = N
 
     With `once`, which PostgreSQL alone takes, what came of it is remembered in the same statement.
     """
-    package, frame_id = ready.package, uuid.uuid4().hex
+    frame_id = uuid.uuid4().hex
     kept = None
     if once is not None:
-        kept = once.columns({"frames": [_told_of(frame_id, ready.signed, new=True)]})
-    return NewFrame(
-        row, ready.columns, ready.upload.priority, ready.of_job,
-        0 if package is None else len(package[1]), kept, frame_id,
-    )  # fmt: skip
+        kept = once.columns({"frames": [{"frame_id": frame_id, "new": True}]})
+    return NewFrame(row, ready.columns, ready.upload.priority, kept, frame_id)
 
 
-def _new_result(new: NewFrame, ready: _Prepared) -> UploadResult:
+def _new_result(new: NewFrame) -> UploadResult:
     """What came of an upload whose frame was taken."""
-    return UploadResult(_added(new.frame_id, new.job_id, FrameState.RECEIVED, ready), new=True)
+    added = Added(frame_id=new.frame_id, job_id=new.job_id, state=FrameState.RECEIVED, reason=None)
+    return UploadResult(added, new=True)
 
 
 def _received_together(
@@ -635,22 +558,7 @@ def _received_together(
     """Uploads of new frames that were taken, by their place; see `_stored` for the others."""
     new = {i: _new_frame(row, one) for i, one in todo.items() if one.upload.frame_id is None}
     ids = receive_frames(connection, list(new.values()))
-    taken = {i: one for i, one in new.items() if one.frame_id in ids}
-    for i, one in taken.items():
-        package = todo[i].package
-        if package is not None:
-            blob, data = package
-            add_package(connection, row.number, one.job_id, blob, len(data), counted=True)
-    return {i: _new_result(one, todo[i]) for i, one in taken.items()}
-
-
-def _added(frame_id: str, job_id: str, state: FrameState, ready: _Prepared) -> Added:
-    return Added(frame_id=frame_id, job_id=job_id, state=state, reason=None, signed=ready.signed)
-
-
-def _known(ready: _Prepared) -> SentSignature | None:
-    """What became of what a robot made of a frame that is there already."""
-    return None if ready.signed is None else "known"
+    return {i: _new_result(one) for i, one in new.items() if one.frame_id in ids}
 
 
 def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[str]) -> UploadResult:
@@ -659,29 +567,26 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
     try:  # once more: another upload may have been first
         frame = find_duplicate(connection, row, ready.content, ready.known, upload.frame_id)
     except errors.FrameConflict as error:
-        left.extend(ready.blobs)
+        left.append(ready.blob)
         return UploadResult(None, error=error)
     if frame is not None and not is_retried(frame.state):
         loosen(connection, frame.number, upload.if_novel)
-        left.extend(ready.blobs)
-        there = upload_response(connection, frame)
-        return UploadResult(there.model_copy(update={"signed": _known(ready)}))
+        left.append(ready.blob)
+        return UploadResult(upload_response(connection, frame))
     new = frame is None or frame.state == FrameState.REDUNDANT
     # a failed one is counted already, and may come packed otherwise
     held = 0 if frame is None or new else frame.bytes
     try:
         require_room(connection, row, ready.size - held, new=new)
     except errors.QuotaExceeded as error:
-        left.extend(ready.blobs)
+        left.append(ready.blob)
         return UploadResult(None, error=error)
     if frame is None:
         frame = add_frame(connection, row.number, ready.columns, upload.frame_id)
     else:  # it was given up, and somebody asks for another try
         left.append(frame.blob)  # it was packed otherwise
         frame = renew_frame(connection, frame.number, ready.of_blob)
-    job = enqueue(connection, "sign", frame.number, upload.priority, data=ready.of_job)
-    if ready.package is not None:
-        blob, data = ready.package
-        add_package(connection, row.number, job.id, blob, len(data))
+    job = enqueue(connection, "sign", frame.number, upload.priority)
     record_event(connection, "frame.received", row.name, frame.id, job.id)
-    return UploadResult(_added(frame.id, job.id, frame.state, ready), new=True)
+    added = Added(frame_id=frame.id, job_id=job.id, state=frame.state, reason=None)
+    return UploadResult(added, new=True)

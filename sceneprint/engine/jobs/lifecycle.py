@@ -16,15 +16,12 @@ from sceneprint.engine.serializers import job_record
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError, UnknownJob
 from sceneprint.store import Store, queue
-from sceneprint.store.deletion import doom
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import frame_of, map_of
 from sceneprint.store.queue import fail_of_dead
 from sceneprint.store.queue import list_jobs as list_stored
-from sceneprint.store.reencoding_rows import REENCODE, touch
-from sceneprint.store.sender_rows import senders_of
-from sceneprint.store.signatures import remove_signature
+from sceneprint.store.reencoding_rows import REENCODE
 from sceneprint.store.tables import ARCHIVE, FrameRow, JobRow, MapRow
 from sceneprint_client.api import FrameState, Job, JobState, Page
 from sceneprint_client.api.admin import RefusedRetry, RetriedJobs
@@ -97,31 +94,16 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
     try:
         with store.database.write(map_number=work.map.number) as connection:
             queue.finish(connection, work.job, JobState.FAILED, reason)
-            is_searched = map_of(connection, work.frame.map_number).model_id == work.model_id
-            number = work.frame.number
             if not work.again:
-                if not is_searched:
+                if map_of(connection, work.frame.map_number).model_id != work.model_id:
                     raise Outdated
-                set_state(connection, number, FrameState.REJECTED, reason)
-                record_job_event(connection, "frame.rejected", work)
-            elif is_searched and _is_sent(connection, work):
-                # a robot made something of what holds nothing: readers learn that it is gone
-                set_state(connection, number, FrameState.REJECTED, reason)
-                doom(connection, remove_signature(connection, number, work.model_id))
-                touch(connection, work.map, [number])
+                set_state(connection, work.frame.number, FrameState.REJECTED, reason)
                 record_job_event(connection, "frame.rejected", work)
     except LostLease:
         return None
     except Outdated:
         return restart_jobs(store, work)
     return JobState.FAILED
-
-
-def _is_sent(connection: Connection, work: Work) -> bool:
-    """Whether a frame is found by a signature that a robot sent."""
-    number = work.frame.number
-    found = senders_of(connection, [number], work.model_id).get(number) is not None
-    return found and frame_of(connection, number).state == FrameState.INDEXED
 
 
 def break_down(store: Store, work: Work, error: Exception) -> JobState | None:

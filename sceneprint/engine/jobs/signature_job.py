@@ -6,8 +6,7 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from sqlalchemy import Connection
@@ -15,7 +14,6 @@ from sqlalchemy import Connection
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_stored
 from sceneprint.engine.jobs import lifecycle
-from sceneprint.engine.jobs.robot_signatures import RobotSignatures, SentSignature
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.search.retrieval import Readers
 from sceneprint.engine.signers import Signers
@@ -23,13 +21,12 @@ from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.formats.artifact import write_geometry
 from sceneprint.geometry.retrieval.ranking import Metric, distance_share, distances
 from sceneprint.models import Model
-from sceneprint.pipeline import Signature, Signer, prepare
+from sceneprint.pipeline import prepare
 from sceneprint.process import span
 from sceneprint.store import Database, Store, queue
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import find_map, frame_of, geometry_blobs, map_of
 from sceneprint.store.reencoding_rows import REENCODE, enqueue_all, models_of
-from sceneprint.store.sender_rows import find_sender
 from sceneprint.store.signatures import (
     StoredSignature,
     changes_since,
@@ -38,7 +35,7 @@ from sceneprint.store.signatures import (
     replace_signature,
 )
 from sceneprint.store.tables import FrameRow, MapRow
-from sceneprint.types import Bytes, Geometry
+from sceneprint.types import Bytes
 from sceneprint_client.api import FrameState, JobState
 
 log = logging.getLogger(__name__)
@@ -77,30 +74,21 @@ def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob
 
 @dataclass(frozen=True)
 class Made:
-    """What came of a frame, and how.
-
-    Parameters
-    ----------
-    signature : to be stored
-    artifact : that it refers to, and that was put
-    result : of the job, where a robot sent what it had made; None: it sent nothing
-    """
+    """The signature of a frame, to be stored, and the artifact that it refers to."""
 
     signature: StoredSignature
     artifact: bytes
-    result: dict[str, Any] | None = None
 
 
 def run(
-    store: Store, signers: Signers, readers: Readers, robots: RobotSignatures,
-    work: lifecycle.Work, lease_s: float, longest_s: float,
-    broke: Callable[[], None] | None = None,
+    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, lease_s: float,
+    longest_s: float, broke: Callable[[], None] | None = None,
 ) -> JobState | None:  # fmt: skip
-    """Sign a claimed frame, or take what a robot made of it.
+    """Sign a claimed frame.
 
     Parameters
     ----------
-    store, signers, readers, robots : see there
+    store, signers, readers : see there
     work : of `claim`
     lease_s : seconds for which each renewal holds
     longest_s : seconds after which it is renewed no more: what takes so long does not end
@@ -118,7 +106,7 @@ def run(
     gone: list[str] = []
     try:
         with lifecycle.renewed(store, work.job, lease_s, longest_s):
-            made = _make(store, signers, robots, work)
+            made = _make(store, signers, work)
             gone = _store_patiently(store, signers, readers, work, made)
         state = JobState.SUCCEEDED
     except errors.LostLease as error:
@@ -146,62 +134,20 @@ def run(
     if state is None:
         return None
     milliseconds = round(1e3 * (time.perf_counter() - start), 1)
-    how = {} if made is None or made.result is None else made.result
-    told = {"state": state, "milliseconds": milliseconds, **how}
-    log.info("job %s", state, extra=lifecycle.about(work, **told))
+    about = lifecycle.about(work, state=state, milliseconds=milliseconds)
+    log.info("job %s", state, extra=about)
     return state
 
 
-def _make(store: Store, signers: Signers, robots: RobotSignatures, work: lifecycle.Work) -> Made:
-    """Take what a robot made of a frame, or sign it."""
+def _make(store: Store, signers: Signers, work: lifecycle.Work) -> Made:
+    """Sign a frame, and store its artifact."""
     if work.model_id not in models_of(work.map):
         raise lifecycle.Outdated
     signer = signers(work.model_id)
-    sent, note = robots.open(work, signer.model)
-    if sent is None:
-        made = _put(store, *_prepared(store, signer, work))
-        if note is None:
-            return made
-        return replace(made, result={"signed_by": "service", "sent": note})
-    if robots.is_sampled(work, sent):
-        return _verify(store, signer, robots, work, sent)
-    with span("artifact"):
-        blob = store.blobs.put(sent.package.artifact)
-    taken = StoredSignature(
-        model_id=sent.package.model_id,
-        vector=sent.package.vector,
-        geometry=blob,
-        n_patches=sent.package.n_patches,
-        n_pairs=sent.package.n_pairs,
-        sender=sent.sender,
-    )
-    return Made(taken, sent.package.artifact, {"signed_by": "robot", "sent": "taken"})
-
-
-def _verify(
-    store: Store, signer: Signer, robots: RobotSignatures, work: lifecycle.Work,
-    sent: SentSignature,
-) -> Made:  # fmt: skip
-    """Sign a frame, and compare what a robot made of it; what is made here is stored."""
-    try:
-        signature, geometry = _prepared(store, signer, work)
-    except errors.FrameError:
-        robots.verify(work, sent, None, None, signer.model)
-        raise
-    agrees = robots.verify(work, sent, signature, geometry, signer.model)
-    note = "verified" if agrees else "wrong: the key is trusted no more"
-    made = _put(store, signature, geometry)
-    return replace(made, result={"signed_by": "service", "sent": note})
-
-
-def _prepared(store: Store, signer: Signer, work: lifecycle.Work) -> tuple[Signature, Geometry]:
     with span("decode"):
         frame = read_stored(store.blobs.get(work.frame.blob), work.frame, store.decoders)
     with span("sign"):
-        return prepare(frame, signer)
-
-
-def _put(store: Store, signature: Signature, geometry: Geometry) -> Made:
+        signature, geometry = prepare(frame, signer)
     artifact = write_geometry(geometry)
     with span("artifact"):
         blob = store.blobs.put(artifact)
@@ -258,13 +204,10 @@ def _store(
             store.database.write(map_number=number) as connection,
         ):
             is_indexed = is_kept and index_claimed_frame(
-                connection, work.job, work.frame, work.map.name, made, result.result
+                connection, work.job, work.frame, work.map.name, made
             )
             if not is_indexed:
-                queue.finish(connection, work.job, JobState.SUCCEEDED, result=result.result)
-            # in its turn nobody trusts a sender no more, nor removes a blob
-            if made.sender is not None and find_sender(connection, made.sender).distrusted_at:
-                raise lifecycle.Outdated  # found to be wrong meanwhile: it is signed here
+                queue.finish(connection, work.job, JobState.SUCCEEDED)
             is_held = store.blobs.holds(made.geometry)
             if is_indexed and is_held:
                 return []
@@ -298,7 +241,7 @@ def _index_alone(store: Store, work: lifecycle.Work, result: Made) -> bool:
         return False
     with store.database.write(map_number=work.frame.map_number, single=True) as connection:
         is_indexed = index_claimed_frame(
-            connection, work.job, work.frame, work.map.name, made, result.result, single=True
+            connection, work.job, work.frame, work.map.name, made, single=True
         )
     if is_indexed:  # a deletion may have removed it before the commit: from now on none does
         store.blobs.ensure(made.geometry, result.artifact)

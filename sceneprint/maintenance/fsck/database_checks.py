@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -19,14 +18,12 @@ from sceneprint.maintenance.fsck.findings import (
     each,
     is_of_rows,
     sign_from_upload,
-    sign_while_indexed,
 )
 from sceneprint.maintenance.snapshot.database_copy import Form
 from sceneprint.models import PRESETS, parse_model, read_model, write_model
 from sceneprint.store.maps import counted_usage, list_maps, use_of
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.queue import enqueue
-from sceneprint.store.sender_rows import distrusted_frames
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
@@ -56,7 +53,6 @@ class _Known:
     tags: frozenset[str]
     signed: frozenset[str]  # models that it is signed with
     busy: bool  # whether a job is to sign it
-    distrusted: bool  # whether it has a signature of a key that sent a wrong one, and no job
 
 
 @dataclass(frozen=True)
@@ -131,14 +127,10 @@ def _frames_at_once(connection: Connection, numbers: list[int]) -> list[_Known]:
         )
     )
     at_work = set(busy.scalars())
-    distrusted = {
-        one.number for one in distrusted_frames(connection, math.inf, len(numbers), numbers)
-    }
     return [
         _Known(
             frame_row(row), known[row["map_number"]], frozenset(tags.get(row["number"], ())),
             frozenset(signed.get(row["number"], ())), row["number"] in at_work,
-            row["number"] in distrusted,
         )
         for row in found
     ]  # fmt: skip
@@ -155,11 +147,6 @@ def _faults(folder: Folder, one: _Known) -> Iterator[_Fault]:
         yield _Fault(
             "frame-without-signature", "it is indexed, and has no signature: it is not found",
             "have it signed again from its upload", _sign,
-        )  # fmt: skip
-    if one.distrusted:
-        yield _Fault(
-            "distrusted-signature", "a robot sent its signature, and another of that key was wrong",
-            "have it signed again from its upload", _sign_again,
         )  # fmt: skip
     if _stray(one):
         yield _Fault(
@@ -216,10 +203,6 @@ def _queue(_: Folder, connection: Connection, one: _Known) -> tuple[str, list[st
 
 def _sign(folder: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
     return sign_from_upload(folder, connection, one.frame.number), []
-
-
-def _sign_again(folder: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
-    return sign_while_indexed(folder, connection, one.frame.number, one.map.model_id), []
 
 
 def _queue_signature(folder: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
