@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
@@ -56,7 +57,7 @@ def test_dead_jobs_are_listed_and_tried_again(
     assert last == "1 jobs queued again, 0 cannot be retried"
     again = first.split()[1]
     with Client(service_url) as client:
-        (job,) = client.wait([again], timeout_s=60)
+        (job,) = client.wait([again], timeout_s=PATIENCE_S)
         assert job.state == "succeeded"
     (said, _) = sceneprint("jobs", "--retry-dead")  # it is history now
     assert said == "0 jobs queued again, 0 cannot be retried\n"

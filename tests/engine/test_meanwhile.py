@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index, verification
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
@@ -118,7 +119,7 @@ def test_queries_beside_deletions_and_publishing_see_one_state(
             builder.delete_frame("hall", name)
             if i == 3:
                 assert builder.publish_due() == 1
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + PATIENCE_S
         while not all(seen and seen[-1] == 3 for seen in sizes) and not raised:
             last = [seen[-1:] for seen in sizes]
             assert time.monotonic() < deadline, f"readers see {last} frames, not 3 each"

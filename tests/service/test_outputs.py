@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.waiting import PATIENCE_S
+
 
 @pytest.fixture(scope="module")
 def shown(served, make_map, small_shots):
@@ -125,7 +127,7 @@ def test_who_does_not_read_an_upload_costs_no_memory(served, make_map):
     head = f"GET {path}/frames/{sent.json()['frame_id']}/upload HTTP/1.1\r\nHost: localhost\r\n\r\n"
     try:
         for _ in range(12):
-            wires.append(wire := socket.create_connection((url.host, url.port), timeout=60))
+            wires.append(wire := socket.create_connection((url.host, url.port), timeout=PATIENCE_S))
             wire.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             wire.sendall(head.encode())
             assert wire.recv(12) == b"HTTP/1.1 200"
