@@ -151,8 +151,8 @@ def _count_on(connection: Connection, name: str, given: int) -> None:
 # What of an embedded store PostgreSQL would refuse, found before anything is moved.
 #
 # SQLite keeps what it is given: a text that is longer than its column, a zero byte in it, a number
-# where a text should be. What comes in through the service today is refused there; files of earlier
-# versions, or that somebody has edited, may hold such rows all the same.
+# where a text should be. The service refuses such values; a file that somebody has edited may hold
+# them all the same.
 
 #: Rows that are named one by one.
 _SHOWN = 6
