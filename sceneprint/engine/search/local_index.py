@@ -3,8 +3,7 @@
 A `Reader` holds one map: the newest generation of its index, and the tail of frames indexed after
 it. What it hands out is a `View`, which never changes; catching up makes a new one beside it.
 A map of which a node would have to read much first is left to PostgreSQL, where that has vectors.
-Signatures compared by L1 have neither index nor vectors, but where Qdrant searches: they are all
-tail.
+Signatures compared by L1 have neither index nor vectors: they are all tail.
 """
 
 from __future__ import annotations
@@ -39,7 +38,6 @@ from sceneprint.index import (
     signatures_of,
 )
 from sceneprint.index.generation_files import SCHEMA_VERSION, GenerationManifest, Keys
-from sceneprint.index.qdrant_shard import can_hold
 from sceneprint.models import Model
 from sceneprint.store import require_primary
 from sceneprint.store.events import holds_anchor
@@ -298,18 +296,6 @@ _FOLDER_NAME = re.compile(
 )
 
 
-def qdrant_metric(model: Model, wanted: bool) -> Metric | None:
-    """By what Qdrant compares the signatures of a model; None where it does not.
-
-    Parameters
-    ----------
-    model : of a map
-    wanted : whether Qdrant is to search at all
-    """
-    holds = wanted and can_hold(model.signature_bytes, model.metric)
-    return model.metric if holds else None
-
-
 def is_index_folder(name: str) -> bool:
     """Return whether a name is one of `index_folder`."""
     return _FOLDER_NAME.fullmatch(name) is not None
@@ -339,14 +325,10 @@ class Reader:
     connection, row : see `view`
     folder : of its index
     model : of its signatures
-    qdrant : whether Qdrant is to search its index
     """
 
-    def __init__(
-        self, connection: Connection, row: MapRow, folder: Path, model: Model, qdrant: bool = False
-    ) -> None:
+    def __init__(self, connection: Connection, row: MapRow, folder: Path, model: Model) -> None:
         self._folder, self._model = folder, model
-        self._qdrant = qdrant_metric(model, qdrant)
         self._looked = self._asked = time.monotonic()
         self._lock = threading.Lock()
         self._unsound = 0, 0.0  # number of a generation that cannot be used, until the next try
@@ -468,8 +450,7 @@ class Reader:
         self._publish(found, view.revision)
 
     def _newest_number(self) -> int | None:
-        has_index = self._model.metric == "l2" or self._qdrant is not None
-        return newest_number(self._folder) if has_index else None
+        return newest_number(self._folder) if self._model.metric == "l2" else None
 
     def _newest(
         self, connection: Connection, row: MapRow, known: Generation | None
@@ -478,7 +459,7 @@ class Reader:
         if number is None:
             return None
         length = self._model.signature_bytes
-        found = newest(self._folder, row.model_id, length, known=known, qdrant=self._qdrant)
+        found = newest(self._folder, row.model_id, length, known=known)
         if found is None or found.number < number:
             self._unsound = number, time.monotonic() + _AGAIN_S
         return trusted(connection, row, found)

@@ -46,7 +46,7 @@ from sceneprint_client.api.frames import Kind
 
 # The readers of all maps, and where each is searched.
 
-Setting = Literal["auto", "local", "database", "qdrant"]
+Setting = Literal["auto", "local", "database"]
 #: Memory of all tails above which maps that were not asked for long are forgotten.
 HELD_BYTES = 1 << 30
 #: Seconds between two looks for maps that are held and no longer there.
@@ -60,8 +60,8 @@ class Readers:
     ----------
     signers : see Signers
     indexes : folder of all indexes
-    setting : `local` and `qdrant` never ask the database; `database` wherever it can; `auto` where
-        much is missing here. `qdrant` has Qdrant search the indexes of this node
+    setting : `local` never asks the database; `database` wherever it can; `auto` where much is
+        missing here
     shared : indexes of the fleet, of which maps that are asked are fetched
     """
 
@@ -99,7 +99,7 @@ class Readers:
         return bool(self._searched_there(connection))
 
     def _searched_there(self, connection: Connection) -> frozenset[int]:
-        if self._setting in ("local", "qdrant") or self._database.is_sqlite:
+        if self._setting == "local" or self._database.is_sqlite:
             return frozenset()
         return vectors.complete_dimensions(connection)
 
@@ -136,8 +136,7 @@ class Readers:
             wanted = (row.number, row.model_id)
             if reader is None or held != wanted:  # made anew, or signed with another model
                 model = self._signers(row.model_id).model
-                folder, qdrant = index_folder(self._indexes, row), self._setting == "qdrant"
-                reader = Reader(connection, row, folder, model, qdrant)
+                reader = Reader(connection, row, index_folder(self._indexes, row), model)
                 self._open[row.name] = (wanted, reader)
             self._open.move_to_end(row.name)
             # the one that was asked longest ago first, and never the one that is asked now

@@ -24,7 +24,6 @@ from sceneprint.engine.search.local_index import (
     READ_MOST,
     index_folder,
     is_index_folder,
-    qdrant_metric,
     trusted,
 )
 from sceneprint.engine.search.retrieval import Setting
@@ -40,9 +39,8 @@ from sceneprint.errors import (
     UnknownMap,
     UnusableStore,
 )
-from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.index import Generation, clear, manifests, newest, newest_number, publish, scrub
-from sceneprint.index.generation_files import GenerationManifest, remove
+from sceneprint.index.generation_files import GenerationManifest
 from sceneprint.models import Model
 from sceneprint.settings import Settings
 from sceneprint.store import Store
@@ -103,7 +101,7 @@ class Scrubber:
                 return None
             if damaged is not None:
                 log.error("damaged index file removed", extra={"path": str(damaged)})
-                remove(damaged)  # what names it is passed over from now on
+                damaged.unlink(missing_ok=True)  # what names it is passed over from now on
                 return damaged.parent
         return None
 
@@ -144,7 +142,7 @@ class Upkeep:
     settings : `indexes` is the folder of all indexes; a generation may lack `tail_frames` frames,
         and as many deletions; after `scrub_s` seconds all files are read again, to see that they
         are sound; an index that lacks a deletion of `deleted_rows_days` ago cannot be brought up
-        to date; `search` says whether indexes have shards of Qdrant
+        to date
     shared : indexes of the fleet; None where each host builds its own
     """
 
@@ -160,7 +158,6 @@ class Upkeep:
         # read all of them for each thousand frames would take longer than to write
         self._verified: dict[tuple[int, str], Mapping[str, int]] = {}
         self._models: dict[str, Model | None] = {}
-        self._qdrant = settings.search == "qdrant"
         self._scrubber = Scrubber(settings.indexes, settings.scrub_s)
         self._rows_s = DAY_S * settings.deleted_rows_days
         # map and model: when it is looked next for deletions that the index should know of by now
@@ -274,8 +271,8 @@ class Upkeep:
         return model is not None and self._is_indexed(model)
 
     def _is_indexed(self, model: Model) -> bool:
-        """Whether maps of a model have an index: those of L1 where Qdrant searches it alone."""
-        return model.metric == "l2" or qdrant_metric(model, self._qdrant) is not None
+        """Return whether maps of a model have an index: signatures compared by L1 have none."""
+        return model.metric == "l2"
 
     def _due(self, connection: Connection, row: MapRow) -> bool:
         number, since = self._published.get((row.number, row.model_id), (None, 0))
@@ -323,11 +320,8 @@ class Upkeep:
         model = self._model(row.model_id)
         if model is None:  # of another version's model, which says so where there is an index
             return self._purge_own(row)
-        if not self._is_indexed(model):  # Qdrant may have searched it before
-            folder = index_folder(self._indexes, row)
-            left = any(folder.glob("*.json"))
-            shutil.rmtree(folder, ignore_errors=True)
-            return left
+        if not self._is_indexed(model):
+            return False
         own = self._purge_own if self._shared is None else self._purge_shared
         return own(row)
 
@@ -490,14 +484,13 @@ class Upkeep:
                 return None  # made anew, or signed anew, in the meantime; next time
             folder = index_folder(self._indexes, now)
             length = signer.model.signature_bytes
-            metric, previous = qdrant_metric(signer.model, self._qdrant), None
+            previous = None
             if not anew:
                 previous = trusted(connection, now, self._newest(now, folder, length))
             since = 0 if previous is None else previous.revision
             if previous is not None:
                 self._note(now, previous)
-            wanted = anyway or _lacks_shard(previous, metric)
-            if not wanted and not self._is_long(connection, now, since):
+            if not anyway and not self._is_long(connection, now, since):
                 return None  # another worker was first
             if previous is None and count_indexed(connection, now.number, 0) == 0:
                 if anew:
@@ -516,7 +509,6 @@ class Upkeep:
                 clean=clean,
                 after=after,
                 share=share,
-                qdrant=metric,
             )
         resign_frames(self._store, now, damaged, now.model_id)
         if generation is None:
@@ -535,8 +527,7 @@ class Upkeep:
     def _newest(self, row: MapRow, folder: Path, length: int) -> Generation | None:
         """The newest sound generation here; what this process has verified is not read again."""
         sound = self._verified.get((row.number, row.model_id))
-        metric = qdrant_metric(self._signers(row.model_id).model, self._qdrant)
-        return newest(folder, row.model_id, length, sound=sound, qdrant=metric)
+        return newest(folder, row.model_id, length, sound=sound)
 
     def _clean(self, rows: Sequence[MapRow]) -> None:
         """Remove the indexes of maps that are no more, of models that they had, and of psi."""
@@ -556,15 +547,6 @@ class Upkeep:
         # a model of another version is another's concern
         known = [r for r in known if self._model(r.model_id) is None or self._has_index(r.model_id)]
         return {index_folder(self._indexes, row).name for row in known}
-
-
-def _lacks_shard(previous: Generation | None, metric: Metric | None) -> bool:
-    """Whether a generation was published before Qdrant was to search, or by another engine."""
-    return (
-        metric is not None
-        and previous is not None
-        and any(one.shard is None for one in previous.segments)
-    )
 
 
 def _coming(row: MapRow) -> MapRow:
@@ -604,7 +586,7 @@ class VectorTables:
     Parameters
     ----------
     signers : that know the models, and the database
-    setting : with `local` and `qdrant` there are none; with `auto` none that no node would ask
+    setting : with `local` there are none; with `auto` none that no node would ask
     """
 
     def __init__(self, signers: Signers, setting: Setting) -> None:
@@ -614,7 +596,7 @@ class VectorTables:
     def run(self) -> bool:
         """Do a little of what is due; returns whether there is more to do at once."""
         database = self._database
-        if database.is_sqlite or database.read_only or self._setting in ("local", "qdrant"):
+        if database.is_sqlite or database.read_only or self._setting == "local":
             return False
         if time.monotonic() < self._not_before:
             return False
