@@ -51,9 +51,6 @@ class Settings(BaseSettings):
     #: Where snapshots taken over the service are kept, likewise; default: `snapshots` in the data
     #: folder.
     snapshot_url: str | None = None
-    #: Who searches: this node, PostgreSQL with pgvector, or (`auto`) PostgreSQL for maps of which
-    #: this node would have to read much first.
-    search: Literal["auto", "local", "database"] = "auto"
     #: Folder of search indexes, of this machine alone. Deleting it loses nothing but minutes;
     #: default: `index` in the data folder.
     index_dir: Path | None = None

@@ -58,7 +58,7 @@ APART = (
 LONG = (
     "test_container.py", "test_on_postgres.py", "test_deployment.py", "test_shared_index.py",
     "test_commands.py", "test_surfaces.py", "test_quality.py",
-    "test_lookalikes.py", "test_stored_search.py", "test_lifecycle.py", "test_tracing.py",
+    "test_lookalikes.py", "test_lifecycle.py", "test_tracing.py",
     "test_hostile.py", "test_pulled_copies.py", "test_fleets.py", "test_fuzz.py",
     "test_training.py", "test_survival.py", "test_work.py",
     "test_recovery.py", "test_siege.py", "test_cli.py", "test_map_copy.py", "test_failover.py",

@@ -6,7 +6,6 @@ import logging
 import os
 import shutil
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -17,16 +16,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection
-from sqlalchemy.exc import SQLAlchemyError
 
 from sceneprint.atomic_files import PRIVATE_FILE, make_folder
 from sceneprint.engine.search.local_index import (
-    READ_MOST,
     index_folder,
     is_index_folder,
     trusted,
 )
-from sceneprint.engine.search.retrieval import Setting
 from sceneprint.engine.search.shared_index import SharedIndexes
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
@@ -34,7 +30,6 @@ from sceneprint.errors import (
     BusyIndex,
     DamagedIndex,
     InvalidRequest,
-    ModelError,
     SceneprintError,
     UnknownMap,
     UnusableStore,
@@ -47,10 +42,9 @@ from sceneprint.store import Store
 from sceneprint.store.deletion import DAY_S, newest_deletion
 from sceneprint.store.events import anchor_of_now
 from sceneprint.store.maps import find_map, list_maps
-from sceneprint.store.postgres import vectors
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.queue import read_clock
-from sceneprint.store.reencoding_rows import is_complete, models_of
+from sceneprint.store.reencoding_rows import is_complete
 from sceneprint.store.signatures import changes_since, count_gone, count_indexed, deleted_since
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Bytes
@@ -566,82 +560,3 @@ def _blocks(
         if made:
             rows = np.stack([np.frombuffer(vector, np.uint8) for _, vector in made])
             yield np.array([number for number, _ in made], np.int64), rows
-
-
-# Vectors of signatures in PostgreSQL, made and filled by workers beside everything else.
-#
-# models of the maps  --VectorTables.run-->  a table for each dimension, filled block by block
-
-#: Seconds for which a worker adds vectors before it looks for frames to sign again.
-FILL_S = 2.0
-#: Seconds between two looks for what is missing.
-LOOK_S = 10.0
-#: Seconds until another try where the database has no pgvector, and after any other error.
-AGAIN_S, PAUSE_S = 600.0, 30.0
-
-
-class VectorTables:
-    """Keeps a table of vectors for each dimension that the maps of this database need.
-
-    Parameters
-    ----------
-    signers : that know the models, and the database
-    setting : with `local` there are none; with `auto` none that no node would ask
-    """
-
-    def __init__(self, signers: Signers, setting: Setting) -> None:
-        self._signers, self._database, self._setting = signers, signers.database, setting
-        self._not_before = 0.0
-
-    def run(self) -> bool:
-        """Do a little of what is due; returns whether there is more to do at once."""
-        database = self._database
-        if database.is_sqlite or database.read_only or self._setting == "local":
-            return False
-        if time.monotonic() < self._not_before:
-            return False
-        try:
-            until = time.monotonic() + FILL_S
-            more = [self._bring_on(dimension, until) for dimension in self._wanted()]
-        except (SceneprintError, SQLAlchemyError) as error:  # it costs nobody anything but time
-            self._not_before = time.monotonic() + PAUSE_S
-            log.error("vector table update failed", extra={"error": f"{error!s:.500}"})
-            return False
-        if not any(more) and time.monotonic() > self._not_before:
-            self._not_before = time.monotonic() + LOOK_S
-        return any(more)
-
-    def _wanted(self) -> list[int]:
-        """Dimensions of the models in use whose signatures are compared by L2."""
-        frames: Counter[int] = Counter()
-        with self._database.read() as connection:
-            rows = list_maps(connection)
-        for row in rows:
-            for model_id in models_of(row):
-                try:
-                    model = self._signers(model_id).model
-                except ModelError:  # its maps can be neither signed nor searched; `warm` says so
-                    continue
-                if model.metric == "l2":
-                    frames[model.signature_bytes] += row.used_frames
-        least = READ_MOST if self._setting == "auto" else -1
-        return sorted(dimension for dimension, n in frames.items() if n > least)
-
-    def _bring_on(self, dimension: int, until: float) -> bool:
-        with self._database.read() as connection:
-            complete = dimension in vectors.complete_dimensions(connection)
-        if not complete:
-            with self._database.write() as connection:
-                reason = vectors.make_table(connection, dimension)
-            if reason is not None:
-                self._not_before = time.monotonic() + AGAIN_S
-                log.warning("database search disabled: %s", reason)
-                return False
-        while not complete:
-            with self._database.write() as connection:
-                complete = vectors.fill(connection, dimension)
-            if time.monotonic() >= until:
-                break
-        if complete and vectors.add_graph(self._database, dimension):
-            log.info("vector index built", extra={"dimension": dimension})
-        return not complete
