@@ -26,6 +26,7 @@ from xdist.scheduler import LoadFileScheduling
 
 from benchmarks.fleet.postgres import NoServer, Server
 from benchmarks.fleet.s3 import ObjectServer
+from benchmarks.waiting import until as wait_until
 from sceneprint.cli.demo import write_building
 from sceneprint.geometry.registration.patch_descriptors import (
     Compression,
@@ -186,6 +187,12 @@ def _databases_go(request: pytest.FixtureRequest) -> Iterator[None]:
         asked = "DELETE FROM folders WHERE place = %s OR starts_with(place, %s) RETURNING name"
         for (name,) in connection.execute(asked, (place, f"{place}/")).fetchall():
             connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)'.encode())
+
+
+@pytest.fixture(scope="session")
+def until() -> Callable[..., Any]:
+    """Wait for the first true value of a condition, as `benchmarks.waiting.until` does."""
+    return wait_until
 
 
 @pytest.fixture(scope="session")

@@ -31,6 +31,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.models import PRESETS
 from sceneprint.process import SECRETS
 from sceneprint.settings import Settings
@@ -169,7 +170,7 @@ def hadolint(text: str) -> list[str]:
     """Codes of what hadolint finds."""
     done = subprocess.run(
         [tool("hadolint"), "--no-color", "--format", "json", "-"],
-        input=text, capture_output=True, text=True, timeout=60,
+        input=text, capture_output=True, text=True, timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.stderr == ""
     return sorted({str(found["code"]) for found in json.loads(done.stdout)})
@@ -356,7 +357,7 @@ def test_our_rules_have_nothing_against_the_composition() -> None:
 def by_schema(path: Path) -> subprocess.CompletedProcess[str]:
     """What the schema of the Compose specification says; check-jsonschema brings a copy."""
     command = [tool("check-jsonschema"), "--builtin-schema", "vendor.compose-spec", str(path)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
 
 
 def test_the_composition_is_as_the_specification_has_it(tmp_path: Path) -> None:
@@ -393,7 +394,7 @@ def test_the_workers_health_check_tells_a_worker_from_itself(tmp_path: Path) -> 
             (tmp_path / f"proc/{number + 1}").mkdir(parents=True)
             (tmp_path / f"proc/{number + 1}/cmdline").write_text("\0".join([*words, ""]))
         there = changed(code, "'/proc'", repr(str(tmp_path / "proc")))
-        return subprocess.run([sys.executable, "-c", there], timeout=30).returncode
+        return subprocess.run([sys.executable, "-c", there], timeout=PATIENCE_S).returncode
 
     own = ["python", "-c", code]
     watching = ["python", "/opt/sceneprint/bin/sceneprint", "work"]
@@ -458,7 +459,7 @@ def run_step(image: Image, shell: str, cwd: Path) -> None:
         image.ran.append(" && ".join(mine))
         done = subprocess.run(
             ["/bin/sh", "-c", image.here(image.ran[-1])],
-            cwd=cwd, env=image.env, capture_output=True, text=True, timeout=400,
+            cwd=cwd, env=image.env, capture_output=True, text=True, timeout=PATIENCE_S,
         )  # fmt: skip
         assert done.returncode == 0, (
             f"a step of the Dockerfile fails. Where pip found nothing to install, this test needs "
@@ -539,9 +540,7 @@ def test_what_is_installed_is_the_lock_and_no_more(image: Image) -> None:
     )  # fmt: skip
     there: dict[str, str] = json.loads(told.stdout)
     assert there.pop("sceneprint") == there.pop("sceneprint-client") == PROJECT["version"]
-    lock = set(
-        re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / "requirements-image.lock").read_text(), re.M)
-    )
+    lock = set(re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / "requirements.lock").read_text(), re.M))
     assert set(there.items()) <= {(name.lower(), version) for name, version in lock}
     wanted = {re.split(r"[<>=;\[ ]", line)[0] for line in PROJECT["dependencies"]}
     assert wanted - set(there) == {"open3d", "sceneprint-client"}
@@ -611,12 +610,12 @@ def test_service_and_worker_run_as_composed(
 
     def exits(words: list[str]) -> int:
         env = {**image.env, **port}
-        return subprocess.run(image.command(words), env=env, timeout=30, cwd=image.root,
+        return subprocess.run(image.command(words), env=env, timeout=PATIENCE_S, cwd=image.root,
                               capture_output=True).returncode  # fmt: skip
 
     assert exits(health_check(steps)) == 1  # nobody is there
     service = start("service", port)
-    until = time.monotonic() + 90
+    until = time.monotonic() + PATIENCE_S
     while exits(health_check(steps)) != 0:
         assert service.process.poll() is None, service.log.read_text()
         assert time.monotonic() < until, service.log.read_text()
@@ -631,7 +630,7 @@ def test_service_and_worker_run_as_composed(
         capture_output=True, check=True, cwd=image.root,
     )  # fmt: skip
     headers = {"Authorization": f"Bearer {made.stdout.strip()}"}
-    with httpx.Client(base_url=url, headers=headers, timeout=90) as client:
+    with httpx.Client(base_url=url, headers=headers, timeout=PATIENCE_S) as client:
         assert client.post("/maps", json={"name": "hall"}).status_code == 201
         worker = start("worker", port)
         frame = room_frames[0]

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.fleet.postgres import Server, binaries, of_nobody
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import list_keys
 from sceneprint.settings import Settings
@@ -52,7 +53,7 @@ def run(primary: Server, bucket: str, tmp_path: Path) -> Run:
         }  # fmt: skip
         done = subprocess.run(
             [*of_nobody(), "bash", "-euo", "pipefail", "-c", block],
-            env=told, cwd=tmp_path, capture_output=True, text=True, timeout=120,
+            env=told, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S,
         )  # fmt: skip
         assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
         return done.stdout

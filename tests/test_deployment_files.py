@@ -20,6 +20,7 @@ from typing import cast
 import httpx
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.decoders import sandbox
 from sceneprint.settings import Settings
 from sceneprint_client.errors import StoreAway
@@ -44,7 +45,8 @@ def said_by_haproxy(text: str, folder: Path) -> tuple[int, str]:
     path.write_text(text)
     done = subprocess.run(
         [tool("haproxy", "haproxy"), "-c", "-f", str(path)],
-        env={**os.environ, "API_HOST": "localhost"}, capture_output=True, text=True, timeout=60,
+        env={**os.environ, "API_HOST": "localhost"}, capture_output=True, text=True,
+        timeout=PATIENCE_S,
     )  # fmt: skip
     return done.returncode, done.stdout + done.stderr
 
@@ -80,7 +82,7 @@ class _Answer(BaseHTTPRequestHandler):
         api = cast(_Api, self.server)
         if self.path.endswith("/hold"):
             api.held.release()
-            api.release.wait(30)
+            api.release.wait(PATIENCE_S)
         body = api.name.encode()
         self.send_response(200)
         self.send_header("Content-Length", str(len(body)))
@@ -128,7 +130,7 @@ def proxied(tmp_path: Path) -> Iterator[tuple[httpx.Client, dict[str, _Api]]]:
 
 def until(holds: Callable[[], bool]) -> None:
     """Ask until it holds, at most for some seconds."""
-    end = time.monotonic() + 20
+    end = time.monotonic() + PATIENCE_S
     while not holds():
         assert time.monotonic() < end
 
@@ -221,7 +223,8 @@ def said_of_unit(text: str, name: str, folder: Path) -> str:
     path.write_text(text.replace("/opt/sceneprint/bin/sceneprint", "/bin/true"))
     done = subprocess.run(
         [tool("systemd-analyze", "systemd"), "verify", "--man=no", str(path)],
-        capture_output=True, text=True, timeout=60,
+        capture_output=True, text=True,
+        timeout=PATIENCE_S,
     )  # fmt: skip
     return done.stdout + done.stderr
 

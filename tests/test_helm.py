@@ -11,6 +11,7 @@ import kubernetes_validate
 import pytest
 import yaml
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint import __version__
 from sceneprint.cli import COMMANDS
 from sceneprint.settings import Settings
@@ -59,7 +60,7 @@ def run_helm(*arguments: str, values: dict[str, Any], folder: Path) -> tuple[int
     command, *others = arguments
     done = subprocess.run(
         [helm, command, *others, str(CHART), "--values", str(path)],
-        env={"HOME": str(folder), "PATH": ""}, capture_output=True, text=True, timeout=60,
+        env={"HOME": str(folder), "PATH": ""}, capture_output=True, text=True, timeout=PATIENCE_S,
     )  # fmt: skip
     return done.returncode, done.stdout, done.stderr
 

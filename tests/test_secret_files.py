@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest
 from sceneprint.process import SECRETS, read_secret_files
 
@@ -51,8 +52,8 @@ def test_every_command_reads_them(command: list[str], tmp_path: Path) -> None:
     given = {**os.environ, "SCENEPRINT_DATABASE_URL_FILE": str(path), "SCENEPRINT_PORT": "0"}
     given.pop("SCENEPRINT_DATABASE_URL", None)
     done = subprocess.run(
-        [sys.executable, "-m", *command], env=given, capture_output=True, text=True, timeout=90,
-        check=False, cwd=tmp_path,
+        [sys.executable, "-m", *command], env=given, capture_output=True, text=True,
+        timeout=PATIENCE_S, check=False, cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 2
     assert "'nothing' begins no URL of a database" in done.stderr or "'nothing' is no database" in (

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.turns import ACTIVE_S, PRESENT_S, ThreadTurns, TurnOrder
 
 
@@ -37,7 +38,7 @@ def queue(turns: ThreadTurns, tenants: str, order: list[str]) -> list[threading.
 
 
 def await_waiting(turns: ThreadTurns, count: int) -> None:
-    until = time.monotonic() + 60
+    until = time.monotonic() + PATIENCE_S
     while len(turns._order.waiters()) != count:
         assert time.monotonic() < until
         time.sleep(0.001)
@@ -71,7 +72,7 @@ def test_after_the_end_there_are_no_turns() -> None:
     waiting.start()
     await_waiting(turns, 1)
     turns.close()
-    waiting.join(60)
+    waiting.join(PATIENCE_S)
     assert told == [False]
     assert not turns.acquire("c", 600)
 

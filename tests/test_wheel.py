@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.geometry.kernel import runs_here
 
 ROOT = Path(__file__).parents[1]
@@ -138,7 +139,7 @@ def run(program: str, installed: Path, folder: Path, *arguments: str, **env: str
     }  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-c", program, str(folder), *arguments], cwd=folder, env=given,
-        capture_output=True, text=True, timeout=300,
+        capture_output=True, text=True, timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()[-1]

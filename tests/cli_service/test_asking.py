@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from benchmarks.rooms import circled
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli.query import frame_argument
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta
@@ -29,7 +30,7 @@ def maps(service_url: str, rooms: Path) -> dict[str, list[str]]:
     with Client(service_url) as client:
         for name, which in (("near", (0, 1)), ("far", (0, 3))):
             client.create_map(name, model="depth")
-            added = [client.upload(name, frames[i], wait_s=60) for i in which]
+            added = [client.upload(name, frames[i], wait_s=PATIENCE_S) for i in which]
             found[name] = [one.frame_id for one in added]
     return found
 
@@ -111,7 +112,7 @@ def sides(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     with Client(service_url) as client:
         client.create_map("sides", model="depth")
         for one in circled((30, 120, 210, 300)):
-            client.upload("sides", one.data, FrameMeta.model_validate(one.meta), wait_s=60)
+            client.upload("sides", one.data, FrameMeta.model_validate(one.meta), wait_s=PATIENCE_S)
     (asked,) = circled([40])
     (folder / "view.npy").write_bytes(asked.data)
     (folder / "intrinsics.json").write_text(json.dumps(asked.meta["intrinsics"]))

@@ -16,6 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import demo as served
 from sceneprint.cli.demo import choose_frames, fill, serving
 from sceneprint.cli.options import ended_by_signals
@@ -57,7 +58,7 @@ def processes_with(temporary: Path) -> list[Path]:
 
 
 def leaves_nothing(temporary: Path) -> None:
-    deadline = time.monotonic() + 10  # a resource tracker ends after its parent
+    deadline = time.monotonic() + PATIENCE_S  # a resource tracker ends after its parent
     while (left := processes_with(temporary)) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert left == []
@@ -68,7 +69,7 @@ def test_demo_goes_the_whole_way_and_leaves_nothing(
     demo: Callable[..., subprocess.Popen[str]], tmp_path: Path, rooms: Path
 ) -> None:
     process = demo("--dataset", rooms)
-    out, err = process.communicate(timeout=300)
+    out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, err
     service, uploaded, asked, queries, head, *lines = out.splitlines()
     assert re.match(r"service: http://127\.0\.0\.1:\d+, empty data folder, 1 worker", service)
@@ -99,13 +100,13 @@ def test_demo_that_is_stopped_leaves_nothing(
     if stage == "serving":
         assert process.stdout.readline().startswith("service: ")
     else:
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + PATIENCE_S
         while not any(temporary.glob("sceneprint-demo-*/building/*")):
             assert time.monotonic() < deadline, "no building is begun"
             time.sleep(0.01)
     process.send_signal(number)
     process.send_signal(number)  # as `make` does: it passes on what the terminal has sent before
-    _, err = process.communicate(timeout=120)
+    _, err = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, err) == (130, "sceneprint demo: stopped\n")
     leaves_nothing(temporary)
 
@@ -114,7 +115,7 @@ def test_demo_needs_frames_for_the_map_and_to_look_up(
     demo: Callable[..., subprocess.Popen[str]], rooms: Path
 ) -> None:
     process = demo("--dataset", rooms / "room-0/seq-01/frame-000000.depth.png")
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
     assert len(err.splitlines()) == 1
     assert "has 1 frames for the map and 0 to query" in err

@@ -9,6 +9,7 @@ import pytest
 from pydantic import SecretStr
 
 from benchmarks.fleet.postgres import Server
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli.checks import Check, store_check
 from sceneprint.cli.doctor import database, object_stores, server
 from sceneprint.engine import Engine
@@ -41,7 +42,7 @@ def test_a_server_and_its_replica(postgres: Server, tmp_path: Path) -> None:
             time.sleep(0.01)
         standby.execute("SELECT pg_wal_replay_pause()")
         postgres.execute("CREATE TABLE unseen (number int)", "looked_at")
-        until = time.monotonic() + 30
+        until = time.monotonic() + PATIENCE_S
         while found["replica"].verdict == "ok" and time.monotonic() < until:
             found = found_in(url, replica_url=SecretStr(near), replica_lag_s=0.1)
         assert "SCENEPRINT_REPLICA_LAG_S is 0.1 s: it is not used" in found["replica"].text

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint_client import Client
 
 Run = Callable[..., tuple[str, str]]
@@ -56,7 +57,7 @@ def test_events_are_followed_line_by_line(service_url: str) -> None:
                 assert json.loads(process.stdout.readline())["map"] == name
         finally:
             process.send_signal(signal.SIGINT)
-            process.wait(30)
+            process.wait(PATIENCE_S)
         assert (process.returncode, process.stderr.read()) == (130, "sceneprint events: stopped\n")
         process.stdout.close()
         process.stderr.close()

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint_client import Client
 from sceneprint_client.api import CameraIntrinsics, FrameMeta
 from sceneprint_client.errors import FrameError
@@ -140,7 +141,7 @@ def test_records_of_a_copys_queries_are_spooled_and_sent(
         for frame in (b"no depth image", b"nor this"):
             with pytest.raises(FrameError):
                 robot.query("offline-records", frame, FrameMeta(robot="cart", intrinsics=CAMERA))
-        end = time.monotonic() + 90.0
+        end = time.monotonic() + PATIENCE_S
         while len(list(robot.queries("offline-records"))) < 2:  # they are written in a moment
             assert time.monotonic() < end
         added = sceneprint("spool", "add-queries", spool, "--data", copy)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli.upload import is_starting
 from sceneprint.errors import MissingDependency, TooLarge
 from sceneprint.formats.dataset import read_pose, write_depth_png
@@ -100,7 +101,7 @@ def test_upload_without_waiting(sceneprint: Run, service_url: str, rooms: Path) 
     with Client(service_url) as client:
         assert client.map("later").model.startswith("depth-")
         ids = [one.job_id for one in client.frames("later")]
-        assert {job.state for job in client.wait(ids, timeout_s=60)} == {"succeeded"}
+        assert {job.state for job in client.wait(ids, timeout_s=PATIENCE_S)} == {"succeeded"}
 
 
 def test_poses_lead_to_the_frame_that_is_named(
@@ -147,11 +148,11 @@ def test_ctrl_c_keeps_what_was_received(service_url: str, rooms: Path) -> None:
             env={**os.environ, "SCENEPRINT_URL": service_url},
         )  # fmt: skip
         signal.signal(signal.SIGINT, before)
-        until = time.monotonic() + 30
+        until = time.monotonic() + PATIENCE_S
         while not sum(client.map("stopped").frames.values()) and time.monotonic() < until:
             pass  # the first frame arrives
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=PATIENCE_S)
         kept = sum(client.map("stopped").frames.values())
     assert process.returncode == 130
     assert "Traceback" not in err

@@ -16,6 +16,7 @@ from threading import Thread
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import (
     Camera,
     FrameReference,
@@ -54,7 +55,7 @@ def _serving(data: Path) -> Iterator[str]:
             yield line.split()[-1]
         finally:
             process.terminate()
-            process.communicate(timeout=30)
+            process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
 
 

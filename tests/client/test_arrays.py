@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidIntrinsics, InvalidRequest, UnreadableCloud, UnreadableFrame
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.types import DepthFrame
@@ -98,7 +99,7 @@ def test_a_path_string_and_arrays_are_one_frame(
     room_frames: tuple[DepthFrame, ...],
 ) -> None:
     client.create_map(map_name, "arrays")
-    added = client.upload(map_name, str(references[0].path), wait_s=30)
+    added = client.upload(map_name, str(references[0].path), wait_s=PATIENCE_S)
     assert added.state == "indexed"
     seen = room_frames[0]
     K = np.array([[seen.intrinsics.fx, 0, seen.intrinsics.cx],
@@ -134,7 +135,7 @@ def test_the_pose_of_the_base_is_stored_as_that_of_the_sensor(
     }  # fmt: skip
     client.create_map(map_name, "base")
     meta = FrameMeta.model_validate(told)
-    added = client.upload(map_name, room_frames[0].depth, meta, wait_s=30)
+    added = client.upload(map_name, room_frames[0].depth, meta, wait_s=PATIENCE_S)
     pose = client.frame(map_name, added.frame_id).pose
     assert pose is not None
     np.testing.assert_allclose(np.array(pose.matrix)[:3, 3], [1, 2.2, 0.5], atol=1e-12)

@@ -11,6 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
 from sceneprint.errors import InvalidRequest, UnknownJob, UnknownMap
 from sceneprint.formats.dataset import write_depth_png
@@ -59,7 +60,7 @@ class Filled:
 
 def filled(client: Client, sent: list[Sent]) -> Filled:
     client.create_map(MAP, model="depth")
-    ids = [client.upload(MAP, one.data, one.meta, wait_s=60).frame_id for one in sent]
+    ids = [client.upload(MAP, one.data, one.meta, wait_s=PATIENCE_S).frame_id for one in sent]
     assert {frame.state for frame in client.frames(MAP)} == {"indexed"}
     return Filled(client, {frame_id: i for i, frame_id in enumerate(ids)})
 
@@ -97,7 +98,7 @@ def test_list_remove_and_refusals(associated: Filled) -> None:
     assert [one.association_id for one in client.associations(MAP)] == [
         begun.association_id, *before,
     ]  # fmt: skip
-    done = client.wait_for_association(begun, timeout_s=60)
+    done = client.wait_for_association(begun, timeout_s=PATIENCE_S)
     assert done.result is not None
     assert done.result.frames == 3
     of = MAP, begun.association_id
@@ -125,11 +126,11 @@ def test_list_remove_and_refusals(associated: Filled) -> None:
 def test_over_http(associated: Filled, service_url: str) -> None:
     client = associated.client
     root = f"/v1/maps/{MAP}/associations"
-    with httpx.Client(base_url=service_url, trust_env=False, timeout=60) as http:
+    with httpx.Client(base_url=service_url, trust_env=False, timeout=PATIENCE_S) as http:
         answer = http.post(root, json={"sessions": ["a", "b"]})
         assert answer.status_code == 202
         begun = client.wait_for_association(
-            client.association(MAP, answer.json()["association_id"]), timeout_s=60
+            client.association(MAP, answer.json()["association_id"]), timeout_s=PATIENCE_S
         )
         place = answer.headers["Location"]
         assert place == f"{root}/{begun.association_id}"

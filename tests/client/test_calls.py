@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import (
     CannotRetry,
     FrameConflict,
@@ -49,7 +50,7 @@ def test_a_frame_from_upload_to_deletion(
 ) -> None:
     client.create_map(map_name)
     reference = references[0]
-    added = client.upload(map_name, reference, wait_s=30)
+    added = client.upload(map_name, reference, wait_s=PATIENCE_S)
     assert (added.state, added.reason) == (FrameState.INDEXED, None)
     frame = client.frame(map_name, added.frame_id)
     assert (frame.map, frame.state, frame.job_id) == (map_name, "indexed", added.job_id)
@@ -80,7 +81,7 @@ def test_jobs_are_waited_for(
     added = [client.upload(map_name, one) for one in (*references[:2], bare_wall)]
     seen: list[tuple[int, int]] = []
     ids = [one.job_id for one in added]
-    jobs = client.wait([*ids, ids[0]], timeout_s=60, progress=lambda *n: seen.append(n))
+    jobs = client.wait([*ids, ids[0]], timeout_s=PATIENCE_S, progress=lambda *n: seen.append(n))
     assert [job.job_id for job in jobs] == [*ids, ids[0]]
     assert [job.state for job in jobs] == ["succeeded", "succeeded", "failed", "succeeded"]
     assert seen[-1] == (3, 3)
@@ -98,8 +99,8 @@ def test_jobs_that_are_over(
     client: Client, map_name: str, references: tuple[FrameReference, ...], bare_wall: Path
 ) -> None:
     client.create_map(map_name, model="depth")
-    good = client.upload(map_name, references[0], wait_s=30, priority=-10)
-    wall = client.upload(map_name, bare_wall, wait_s=30)
+    good = client.upload(map_name, references[0], wait_s=PATIENCE_S, priority=-10)
+    wall = client.upload(map_name, bare_wall, wait_s=PATIENCE_S)
     assert [client.job(one.job_id).priority for one in (good, wall)] == [-10, 0]
     with pytest.raises(JobOver, match="is succeeded"):
         client.cancel_job(good.job_id)
@@ -107,7 +108,7 @@ def test_jobs_that_are_over(
         client.retry_job(good.job_id)
     again = client.retry_job(wall.job_id)
     assert (again.frame_id, again.job_id != wall.job_id) == (wall.frame_id, True)
-    (done,) = client.wait([again.job_id], timeout_s=60)
+    (done,) = client.wait([again.job_id], timeout_s=PATIENCE_S)
     assert done.state is JobState.FAILED
     assert client.frame(map_name, wall.frame_id).state is FrameState.REJECTED
     with pytest.raises(CannotRetry, match=f"was replaced by {again.job_id}"):
@@ -134,7 +135,7 @@ def test_a_job_is_cancelled_before_anybody_waits_for_it(
     late = embedded.upload("m", references[1], priority=5)
     again = embedded.retry_job(first.job_id)
     assert embedded.retry_job(first.job_id) == again
-    jobs = embedded.wait([again.job_id, late.job_id], timeout_s=60)
+    jobs = embedded.wait([again.job_id, late.job_id], timeout_s=PATIENCE_S)
     assert [job.state for job in jobs] == ["succeeded", "succeeded"]
     assert jobs[0].started_at is not None
     assert jobs[1].started_at is not None
@@ -161,7 +162,7 @@ def test_a_wait_ends_when_its_time_is_over(
     assert (job.state, job.state.over, job.attempts) == (JobState.QUEUED, False, 0)
     status = embedded.status()
     assert (status.frames["received"], status.jobs) == (1, {"queued": 1})
-    (job,) = embedded.wait([added.job_id], timeout_s=30)
+    (job,) = embedded.wait([added.job_id], timeout_s=PATIENCE_S)
     assert job.state is JobState.SUCCEEDED
 
 
@@ -221,7 +222,7 @@ def test_requests_that_make_no_sense(
         client.query(map_name, references[0], stages=["validate"])
     with pytest.raises(TypeError, match="either"):
         client.query(map_name)
-    rejected = client.upload(map_name, bare_wall, wait_s=30)
+    rejected = client.upload(map_name, bare_wall, wait_s=PATIENCE_S)
     assert rejected.state is FrameState.REJECTED
     with pytest.raises(InvalidRequest, match="is rejected: Nothing in it can be signed") as told:
         client.query(map_name, frame_id=rejected.frame_id)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, UnreadableCloud
 from sceneprint.formats.dataset import find_sequences, write_pose
 from sceneprint.formats.export import write_ply
@@ -53,12 +54,12 @@ def test_a_folder_of_scans(client: Client, map_name: str, folder: Path, seen: li
     client.create_map(map_name, model="depth")
     [sequence] = find_sequences(folder)
     for reference in sequence.frames:
-        assert client.upload(map_name, reference, wait_s=60).state == "indexed"
+        assert client.upload(map_name, reference, wait_s=PATIENCE_S).state == "indexed"
     first, second = client.frames(map_name)
     assert (first.kind, first.points, first.units_per_metre) == ("cloud", len(seen[0]), 100)
     assert first.viewpoint is not None
     assert (first.viewpoint.z, first.base_frame) == (1.5, "cloud")
-    again = client.upload(map_name, folder / "0.ply", wait_s=60)
+    again = client.upload(map_name, folder / "0.ply", wait_s=PATIENCE_S)
     assert again.frame_id == first.frame_id
 
     # asked by bytes alone: the same numbers as of the library
@@ -89,7 +90,7 @@ def test_a_cloud_of_many_views_says_so_on_its_way(
     fused = FrameMeta(viewpoint=None)
     [one] = client.upload_batch(map_name, [placed], [fused])
     assert one.frame is not None
-    put = client.put_frame(map_name, "own", placed, fused, wait_s=60)
+    put = client.put_frame(map_name, "own", placed, fused, wait_s=PATIENCE_S)
     assert put.state == "indexed", put.reason
     for frame in (client.frame(map_name, one.frame.frame_id), client.frame(map_name, "own")):
         assert (frame.viewpoint, frame.base_frame, frame.kind) == (None, None, "cloud")

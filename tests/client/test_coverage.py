@@ -10,6 +10,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
 from sceneprint.cli.coverage import change_lines, coverage_lines
 from sceneprint.errors import InvalidRequest, JobOver, NotIndexed, UnknownJob, UnknownMap
@@ -111,7 +112,7 @@ def test_refusals(covered: Client, whole: MapCoverage) -> None:
 
 def test_over_http(covered: Client, whole: MapCoverage, service_url: str) -> None:
     root = f"/v1/maps/{MAP}/coverage"
-    with httpx.Client(base_url=service_url, trust_env=False, timeout=60) as http:
+    with httpx.Client(base_url=service_url, trust_env=False, timeout=PATIENCE_S) as http:
         begun = http.post(root)  # without a body: the defaults
         assert begun.status_code == 202
         place = begun.headers["Location"]

@@ -12,6 +12,7 @@ import httpx
 import pytest
 
 import sceneprint
+from benchmarks.waiting import PATIENCE_S
 from sceneprint_client import Client, client, errors
 from service.embedded import LocalService, embedded_settings
 
@@ -91,10 +92,10 @@ def test_closing_ends_streams_and_threads(tmp_path: Path) -> None:
     listener = threading.Thread(target=listen)
     listener.start()
     client.close()
-    listener.join(30)
+    listener.join(PATIENCE_S)
     assert "closed" in str(ended[0])
     for thread in set(threading.enumerate()) - before:
-        thread.join(10)  # the last of the loop's workers may still be on its way out
+        thread.join(PATIENCE_S)  # the last of the loop's workers may still be on its way out
     assert set(threading.enumerate()) <= before
     client.close()  # again: nothing more to do
     with pytest.raises(RuntimeError, match="closed"):
@@ -108,7 +109,11 @@ def test_a_program_that_closes_nothing_ends(tmp_path: Path) -> None:
         "print(client.create_map('m').name)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "m\n", "")
 

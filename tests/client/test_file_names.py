@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta
@@ -67,7 +68,7 @@ def test_names_come_back_in_matches_and_are_searched(
 ) -> None:
     client.create_map(map_name)
     for one in reversed(references[:3]):
-        client.upload(map_name, one, wait_s=60)
+        client.upload(map_name, one, wait_s=PATIENCE_S)
     names = [f"frame-00000{i}.depth.png" for i in range(3)]
     assert [one.name for one in client.frames(map_name)] == names[::-1]
     taken = client.frames(map_name, session="seq-01", order="taken")

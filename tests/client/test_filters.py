@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, meta_of
@@ -17,7 +18,9 @@ def test_only_what_passes_is_searched(
 ) -> None:
     client.create_map(map_name, model="depth")
     added = [
-        client.upload(map_name, one, meta_of(one, robot=f"r{i % 2}", tags=[f"t{i}"]), wait_s=60)
+        client.upload(
+            map_name, one, meta_of(one, robot=f"r{i % 2}", tags=[f"t{i}"]), wait_s=PATIENCE_S
+        )
         for i, one in enumerate(references)
     ]
     ids = [one.frame_id for one in added]
@@ -44,15 +47,15 @@ def test_what_the_map_has_is_not_kept(
     client: Client, map_name: str, references: References
 ) -> None:
     client.create_map(map_name, model="depth")
-    first = client.upload(map_name, references[0], wait_s=60, if_novel=True)
+    first = client.upload(map_name, references[0], wait_s=PATIENCE_S, if_novel=True)
     assert first.state is FrameState.INDEXED
-    second = client.upload(map_name, references[1], wait_s=60, if_novel=1.0)
+    second = client.upload(map_name, references[1], wait_s=PATIENCE_S, if_novel=1.0)
     assert second.state is FrameState.REDUNDANT
     assert first.frame_id in str(second.reason)
-    (job,) = client.wait([second.job_id], timeout_s=60)
+    (job,) = client.wait([second.job_id], timeout_s=PATIENCE_S)
     assert job.state is JobState.SUCCEEDED
     assert client.map(map_name).frames == {"indexed": 1, "redundant": 1}
-    kept = client.upload(map_name, references[1], wait_s=60)
+    kept = client.upload(map_name, references[1], wait_s=PATIENCE_S)
     assert (kept.state, kept.frame_id) == (FrameState.INDEXED, second.frame_id)
     with pytest.raises(InvalidRequest, match="above 0, up to 1"):
         client.upload(map_name, references[2], if_novel=0.0)

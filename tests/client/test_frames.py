@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import sceneprint
+from benchmarks.waiting import PATIENCE_S
 from sceneprint import errors
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, meta_of
@@ -106,11 +107,11 @@ def test_a_stopped_job_waits_for_the_next_worker(
     with monkeypatch.context() as patch:
         patch.setattr("sceneprint.engine.jobs.signature_job.prepare", stopped)
         with pytest.raises(KeyboardInterrupt):
-            embedded.upload("m", references[0], wait_s=30)
+            embedded.upload("m", references[0], wait_s=PATIENCE_S)
     (frame,) = embedded.frames("m")
     job = embedded.job(frame.job_id)
     assert (frame.state, job.state, job.attempts) == (FrameState.RECEIVED, JobState.QUEUED, 0)
-    (job,) = embedded.wait([job.job_id], timeout_s=30)  # at once: no lease has to run out
+    (job,) = embedded.wait([job.job_id], timeout_s=PATIENCE_S)  # at once: no lease has to run out
     assert (job.state, job.attempts) == (JobState.SUCCEEDED, 1)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import (
     FrameConflict,
     InvalidRequest,
@@ -55,10 +56,10 @@ def done(client: Client, map_name: str, archive: Any, options: ImportOptions | N
     """What came of an import, when it and all its frames are done."""
     job = client.import_archive(map_name, archive, options)
     assert (job.kind, job.map, job.state.over) == ("import", map_name, False)
-    [over] = client.wait([job.job_id], timeout_s=60)
+    [over] = client.wait([job.job_id], timeout_s=PATIENCE_S)
     assert over == client.import_job(map_name, job.job_id)
     items = list(client.import_items(map_name, job.job_id))
-    client.wait([one.job_id for one in items if one.job_id is not None], timeout_s=60)
+    client.wait([one.job_id for one in items if one.job_id is not None], timeout_s=PATIENCE_S)
     return over, items
 
 
@@ -67,7 +68,7 @@ def test_a_frame_put_under_an_id(
 ) -> None:
     client.create_map(map_name, model="depth")
     meta = meta_of(references[0], base=BASE)
-    added = client.put_frame(map_name, "a.0-1_b", references[0], meta, wait_s=30)
+    added = client.put_frame(map_name, "a.0-1_b", references[0], meta, wait_s=PATIENCE_S)
     assert (added.frame_id, added.state) == ("a.0-1_b", "indexed")
     assert client.put_frame(map_name, "a.0-1_b", references[0], meta) == added
     frame = client.frame(map_name, "a.0-1_b")

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.errors import (
     Conflict,
@@ -64,7 +65,7 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Cl
         for one in clients:
             one.close()
         process.terminate()
-        process.communicate(timeout=30)
+        process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
 
 
@@ -128,7 +129,7 @@ def test_each_key_does_what_it_may(
     with pytest.raises(Forbidden, match="a map named 'yard'"):
         robot.create_map("yard")
     other.create_map("yard", model="depth")  # its own, though it was not there
-    added = robot.upload("hall", references[0], wait_s=60)
+    added = robot.upload("hall", references[0], wait_s=PATIENCE_S)
     assert added.state == FrameState.INDEXED
     assert [one.frame_id for one in screen.frames("hall")] == [added.frame_id]
     answer = screen.query("hall", references[0])

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import Conflict, InvalidRequest, UnknownMap, Unreachable
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.models import PRESETS, read_model
@@ -21,7 +22,7 @@ def test_events_that_are_kept(
     client: Client, map_name: str, references: tuple[FrameReference, ...]
 ) -> None:
     client.create_map(map_name, model="depth")
-    added = client.upload(map_name, references[0], wait_s=60)
+    added = client.upload(map_name, references[0], wait_s=PATIENCE_S)
     client.delete_frame(map_name, added.frame_id)
     found = list(client.events(map_name, follow=False))
     assert [(one.kind, one.frame_id) for one in found] == [
@@ -75,7 +76,7 @@ def test_events_as_they_happen(client: Client, map_name: str) -> None:
 
 def test_figures(client: Client, map_name: str, references: tuple[FrameReference, ...]) -> None:
     client.create_map(map_name, model="depth")
-    client.upload(map_name, references[0], wait_s=60)
+    client.upload(map_name, references[0], wait_s=PATIENCE_S)
     own = client.stats(map_name, minutes=2)
     assert (own.map, own.maps, own.frames, own.jobs) == (
         map_name, 1, {"indexed": 1}, {"succeeded": 1}

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, NotIndexed, PreconditionFailed, UnknownFrame
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, meta_of
@@ -25,7 +26,9 @@ def ids(client: Client, map_name: str, references: tuple[FrameReference, ...]) -
     for i, one in enumerate(references[:3]):
         meta = meta_of(one, robot="r2", tags=["door"] if i else [])
         meta = meta.model_copy(update={"captured_at": START + timedelta(seconds=i)})
-        found.append(client.upload(map_name, one.path.read_bytes(), meta, wait_s=60).frame_id)
+        found.append(
+            client.upload(map_name, one.path.read_bytes(), meta, wait_s=PATIENCE_S).frame_id
+        )
     return found
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client
@@ -27,7 +28,7 @@ def filled(
     numbers = []
     for client in (remote, embedded):
         client.create_map(map_name, "both")
-        added = [client.upload(map_name, one, wait_s=30) for one in references]
+        added = [client.upload(map_name, one, wait_s=PATIENCE_S) for one in references]
         assert {one.state for one in added} == {"indexed"}
         numbers.append({one.frame_id: i for i, one in enumerate(added)})
     return numbers[0], numbers[1]
@@ -87,9 +88,9 @@ def test_all_ways_of_asking(
     """One after the other: options, maps as one, a pose, and two frames compared."""
     other = f"{map_name}-b"
     client.create_map(map_name)
-    ids = [client.upload(map_name, one, wait_s=30).frame_id for one in references]
+    ids = [client.upload(map_name, one, wait_s=PATIENCE_S).frame_id for one in references]
     client.create_map(other)
-    added = client.upload(other, references[2], wait_s=30).frame_id
+    added = client.upload(other, references[2], wait_s=PATIENCE_S).frame_id
     options: dict[str, Any] = {
         "k": 2, "seed": 3, "candidates": 4, "diversity": {"omega": 8.0},
         "validation": ValidationOptions(strong=1.0), "explain": True, "keep": False,

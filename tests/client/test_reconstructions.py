@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownQuery
 from sceneprint.formats.dataset import (
     Camera,
@@ -42,7 +43,7 @@ def answered(client: Client, views: list[FrameReference], with_open3d: None) -> 
     """The answer to a query of a map with the other views."""
     client.create_map(NAME, model="depth")
     for view in views[1:]:
-        assert client.upload(NAME, view, wait_s=60).state == "indexed"
+        assert client.upload(NAME, view, wait_s=PATIENCE_S).state == "indexed"
     answer = client.query(NAME, views[0], k=4)
     assert answer.status == "found"
     return answer
@@ -67,7 +68,7 @@ def test_a_surface_and_its_figures(client: Client, answered: Answer) -> None:
     made = client.reconstruct(answered, voxel_m=0.04)
     assert made.state == JobState.QUEUED
     assert (made.query_id, made.maps, made.coverage) == (answered.query_id, [NAME], None)
-    [job] = client.wait([made.job_id], timeout_s=120)
+    [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
     assert (job.state, job.kind, job.map) == ("succeeded", "reconstruct", NAME), job.error
     done = client.reconstruction(made.job_id)
     coverage = done.coverage
@@ -82,7 +83,7 @@ def test_a_surface_and_its_figures(client: Client, answered: Answer) -> None:
     assert (points, triangles) == (coverage.points, coverage.triangles)
     assert comment == "comment frame query.optical: x right, y down, z forward, metres"
     assert struct.unpack(">II", picture[16:24]) == (1440, 920)
-    again = client.reconstruct(answered, voxel_m=0.04, wait_s=60)
+    again = client.reconstruct(answered, voxel_m=0.04, wait_s=PATIENCE_S)
     assert client.reconstruction_mesh(again.job_id) == mesh
     accepted = [m for m in answered.matches if m.validation.status == "accepted"]
     views = coverage.views
@@ -101,7 +102,7 @@ def test_what_is_wanted_is_what_is_fused(client: Client, answered: Answer) -> No
     first = next(match for match in answer.matches if match.validation.status == "accepted")
     made = client.reconstruct(
         answer.query_id, frames=[first.frame_id], include_query=False, voxel_m=0.05,
-        output="cloud", wait_s=60,
+        output="cloud", wait_s=PATIENCE_S,
     )  # fmt: skip
     assert made.coverage is not None, made.error
     assert [one.frame_id for one in made.coverage.views] == [first.frame_id]
@@ -115,7 +116,7 @@ def test_the_surface_lies_where_the_query_saw_it(
     client: Client, answered: Answer, views: list[FrameReference]
 ) -> None:
     """Matches alone, in the query's camera: their points project onto the query's depth."""
-    made = client.reconstruct(answered, include_query=False, strength="strong", wait_s=60)
+    made = client.reconstruct(answered, include_query=False, strength="strong", wait_s=PATIENCE_S)
     data = client.reconstruction_mesh(made.job_id).partition(b"end_header\n")[2]
     assert made.coverage is not None
     rows = np.frombuffer(data[: 27 * made.coverage.points], np.uint8).reshape(-1, 27)
@@ -143,7 +144,7 @@ def test_refusals(client: Client, answered: Answer) -> None:
     with pytest.raises(UnknownJob, match="no job"):
         client.reconstruction("nothing")
     made = client.reconstruct(answered, voxel_m=0.002)  # finer than memory allows for a room
-    [job] = client.wait([made.job_id], timeout_s=60)
+    [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
     assert (job.state, job.attempts) == ("failed", 1)
     assert "Ask for" in str(job.error)
     with pytest.raises(NotIndexed, match=r"is failed, and mesh\.ply exists once it has succeeded"):
@@ -176,7 +177,7 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
         next(path for path in files(tmp_path) if path.stat().st_size == size).unlink()
         client.delete_frame(NAME, deleted)
         client.put_frame(NAME, deleted, views[0])  # another frame, which nobody has matched
-        [job] = client.wait([made.job_id], timeout_s=60)
+        [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
         assert job.state == "succeeded", job.error
         coverage = client.reconstruction(made.job_id).coverage
         assert coverage is not None
@@ -191,7 +192,7 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
 
 
 def test_files_are_sent_in_ranges(client: Client, answered: Answer) -> None:
-    made = client.reconstruct(answered, voxel_m=0.05, wait_s=60)
+    made = client.reconstruct(answered, voxel_m=0.05, wait_s=PATIENCE_S)
     whole = client.reconstruction_picture(made.job_id)
     url = f"/v1/reconstructions/{made.job_id}/picture.png"
     http = client._http

@@ -36,7 +36,7 @@ def test_a_busy_service_is_asked_again_when_it_said(scripted: Make) -> None:
     with Client(server.url) as client:
         start = time.monotonic()
         assert client.map("m").name == "m"
-        assert 1.0 <= time.monotonic() - start < 3.0
+        assert time.monotonic() - start >= 1.0
     assert [asked[:2] for asked in server.asked] == [("GET", "/v1/maps/m")] * 2
 
 

@@ -6,6 +6,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, UnknownDeletion, UnknownFrame, UnknownQuery
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client
@@ -53,7 +54,7 @@ def test_an_answer_is_kept_and_released(
     client: Client, map_name: str, references: tuple[FrameReference, ...]
 ) -> None:
     client.create_map(map_name)
-    added = client.upload(map_name, references[0], wait_s=60)
+    added = client.upload(map_name, references[0], wait_s=PATIENCE_S)
     answer = client.query(map_name, frame_id=added.frame_id, robot="cart")
     (record,) = client.queries(map_name)
     told = client.answer_retention(answer.query_id)

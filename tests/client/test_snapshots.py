@@ -8,6 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import SnapshotError, UnknownSnapshot
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.maintenance.fsck.check import fsck
@@ -25,9 +26,9 @@ def test_a_snapshot_taken_over_the_service_restores_to_the_same_answers(
 ) -> None:  # fmt: skip
     remote.create_map(map_name, model="depth")
     for reference in references[:4]:
-        remote.upload(map_name, reference, wait_s=60)
+        remote.upload(map_name, reference, wait_s=PATIENCE_S)
     before = {one.snapshot_id for one in remote.snapshots()}
-    job = remote.take_snapshot(wait_s=60)
+    job = remote.take_snapshot(wait_s=PATIENCE_S)
     assert (job.state, job.kind, job.map) == (JobState.SUCCEEDED, "snapshot", None), job.error
     [taken] = [one for one in remote.snapshots() if one.snapshot_id not in before]
     assert job.result == taken.model_dump(mode="json")
@@ -66,7 +67,7 @@ def test_only_the_newest_are_kept_and_fsck_has_nothing_to_say(
     data = tmp_path / "data"
     with Client.embedded(data) as client:
         client.create_map("hall", model="depth")
-        client.upload("hall", references[0], wait_s=60)
+        client.upload("hall", references[0], wait_s=PATIENCE_S)
         job = client.take_snapshot()
         assert client.take_snapshot().job_id == job.job_id  # the one that waits is enough
         [job] = client.wait([job.job_id])
@@ -99,6 +100,6 @@ def test_only_the_newest_are_kept_and_fsck_has_nothing_to_say(
 def test_where_none_can_be_taken_the_job_says_why(tmp_path: Path) -> None:
     with Client.embedded(tmp_path) as client:
         (tmp_path / "snapshots").write_text("in the way")
-        job = client.take_snapshot(wait_s=30)
+        job = client.take_snapshot(wait_s=PATIENCE_S)
         assert (job.state, job.attempts) == (JobState.FAILED, 1)
         assert "no snapshot can be written" in str(job.error)

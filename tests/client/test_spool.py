@@ -26,6 +26,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, Spool, meta_of
 from sceneprint_client import spool as module
@@ -554,7 +555,7 @@ def test_kills_while_frames_are_added_and_uploaded_lose_and_double_nothing(
     assert waiting[:acknowledged] == said
     assert len(waiting) <= acknowledged + 1  # one may have been durable, and not acknowledged
     with child("sync", path, service_url, map_name, 1) as process:
-        out, _ = process.communicate(timeout=60)
+        out, _ = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, out) == (-signal.SIGKILL, b"")
     assert len(list(remote.frames(map_name))) == 64
     assert names(path) == waiting
@@ -601,7 +602,7 @@ def test_records_of_queries_reach_the_service_each_once(
     known = CameraIntrinsics(
         width=lens.width, height=lens.height, fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy
     )
-    copy.upload(map_name, references[0], meta_of(references[0]), wait_s=300)
+    copy.upload(map_name, references[0], meta_of(references[0]), wait_s=PATIENCE_S)
     asked = FrameMeta(intrinsics=known, robot="cart", session="monday")
     found = copy.query(map_name, references[0], asked)
     assert found.location is not None
@@ -775,14 +776,14 @@ def test_kills_and_a_full_disk_lose_and_double_no_record(
         assert spool.status().waiting == before.waiting
     for most in (0, 120, 249):
         with child("queries", path, folder, most) as process:
-            process.communicate(timeout=120)
+            process.communicate(timeout=PATIENCE_S)
         assert process.returncode == -signal.SIGKILL
     with Spool(path) as spool:
         spool.add_queries(copy)
         assert held(path) == ids
         assert spool.add_queries(copy) == 0
     with child("sync", path, service_url, map_name, 2) as process:
-        process.communicate(timeout=120)
+        process.communicate(timeout=PATIENCE_S)
     assert process.returncode == -signal.SIGKILL
     assert sum(1 for _ in remote.queries(map_name)) == 200
     assert held(path) == ids[100:]
@@ -815,7 +816,7 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
         first += len(numbers)  # one more may be durable: it is added again
     for _ in range(12):
         with child("queries", path, folder, chance.randrange(1200)) as process:
-            process.communicate(timeout=120)
+            process.communicate(timeout=PATIENCE_S)
         assert process.returncode == -signal.SIGKILL
     with Client.embedded(folder) as copy, Spool(path) as spool:
         spool.add_queries(copy)
@@ -847,7 +848,7 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
             records = [one.query_id for one in client.queries("hall")]
     finally:
         os.killpg(service.pid, signal.SIGTERM)
-        service.communicate(timeout=30)
+        service.communicate(timeout=PATIENCE_S)
     with Spool(path) as spool:
         now = spool.status()
     sys.stdout.write(f"{count} frames: {kills} kills, {full} full disks, {syncs} kills of sync\n")

@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, NotIndexed, Refused
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.formats.export import encode_points
@@ -64,7 +65,7 @@ def test_points_of_frames_and_queries(
     client: Client, map_name: str, references: tuple[FrameReference, ...]
 ) -> None:
     client.create_map(map_name)
-    frame_id = client.upload(map_name, references[0], wait_s=60).frame_id
+    frame_id = client.upload(map_name, references[0], wait_s=PATIENCE_S).frame_id
     cloud = client.cloud(map_name, frame_id).partition(b"end_header\n")[2]
     exact = np.frombuffer(cloud, "<f4").reshape(-1, 6)[:, :3]
     told = client.frame_points(map_name, frame_id)

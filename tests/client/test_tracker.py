@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.lab.synth import KINECT, SynthRoom, corridor, render, synthesise_lookalike
 from sceneprint.lab.synth.trajectories import pose as camera_pose
@@ -68,7 +69,7 @@ class FakeClient:
     def localize(self, map_name: str, frame: Any, meta: Any = None, **how: Any) -> Localization:
         self.asked.append({"map": map_name, "frame": frame, "meta": meta, **how})
         self.begun.set()
-        assert self.may_answer.wait(60)
+        assert self.may_answer.wait(PATIENCE_S)
         told = self.answers[min(len(self.asked), len(self.answers)) - 1]
         if isinstance(told, Exception):
             raise told
@@ -155,18 +156,18 @@ def test_a_thread_asks_for_the_latest_frame_alone() -> None:
     log = io.StringIO()
     with AsyncTracker(Tracker(client, "m", camera=K, log=log)) as tracker:
         assert tracker.submit("0", ahead(0), stamp=0.0).status == "lost"
-        assert client.begun.wait(60)
+        assert client.begun.wait(PATIENCE_S)
         for i in (1, 2, 3):
             assert tracker.submit(str(i), ahead(i), stamp=float(i)).status == "lost"
         assert not tracker.wait(0)
         client.may_answer.set()
-        assert tracker.wait(60)
+        assert tracker.wait(PATIENCE_S)
         assert [one["frame"] for one in client.asked] == ["0", "3"]
         assert tracker.dropped == 2
         state = tracker.submit("4", ahead(4), stamp=4.0)
         assert (state.status, state.age) == ("tracking", 1.0)
         np.testing.assert_allclose(state.T_map_sensor, ahead(9), atol=1e-9)
-        assert tracker.wait(60)
+        assert tracker.wait(PATIENCE_S)
     assert equal(list(replay(log.getvalue().splitlines()))[-2], state)
 
 
@@ -176,20 +177,20 @@ def test_an_answer_to_a_frame_from_before_a_reset_is_not_used() -> None:
     inner = Tracker(client, "m", camera=K)
     with AsyncTracker(inner) as tracker:
         tracker.submit("0", ahead(0), stamp=0.0)
-        assert client.begun.wait(60)
+        assert client.begun.wait(PATIENCE_S)
         tracker.submit("1", ahead(1), stamp=1.0)
         assert inner.reset("a lift").reason == "a lift"
         client.may_answer.set()
-        assert tracker.wait(60)
+        assert tracker.wait(PATIENCE_S)
         assert tracker.submit("2", ahead(0), stamp=0.5).status == "lost"  # the clock began anew
-        assert tracker.wait(60)
+        assert tracker.wait(PATIENCE_S)
         assert tracker.submit("3", ahead(0), stamp=0.6).status == "tracking"
 
 
 def test_what_the_thread_meets_is_raised_by_the_next_submit() -> None:
     with AsyncTracker(Tracker(fake(errors.UnknownMap("no map")), "m", camera=K)) as tracker:
         tracker.submit(DEPTH, ahead(0), stamp=0.0)
-        assert tracker.wait(60)
+        assert tracker.wait(PATIENCE_S)
         with pytest.raises(errors.UnknownMap):
             tracker.submit(DEPTH, ahead(1), stamp=1.0)
 

@@ -30,10 +30,12 @@ from playwright.sync_api import (
     Page,
     Request,
     ViewportSize,
+    expect,
     sync_playwright,
 )
 
 from benchmarks.rooms import circled, send
+from benchmarks.waiting import PATIENCE_S, until
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.lab.synth import SynthRoom
 
@@ -44,23 +46,10 @@ FLAGS = [
 #: What Chromium says of drawing without a graphics card, whatever a page does.
 NOISE = "GL Driver Message"
 VIEWPORT: ViewportSize = {"width": 1280, "height": 800}
-#: Processors are few and shared: what takes longer than this does not come.
-PATIENCE_S = 60.0
 ROOMS, VIEWS = 2, 8
 #: When the first frame was taken; each next one is a second later.
 TAKEN = "2026-11-20T09:{minute:02d}:{second:02d}Z"
 Settle = Callable[[Page], None]
-
-
-def until(what: Callable[[], Any], seconds: float = PATIENCE_S) -> Any:
-    """The first true value of it."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        found = what()
-        if found:
-            return found
-        time.sleep(0.05)
-    raise AssertionError(f"{what} did not come true within {seconds:g} s")
 
 
 @dataclass(frozen=True)
@@ -141,7 +130,7 @@ def running(data: Path, workers: int, port: int = 0) -> Iterator[Station]:
         said = (data / "service.log").read_text()
         assert line.startswith("sceneprint: serving http://"), said
         url = line.split()[-1].rstrip("/")
-        with httpx.Client(base_url=url, timeout=60, trust_env=False) as client:
+        with httpx.Client(base_url=url, timeout=PATIENCE_S, trust_env=False) as client:
             yield Station(url, data, client, process.pid)
     finally:
         process.terminate()
@@ -174,6 +163,7 @@ def browser(chromium: str, folder_stack: ExitStack) -> Browser:
     """One for all tests of this folder: as long as it is there no others may run an event loop."""
     playwright = folder_stack.enter_context(sync_playwright())
     one = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+    expect.set_options(timeout=1000 * PATIENCE_S)
     folder_stack.callback(one.close)
     return one
 
@@ -209,7 +199,7 @@ def station(
         states.update(found.client.get("/v1/maps/building").json()["frames"])
         return states.get("indexed") == len(files)
 
-    until(signed, 4 * PATIENCE_S)  # a machine of many engineers signs slowly
+    until(signed)
     return found
 
 
@@ -295,6 +285,7 @@ def open_page(browser: Browser, shared_context: BrowserContext) -> Iterator[Call
             browser.new_context(**{"viewport": VIEWPORT, **context}) if context else shared_context
         )
         page = within.new_page()
+        page.set_default_timeout(1000 * PATIENCE_S)
         page.allowed, page.said, page.pending = [], [], set()  # type: ignore[attr-defined]
         page.origins = set()  # type: ignore[attr-defined]
         page.on(
@@ -386,9 +377,3 @@ def free_port() -> int:
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         return int(one.getsockname()[1])
-
-
-@pytest.fixture(scope="session", name="until")
-def patience() -> Callable[..., Any]:
-    """Poll: the first true value of what is called."""
-    return until

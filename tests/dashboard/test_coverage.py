@@ -12,7 +12,6 @@ import pytest
 from playwright.sync_api import Page, expect
 
 Settle = Callable[[Page], None]
-PATIENCE_MS = 60_000
 OUTCOMES = ("found", "wrong", "ambiguous", "not_found")
 CELLS = """all => all.map(one => ({cell: one.dataset.cell, outcome: one.dataset.outcome,
     x: Number(one.getAttribute("x")), y: Number(one.getAttribute("y")),
@@ -49,7 +48,7 @@ def measured(
     dialog.get_by_text("Tolerance and cells").click()
     dialog.get_by_label("Cell width, m").fill("0.5")
     dialog.get_by_role("button", name="Start").click()
-    expect(page.get_by_text("Coverage was measured.")).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.get_by_text("Coverage was measured.")).to_be_visible()
     settle(page)
     (one,) = (
         one for one in station.client.get(path).json()["items"] if one["coverage_id"] not in known

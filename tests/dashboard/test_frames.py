@@ -131,7 +131,7 @@ def test_a_click_counts_although_what_was_pressed_is_drawn_anew(
     pressed = link.element_handle()
     page.mouse.down()
     add(station, name, range(1, 2))
-    expect(page.locator("#frames .tile")).to_have_count(2, timeout=30_000)
+    expect(page.locator("#frames .tile")).to_have_count(2)
     assert not pressed.evaluate("(link) => link.isConnected")
     if moved:
         page.mouse.move(2, 2)  # taken back, as anywhere
@@ -204,15 +204,15 @@ def test_states_change_as_they_happen(
     settle(page)
     expect(page.get_by_role("heading", name="No frames yet")).to_be_visible()
     [one] = add(station, "coming", range(1), columns=64)
-    expect(page.locator(f"[data-frame='{one}'] .badge")).to_have_text("indexed", timeout=30_000)
+    expect(page.locator(f"[data-frame='{one}'] .badge")).to_have_text("indexed")
     settle(page)
     want = told(station, f"{path}/frames/{one}/preview.png", width=240)
     assert np.array_equal(drawn(page.locator(".tile canvas")), want)
     station.client.delete(f"{path}/frames/{one}")
-    expect(page.locator(f"[data-frame='{one}'] .badge")).to_have_text("deleted", timeout=30_000)
+    expect(page.locator(f"[data-frame='{one}'] .badge")).to_have_text("deleted")
     page.allowed.append("404")  # type: ignore[attr-defined]
     station.client.delete(path)
-    expect(page.get_by_role("main")).to_contain_text("There is no map 'coming'", timeout=30_000)
+    expect(page.get_by_role("main")).to_contain_text("There is no map 'coming'")
 
 
 @pytest.fixture

@@ -118,10 +118,10 @@ def test_counts_move_while_workers_sign(station: Any, page: Page, settle: Settle
     settle(page)
     path = station.make_map("growing")  # by another: the card comes by itself
     one = card(page, "growing")
-    expect(one.locator(".map-number")).to_have_text("0", timeout=30_000)
+    expect(one.locator(".map-number")).to_have_text("0")
     for frame in station.frames[:2]:
         station.client.post(f"{path}/frames", **frame.form())
-    expect(one.locator(".map-number")).to_have_text("2", timeout=30_000)
+    expect(one.locator(".map-number")).to_have_text("2")
     expect(one).to_contain_text("Up to date")
     expect(page.locator("#summary")).to_contain_text("frames indexed")
 
@@ -136,7 +136,7 @@ def test_a_map_keeps_the_focus_while_its_counts_move(
     title = one.get_by_role("heading").get_by_role("link")
     title.focus()
     station.client.post(f"{path}/frames", **station.frames[0].form())
-    expect(one.locator(".map-number")).to_have_text("1", timeout=30_000)
+    expect(one.locator(".map-number")).to_have_text("1")
     expect(title).to_be_focused()
     page.keyboard.press("Enter")
     expect(page).to_have_url(f"{station.home}#/maps/focused/place")

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-PATIENCE_MS = 60_000
 #: bob's odometry begins elsewhere, and turned.
 _A = np.deg2rad(40)
 B_FROM_A = np.array([
@@ -77,9 +76,7 @@ def test_runs_are_joined_from_here(
     dialog = page.get_by_role("dialog")
     expect(dialog.get_by_label("Query the frames of")).to_have_value("0")
     dialog.get_by_role("button", name="Start").click()
-    expect(page.locator(".paths-run")).to_have_text(
-        ["1ann4 poses", "2bob4 poses"], timeout=PATIENCE_MS
-    )
+    expect(page.locator(".paths-run")).to_have_text(["1ann4 poses", "2bob4 poses"])
     settle(page)
     (one,) = station.client.get(f"{apart['path']}/associations").json()["items"]
     result = one["result"]

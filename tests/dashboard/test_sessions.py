@@ -10,7 +10,6 @@ import pytest
 from playwright.sync_api import Page, expect
 
 Settle = Callable[[Page], None]
-PATIENCE_MS = 60_000
 PROXIED = {"X-Forwarded-For": "192.0.2.7"}
 #: Session and robot of each of six frames.
 TAKEN = [("monday", "ann")] * 2 + [("monday", None)] + [("tuesday/2", "ann")] * 2 + [(None, None)]
@@ -90,7 +89,7 @@ def test_sessions_are_listed_renamed_tagged_joined_and_deleted(
     page.keyboard.press("Enter")
     expect(dialog).to_contain_text("There is a session monday. Rename again to join the two")
     page.keyboard.press("Enter")
-    expect(rows).to_have_count(3, timeout=PATIENCE_MS)
+    expect(rows).to_have_count(3)
     assert listed(station, runs)["monday", "ann"] == (4, ["dock", "wet"])
 
     # without a robot all frames of the session are meant, and that is said
@@ -106,18 +105,18 @@ def test_sessions_are_listed_renamed_tagged_joined_and_deleted(
     expect(delete).to_be_disabled()
     dialog.get_by_role("textbox").fill("monday")
     delete.click()
-    expect(rows).to_have_count(2, timeout=PATIENCE_MS)
+    expect(rows).to_have_count(2)
     expect(page.get_by_role("status").filter(has_text="Deleted 4 frames.")).to_be_visible()
     assert set(listed(station, runs)) == {(None, None), ("monday", None)}
     assert axe(page) == []
     expect(page.get_by_role("button", name="Undo the deletion of 4 frames")).to_be_visible()
     page.locator(".toast", has_text="Deleted").get_by_role("button", name="Undo").click()
-    expect(rows).to_have_count(3, timeout=PATIENCE_MS)
+    expect(rows).to_have_count(3)
     assert listed(station, runs)["monday", "ann"] == (4, ["dock", "wet"])
     # what others do is seen
     told = station.client.delete(f"{runs}/sessions", params={"session": "monday"}).json()
     assert (told["frames"], told["deletion"]["frames"]) == (5, 5)
-    expect(rows).to_have_count(1, timeout=PATIENCE_MS)
+    expect(rows).to_have_count(1)
 
 
 def test_who_may_only_read_changes_nothing(

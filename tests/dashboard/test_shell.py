@@ -201,23 +201,23 @@ def test_a_service_without_maps_goes_and_comes_back(
         expect(health).to_have_text("ready")
         os.kill(alone.process, signal.SIGSTOP)  # it takes connections, and answers none
         try:
-            expect(page.locator("#banner")).to_contain_text("does not answer", timeout=60_000)
+            expect(page.locator("#banner")).to_contain_text("does not answer")
             expect(health).to_have_text("not answering")
         finally:
             os.kill(alone.process, signal.SIGCONT)
         expect(page.locator("#banner")).to_be_hidden(timeout=60_000)
-        expect(health).to_have_text("ready", timeout=60_000)
+        expect(health).to_have_text("ready")
         page.goto(alone.home + "#/")
         settle(page)
         expect(page.locator(".map")).to_have_count(1)
     # what is shown stays, and it is said that it may be old
-    expect(page.locator("#banner")).to_contain_text("does not answer", timeout=30_000)
+    expect(page.locator("#banner")).to_contain_text("does not answer")
     expect(page.locator(".map")).to_have_count(1)
     page.evaluate("() => { location.hash = '#/nowhere'; }")
     page.evaluate("() => { location.hash = '#/'; }")
     expect(page.get_by_role("main")).to_contain_text("The service does not answer")
     with serve(tmp_path, workers=0, port=free_port):
-        expect(page.locator(".map")).to_have_count(1, timeout=30_000)  # by itself
+        expect(page.locator(".map")).to_have_count(1)  # by itself
         expect(page.locator("#banner")).to_be_hidden(timeout=30_000)
 
 

@@ -99,7 +99,7 @@ def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(
     # the first cloud of a worker may wait for its kernels to be compiled
     until(lambda: _states(station, path) <= settled and _count(station, path) == 4, 180)
     for name in ("frame-000000.depth.png", "frame-000001.depth.png", "twice.png"):
-        expect(row(page, name).locator(".badge")).to_have_text("indexed", timeout=30_000)
+        expect(row(page, name).locator(".badge")).to_have_text("indexed")
 
     expect(row(page, "empty.png").locator(".row-more")).to_have_text("The file is empty.")
     refusal = station.client.post(
@@ -164,8 +164,8 @@ def test_a_drop_waits_for_its_camera_and_an_archive_goes_to_imports(
         page.locator(f"input[name={name}]").fill(f"{value:g}")
     expect(page.get_by_label("Preset")).to_have_value("")
     start.click()
-    expect(row(page, "run.zip").locator(".badge")).to_have_text("imported", timeout=60_000)
-    expect(row(page, "lone.png").locator(".badge")).to_have_text("indexed", timeout=60_000)
+    expect(row(page, "run.zip").locator(".badge")).to_have_text("imported")
+    expect(row(page, "lone.png").locator(".badge")).to_have_text("indexed")
     expect(row(page, "run.zip").locator(".row-more > p")).to_have_text(
         "Frames: 1 imported, 1 refused."
     )
@@ -216,7 +216,7 @@ def test_five_hundred_files_and_a_service_that_asks_to_wait(
         first = page.locator(".row[data-state=cancelled]").first
         name = str(first.get_attribute("data-name"))
         first.get_by_role("button", name="Retry").click()
-        expect(row(page, name)).to_have_attribute("data-state", "received", timeout=30_000)
+        expect(row(page, name)).to_have_attribute("data-state", "received")
         page.close()  # it asks no more
 
 

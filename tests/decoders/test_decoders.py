@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint import errors
 from sceneprint.decoders import LocalDecoders
 from sceneprint.decoders.child_process import _arrays, _images, _texts
@@ -46,13 +47,13 @@ def do(pool: DecoderPool, task: str, **request: Any) -> dict[str, Any]:
 
 
 def await_end(pid: int) -> None:
-    """Wait until a process is gone, at most a minute."""
+    """Wait until a process is gone."""
     try:
         handle = os.pidfd_open(pid)
     except ProcessLookupError:
         return
     try:
-        assert select.select([handle], [], [], 60)[0], f"process {pid} lives"
+        assert select.select([handle], [], [], PATIENCE_S)[0], f"process {pid} lives"
     finally:
         os.close(handle)
 
@@ -174,14 +175,14 @@ def test_a_tenant_alone_has_all_places_and_beside_another_half() -> None:
         asked.set()
         with pool.place():
             served.set()
-            release.wait(60)
+            release.wait(PATIENCE_S)
 
     thread = threading.Thread(target=other)
     thread.start()
-    assert asked.wait(60)
+    assert asked.wait(PATIENCE_S)
     assert not served.is_set()
     held.pop().__exit__(None, None, None)  # goes to b, though a might ask first
-    assert served.wait(60)
+    assert served.wait(PATIENCE_S)
     # a holds three of four, more than half: a place that b gives back is not for a
     done = threading.Event()
 
@@ -193,12 +194,12 @@ def test_a_tenant_alone_has_all_places_and_beside_another_half() -> None:
     waiting = threading.Thread(target=again)
     waiting.start()
     release.set()
-    thread.join(60)
+    thread.join(PATIENCE_S)
     assert not done.is_set()
     held.pop().__exit__(None, None, None)
     held.pop().__exit__(None, None, None)
-    assert done.wait(60)
-    waiting.join(60)
+    assert done.wait(PATIENCE_S)
+    waiting.join(PATIENCE_S)
     held.pop().__exit__(None, None, None)
     pool.close()
 

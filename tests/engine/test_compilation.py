@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import threading
-import time
 from importlib.resources import files
 from pathlib import Path
 
@@ -46,11 +46,8 @@ def test_who_is_told_to_stop_leaves_no_process(
 ) -> None:
     stop, said = threading.Event(), list[str]()
     threading.Timer(0.3, stop.set).start()
-    begun = time.monotonic()
     compile_kernels(Path("slow"), DEPTH, said.append, stop)
-    assert time.monotonic() - begun < 10
-    assert len(told_to) == 2
-    assert all(process.returncode is not None for process in told_to)
+    assert [process.returncode for process in told_to] == 2 * [-signal.SIGTERM]
     assert len(said) == 1  # nothing is finished
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.store.tables import jobs, signatures
 from sceneprint_client.api import FrameState, JobState, Query
@@ -33,7 +34,7 @@ def stand_still(*given):
     time.sleep(600)
 
 setattr(signature_job, sys.argv[2], stand_still)
-engine = Engine(Settings(data_dir=Path(sys.argv[1]), lease_s=0.3))
+engine = Engine(Settings(data_dir=Path(sys.argv[1]), lease_s=2))
 engine.run(engine.claim("doomed"))
 """
 
@@ -62,10 +63,10 @@ def test_what_a_killed_worker_had_in_hand_is_done_once_by_another(
             assert worker.stdout.readline() == f"{step}\n"
             if step == "write_geometry":  # while it works it keeps the job
                 renewed, begun = {lease(empty)}, time.monotonic()
-                while len(renewed) < 5:
+                while len(renewed) < 3:
                     assert empty.claim("other") is None
                     renewed.add(lease(empty))
-                    assert time.monotonic() - begun < 60
+                    assert time.monotonic() - begun < PATIENCE_S
                     time.sleep(0.02)
         finally:
             worker.kill()
@@ -73,7 +74,7 @@ def test_what_a_killed_worker_had_in_hand_is_done_once_by_another(
     assert len(list(empty.store.blobs.digests())) == 1 + artifact
     begun = time.monotonic()
     while (claimed := empty.claim("other")) is None:
-        assert time.monotonic() - begun < 60
+        assert time.monotonic() - begun < PATIENCE_S
         time.sleep(0.02)
     assert (claimed.job.token, claimed.job.attempts) == (2, 2)
     assert claimed.job.worker == "other"

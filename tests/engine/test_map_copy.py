@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.maps import map_copy
 from sceneprint.engine.maps.map_copy import PulledMap, pull_map
 from sceneprint.errors import Conflict, DamagedBlob, InvalidRequest, UnknownMap
@@ -49,7 +50,7 @@ def upload(client: Client, views: tuple[DepthFrame, ...], name: str = MAP) -> li
             captured_at="2026-11-16T09:30:00.125Z", up=(0.0, -1.0, 0.0), tags=["lit", "door"],
             name=f"a/{number}.png",
         )  # fmt: skip
-        added = client.upload(name, view.depth, meta, wait_s=400)
+        added = client.upload(name, view.depth, meta, wait_s=PATIENCE_S)
         assert added.state == "indexed"
         ids.append(added.frame_id)
     return ids
@@ -120,7 +121,9 @@ def test_a_pulled_map_answers_as_the_service_and_follows_it(
     service.edit_frame(MAP, ids[2], {"tags": ["dark"], "pose": None})
     service.delete_frame(MAP, ids[3])
     view = walk[12]
-    service.put_frame(MAP, ids[3], view.depth, FrameMeta(intrinsics=camera_of(view)), wait_s=400)
+    service.put_frame(
+        MAP, ids[3], view.depth, FrameMeta(intrinsics=camera_of(view)), wait_s=PATIENCE_S
+    )
     second = robot.pull()
     assert (second.frames, second.written, second.removed, second.artifacts) == (5, 3, 1, 2)
     assert robot.answers(asked) == answers(service, asked)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.engine import stored_maps
 from sceneprint.engine.jobs import signature_job as working
@@ -183,7 +184,7 @@ def test_of_two_that_are_signed_at_once_one_is_kept(
         seen = look(*given)
         assert seen is not None
         assert seen.nearest is None
-        looked.wait(60)
+        looked.wait(PATIENCE_S)
         return seen
 
     monkeypatch.setattr(working, "look", together)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.maps import map_lifecycle
@@ -122,7 +123,7 @@ def test_no_answer_mixes_models_while_a_map_goes_to_and_fro(
     try:
         for model in (small_file, DEPTH) * 2:
             switch(full, model, work_off)
-            label, end = full.get_map("hall").model, time.monotonic() + 60
+            label, end = full.get_map("hall").model, time.monotonic() + PATIENCE_S
             while not all(mine and mine[-1] == label for mine in seen) and not raised:
                 assert time.monotonic() < end, (label, [mine[-1:] for mine in seen])
                 over.wait(0.01)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -10,8 +9,9 @@ import pytest
 from sqlalchemy import select, update
 
 from sceneprint.engine import Engine
+from sceneprint.engine.jobs import tasks
 from sceneprint.engine.jobs.lifecycle import list_jobs
-from sceneprint.engine.jobs.tasks import SLICE_S, Handler, IsOver, LongJob, SliceResult
+from sceneprint.engine.jobs.tasks import Handler, IsOver, LongJob, SliceResult
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
 from sceneprint.process import work_of
@@ -233,16 +233,16 @@ def test_a_file_that_another_takes_the_place_of_is_removed(
     assert engine.store.blobs.get(blob) == b"part 2"
 
 
-def test_a_slice_ends_when_another_tenant_waits(engine: Engine) -> None:
-    took: list[float] = []
+def test_a_slice_ends_when_another_tenant_waits(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tasks, "SLICE_S", 1e6)
 
     def handle(_: LongJob, is_over: IsOver) -> SliceResult:
         with work_of("other"):
             engine.tasks.begin("count", "hall", {})
-        begun = time.monotonic()
         while not is_over():
             pass
-        took.append(time.monotonic() - begun)
         return SliceResult(over=False, progress={"done": 1, "total": 2})
 
     engine.tasks.register("endless", handle)
@@ -252,7 +252,6 @@ def test_a_slice_ends_when_another_tenant_waits(engine: Engine) -> None:
     held = engine.claim("w")
     assert held is not None
     assert engine.run(held) == JobState.QUEUED
-    assert took[0] < SLICE_S / 2
     following = engine.claim("w")
     assert following is not None
     assert (following.job.kind, following.job.tenant) == ("count", "other")

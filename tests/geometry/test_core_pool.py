@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.geometry.kernel import Cores, both
 
 
@@ -23,7 +24,7 @@ def meeting() -> tuple[Callable[[], int], Callable[[], int]]:
 
     def half(number: int) -> Callable[[], int]:
         def run() -> int:
-            barrier.wait(10.0)
+            barrier.wait(PATIENCE_S)
             return number
 
         return run
@@ -70,9 +71,9 @@ def test_a_half_takes_no_core_of_its_own_half(two: Cores) -> None:
     barrier = threading.Barrier(2)
 
     def half() -> None:
-        barrier.wait(10.0)
+        barrier.wait(PATIENCE_S)
         inner.append((threading.current_thread().name, threads_of()))
-        barrier.wait(10.0)
+        barrier.wait(PATIENCE_S)
 
     with two.lent():
         both(half, half)

@@ -14,6 +14,7 @@ import faiss
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.index import (
     Generation,
     clear,
@@ -232,7 +233,7 @@ print(where.split()[1])
         place.mkdir()
         found = subprocess.run(
             [sys.executable, "-c", code, str(place), str(flat)],
-            capture_output=True, text=True, timeout=120, check=False,
+            capture_output=True, text=True, timeout=PATIENCE_S, check=False,
         )  # fmt: skip
         assert found.returncode == 0, found.stderr
         assert found.stdout.startswith("r--")  # a file is mapped, and nobody may write there

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -15,24 +14,6 @@ from sceneprint.formats.dataset import write_depth_png
 from sceneprint.store import Store, open_store
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import CameraIntrinsics, FrameMeta
-
-#: Seconds that anything may take on the slowest machine.
-PATIENCE_S = 90.0
-
-
-@pytest.fixture(scope="session")
-def until() -> Callable[[Callable[[], Any]], Any]:
-    """Wait for the first true value of something."""
-
-    def wait(what: Callable[[], Any]) -> Any:
-        end = time.monotonic() + PATIENCE_S
-        while time.monotonic() < end:
-            if found := what():
-                return found
-            time.sleep(0.02)
-        raise AssertionError("it did not come true")
-
-    return wait
 
 
 class Small(NamedTuple):

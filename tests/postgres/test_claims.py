@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, text, update
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import LostLease
 from sceneprint.store import Store, queue
 from sceneprint.store.maps import add_map, keep_model
@@ -84,7 +85,7 @@ def beside(store: Store, until: Callable[..., Any], what: Callable[[], Any]) -> 
     until(waits)
 
     def end() -> Any:
-        thread.join(60)
+        thread.join(PATIENCE_S)
         (one,) = found
         return one
 

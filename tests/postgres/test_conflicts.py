@@ -12,6 +12,7 @@ import pytest
 from sqlalchemy import Connection
 
 from benchmarks.fleet.postgres import Server
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.errors import StoreLocked
 from sceneprint.store import Store, open_database
@@ -45,7 +46,7 @@ def test_a_deadlock_of_two_costs_none_of_those_written_with_them(
             tries.append(request.key)
             request.keep(connection, {})
             if meet and is_first:
-                both.wait(60)
+                both.wait(PATIENCE_S)
             return "kept"
 
         return work
@@ -74,7 +75,7 @@ def test_a_deadlock_of_two_costs_none_of_those_written_with_them(
                     found.append(pool.submit(run, group, work))
                     while len(group._waiting) == before:
                         pass
-        came = [one.result(60) for one in found]
+        came = [one.result(PATIENCE_S) for one in found]
     assert [came[2], came[5]] == ["done", "done"]
     assert len(tries) > 4  # there was a deadlock, and those of one group were written again
 
@@ -118,7 +119,7 @@ def test_a_new_schema_is_looked_at_by_each_who_sent_the_one_of_before(
     both, look = threading.Barrier(2), postgres.KnownSchema.look
 
     def look_together(self: Any, connection: Any) -> None:
-        both.wait(60)  # both have sent the schema of before
+        both.wait(PATIENCE_S)  # both have sent the schema of before
         look(self, connection)
 
     monkeypatch.setattr(postgres.KnownSchema, "look", look_together)

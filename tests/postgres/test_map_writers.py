@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, insert, select, text
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.admin.operations import next_events
 from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.errors import IdempotencyConflict, StoreLocked
@@ -128,7 +129,7 @@ def test_readers_miss_no_event_and_see_those_of_a_map_in_its_order(
         list(pool.map(write, range(WRITERS)))
     over.set()
     for reader in readers:
-        reader.join(90)
+        reader.join(PATIENCE_S)
     for seen in found:
         by_map = defaultdict(list)
         for event in seen:
@@ -202,7 +203,7 @@ def test_of_two_requests_with_one_key_for_two_maps_only_the_first_takes_effect(
     looked, stored, tries = threading.Event(), threading.Event(), list[int]()
 
     def keep_first(connection: Connection) -> None:
-        assert looked.wait(60)
+        assert looked.wait(PATIENCE_S)
         assert first.found(connection) is None
         first.keep(connection, {"of": "first"})
 
@@ -210,7 +211,7 @@ def test_of_two_requests_with_one_key_for_two_maps_only_the_first_takes_effect(
         tries.append(1)
         assert second.found(connection) is None
         looked.set()
-        assert stored.wait(60)
+        assert stored.wait(PATIENCE_S)
         record_event(connection, "second", rows[1].name)
         second.keep(connection, {"of": "second"})
 
@@ -225,7 +226,7 @@ def test_of_two_requests_with_one_key_for_two_maps_only_the_first_takes_effect(
         writes.run(keep_second)
     with pytest.raises(IdempotencyConflict):  # as uploads do then
         writes.run(keep_second)
-    other.join(60)
+    other.join(PATIENCE_S)
     assert len(tries) == 2
     assert "second" not in [one.kind for one in told(server_store)]
     with database.read() as connection:

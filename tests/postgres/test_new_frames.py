@@ -9,9 +9,10 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from typing import Any
 
 import pytest
-from sqlalchemy import event, select, text, update
+from sqlalchemy import select, text, update
 from sqlalchemy.exc import IntegrityError
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.ingest import write_groups
 from sceneprint.engine.ingest.write_groups import NewFrames
 from sceneprint.errors import StoreLocked
@@ -195,27 +196,6 @@ def test_each_is_of_the_request_that_it_came_with(server_store: Store, rows: lis
         assert [one["request_id"] for one in data] == ["one", "two"]
 
 
-def test_what_comes_next_in_the_index_is_looked_at_whatever_the_tables_were(
-    server_store: Store, rows: list[MapRow]
-) -> None:
-    """A plan of an empty store took any index of a map's frames, and read all of them."""
-    database = server_store.database
-    said = list[tuple[str, Any]]()
-    event.listen(
-        database._engine, "before_cursor_execute",
-        lambda _c, _cursor, statement, given, *_: said.append((statement, given)),
-    )  # fmt: skip
-    receive(database, new(rows[0], 1))
-    [(statement, given)] = [one for one in said if "json_to_recordset" in one[0]]
-    with database._writers.connect() as connection:
-        raw = connection.connection.driver_connection
-        assert raw is not None
-        plan = "\n".join(row[0] for row in raw.execute(f"EXPLAIN {statement}", given))
-    probe = plan.partition("SubPlan")[2].partition("CTE")[0]
-    assert "ix_frames_map_number_content_id" in probe
-    assert "Sort" not in probe
-
-
 @contextmanager
 def in_use(database: Database, row: MapRow) -> Iterator[Any]:
     """The map's turn, of another process."""
@@ -252,7 +232,7 @@ def test_maps_are_locked_in_one_order(
         writer.start()
         until(lambda: other.execute(waiting).scalar_one() == 1)
         assert other.execute(others).scalar_one() == 0
-    writer.join(60)
+    writer.join(PATIENCE_S)
     assert {name: n for name, n, _ in counted(database) if n} == {"a": 1, last.name: 1}
 
 
@@ -361,12 +341,12 @@ def test_others_do_not_wait_for_the_maps_of_who_leads(
             others.enter_context(in_use(database, row))
         writers = [pool.submit(write, row) for row in busy]
         until(lambda: database._map_turns._order._held.get("its tenant", 0) > 0)
-        assert pool.submit(lead).result(60)
+        assert pool.submit(lead).result(PATIENCE_S)
         assert group.receive(new(rows[1], 1))
         assert not any(one.done() for one in writers)
         others.close()
         for one in writers:
-            one.result(60)
+            one.result(PATIENCE_S)
 
 
 def test_a_statement_that_was_prepared_in_vain_is_prepared_again(

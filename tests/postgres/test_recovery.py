@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from benchmarks.fleet.postgres import OPTIONS, Server, binaries, of_nobody
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.errors import UnknownFrame
 from sceneprint.maintenance.fsck.check import fsck
@@ -34,7 +35,9 @@ def recover(*arguments: object, options: str = "") -> subprocess.CompletedProces
     path = f"{binaries()}:{os.environ['PATH']}"
     command = [*of_nobody(), "env", f"PATH={path}", f"PGOPTS={options}", "bash", str(SCRIPT)]
     given = [*command, *map(str, arguments)]
-    return subprocess.run(given, capture_output=True, text=True, timeout=300, cwd="/", check=False)
+    return subprocess.run(
+        given, capture_output=True, text=True, timeout=PATIENCE_S, cwd="/", check=False
+    )
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from sqlalchemy import select, text, update
 
 from benchmarks.fleet.postgres import Server
 from benchmarks.fleet.s3 import ObjectServer
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs, collect_doomed_blobs
@@ -96,7 +97,7 @@ class HeldDeletes:
             with suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)
         for thread in self._threads:
-            thread.join(60)
+            thread.join(PATIENCE_S)
         self._listener.close()
 
     def _accept(self) -> None:
@@ -147,7 +148,7 @@ class Background(threading.Thread):
 
     def result(self) -> Any:
         """What it returned."""
-        self.join(60)
+        self.join(PATIENCE_S)
         assert not self.is_alive()
         if self._error is not None:
             raise self._error
@@ -192,13 +193,13 @@ def removal(remover: Store, held: HeldDeletes) -> Iterator[Callable[..., Backgro
 
     def begin(*blobs: str) -> Background:
         begun.append(Background(lambda: collect_blobs(remover, blobs)))
-        assert held.arrived.wait(60)
+        assert held.arrived.wait(PATIENCE_S)
         return begun[-1]
 
     yield begin
     held.release()
     for one in begun:
-        one.join(60)
+        one.join(PATIENCE_S)
 
 
 def waiting(engine: Engine) -> int:
@@ -386,7 +387,7 @@ def test_what_a_killed_remover_leaves(
         [sys.executable, "-c", REMOVER, postgres_url, bucket, dies, digest, OTHER]
     ) as process:
         if dies == "before":
-            assert held.arrived.wait(60)
+            assert held.arrived.wait(PATIENCE_S)
             process.kill()
     assert process.returncode == -9
     assert doomed_in(engine) == sorted([digest, OTHER])
@@ -529,7 +530,7 @@ def test_who_lost_its_turn_while_it_removes_files_is_waited_for(
         digest = engine.store.blobs.put(small[0].png)
         monkeypatch.setattr(FolderBlobs, "remove", stall)
         removing = Background(lambda: collect_blobs(remover, [digest]))
-        assert arrived.wait(60)
+        assert arrived.wait(PATIENCE_S)
         end_sessions(engine, "objid = 1 AND mode = 'ExclusiveLock'")
         adding = Background(lambda: alone(engine, small))
         until(lambda: not adding.is_alive() or engine.get_map("hall").frames == {"received": 1})

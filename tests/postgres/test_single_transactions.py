@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from sqlalchemy import event, func, insert, literal_column, select, text, update
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.ingest.write_groups import NewFrames
@@ -207,7 +208,7 @@ def test_it_sees_what_was_committed_while_its_turn_was_waited_for(
         writer.start()
         until(lambda: locks(server_store, WAITING) == 1)
         other.execute(update(maps).values(name="renamed"))
-    writer.join(60)
+    writer.join(PATIENCE_S)
     assert found == ["renamed"]
 
 
@@ -229,7 +230,7 @@ def test_who_waited_for_a_migration_writes_nothing(
         other.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
         other.exec_driver_sql("UPDATE schema_range SET least_revision = '9999'")
         other.exec_driver_sql("ALTER TABLE maps RENAME COLUMN name TO gone")  # it would fail, too
-    writer.join(60)
+    writer.join(PATIENCE_S)
     assert [str(one).partition("schema ")[2][:4] for one in raised] == ["9999"]
 
 
@@ -406,8 +407,8 @@ def test_an_upload_to_a_map_in_use_waits_for_it_and_others_go_on(
         until(lambda: len(engine.uploads._writes[row.number]._waiting) == 2)
         assert engine.add_frame("other", *small[2])[1]
         assert done == []
-    first.join(60)
-    second.join(60)
+    first.join(PATIENCE_S)
+    second.join(PATIENCE_S)
     assert (done, tried) == ([True, True], ["hall", "other"])
     assert engine.get_map("hall").frames == {"received": 2}
 

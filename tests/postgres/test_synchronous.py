@@ -10,6 +10,7 @@ import pytest
 from sqlalchemy import text
 
 from benchmarks.fleet.postgres import Server
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import StoreAway
 from sceneprint.store import Store
 from sceneprint.store.events import Wanted, list_events, record_event
@@ -48,7 +49,7 @@ def test_a_commit_whose_wait_is_ended_by_hand_is_not_acknowledged(
     with database.read() as connection:  # others go on reading, and see nothing of it
         assert list_events(connection, Wanted(), after=0, limit=9) == []
     forsaken.execute(f"SELECT pg_cancel_backend(pid) {WAITING}")
-    thread.join(60)
+    thread.join(PATIENCE_S)
     assert [type(error) for error in raised] == [StoreAway]  # it may be stored
     assert "the wait for a standby was ended by hand" in str(raised[0])
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from sqlalchemy import func, insert, select, text
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import NewerSchema, StoreLocked
 from sceneprint.store import Store
 from sceneprint.store.postgres import connection as postgres
@@ -49,7 +50,7 @@ def test_who_waited_for_a_migration_finds_its_schema_and_writes_nothing(
         until(lambda: waiting(server_store) == 1)
         other.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
         other.exec_driver_sql("UPDATE schema_range SET least_revision = '9999'")
-    writer.join(60)
+    writer.join(PATIENCE_S)
     assert [str(one).partition("schema ")[2][:4] for one in raised] == ["9999"]
     with server_store.database.read() as connection:
         late_ones = select(func.count()).where(events.c.kind == "late")

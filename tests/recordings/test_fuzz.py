@@ -7,7 +7,6 @@ import shutil
 import struct
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -132,7 +131,6 @@ def test_bags_with_other_bytes(
     kind: str, times: int, small: dict[str, Path], tmp_path: Path
 ) -> None:
     whole, rng = content_of(small[kind]), np.random.default_rng(2)
-    start = time.monotonic()
     for number in range(times):
         content = bytearray(whole)
         for _ in range(int(rng.integers(1, 4))):
@@ -144,7 +142,6 @@ def test_bags_with_other_bytes(
             new = kinds[int(rng.integers(0, len(kinds)))]
             content[at : at + len(new)] = new
         read_all(damaged(small[kind], tmp_path, bytes(content), number))
-    assert time.monotonic() - start < 120
 
 
 @pytest.mark.parametrize(

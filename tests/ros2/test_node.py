@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import sceneprint_client
+from benchmarks.waiting import PATIENCE_S
 from sceneprint_client.poses import rotation_of
 from sceneprint_client.relocaliser import RelocaliserParameters
 from sceneprint_client.tracker import TrackerParameters, replay
@@ -46,7 +47,7 @@ def play(node: Any, bus: Any, arrived: list[Any]) -> None:
             bus.now_ns = stamp.sec * SECOND + stamp.nanosec
             tick, diagnose = (callback for _, callback in bus.timers)
             tick()
-            assert node._core.wait(120)
+            assert node._core.wait(PATIENCE_S)
             tick()
             diagnose()
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint_client import Client, Tracker
 from sceneprint_client.api import Localization
 from sceneprint_client.poses import quaternion_of, rotation_of
@@ -89,7 +90,7 @@ def run(core: Relocaliser, arrived: list[Any]) -> list[Report]:
     for one in arrived:
         take(core, *one)
         if core.step():
-            assert core.wait(120)
+            assert core.wait(PATIENCE_S)
             reports.append(core.report(one[2].transforms[0].header.stamp.sec * SECOND))
     return reports
 
@@ -158,7 +159,7 @@ def test_a_frame_waits_for_its_transform_and_no_longer_than_told(ros: SimpleName
         for one in writer.written:
             take(core, *one)
         assert core.step() == 1
-        assert core.wait(60)  # else a later frame may overtake it
+        assert core.wait(PATIENCE_S)  # else a later frame may overtake it
         for t in (0.5, 0.7, 0.85):
             writer.image(t, np.full((6, 8), 1000))
             take(core, *writer.written[-1])
@@ -167,7 +168,7 @@ def test_a_frame_waits_for_its_transform_and_no_longer_than_told(ros: SimpleName
             writer.transforms(t, {("odom", "base_link"): np.eye(4)})
             take(core, *writer.written[-1])
         assert core.step() == 1  # of 0.5, between the two
-        assert core.wait(60)
+        assert core.wait(PATIENCE_S)
         writer.image(1.2, np.full((6, 8), 1000))
         take(core, *writer.written[-1])
         assert core.step() == 0
@@ -279,7 +280,7 @@ def test_odometry_of_its_own_topic_serves_where_tf_has_none(ros: SimpleNamespace
         for one in writer.written:
             take(core, *one)
         assert core.step() == 1
-        assert core.wait(60)
+        assert core.wait(PATIENCE_S)
         report = core.report(ros.start * SECOND)
         np.testing.assert_allclose(report.pose.T_map_odom, ros.transform(-1, 0, 0), atol=1e-12)
         # once tf says the same, odometry is passed over

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
 from sceneprint.cli.demo import serving
 from sceneprint.formats.dataset import (
@@ -122,7 +123,7 @@ def client(
         for space, frames in (("room", walk), ("yard", other)):
             for one in frames:
                 client.upload(MAP, one, meta_of(one, session=space, parent_frame=space))
-        client.wait([one.job_id for one in client.frames(MAP)], timeout_s=240)
+        client.wait([one.job_id for one in client.frames(MAP)], timeout_s=PATIENCE_S)
         yield client
 
 

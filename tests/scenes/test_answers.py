@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.scenes.answer_scene import MANY, ONE, AnswerScene, short_name, space_name
 from sceneprint.scenes.map_scene import evenly_taken, listed_runs, map_runs
@@ -191,7 +192,7 @@ def test_the_map_is_drawn_once_and_where_its_frames_are(client: Client, answer: 
 def unposed(client: Client, walk: tuple[FrameReference, ...]) -> Iterator[str]:
     """A map of a frame without a pose."""
     client.create_map("unposed")
-    client.upload("unposed", walk[0], meta_of(walk[0], with_pose=False), wait_s=120)
+    client.upload("unposed", walk[0], meta_of(walk[0], with_pose=False), wait_s=PATIENCE_S)
     yield "unposed"
     client.delete_map("unposed")
 

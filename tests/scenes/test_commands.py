@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
 from sceneprint.cli.options import stamps_of
 from sceneprint.formats.dataset import Camera, FrameReference
@@ -138,7 +139,7 @@ def halves(client: Client, walk: tuple[FrameReference, ...]) -> Any:
         given = {"matrix": pose.tolist(), "parent_frame": name}
         meta = type(meta).model_validate({**meta.model_dump(), "pose": given})
         client.upload("halves", one, meta)
-    client.wait([one.job_id for one in client.frames("halves")], timeout_s=240)
+    client.wait([one.job_id for one in client.frames("halves")], timeout_s=PATIENCE_S)
     yield T
     client.delete_map("halves")
 

@@ -17,6 +17,7 @@ import pytest
 import rerun_cli
 from rerun.chunk import RrdReader
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, Unreachable
 from sceneprint.scenes.mcap_writer import mcap_file, upright
 from sceneprint.scenes.rerun_writer import check_viewer, rerun_file, rerun_viewer
@@ -273,7 +274,7 @@ def test_a_viewer_gets_what_a_file_would(tmp_path: Path) -> None:
             assert viewer.poll() is None
     finally:
         viewer.terminate()
-        viewer.wait(60)
+        viewer.wait(PATIENCE_S)
 
 
 def _free_port() -> int:

@@ -9,7 +9,6 @@ import signal
 import ssl
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -28,6 +27,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
+from benchmarks.waiting import PATIENCE_S, until
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.settings import Settings
@@ -38,19 +38,6 @@ from service.app import create_app
 BIN = Path(sys.executable).parent
 #: The origin whose pages may ask the server for all tests.
 FLEET = "https://fleet.example"
-#: Processors are few and shared: what takes longer than this does not come.
-PATIENCE_S = 90.0
-
-
-def until(what: Callable[[], Any], seconds: float = PATIENCE_S) -> Any:
-    """The first true value of it."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        found = what()
-        if found:
-            return found
-        time.sleep(0.03)
-    raise AssertionError(f"{what} did not come true within {seconds:g} s")
 
 
 def members(group: int) -> list[int]:
@@ -67,11 +54,6 @@ def members(group: int) -> list[int]:
     return found
 
 
-@pytest.fixture(scope="session", name="until")
-def patience() -> Callable[..., Any]:
-    return until
-
-
 @dataclass
 class Server:
     """A command of ours that serves, with all its children, and what it says."""
@@ -80,7 +62,9 @@ class Server:
     folder: Path
     errors: Path
     url: str = ""
-    client: httpx.Client = field(default_factory=lambda: httpx.Client(timeout=60, trust_env=False))
+    client: httpx.Client = field(
+        default_factory=lambda: httpx.Client(timeout=PATIENCE_S, trust_env=False)
+    )
 
     @property
     def workers(self) -> list[int]:
@@ -193,7 +177,7 @@ def starter(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Server]:
             server.url = line.split()[-1]
             if "tls_cert" in settings:
                 server.client = httpx.Client(
-                    timeout=60, trust_env=False,
+                    timeout=PATIENCE_S, trust_env=False,
                     verify=ssl.create_default_context(cafile=str(settings["tls_cert"])),
                 )  # fmt: skip
             server.client.base_url = httpx.URL(server.url)

@@ -11,6 +11,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
+
 LIMIT = 100_000
 
 
@@ -26,7 +28,7 @@ def narrow(begin, make_map):
 def wire(narrow) -> Iterator[socket.socket]:
     """A connection on which anything can be said."""
     address = httpx.URL(narrow.url)
-    with socket.create_connection((address.host, address.port), timeout=60) as opened:
+    with socket.create_connection((address.host, address.port), timeout=PATIENCE_S) as opened:
         yield opened
 
 
@@ -167,7 +169,7 @@ def test_a_caller_who_hangs_up_leaves_nothing_behind(narrow, wire, small_shots):
     head = post("/v1/maps/hall/frames", f"Content-Type: {X}", f"Content-Length: {len(whole)}")
     wire.sendall(head + whole[: len(whole) // 2])
     wire.close()
-    end = time.monotonic() + 60
+    end = time.monotonic() + PATIENCE_S
     while not [line for line in narrow.log("request") if line["status"] == 499]:
         assert time.monotonic() < end
         time.sleep(0.02)

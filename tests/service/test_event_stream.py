@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import Busy
 from sceneprint.store import Database, open_store
 from sceneprint.store.events import EventRow, Wanted, record_event, remove_events
@@ -43,7 +44,7 @@ async def gather(batches: AsyncIterator[Batch], count: int) -> list[int]:
     """The numbers of so many events, as they come."""
     found: list[int] = []
     while len(found) < count:
-        batch = await asyncio.wait_for(anext(batches), 30)
+        batch = await asyncio.wait_for(anext(batches), PATIENCE_S)
         assert not batch[0] or batch[1] >= batch[0][-1].number
         found += ids(batch)
     return found
@@ -156,7 +157,7 @@ def test_events_of_others_are_no_reason_to_go_on(database, monkeypatch):
                 await asyncio.sleep(0.02)
 
         others = asyncio.create_task(busy())
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(PATIENCE_S):
             found = [batch async for batch in feed.batches(wanted, None, twice)]
         others.cancel()
         return found
@@ -182,7 +183,7 @@ def test_there_are_so_many_places_and_all_end_together(database):
             waiting.append(asyncio.ensure_future(anext(stream, None)))
         await asyncio.sleep(0.05)
         feed.close()
-        assert await asyncio.wait_for(asyncio.gather(*waiting), 5) == [None, None]
+        assert await asyncio.wait_for(asyncio.gather(*waiting), PATIENCE_S) == [None, None]
         feed.leave()
         with pytest.raises(Busy):  # a service that stops takes none
             feed.join()

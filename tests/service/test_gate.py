@@ -7,6 +7,7 @@ import threading
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import Busy
 from service.limits import Gate
 
@@ -17,7 +18,7 @@ def test_who_waits_too_long_is_sent_away_and_nothing_of_it_is_begun():
 
     def work(name: str) -> str:
         begun.append(name)
-        assert done.wait(30)
+        assert done.wait(PATIENCE_S)
         return name
 
     async def test() -> None:
@@ -42,14 +43,14 @@ def test_who_hangs_up_while_it_waits_leaves_no_turn_behind():
 
     async def test() -> None:
         gate = Gate(1, 5, longest_s=30)
-        first = asyncio.create_task(gate.run(lambda: done.wait(30)))
+        first = asyncio.create_task(gate.run(lambda: done.wait(PATIENCE_S)))
         await asyncio.sleep(0.05)
         second = asyncio.create_task(gate.run(lambda: True))
         await asyncio.sleep(0.05)
         second.cancel()
         done.set()
         assert await first is True
-        assert await asyncio.wait_for(gate.run(lambda: "third"), 30) == "third"
+        assert await asyncio.wait_for(gate.run(lambda: "third"), PATIENCE_S) == "third"
         with pytest.raises(asyncio.CancelledError):
             await second
 

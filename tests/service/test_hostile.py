@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import doctor
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
@@ -314,7 +315,7 @@ def test_workers_and_doctor_say_that_a_folder_is_read_only(sealed, stored):
     before = contents(stored)
     given = os.environ | {"SCENEPRINT_WORKERS": "1"}
     done = subprocess.run(
-        sealed("work"), env=given, capture_output=True, text=True, timeout=90, check=False
+        sealed("work"), env=given, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert (done.returncode, done.stdout) == (2, "")
     warning, line = done.stderr.splitlines()
@@ -322,7 +323,9 @@ def test_workers_and_doctor_say_that_a_folder_is_read_only(sealed, stored):
     assert "every user of this machine may read the data folder" in warning
     assert line.startswith("sceneprint work: ")
     assert "is read-only: it is read, and nothing can be stored" in line
-    done = subprocess.run(sealed("doctor"), capture_output=True, text=True, timeout=90, check=False)
+    done = subprocess.run(
+        sealed("doctor"), capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert done.returncode == 2
     (line,) = [one for one in done.stdout.splitlines() if one.startswith("WRONG")]
     assert "is read-only" in line

@@ -7,6 +7,7 @@ import socket
 import httpx
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint_client.api.base import is_loopback
 
 HERE = ["localhost", "LocalHost", "127.0.0.1", "127.8.9.10", "[::1]", "[0:0:0:0:0:0:0:1]"]
@@ -56,7 +57,7 @@ def test_a_page_makes_nothing_and_its_body_is_not_waited_for(served, refused):
     refused(served.client.get("/v1/maps/stolen"), 404, "unknown-map")
     address = httpx.URL(served.url)
     head = b"POST /v1/maps HTTP/1.1\r\nHost: evil.example\r\nContent-Length: 99\r\n\r\n"
-    with socket.create_connection((address.host, address.port), timeout=60) as wire:
+    with socket.create_connection((address.host, address.port), timeout=PATIENCE_S) as wire:
         wire.sendall(head)  # and nothing of the body
         assert wire.recv(65536).startswith(b"HTTP/1.1 421 ")
 
@@ -99,7 +100,7 @@ def test_a_page_of_this_machine_that_says_who_it_is_may_ask(served):
 
 def test_an_old_client_that_names_no_host_is_no_browser(served):
     address = httpx.URL(served.url)
-    with socket.create_connection((address.host, address.port), timeout=60) as wire:
+    with socket.create_connection((address.host, address.port), timeout=PATIENCE_S) as wire:
         wire.sendall(b"GET /healthz HTTP/1.0\r\n\r\n")
         assert wire.recv(65536).startswith(b"HTTP/1.1 200 ")
 

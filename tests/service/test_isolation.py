@@ -15,6 +15,7 @@ from typing import Any
 import httpx
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint_client.api import NewMap
@@ -530,7 +531,7 @@ def test_without_a_key_no_body_is_waited_for(walled, there, operations):
         head = f"{given['method']} {given['path']} HTTP/1.1\r\nHost: localhost\r\n"
         if "requestBody" in operations[operation]:
             head += "Content-Type: application/json\r\nContent-Length: 99\r\n"
-        with socket.create_connection((url.host, url.port), timeout=60) as wire:
+        with socket.create_connection((url.host, url.port), timeout=PATIENCE_S) as wire:
             wire.sendall(f"{head}\r\n".encode())
             assert wire.recv(12) == b"HTTP/1.1 401", operation
 

@@ -13,6 +13,7 @@ from anyio import fail_after, to_thread
 from fastapi.security import HTTPAuthorizationCredentials
 from starlette.requests import Request
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
 from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import list_keys
@@ -34,7 +35,9 @@ COMMAND = Path(sys.executable).parent / "sceneprint"
 
 def make(folder: Path, name: str) -> subprocess.CompletedProcess[str]:
     arguments = [COMMAND, "keys", "--create", name, "--data", folder]
-    return subprocess.run(arguments, capture_output=True, text=True, timeout=90, check=False)
+    return subprocess.run(
+        arguments, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ import httpx
 import pytest
 from sqlalchemy.exc import OperationalError
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint_client.api import NewMap
@@ -39,7 +40,7 @@ class Uploader(threading.Thread):
         self.statuses: list[int] = []
 
     def run(self) -> None:
-        with httpx.Client(timeout=30, trust_env=False) as client:
+        with httpx.Client(timeout=PATIENCE_S, trust_env=False) as client:
             for number, form in enumerate(self.forms):
                 self.leave.acquire()
                 while not self.sent(client, number, form):

@@ -11,6 +11,7 @@ from datetime import datetime
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
@@ -216,7 +217,7 @@ sys.exit(cli.main(["serve", "--port", "0", "--data", sys.argv[1]]))
 def test_a_service_whose_workers_cannot_start_ends_with_the_reason(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", UNPREPARED, str(tmp_path)],
-        capture_output=True, text=True, timeout=90,
+        capture_output=True, text=True, timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.returncode == 2
     assert done.stdout.startswith("sceneprint: serving http://")

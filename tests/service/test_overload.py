@@ -10,6 +10,8 @@ from contextlib import ExitStack
 import httpx
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
+
 
 @pytest.fixture(scope="module")
 def busy(begin, make_map, small_shots):
@@ -89,7 +91,7 @@ def test_who_hangs_up_while_waiting_has_sent_a_frame_nevertheless(busy, until, s
     lines = [f"POST {request.url.path} HTTP/1.1".encode()]
     lines += [key + b": " + value for key, value in request.headers.raw]
     before = {one["frame_id"] for one in busy.client.get("/v1/maps/hall/frames").json()["items"]}
-    with socket.create_connection((request.url.host, request.url.port), timeout=60) as wire:
+    with socket.create_connection((request.url.host, request.url.port), timeout=PATIENCE_S) as wire:
         wire.sendall(b"\r\n".join(lines) + b"\r\n\r\n" + request.read())
 
         def came() -> set[str]:
@@ -118,7 +120,9 @@ def test_slow_uploads_hold_their_places_for_a_while_and_no_queries(busy, small_s
     with ExitStack() as opened:
         wires = []
         for _ in range(2):
-            wire = socket.create_connection((request.url.host, request.url.port), timeout=60)
+            wire = socket.create_connection(
+                (request.url.host, request.url.port), timeout=PATIENCE_S
+            )
             wires.append(opened.enter_context(wire))
             wire.sendall(whole[: len(whole) // 2])
         answers = [busy.client.post("/v1/maps/hall/frames", **small_shots[21].form())]

@@ -11,6 +11,7 @@ from datetime import UTC, datetime, timedelta
 import httpx
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest
 from sceneprint.settings import Settings
 from service.auth import AGAIN_S, ALL_AT_ONCE, AT_ONCE, RefusalFilter
@@ -193,7 +194,7 @@ def test_no_body_is_waited_for_of_who_asks_too_often(held):
         f"Authorization: Bearer {held.secrets['robot']}\r\n\r\n"
     ).encode()
     for _ in range(2):  # the second comes too soon, whatever came before
-        with socket.create_connection((url.host, url.port), timeout=60) as wire:
+        with socket.create_connection((url.host, url.port), timeout=PATIENCE_S) as wire:
             wire.sendall(head)
             if wire.recv(12) == b"HTTP/1.1 429":
                 return
@@ -213,7 +214,9 @@ def test_one_key_does_not_take_every_place(walled, refused, until):
     with ExitStack() as held:
 
         def hold() -> None:
-            wire = held.enter_context(socket.create_connection((url.host, url.port), timeout=60))
+            wire = held.enter_context(
+                socket.create_connection((url.host, url.port), timeout=PATIENCE_S)
+            )
             wire.sendall(head)
 
         def full() -> bool:

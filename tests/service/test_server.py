@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import UnusableStore
 from sceneprint.settings import Settings
 from sceneprint_client import Client
@@ -41,7 +42,7 @@ def test_by_two_settings_the_service_speaks_https(begin, certificate, monkeypatc
     port = server.client.base_url.port
     with pytest.raises(Unreachable, match=r"not trusted here .* set SSL_CERT_FILE"):
         Client(server.url).status()
-    with socket.create_connection(("127.0.0.1", port), timeout=60) as wire:
+    with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as wire:
         wire.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert not wire.recv(1 << 16).startswith(b"HTTP")
     monkeypatch.setenv("SSL_CERT_FILE", str(cert))
@@ -50,7 +51,7 @@ def test_by_two_settings_the_service_speaks_https(begin, certificate, monkeypatc
         command = str(Path(sys.executable).with_name("sceneprint"))
         done = subprocess.run(
             [command, "maps", "--url", f"https://localhost:{port}"],
-            capture_output=True, text=True, timeout=90, check=False,
+            capture_output=True, text=True, timeout=PATIENCE_S, check=False,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         assert server.end(signal.SIGTERM) == 0

@@ -16,6 +16,7 @@ from sqlalchemy import select
 from starlette.applications import Starlette
 
 import service
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import create_tenant
 from sceneprint.errors import RateLimited
@@ -71,7 +72,9 @@ def test_keys_of_a_tenant_share_its_streams_and_leave_some_to_others(shared, unt
     url = httpx.URL(shared.server.url)
 
     def listen(key: str, stack: ExitStack) -> bytes:
-        wire = stack.enter_context(socket.create_connection((url.host, url.port), timeout=60))
+        wire = stack.enter_context(
+            socket.create_connection((url.host, url.port), timeout=PATIENCE_S)
+        )
         wire.sendall(
             "GET /v1/events HTTP/1.1\r\nHost: localhost\r\nAccept: text/event-stream\r\n"
             f"Authorization: Bearer {shared.secrets[key]}\r\n\r\n".encode()
@@ -175,7 +178,7 @@ def test_who_rested_gets_its_turn_though_nobody_asks_meanwhile():
             await asyncio.sleep(0)
         turns.release("a")
         released = clock()
-        assert await asyncio.wait_for(turns.acquire("a"), 30) == 1
+        assert await asyncio.wait_for(turns.acquire("a"), PATIENCE_S) == 1
         return clock() - released
 
     assert asyncio.run(test()) >= 0.05
@@ -194,7 +197,7 @@ def test_everybody_gets_a_turn_however_the_rests_fall():
                 done += 1
 
         asking = (ask(tenant, number) for tenant in "ab" for number in range(4))
-        await asyncio.wait_for(asyncio.gather(*asking), 60)
+        await asyncio.wait_for(asyncio.gather(*asking), PATIENCE_S)
         return done
 
     assert asyncio.run(test()) == 800
@@ -209,11 +212,13 @@ def test_who_gives_up_takes_no_turn():
         await asyncio.sleep(0)
         gone.cancel()
         turns.release("a")
-        assert await asyncio.wait_for(next_one, 30) == 1
+        assert await asyncio.wait_for(next_one, PATIENCE_S) == 1
         with pytest.raises(asyncio.CancelledError):
             await gone
         turns.release("c")
-        assert await asyncio.wait_for(turns.acquire("b", 9), 30) == 1  # no more than there are
+        assert (
+            await asyncio.wait_for(turns.acquire("b", 9), PATIENCE_S) == 1
+        )  # no more than there are
 
     asyncio.run(test())
 

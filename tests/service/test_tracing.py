@@ -14,6 +14,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
 
+from benchmarks.waiting import PATIENCE_S
+
 TRACE, PARENT = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
 
 
@@ -152,7 +154,7 @@ def test_without_opentelemetry_nothing_starts_and_it_says_what_to_install(packag
     settings = {"SCENEPRINT_DATA_DIR": f"{tmp_path}", "SCENEPRINT_TRACES_URL": "http://127.0.0.1:1"}
     done = subprocess.run(
         [sys.executable, "-c", code], env=os.environ | settings, capture_output=True, text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
     )  # fmt: skip
     (line,) = done.stderr.splitlines()
     assert (done.returncode, done.stdout) == (2, "")

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, event, update
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.store import Store, open_database, open_store, queue
 from sceneprint.store.maps import add_frame, add_map, keep_model
 from sceneprint.store.tables import FrameRow, JobRow, MapRow, jobs
@@ -47,7 +48,7 @@ for line in sys.stdin:
     ]
     for child in children:
         child.start()
-    results = dict(told.get(timeout=60) for _ in children)
+    results = dict(told.get(timeout=240) for _ in children)
     for child in children:
         child.join()
     print(json.dumps([results[i] for i in range(count)]), flush=True)
@@ -72,7 +73,7 @@ def race() -> Iterator[Callable[..., list[Any]]]:
         return found
 
     yield run
-    nursery.communicate(timeout=60)
+    nursery.communicate(timeout=PATIENCE_S)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

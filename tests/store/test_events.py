@@ -44,8 +44,8 @@ from sceneprint.engine.admin.operations import next_events
 import time
 
 def read(store):
-    seen, place, until = [], 0, time.monotonic() + 60
-    while len(seen) < int(ARGS[2]) and time.monotonic() < until:
+    seen, place = [], 0
+    while len(seen) < int(ARGS[2]):
         found, place, _ = next_events(store.database, Wanted(), place, 5)
         seen += [(one.number, one.frame_id) for one in found]
     return seen

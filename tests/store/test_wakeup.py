@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.store import wakeup
 from sceneprint.store.wakeup import Wakeup
 
@@ -37,7 +38,7 @@ def test_all_who_wait_are_woken(ours: Wakeup) -> None:
             thread.start()
         ours.ring()
         for thread in threads:
-            thread.join(60)
+            thread.join(PATIENCE_S)
         assert rung == [True, True]
 
 

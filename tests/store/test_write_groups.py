@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, event, func, select
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.ingest.write_groups import MOST_TOGETHER, Grouping, _Group, _Waiting
 from sceneprint.errors import FrameConflict, LostLease, StoreFull
 from sceneprint.process import of_request, request_id
@@ -53,7 +54,7 @@ def together(
 
 
 def until_waiting(group: _Group[Any], count: int) -> None:
-    end = time.monotonic() + 60
+    end = time.monotonic() + PATIENCE_S
     while len(group._waiting) < count:
         assert time.monotonic() < end
         time.sleep(0.001)
@@ -187,10 +188,10 @@ def test_ctrl_c_of_who_leads_and_of_one_that_it_took_ends_both_alone(
     class Interrupted(_Group[str]):
         def _write_together(self, taken: list[_Waiting[str]]) -> None:
             entered.set()
-            assert taken_by_now.wait(60)
+            assert taken_by_now.wait(PATIENCE_S)
             self._take(taken)
             leave.set()
-            waiter.join(60)
+            waiter.join(PATIENCE_S)
             raise KeyboardInterrupt
 
     class Leaving(_Waiting[str]):
@@ -199,7 +200,7 @@ def test_ctrl_c_of_who_leads_and_of_one_that_it_took_ends_both_alone(
             monkeypatch.setattr(self.told, "wait", self.leave)
 
         def leave(self) -> None:
-            assert leave.wait(60)
+            assert leave.wait(PATIENCE_S)
             raise KeyboardInterrupt
 
     def run(name: str) -> None:
@@ -209,10 +210,10 @@ def test_ctrl_c_of_who_leads_and_of_one_that_it_took_ends_both_alone(
     group = Interrupted()
     leader, waiter = (threading.Thread(target=run, args=(name,)) for name in ("leader", "waiter"))
     leader.start()
-    assert entered.wait(60)
+    assert entered.wait(PATIENCE_S)
     monkeypatch.setattr("sceneprint.engine.ingest.write_groups._Waiting", Leaving)
     waiter.start()
     until_waiting(group, 2)
     taken_by_now.set()
-    leader.join(60)
+    leader.join(PATIENCE_S)
     assert (group._led, group._waiting) == (False, [])

@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.lab.synth import KINECT, SynthRoom, render, synthesise_room
 from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.types import Intrinsics
@@ -31,7 +32,7 @@ def test_the_same_seed_gives_the_same_bytes_in_any_process():
         "print(t.digest(t.synthesise_room(11, 4, 3, intrinsics=t.SMALL)))"
     )
     there = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=PATIENCE_S
     )
     assert there.stdout.strip() == here
 

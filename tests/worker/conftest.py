@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
@@ -17,22 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S, until
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.settings import Settings
 from sceneprint_client.api import Added, CameraIntrinsics, FrameMeta, NewMap
 
 LEASE_S = 1.5  # a busy machine renews one late at times
-
-
-def until(what: Callable[[], Any], seconds: float = 90) -> Any:
-    """The first true value of it."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if found := what():
-            return found
-        time.sleep(0.02)
-    raise AssertionError("it did not come true")
 
 
 @dataclass
@@ -59,11 +49,6 @@ class Crew:
     def settled(self, map_name: str, count: int) -> None:
         """Wait until all frames of a map are indexed."""
         until(lambda: self.engine.get_map(map_name).frames == {"indexed": count})
-
-    @staticmethod
-    def until(what: Callable[[], Any], seconds: float = 90) -> Any:
-        """The first true value of it."""
-        return until(what, seconds)
 
     def job(self, job_id: str, columns: str) -> tuple[Any, ...]:
         (row,) = self.rows(f"SELECT {columns} FROM jobs WHERE id = '{job_id}'")
@@ -140,7 +125,7 @@ def crew(hire) -> Iterator[Crew]:
     with hire([f"{Path(sys.executable).parent}/sceneprint", "work"], lease_s=LEASE_S) as crew:
         yield crew
         crew.process.terminate()
-        assert crew.process.wait(60) == 0
+        assert crew.process.wait(PATIENCE_S) == 0
         assert len(crew.log("worker stopped")) == 2
         assert crew.log("worker died") == []
 

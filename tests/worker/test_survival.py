@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S, until
 from sceneprint.engine import Engine
 from sceneprint_client.api import FrameMeta, NewMap
 
@@ -76,7 +77,7 @@ def test_a_frame_that_ends_its_worker_is_given_up_and_costs_no_other(crew, frame
     bad = {what: add_marked(crew.engine, frames[i], what) for i, what in enumerate(MARKS)}
     good = [crew.engine.add_frame("hall", *one)[0].job_id for one in frames[8:20]]
     ended = {"failed": 4, "indexed": 12}  # eight workers later, on a machine that is busy
-    crew.until(lambda: crew.engine.get_map("hall").frames == ended, 300)
+    until(lambda: crew.engine.get_map("hall").frames == ended, 2 * PATIENCE_S)
     jobs: dict[str, Any] = {what: crew.engine.get_job(job) for what, job in bad.items()}
     assert {(job.state, job.attempts) for job in jobs.values()} == {("dead", 2)}
     for what, job in jobs.items():
@@ -89,7 +90,7 @@ def test_a_frame_that_ends_its_worker_is_given_up_and_costs_no_other(crew, frame
     assert jobs["broken"].error == "ZeroDivisionError: a bug"
     # the others did not notice: none was tried twice, and nobody died but of the frames at fault
     assert {crew.job(job, "state, attempts, failures") for job in good} == {("succeeded", 1, 0)}
-    crew.until(lambda: len(crew.log("worker replaced")) == 4)
+    until(lambda: len(crew.log("worker replaced")) == 4)
     died = [line["job_id"] for line in crew.log("worker died")]
     assert sorted(died) == sorted(2 * [bad["crashing"], bad["hanging"]])
     assert crew.log("lease lost") == []
@@ -99,9 +100,9 @@ def test_a_frame_that_ends_its_worker_is_given_up_and_costs_no_other(crew, frame
 def test_a_worker_that_does_not_stop_gives_its_job_back(crew, frames):
     before = len(crew.log("hanging"))
     job = add_marked(crew.engine, frames[20], "hanging")
-    crew.until(lambda: len(crew.log("hanging")) > before)  # claimed alone, it would be put back
+    until(lambda: len(crew.log("hanging")) > before)  # claimed alone, it would be put back
     crew.process.terminate()
-    assert crew.process.wait(60) == 0
+    assert crew.process.wait(PATIENCE_S) == 0
     assert crew.pid(job) in [line["pid"] for line in crew.log("worker does not stop")]
     assert crew.job(job, "state, attempts, failures, leased_until") == ("queued", 1, 0, None)
     assert crew.engine.get_frame("hall", crew.engine.get_job(job).frame_id).state == "received"
@@ -112,8 +113,8 @@ def test_waiting_workers_leave_with_the_one_who_started_them(hire, script, alive
         pids = [int(line["worker"].rpartition(":")[2]) for line in crew.log("worker ready")]
         assert [alive(pid) for pid in pids] == [True, True]
         crew.process.send_signal(signal.SIGKILL)
-        crew.process.wait(60)
-        crew.until(lambda: not any(alive(pid) for pid in pids))
+        crew.process.wait(PATIENCE_S)
+        until(lambda: not any(alive(pid) for pid in pids))
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,7 @@ import re
 import signal
 import time
 
+from benchmarks.waiting import PATIENCE_S, until
 from sceneprint_client.api import NewMap
 
 
@@ -41,7 +42,7 @@ def test_frames_of_a_greater_priority_are_signed_first(crew, frames):
 def test_a_database_that_vanishes_for_a_moment_is_waited_for(crew, frames):
     crew.engine.create_map(NewMap(name="shaken", model="depth"))
     crew.change("ALTER TABLE jobs RENAME TO away")
-    crew.until(lambda: len(crew.log("store unreachable")) >= 2)
+    until(lambda: len(crew.log("store unreachable")) >= 2)
     crew.change("ALTER TABLE away RENAME TO jobs")
     for one in frames[32:36]:
         crew.engine.add_frame("shaken", *one)
@@ -55,9 +56,7 @@ def test_a_job_that_takes_many_leases_is_kept_by_its_worker(crew, slow):
     job = slow("patient", 40)
     holder, job_id = crew.pid(job.added.job_id), job.added.job_id
     (first,) = crew.job(job_id, "leased_until")
-    crew.until(
-        lambda: crew.job(job_id, "leased_until")[0] > first + 4 * crew.engine.settings.lease_s
-    )
+    until(lambda: crew.job(job_id, "leased_until")[0] > first + 4 * crew.engine.settings.lease_s)
     assert crew.job(job_id, "state, attempts, token") == ("running", 1, 1)
     job.give()
     crew.settled("patient", 1)
@@ -82,7 +81,7 @@ def test_a_worker_that_wakes_up_late_stores_nothing(crew, slow, frames):
         )
     finally:
         os.kill(sleeper, signal.SIGCONT)  # opens the file once more, and finds the mended one
-    (lost,) = crew.until(lambda: [one for one in crew.log("lease lost") if one["job_id"] == job_id])
+    (lost,) = until(lambda: [one for one in crew.log("lease lost") if one["job_id"] == job_id])
     assert (lost["attempt"], lost["level"]) == (1, "warning")
     assert crew.job(job_id, "state, attempts, token") == ("succeeded", 2, 2)
     assert crew.pid(job_id) == other
@@ -98,7 +97,7 @@ def test_a_frame_deleted_while_it_is_signed_stays_deleted(crew, slow):
     job = slow("gone", 43)
     crew.engine.delete_frame("gone", job.added.frame_id)
     job.give()
-    crew.until(lambda: [o for o in crew.log("lease lost") if o["job_id"] == job.added.job_id])
+    until(lambda: [o for o in crew.log("lease lost") if o["job_id"] == job.added.job_id])
     assert crew.engine.get_map("gone").frames == {"deleted": 1}
     assert crew.engine.get_job(job.added.job_id).state == "cancelled"
     assert crew.signed("gone") == []
@@ -116,6 +115,6 @@ def test_told_to_stop_workers_give_back_what_they_have_not_begun(crew, frames):
         time.sleep(1)
         crew.process.terminate()  # before they do: it replaces nobody from now on
         crew.send(signal.SIGTERM)
-    assert crew.process.wait(60) == 0
+    assert crew.process.wait(PATIENCE_S) == 0
     assert crew.job(added.job_id, "state, attempts, leased_until") == ("queued", 0, None)
     assert crew.engine.get_frame("stopped", added.frame_id).state == "received"

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
 from sceneprint.cli.demo import serving
 from sceneprint_client import Client
@@ -128,7 +129,7 @@ def test_beside_a_service_nothing_is_lost(house: Any, uploads: Any) -> None:
         assert ended == [(0, "")] * 2
         # what may be found is a blob before its commit, or after its frame was deleted
         assert {one["kind"] for one in found} <= {"unreferenced-blob"}
-        client.wait([job for job, _ in kept.values()], timeout_s=300)
+        client.wait([job for job, _ in kept.values()], timeout_s=PATIENCE_S)
         assert client.map("busy").frames == {"deleted": deleted, "indexed": len(kept)}
     for frame, (_, data) in kept.items():
         ((blob,),) = house.sql("SELECT blob FROM frames WHERE id = ?", frame)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import write_depth_png
@@ -127,7 +128,7 @@ def rows() -> Callable[..., list[tuple[Any, ...]]]:
     """Ask a data folder's database."""
 
     def ask(folder: Path, asked: str) -> list[tuple[Any, ...]]:
-        with closing(sqlite3.connect(folder / "sceneprint.db", timeout=30)) as database:
+        with closing(sqlite3.connect(folder / "sceneprint.db", timeout=PATIENCE_S)) as database:
             found = database.execute(asked).fetchall()
             database.commit()
             return found

@@ -19,6 +19,7 @@ import pytest
 from pydantic import SecretStr
 from sqlalchemy import insert
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
 from sceneprint.errors import DamagedSnapshot, SnapshotError, UnknownSnapshot, UnusableStore
@@ -181,7 +182,7 @@ def test_killed_half_way_it_can_be_restored_again(archive, postgres_url, tmp_pat
             env=os.environ | said,
         )
         waits = "SELECT count(*) FROM pg_locks WHERE NOT granted AND locktype = 'relation'"
-        until = time.monotonic() + 60
+        until = time.monotonic() + PATIENCE_S
         while holder.execute(waits).fetchone() == (0,) and time.monotonic() < until:
             assert process.poll() is None
             time.sleep(0.05)

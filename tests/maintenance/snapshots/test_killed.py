@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.maintenance.snapshot.restoration import restore_snapshot, verify_snapshot
 
@@ -64,7 +65,7 @@ def killed(what: str, source: Path, folder: Path) -> Iterator[list[int]]:
             waited = time.monotonic()
             first = (folder / f"{life}-0", folder / f"{life}-0.tar")
             while not any(path.exists() for path in first):  # it has begun, and goes on
-                assert time.monotonic() - waited < 60
+                assert time.monotonic() - waited < PATIENCE_S
                 time.sleep(0.002)
             time.sleep(delays.uniform(0, 0.15))
             nursery.stdin.write("die\n")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
 from sceneprint.cli.demo import serving
 from sceneprint.lab.synth import SynthRoom
@@ -46,7 +47,7 @@ def upload(client: Client, views: tuple[DepthFrame, ...]) -> None:
     for view in views:
         pose = GivenPose(parent_frame="room", matrix=np.array(view.pose).tolist())
         meta = FrameMeta(intrinsics=camera_of(view), session="s", pose=pose)
-        assert client.upload(MAP, view.depth, meta, wait_s=400).state == "indexed"
+        assert client.upload(MAP, view.depth, meta, wait_s=PATIENCE_S).state == "indexed"
 
 
 def answers(client: Client, views: tuple[DepthFrame, ...]) -> list[dict[str, Any]]:
@@ -79,11 +80,11 @@ def test_a_copy_answers_as_the_service_did_and_is_renewed(
         assert main(pull) == 2
         assert "keeps no snapshot" in capsys.readouterr().err
         upload(client, walk[:14:2])
-        first = client.take_snapshot(wait_s=400)
+        first = client.take_snapshot(wait_s=PATIENCE_S)
         online, tracked = answers(client, (*walk[3:10:2], nowhere)), states(client, walk[3:10:2])
         assert main(pull) == 0
         upload(client, walk[14:15])
-        client.take_snapshot(wait_s=400)
+        client.take_snapshot(wait_s=PATIENCE_S)
         capsys.readouterr()
         second = [path.name for path in copy.parent.iterdir()]
         renewed = answers(client, (walk[15], nowhere))
@@ -119,7 +120,7 @@ def test_a_copy_answers_as_the_service_did_and_is_renewed(
             assert sum(1 for _ in offline.frames(MAP)) == 8
             upload(offline, walk[16:17])
         with Client(url) as client:
-            client.take_snapshot(wait_s=400)
+            client.take_snapshot(wait_s=PATIENCE_S)
         assert main(pull) == 0
         aside = Path(capsys.readouterr().err.strip().splitlines()[-1].rpartition(": ")[2])
         with Client.embedded(aside) as offline:  # what a robot added is never thrown away

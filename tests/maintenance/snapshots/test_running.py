@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
 from sceneprint.maintenance.snapshot.creation import take_snapshot
@@ -38,7 +39,7 @@ class Robot(threading.Thread):
         import httpx
 
         try:
-            with httpx.Client(base_url=self.url, timeout=60, trust_env=False) as client:
+            with httpx.Client(base_url=self.url, timeout=PATIENCE_S, trust_env=False) as client:
                 while not self.over.is_set():
                     self.round(client)
         except Exception as error:
@@ -81,7 +82,7 @@ def test_it_holds_one_state_and_all_of_it(data, tmp_path, uploads, rows, answers
     with serving(data, 1) as url:
         with Client(url) as client:
             client.create_map("busy", model="depth")
-            client.wait([row[0] for row in rows(data, "SELECT id FROM jobs")], timeout_s=60)
+            client.wait([row[0] for row in rows(data, "SELECT id FROM jobs")], timeout_s=PATIENCE_S)
         with at_work(url, uploads[6:]) as robots:
             began, ended = [], []
             for path in archives:
