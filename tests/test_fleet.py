@@ -182,7 +182,7 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
         "plan": Plan(), "kills": Counter(service=2, primary=1),
         "outages": {"service": [1.25, 0.0], PRIMARY: [3.0]},
         "promotions": [Promotion(None, 10.0, 11.5, {"a": 0.5, "b": 2.0}, frozenset())],
-        "steps": (), "refused": Counter(), "waits_ms": {"query": (90.0, 1200.0)},
+        "waits_ms": {"query": (90.0, 1200.0)},
         "memory": (200_000_000, 100_000_000),
         "answers": Counter(found=3), "repeated": 4, "faults": [], "damaged": 0, "leftovers": 0,
         "lost": 0, "window": 0, "seconds": 99.0, "spooled": 0, "spooled_twice": 0,

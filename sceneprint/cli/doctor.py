@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
@@ -388,7 +389,7 @@ def _replica(url: str, settings: Settings) -> Check:
 
 #: The oldest SQLite with all that the store asks for (UPDATE ... RETURNING).
 OLDEST_SQLITE = (3, 35, 0)
-#: What open3d loads of the system, and the Debian packages that bring it.
+#: System libraries that open3d loads, and the Debian packages that contain them.
 OPEN3D_LIBRARIES = {
     "libGL.so.1": "libgl1",
     "libEGL.so.1": "libegl1",
@@ -537,6 +538,9 @@ def _embree() -> Check:
 
 
 def _open3d() -> Check:
+    needed = "only reconstructions and baselines need it"
+    if find_spec("open3d") is None:
+        return Check("note", "open3d", f"not installed; {needed}: pip install open3d")
     missing = []
     for library, package in OPEN3D_LIBRARIES.items():
         try:
@@ -545,9 +549,9 @@ def _open3d() -> Check:
             missing.append(package)
     if missing:
         packages = " ".join(missing)
-        text = f"only reconstructions and benchmarks need them: apt-get install {packages}"
-        return Check("note", "open3d libraries", text)
-    return Check("ok", "open3d libraries", "installed")
+        text = f"lacks system libraries; {needed}: apt-get install {packages}"
+        return Check("note", "open3d", text)
+    return Check("ok", "open3d", "installed, with its system libraries")
 
 
 def _may_write(folder: Path) -> bool:
