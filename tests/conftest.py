@@ -19,6 +19,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import hypothesis
 import numpy as np
 import pytest
 from sqlalchemy import Connection, NullPool, create_engine
@@ -78,6 +79,12 @@ THOROUGH_S = 1800
 ON_POSTGRES = os.environ.get("SCENEPRINT_TEST_DATABASE") == "postgresql"
 #: The database that new ones of a test are copied from.
 TEMPLATE = "sceneprint_template"
+#: Property tests draw the same examples every time, and have no deadline that load can reach.
+hypothesis.settings.register_profile(
+    "suite", derandomize=True, deadline=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)  # fmt: skip
+hypothesis.settings.load_profile("suite")
 #: What makes a folder of that name by calling that function.
 Once = Callable[[str, Callable[[Path], object]], Path]
 
