@@ -44,7 +44,7 @@ from sceneprint.engine.sessions.session_differences import (
 )
 from sceneprint.engine.signers import Signers, warm
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
-from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
+from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.engine.upkeep.purge import Purging, Retention
 from sceneprint.errors import ModelError
 from sceneprint.geometry.kernel import Cores
@@ -114,8 +114,7 @@ class Engine:
         self._shared = open_shared(self.store, settings)
         self._upkeep = Upkeep(self.store, self.signers, settings, self._shared)
         self._reencoding = Reencodings(self.store, self._upkeep)
-        self._readers = Readers(self.signers, settings.indexes, settings.search, self._shared)
-        self._vector_tables = VectorTables(self.signers, settings.search)
+        self._readers = Readers(self.signers, settings.indexes, self._shared)
         answers = open_answers(self.store.blobs, settings.query_dir)
         self.query_log = QueryLog(self.store, answers, settings)
         self.inspection = Inspection(self.store, self.signers, self.query_log)
@@ -390,7 +389,6 @@ class Engine:
         self._reencoding.run()
         self.retiring.run()
         published = self._upkeep.run()
-        self._vector_tables.run()
         self.operations.tidy()
         self.audit.tidy()
         self.query_log.tidy()
