@@ -21,15 +21,15 @@ ENV PIP_NO_CACHE_DIR=1 \
 WORKDIR /src
 
 # What changes seldom first, so that a change of code installs no dependency anew.
-COPY requirements-image.lock ./
+COPY requirements.lock ./
 
 # Every file that is installed has a hash in the lock, or pip refuses it.
-# Without open3d: 0.9 GB with what it brings, and it wants libGL, libX11 and libusb. Only benchmarks,
-# which are not in the image, and reconstructions load it (an import contract in pyproject.toml keeps
-# that true): here those fail, and name what is missing. All else works.
+# The lock leaves open3d out: it takes 0.9 GB with its own dependencies, and needs libGL, libX11 and
+# libusb. Only reconstructions and baselines load it (an import contract in pyproject.toml ensures
+# that), and they say what to install.
 # Without pip in the environment: the final stage installs nothing.
 RUN python -m venv --without-pip /opt/sceneprint && \
-    python -m pip --python /opt/sceneprint install --quiet --require-hashes --requirement requirements-image.lock
+    python -m pip --python /opt/sceneprint install --quiet --require-hashes --requirement requirements.lock
 
 COPY pyproject.toml README.md LICENSE ./
 COPY client client/

@@ -3,10 +3,11 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
+# What running needs is installed; development's packages are as well.
+RUNTIME := $(VENV)/.runtime
+STAMP := $(VENV)/.development
 # Tools of the supply chain, apart: what they need must not move what we run.
 TOOLS := $(VENV)/tools
-PIP := python -m pip install --quiet --disable-pip-version-check
 # Our kernels want one thread each; more processes, not more threads, use more processors.
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
@@ -16,13 +17,14 @@ unexport PYTHONDONTWRITEBYTECODE
 export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
 	'import os; print(2 * len(os.sched_getaffinity(0)))')
 
-.PHONY: help demo test pytest test-thorough test-postgres lint kernels bytecode goldens format bench screenshots docs \
-	docs-serve soak siege fleet models lock sbom advisories dist clean
+.PHONY: help demo test pytest test-thorough test-portable test-postgres lint kernels bytecode goldens format bench \
+	screenshots docs docs-serve soak siege fleet models lock sbom advisories dist clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
 	@echo "make test    lint, types, import contracts and the tests"
 	@echo "make test-thorough  tests that make test leaves out, as they take minutes or seldom fail"
+	@echo "make test-portable  numeric tests as other processors compute them, one after another [TARGET=generic]"
 	@echo "make test-postgres  the tests of what stands on the database, on PostgreSQL"
 	@echo "make goldens  what tests/golden freezes, after an intended change; read the diff"
 	@echo "make lint    lint, types and import contracts only, of the dashboard's JavaScript too"
@@ -35,20 +37,20 @@ help:
 	@echo "make fleet   robots, services, workers and PostgreSQL with a standby, parts killed; likewise"
 	@echo "make models  train the presets that ship with the package (minutes)"
 	@echo "make lock    write requirements*.lock anew from pyproject.toml [UPGRADE=1 for the newest]"
-	@echo "make sbom    what the service and its image consist of, as CycloneDX, into out/"
+	@echo "make sbom    the packages of the service and its image, as CycloneDX, into out/"
 	@echo "make dist    wheels and source distributions of both packages, tried in an empty environment"
 	@echo "make advisories  known vulnerabilities of all locked packages; needs a network"
 
-$(STAMP): requirements-dev.lock pyproject.toml client/pyproject.toml
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-		{ echo "sceneprint needs Python 3.11 or later; set PYTHON=/path/to/python3"; exit 2; }
-	$(PYTHON) -m venv $(VENV) || \
-		{ echo "python3 cannot make environments; on Debian or Ubuntu: apt install python3-venv"; exit 2; }
-	$(BIN)/$(PIP) --require-hashes -r requirements-dev.lock
-	$(BIN)/$(PIP) --no-deps --no-build-isolation -e client -e .
-	@touch $(STAMP)
+# What running needs comes first: `make demo` asks for no more. Development adds its packages.
+$(RUNTIME): requirements.lock requirements-uv.lock pyproject.toml client/pyproject.toml tools/install
+	@tools/install $(PYTHON) $(VENV) requirements.lock client .
+	@touch $@
 
-demo: $(STAMP)
+$(STAMP): $(RUNTIME) requirements-dev.lock
+	@tools/install $(PYTHON) $(VENV) requirements-dev.lock
+	@touch $@
+
+demo: $(RUNTIME)
 	$(BIN)/sceneprint demo --out demo $(if $(DATASET),--dataset "$(DATASET)")
 
 lint: $(STAMP)
@@ -81,6 +83,10 @@ pytest: kernels bytecode
 # What takes long and seldom breaks: the image built step by step, whole recordings, benchmarks.
 test-thorough: $(STAMP) kernels
 	$(BIN)/python -m pytest -n auto --dist loadfile -m thorough
+
+# Bounds that hold on this processor alone show here; the script says what each target changes.
+test-portable: $(STAMP)
+	$(BIN)/python tools/portable_tests.py $(TARGET)
 
 # What PostgreSQL does as well, on it: tests/on_postgres leads each process there.
 test-postgres: $(STAMP) kernels
@@ -130,36 +136,34 @@ models: $(STAMP)
 	$(BIN)/sceneprint train --preset lidar --out sceneprint/presets/lidar.safetensors
 	$(BIN)/sceneprint train --preset paper --out sceneprint/presets/paper.safetensors
 
-$(TOOLS)/.installed: requirements-tools.lock
-	$(PYTHON) -m venv $(TOOLS)
-	$(TOOLS)/bin/$(PIP) --require-hashes -r requirements-tools.lock
+$(TOOLS)/.installed: requirements-tools.lock requirements-uv.lock tools/install
+	@tools/install $(PYTHON) $(TOOLS) requirements-tools.lock
 	@touch $@
 
 # Every version with the hashes of all its files, for every platform and Python from 3.11 on. Pins
-# that are there stay, unless UPGRADE is set. The image leaves open3d out (docs/dependencies.md).
-COMPILE = $(TOOLS)/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes \
+# that are there stay, unless UPGRADE is set. Without open3d, what running needs and the image has
+# (docs/dependencies.md); with it, development.
+COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes \
 	--no-header --no-annotate --no-emit-index-url --no-emit-package sceneprint-client \
 	$(if $(UPGRADE),--upgrade)
 
-lock: $(TOOLS)/.installed
-	$(COMPILE) --extra build --output-file requirements.lock pyproject.toml
-	echo open3d | $(COMPILE) --extra build --constraint requirements.lock --excludes /dev/stdin \
-		--output-file requirements-image.lock pyproject.toml
+lock: $(RUNTIME)
+	echo open3d | $(COMPILE) --extra build --extra ros --excludes /dev/stdin \
+		--output-file requirements.lock pyproject.toml
 	$(COMPILE) --extra dev --constraint requirements.lock \
 		--output-file requirements-dev.lock pyproject.toml
 	$(COMPILE) --group tools --output-file requirements-tools.lock
+	$(COMPILE) --group uv --output-file requirements-uv.lock
 
 sbom: $(TOOLS)/.installed
 	@mkdir -p out
-	@for of in "" -image; do \
-		$(TOOLS)/bin/cyclonedx-py requirements requirements$$of.lock --pyproject pyproject.toml \
-			--output-reproducible --output-format JSON --output-file out/sbom$$of.cdx.json && \
-		echo "out/sbom$$of.cdx.json" || exit 1; \
-	done
+	@$(TOOLS)/bin/cyclonedx-py requirements requirements.lock --pyproject pyproject.toml \
+		--output-reproducible --output-format JSON --output-file out/sbom.cdx.json
+	@echo out/sbom.cdx.json
 
 # It asks OSV about each version that is locked, so it installs nothing.
 advisories: $(TOOLS)/.installed
-	@for of in "" -dev -tools; do \
+	@for of in -dev -tools -uv; do \
 		$(TOOLS)/bin/pip-audit --disable-pip --require-hashes --vulnerability-service osv \
 			--requirement requirements$$of.lock || failed=1; \
 	done; exit $${failed:-0}
@@ -171,9 +175,8 @@ dist: $(STAMP)
 		'import sys; from setuptools.build_meta import build_sdist; build_sdist(sys.argv[1])' \
 		$(CURDIR)/dist > /dev/null) || exit 1; done
 	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist dist/*.tar.gz
-	$(PYTHON) -m venv dist/try
-	dist/try/bin/$(PIP) --require-hashes -r requirements.lock
-	dist/try/bin/$(PIP) --no-deps dist/*.whl
+	@tools/install $(PYTHON) dist/try requirements.lock
+	dist/try/bin/python -m pip install --quiet --no-deps dist/*.whl
 	cd dist && try/bin/sceneprint demo --out demo
 	@rm -rf dist/try dist/demo && ls -l dist
 

@@ -41,7 +41,7 @@ from sceneprint_client.api.listing import (
     RestoreOptions,
     SessionEdit,
 )
-from sceneprint_client.api.results import KeepOptions, NewQueryRecords
+from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.sessions import NewAssociation, NewDifference
 from sceneprint_client.api.surface import NewReconstruction
 from service import dashboard, problems, static_files
@@ -100,7 +100,6 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
                 (NewMapCoverage, "validation"),
                 (NewDifference, "validation"),
                 (NewModel, "validation"),
-                (NewQueryRecords, "validation"),
                 (NewReconstruction, "validation"),
                 (Problem, "serialization"),
             ],
@@ -125,7 +124,7 @@ ROUTERS = (
     maps.router, frames.router, selections.router, frame_data.router, frame_data.points_router,
     maps.edits_router, copies.router,
     sessions.router, frames.imports_router, queries.router,
-    results.history_router, results.offline_router,
+    results.history_router,
     results.router,
     queries.similarity_router, sessions.associations_router, coverage.router, differences.router,
     surface.router,
@@ -217,11 +216,11 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
     # lead whoever follows it, with a key, to where Host says, and behind a proxy away from TLS
     app = FastAPI(
         title="sceneprint", version=__version__, description=DESCRIPTION, lifespan=lifespan,
-        redirect_slashes=False, docs_url=None, redoc_url=None,
+        redirect_slashes=False, docs_url=None, redoc_url=None, openapi_url=None,
     )  # fmt: skip
     for router in (*ROUTERS, admin.router):  # as they are: `include_router` would make each anew
         app.router.routes.extend(router.routes)
-    app.include_router(static_files.routes())
+    app.include_router(static_files.routes(lambda: openapi_of(app)))
     app.include_router(dashboard.routes(dashboard.files_in(dashboard.PAGES)))
     problems.install(app)
     app.add_middleware(

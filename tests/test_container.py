@@ -540,9 +540,7 @@ def test_what_is_installed_is_the_lock_and_no_more(image: Image) -> None:
     )  # fmt: skip
     there: dict[str, str] = json.loads(told.stdout)
     assert there.pop("sceneprint") == there.pop("sceneprint-client") == PROJECT["version"]
-    lock = set(
-        re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / "requirements-image.lock").read_text(), re.M)
-    )
+    lock = set(re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / "requirements.lock").read_text(), re.M))
     assert set(there.items()) <= {(name.lower(), version) for name, version in lock}
     wanted = {re.split(r"[<>=;\[ ]", line)[0] for line in PROJECT["dependencies"]}
     assert wanted - set(there) == {"open3d", "sceneprint-client"}

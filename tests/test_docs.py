@@ -10,7 +10,7 @@ import re
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -131,46 +131,6 @@ def test_every_attack_that_succeeded_has_its_test() -> None:
         for path, name in named:
             text = (ROOT / "tests" / path).read_text()
             assert re.search(rf"^(async )?def {name}\(", text, re.MULTILINE), (path, name)
-
-
-def test_every_dependency_has_a_reason() -> None:
-    import tomllib
-
-    read = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    project = read["project"]
-    reasons = (ROOT / "docs/dependencies.md").read_text()
-    extras = project["optional-dependencies"]
-    runtime, build = project["dependencies"], extras["build"]
-    tools = read["dependency-groups"]["tools"]
-    given = names_of(sum(extras.values(), runtime + tools))
-    assert [name for name in given if name not in reasons] == []
-    wanted = {
-        "requirements.lock": runtime + build,
-        "requirements-image.lock": [one for one in runtime if "open3d" not in one] + build,
-        "requirements-dev.lock": runtime + extras["dev"],
-        "requirements-tools.lock": tools,
-    }
-    locks = {name: locked(ROOT / name) for name in wanted}
-    for name, requirements in wanted.items():
-        missing = set(names_of(requirements)) - set(locks[name])
-        assert missing == ({"sceneprint-client"} if runtime[0] in requirements else set()), name
-    image, full, dev = (locks[f"requirements{of}.lock"] for of in ("-image", "", "-dev"))
-    assert image.items() <= full.items() <= dev.items()  # of each package one version, and files
-    assert {"open3d", "pytest", "uv"} & set(image) == set()
-
-
-def names_of(requirements: Sequence[str]) -> list[str]:
-    return [re.split(r"[<>=;\[ ]", requirement)[0] for requirement in requirements]
-
-
-def locked(path: Path) -> dict[str, str]:
-    """Version and hashes of each package of a lock; each has a hash at least."""
-    text = path.read_text()
-    assert "://" not in text
-    hashed = r"((?:\\\n    --hash=sha256:[0-9a-f]{64} ?)+)"
-    entries = re.findall(rf"^([\w.-]+)(?:\[.*\])?==(\S+).*?{hashed}$", text, re.M)
-    assert len(entries) == len(re.findall(r"^\S", text, re.M))
-    return {name: f"{version} {hashes}" for name, version, hashes in entries}
 
 
 def blocks(text: str, language: str) -> list[str]:

@@ -27,8 +27,6 @@ def marks(plan: Plan) -> tuple[str, str]:
         name = "fleet-delays"
     if plan.is_crowd:
         name = "fleet-crowd"
-    if plan.before is not None:
-        name = "fleet-upgrade"
     return f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
 
 
@@ -43,14 +41,10 @@ def table(figures: FleetFigures) -> list[str]:
             f" (a message to the database takes {1e3 * DATABASE_S:g} ms, one to the store "
             f"{1e3 * STORE_S:g} ms)"
         )
-    what = f"{standby} standby"
     killed = {name: n for name, n in figures.kills.items() if name not in (FROZEN, CUT_OFF)}
     done = "SIGKILL of " + ", ".join(f"{n} of {name}" for name, n in sorted(killed.items()))
-    if plan.before is not None:
-        what = "the version before replaced"
-        done = "Replaced by this version, in this order: " + ", ".join(figures.steps)
     lines = [
-        f"### {plan.robots} robots for {plan.seconds:.0f} s, {what}",
+        f"### {plan.robots} robots for {plan.seconds:.0f} s, {standby} standby",
         "",
         f"PostgreSQL with {standby} standby, {plan.services} services, {plan.workers} workers, "
         f"blobs in {blobs}{delayed}; {plan.robots:,} robots send {plan.rate:g} frames a second "
@@ -96,9 +90,6 @@ def table(figures: FleetFigures) -> list[str]:
         f"{figures.memory[1] / 1e6:,.0f} MB |",
         "",
     ]
-    if plan.before is not None:
-        refused = ", ".join(f"{n} of {name}" for name, n in sorted(figures.refused.items()))
-        return [*lines, f"Requests refused (429, 503): {refused or 'none'}.", ""]
     lines += [
         "| killed | longest that a robot had no answer, s |",
         "|---|--:|",
@@ -166,10 +157,6 @@ def main(arguments: list[str] | None = None) -> int:
         help="the standby need not have what is acknowledged, and is cut off for a while first",
     )  # fmt: skip
     parser.add_argument("--data", type=Path, help="folder of recordings; default: synthetic rooms")
-    parser.add_argument(
-        "--before", type=Path,
-        help="checkout of the version before: upgrade such a fleet while the robots go on",
-    )  # fmt: skip
     parser.add_argument("--page", type=Path, help="whose figures to replace")
     parser.add_argument("--keep", type=Path, help="new folder for data and logs, left there")
     options = vars(parser.parse_args(arguments))

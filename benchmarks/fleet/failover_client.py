@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
 from dataclasses import dataclass, field
 from itertools import cycle
 from types import TracebackType
@@ -53,7 +52,6 @@ class RequestLog:
     waits: list[Wait] = field(default_factory=list)
     answered: list[tuple[float, str]] = field(default_factory=list)
     repeated: int = 0
-    refused: Counter[str] = field(default_factory=Counter)
     seconds: dict[str, list[float]] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
 
@@ -66,11 +64,6 @@ class RequestLog:
             self.repeated += tries - 1
             if tries > 1:
                 self.waits.append(Wait(kind, begun, now))
-
-    def refuse(self, what: str) -> None:
-        """A request was answered that somebody comes back with."""
-        with self.lock:
-            self.refused[what] += 1
 
     def fault(self, text: str) -> None:
         """Something that should not be."""
@@ -136,7 +129,6 @@ class FailoverClient:
                 if response.status_code < 500 and response.status_code not in _LATER:
                     self._log.note(kind, begun, tries=tries)
                     return response
-                self._log.refuse(f"{kind} {response.status_code}")
                 if response.status_code not in _LATER:
                     self._log.fault(f"{kind}: {response.status_code} {response.text:.300}")
                 pause = min(retry_after_s(response.headers.get("Retry-After", "")), 1.0)

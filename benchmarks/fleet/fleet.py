@@ -46,7 +46,6 @@ class Fleet:
     services, workers : how many processes of each
     synchronous : whether the database waits for its standby
     objects : keep blobs in an object store, and not in a folder that all hosts share
-    before : checkout of another version, which all processes begin as; None: of this one
     delays : let messages to the database take DATABASE_S, and those to the object store STORE_S
     partitions : whether `partitioned` is asked for
     surfaces : whether maps get surfaces
@@ -54,10 +53,9 @@ class Fleet:
 
     def __init__(
         self, folder: Path, services: int, workers: int, *, synchronous: bool, objects: bool,
-        before: Path | None = None, delays: bool = False, partitions: bool = False,
-        surfaces: bool = True,
+        delays: bool = False, partitions: bool = False, surfaces: bool = True,
     ) -> None:  # fmt: skip
-        self.folder, self._before = folder, before
+        self.folder = folder
         self._delays, self._partitions, self._surfaces = delays, partitions, surfaces
         #: By which each host reaches the servers, where it does not reach them itself.
         self._networks: list[list[DelayProxy]] = []
@@ -86,7 +84,7 @@ class Fleet:
             self._shared |= {"SCENEPRINT_SURFACES": "asked"}
         made = subprocess.run(
             [sys.executable, "-c", _MAKE_KEY, str(self.host)], check=True, text=True,
-            env=self.environment() | _path_of(self._before), stdout=subprocess.PIPE,
+            env=self.environment(), stdout=subprocess.PIPE,
         )  # fmt: skip
         secret = made.stdout.strip()
         hosts = [self._host_environment() for _ in range(n_services)]
@@ -174,7 +172,7 @@ class Fleet:
     ) -> Process:
         arguments = ["sceneprint", *command, "--data", str(self.folder / f"host-{host + 1}")]
         log = self.folder / f"{name}.log"
-        return Process(name, arguments, log, environment, self._before)
+        return Process(name, arguments, log, environment)
 
     @contextmanager
     def _here(self) -> Iterator[Settings]:
@@ -203,7 +201,7 @@ def _most_memory(parts: Sequence[Process]) -> int:
     return most
 
 
-#: Makes the key of who may do everything, as any version does.
+#: Creates a key that may do everything.
 _MAKE_KEY = """
 import sys
 from sceneprint.engine import Engine
@@ -214,16 +212,6 @@ with Engine(Settings(data_dir=sys.argv[1])) as engine:
 """
 
 
-def _path_of(checkout: Path | None) -> dict[str, str]:
-    """What lets a process import the packages of a checkout, and not those that are installed or of
-    the folder that it begins in.
-    """
-    if checkout is None:
-        return {}
-    path = os.pathsep.join(map(str, (checkout.absolute(), checkout.absolute() / "client")))
-    return {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
-
-
 class Process(Part):
     """A part whose environment has more than settings.
 
@@ -231,20 +219,13 @@ class Process(Part):
     ----------
     name, arguments, log : see Part
     environment : beside this process's
-    before : see Fleet
     """
 
     def __init__(
-        self, name: str, arguments: list[str], log: Path, environment: Mapping[str, str],
-        before: Path | None = None,
-    ) -> None:  # fmt: skip
+        self, name: str, arguments: list[str], log: Path, environment: Mapping[str, str]
+    ) -> None:
         super().__init__(name, arguments, log)
-        self._present = {**self._environment, **environment}
-        self._environment = {**self._present, **_path_of(before)}
-
-    def take_present(self) -> None:
-        """From the next beginning on, be of this version."""
-        self._environment = self._present
+        self._environment = {**self._environment, **environment}
 
 
 def await_service(url: str) -> None:

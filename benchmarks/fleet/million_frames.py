@@ -84,7 +84,7 @@ def maintain(folder: Path) -> dict[str, tuple[float, float | None]]:
     folder : as `measure` left it
     """
     settings, found = Settings(data_dir=folder), dict[str, tuple[float, float | None]]()
-    full, more = folder.parent / "full.tar", folder.parent / "more.tar"
+    full = folder.parent / "full.tar"
     begun = time.perf_counter()
     take_snapshot(settings, full)
     found["snapshot"] = time.perf_counter() - begun, full.stat().st_size / 1e6
@@ -96,10 +96,6 @@ def maintain(folder: Path) -> dict[str, tuple[float, float | None]]:
         found["one slice of the workers' scrub"] = time.perf_counter() - begun, None
         if slice_ is None or slice_.position == 0:
             raise RuntimeError("nothing was scrubbed")
-    begun = time.perf_counter()
-    take_snapshot(settings, more, since=[full])
-    label = f"snapshot since the first, {LATER} uploads of {UPLOAD // 1000} kB later"
-    found[label] = time.perf_counter() - begun, more.stat().st_size / 1e6
     begun = time.perf_counter()
     wrong = {one.finding.kind for one in fsck(settings)}
     found["`sceneprint fsck` of everything"] = time.perf_counter() - begun, None

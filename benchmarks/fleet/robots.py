@@ -240,8 +240,7 @@ class OfflineRobot(threading.Thread):
             with Client(url, self._robot.key, timeout_s=SILENCE_S) as client:
                 try:
                     self.there += spool.sync(client, self._robot.map_name).there
-                except (errors.Unreachable, errors.Busy, errors.RateLimited) as error:
-                    self._log.refuse(f"spool {type(error).__name__}")
+                except (errors.Unreachable, errors.Busy, errors.RateLimited):
                     time.sleep(PAUSE_S)
 
     def _learn(self) -> None:

@@ -35,7 +35,6 @@ from benchmarks.fleet.robots import (
     Robot,
     asked,
 )
-from benchmarks.fleet.rolling_upgrade import upgrade
 from sceneprint.store.deletion import DAY_S
 from sceneprint_client import Client
 
@@ -73,8 +72,6 @@ class Plan:
     objects : blobs are in an object store
     delays : messages to the database and to the object store take their time
     data : folder of recordings; None: synthetic rooms
-    before : checkout of the version before, which the fleet begins as: instead of being killed,
-        its parts are replaced by this version
     most_turn_ms : of a frame, for which all writers may have to wait for one, beside the time for
         which hosts are cut off
     most_query_ms : 99 of 100 queries are answered within: little later than a robot gives up an
@@ -101,7 +98,6 @@ class Plan:
     objects: bool = False
     delays: bool = False
     data: Path | None = None
-    before: Path | None = None
 
     @property
     def is_crowd(self) -> bool:
@@ -132,8 +128,6 @@ class FleetFigures:
     kills : by victim
     outages : see `outages`
     promotions : of the standby
-    steps : of the upgrade
-    refused : answers that asked to come back, by request and status
     waits_ms : milliseconds of uploads and of queries until they were answered: median, p99
     memory : most bytes of a process of the services, and of the workers
     answers : queries by status
@@ -153,8 +147,6 @@ class FleetFigures:
     kills: Counter[str]
     outages: dict[str, list[float]]
     promotions: Sequence[Promotion]
-    steps: Sequence[str]
-    refused: Counter[str]
     waits_ms: Mapping[str, tuple[float, float]]
     memory: tuple[int, int]
     answers: Counter[str]
@@ -220,7 +212,7 @@ def drive(folder: Path, plan: Plan) -> FleetFigures:
     walked = walked[: plan.robots]
     fleet = Fleet(
         folder, plan.services, plan.workers, synchronous=not plan.asynchronous,
-        objects=plan.objects, before=plan.before, delays=plan.delays,
+        objects=plan.objects, delays=plan.delays,
         partitions=plan.partitions > 0, surfaces=not plan.is_crowd,
     )  # fmt: skip
     try:
@@ -240,7 +232,6 @@ class _Run:
         self._ledger, self._log, self._stop = Ledger(), RequestLog(), threading.Event()
         self._rng = random.Random(plan.seed)
         self._locks = LockSampler(lambda: fleet.pair.primary.url(DATABASE).replace("+psycopg", ""))
-        self._steps: list[str] = []
 
     def figures(self) -> FleetFigures:
         """Run it to its end."""
@@ -279,8 +270,6 @@ class _Run:
             kills=Counter(one.victim for one in injector.kills),
             outages=outages(injector.kills, log.waits),
             promotions=injector.promotions,
-            steps=self._steps,
-            refused=log.refused,
             waits_ms={
                 kind: (1e3 * float(np.quantile(of, 0.5)), 1e3 * float(np.quantile(of, 0.99)))
                 for kind, of in sorted(log.seconds.items())
@@ -325,14 +314,11 @@ class _Run:
             for one in (*others, crowd, telling, self._locks):
                 one.start()
             try:
-                if plan.before is not None:
-                    self._steps = upgrade(fleet, plan.seconds, bar.set_postfix_str)
-                else:
-                    due = schedule(
-                        plan.seconds, plan.kills, plan.promotions, self._rng, plan.freezes,
-                        plan.partitions,
-                    )  # fmt: skip
-                    injector.run(due, bar.set_postfix_str)
+                due = schedule(
+                    plan.seconds, plan.kills, plan.promotions, self._rng, plan.freezes,
+                    plan.partitions,
+                )  # fmt: skip
+                injector.run(due, bar.set_postfix_str)
                 stop.wait(max(walking + plan.seconds - time.monotonic(), 0.0))
             finally:
                 stop.set()

@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
@@ -227,10 +228,7 @@ SELECT current_setting('server_version') AS version,
   current_setting('max_connections')::int
     - current_setting('superuser_reserved_connections')::int AS connections,
   (SELECT count(*) FROM pg_stat_activity WHERE backend_type = 'client backend') AS taken,
-  pg_is_in_recovery() AS standby,
-  (SELECT extversion FROM pg_extension WHERE extname = 'vector') AS vector,
-  (SELECT default_version FROM pg_available_extensions WHERE name = 'vector') AS installable,
-  has_database_privilege(current_database(), 'CREATE') AS creates
+  pg_is_in_recovery() AS standby
 """
 _BEHIND = """
 SELECT pg_is_in_recovery(), CASE WHEN pg_last_wal_receive_lsn() = pg_last_wal_replay_lsn() THEN 0
@@ -279,7 +277,6 @@ def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
     yield Check("ok", "database server", text)
     yield _durability(told)
     yield _connections(told, settings)
-    yield _vector(told, settings)
     yield _clock(before, there, after, settings)
 
 
@@ -321,23 +318,6 @@ def _connections(told: Mapping[str, object], settings: Settings) -> Check:
     if taken + wanted > most:
         return Check("note", "connections", f"{text}. Raise max_connections, or run fewer workers.")
     return Check("ok", "connections", text)
-
-
-def _vector(told: Mapping[str, object], settings: Settings) -> Check:
-    wanted = settings.search == "database"
-    if told["vector"] is not None:
-        return Check("ok", "pgvector", f"{told['vector']}")
-    if told["installable"] is not None and told["creates"]:
-        text = f"{told['installable']} is installed; the first use enables it (CREATE EXTENSION)"
-        return Check("ok", "pgvector", text)
-    why = "not installed" if told["installable"] is None else "this user may not enable it"
-    text = (
-        f"{why}: each node loads the index of every map that it searches, and waits for it at "
-        "startup; everything else works. Run CREATE EXTENSION vector in this database"
-    )
-    verdict: Verdict = "WRONG" if wanted else "note"
-    return Check(verdict, "pgvector", f"{text}." if not wanted else f"{text}, or set "
-                   "SCENEPRINT_SEARCH=auto.")  # fmt: skip
 
 
 def _clock(before: float, there: float, after: float, settings: Settings) -> Check:
@@ -388,7 +368,7 @@ def _replica(url: str, settings: Settings) -> Check:
 
 #: The oldest SQLite with all that the store asks for (UPDATE ... RETURNING).
 OLDEST_SQLITE = (3, 35, 0)
-#: What open3d loads of the system, and the Debian packages that bring it.
+#: System libraries that open3d loads, and the Debian packages that contain them.
 OPEN3D_LIBRARIES = {
     "libGL.so.1": "libgl1",
     "libEGL.so.1": "libegl1",
@@ -537,6 +517,9 @@ def _embree() -> Check:
 
 
 def _open3d() -> Check:
+    needed = "only reconstructions and baselines need it"
+    if find_spec("open3d") is None:
+        return Check("note", "open3d", f"not installed; {needed}: pip install open3d")
     missing = []
     for library, package in OPEN3D_LIBRARIES.items():
         try:
@@ -545,9 +528,9 @@ def _open3d() -> Check:
             missing.append(package)
     if missing:
         packages = " ".join(missing)
-        text = f"only reconstructions and benchmarks need them: apt-get install {packages}"
-        return Check("note", "open3d libraries", text)
-    return Check("ok", "open3d libraries", "installed")
+        text = f"lacks system libraries; {needed}: apt-get install {packages}"
+        return Check("note", "open3d", text)
+    return Check("ok", "open3d", "installed, with its system libraries")
 
 
 def _may_write(folder: Path) -> bool:

@@ -370,8 +370,6 @@ def add_snapshot(commands: Any) -> None:
         help="archive to write, or its folder (default: SCENEPRINT_SNAPSHOT_URL, else "
         "sceneprint-TIME.tar here)",
     )
-    add_since_option(command, "leave out the blobs that this earlier archive holds, which is "
-                     "needed to restore the new one; may be repeated")  # fmt: skip
     command.add_argument(
         "--url",
         metavar="URL",
@@ -388,22 +386,10 @@ def add_snapshot(commands: Any) -> None:
     command.set_defaults(run=run_snapshot)
 
 
-def add_since_option(command: argparse.ArgumentParser, told: str) -> None:
-    """`--since`."""
-    command.add_argument(
-        "--since", type=Path, action="append", default=[], metavar="ARCHIVE", help=told
-    )
-
-
 def run_snapshot(options: argparse.Namespace) -> int:
     """Take a snapshot; returns 1 where something could not be taken along."""
     from sceneprint.maintenance.snapshot.creation import take_snapshot
 
-    if options.since and options.url is not None:
-        raise InvalidRequest(
-            "--since is for archives of this machine, and a service takes full snapshots. Leave "
-            "out --url or --since."
-        )
     name = f"sceneprint-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tar"
     path = Path(name) if options.out is None else options.out
     if path.is_dir():
@@ -413,14 +399,9 @@ def run_snapshot(options: argparse.Namespace) -> int:
         return _fetched(options, path)
     settings = named_database(options)
     if options.out is None and settings.snapshot_url is not None:
-        if options.since:
-            raise InvalidRequest(
-                "SCENEPRINT_SNAPSHOT_URL is set, and full snapshots alone are kept there. Name the "
-                "archive with --out."
-            )
         return _shelved(settings)
     with ended_by_signals(), byte_progress("snapshot") as progress:
-        taken = take_snapshot(settings, path, progress, options.since)
+        taken = take_snapshot(settings, path, progress)
     print(f"{one_line(str(path))}: {contents(taken)} in {time.perf_counter() - start:.1f} s")
     return 1 if name_damaged(taken, "Run `sceneprint fsck` to see what can be repaired.") else 0
 
@@ -568,7 +549,6 @@ def add_restore(commands: Any) -> None:
         metavar="ARCHIVE",
         help="archive of `sceneprint snapshot`, or the id of a snapshot that a service has taken",
     )
-    add_since_option(command, "an earlier archive that this one was taken since; may be repeated")
     add_data_option(command)
     add_database_option(command)
     choice = command.add_mutually_exclusive_group()
@@ -586,7 +566,7 @@ def run_restore(options: argparse.Namespace) -> int:
     settings, start = named_database(options), time.perf_counter()
     with ended_by_signals(), _archive(options, settings) as archive:
         if options.verify_only:
-            snapshot, done, aside = *_verified(archive, options), None
+            snapshot, done, aside = *_verified(archive), None
         elif settings.database_url is not None:
             snapshot, done, aside = *_filled(archive, settings, options), None
         else:
@@ -620,11 +600,11 @@ def _archive(options: argparse.Namespace, settings: Settings) -> Iterator[Path]:
         yield archive
 
 
-def _verified(archive: Path, options: argparse.Namespace) -> tuple[Snapshot, str]:
+def _verified(archive: Path) -> tuple[Snapshot, str]:
     from sceneprint.maintenance.snapshot.restoration import verify_snapshot
 
     with byte_progress("verify") as progress:
-        return verify_snapshot(archive, progress, options.since), "is complete"
+        return verify_snapshot(archive, progress), "is complete"
 
 
 def _filled(archive: Path, settings: Settings, options: argparse.Namespace) -> tuple[Snapshot, str]:
@@ -646,7 +626,7 @@ def _filled(archive: Path, settings: Settings, options: argparse.Namespace) -> t
             "database (CREATE DATABASE), and name that."
         )
     with byte_progress("restore") as progress:
-        snapshot = restore_to_fleet(archive, settings, progress, options.since)
+        snapshot = restore_to_fleet(archive, settings, progress)
     return snapshot, f"is restored to {one_line(database.shown)}"
 
 
@@ -664,9 +644,8 @@ def _restore_to_folder(
         )
     with byte_progress("restore") as progress:
         snapshot, aside = restore_snapshot(
-            archive, settings.data_dir, replace=options.replace, progress=progress,
-            since=options.since,
-        )  # fmt: skip
+            archive, settings.data_dir, replace=options.replace, progress=progress
+        )
     return snapshot, f"is restored to {one_line(str(settings.data_dir))}", aside
 
 

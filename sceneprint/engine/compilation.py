@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
+from typing import IO, Any
 
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES, cached_at, runs_here
@@ -35,6 +36,8 @@ _LAST = {
 DEPTH, ALL = ("signing", "validation"), ("signing", "validation", "clouds")
 #: Seconds between two looks whether they are compiled.
 _LOOK_S = 0.05
+#: Seconds between two reports of progress.
+_REPORT_S = 5.0
 #: Those who need kernels wait for whoever compiles them.
 _compiling = threading.Lock()
 
@@ -59,7 +62,7 @@ def compile_kernels(
     ----------
     cache_dir : of pair tables: the one that signing needs is built on the way
     parts : of `ALL`
-    say : what tells that it takes a while, and how long it took
+    say : takes each line of progress
     stop : once it is set, nothing more is compiled
     """
     with _compiling:
@@ -67,34 +70,43 @@ def compile_kernels(
         if not wanted:
             return
         tell, begun = say or (lambda _: None), time.monotonic()
-        tell(f"first use after installation: compiling kernels for {' and '.join(wanted)}, once")
+        tell(
+            f"first use after installation: compiling kernels for {' and '.join(wanted)}, once; "
+            "it takes half a minute on two idle processors"
+        )
         environment = dict(os.environ)
         if not environment.get("NUMBA_CPU_NAME") and runs_here():
             environment |= {"NUMBA_CPU_NAME": TARGET, "NUMBA_CPU_FEATURES": TARGET_FEATURES}
         # clouds are validated with the kernels of the other parts: compiled twice, if beside them
-        for group in ([one for one in wanted if one != "clouds"], ["clouds"]):
-            commands = {part: (part, str(cache_dir)) for part in group if part in wanted}
-            if _run(commands, environment, tell, stop):
-                return
+        # each process writes a byte to it for each kernel
+        with os.fdopen(os.memfd_create("compiled kernels"), "wb") as compiled:
+            for group in ([one for one in wanted if one != "clouds"], ["clouds"]):
+                commands = {part: (part, str(cache_dir)) for part in group if part in wanted}
+                if _run(commands, environment, compiled, tell, stop):
+                    return
         tell(f"compilation finished in {time.monotonic() - begun:.0f} s")
 
 
 def _run(
-    commands: Mapping[str, Sequence[str]], environment: Mapping[str, str],
+    commands: Mapping[str, Sequence[str]], environment: Mapping[str, str], compiled: IO[bytes],
     tell: Callable[[str], None], stop: threading.Event | None,
 ) -> bool:  # fmt: skip
-    """Compile parts beside each other; returns whether it was told to stop."""
+    """Compile parts beside each other; return whether `stop` ended it."""
     running: dict[str, subprocess.Popen[bytes]] = {}
     try:
         for part, arguments in commands.items():
             running[part] = subprocess.Popen(
                 [sys.executable, "-m", "sceneprint.engine.compilation", *arguments],
                 env=environment,
-                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                stdin=subprocess.DEVNULL, stdout=compiled, stderr=subprocess.DEVNULL,
             )  # fmt: skip
+        next_report = time.monotonic() + _REPORT_S
         while running:
             if stop is not None and stop.is_set():
                 return True
+            if time.monotonic() > next_report:
+                next_report += _REPORT_S
+                tell(f"compiled {os.fstat(compiled.fileno()).st_size} kernels so far")
             for part, process in [*running.items()]:
                 if process.poll() is not None:
                     del running[part]
@@ -130,5 +142,23 @@ def _compile(part: str, cache_dir: Path) -> None:
         warm_clouds(signer, corner)
 
 
+def _report_kernels() -> None:
+    """Write a byte to standard output whenever a kernel is compiled."""
+    from numba.core import event
+
+    register: Any = event.register  # numba has no types
+
+    class Reporter(event.Listener):
+        def on_start(self, _event: Any) -> None:
+            """Do nothing: kernels are counted at their end."""
+
+        def on_end(self, _event: Any) -> None:
+            sys.stdout.write(".")
+            sys.stdout.flush()
+
+    register("numba:compile", Reporter())
+
+
 if __name__ == "__main__":
+    _report_kernels()
     _compile(sys.argv[1], Path(sys.argv[2]))

@@ -5,14 +5,13 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from datetime import UTC, datetime
 from typing import Any
 
 import pytest
 
 #: Operations that store nothing but an answer.
 READING = {
-    "ask", "ask_several", "ask_again", "localize", "localize_sequence", "compare",
+    "ask", "ask_several", "localize", "localize_sequence", "compare",
 }  # fmt: skip
 
 
@@ -99,11 +98,6 @@ def test_each_change_has_its_lines(recorder: Recorder, small_shots: Any, until: 
     query = client.post("/v1/maps/hall/queries", json={"frame_id": taken[0]}).json()["query_id"]
     fused = do("reconstruct", ["job.queued"], {"query_id": query}, json={})
     do("delete_reconstruction", ["job.removed"], job_of(fused))
-    record = {
-        "query_id": "5" * 32, "at": datetime.now(UTC).isoformat(), "status": "failed",
-        "reason": "", "milliseconds": 1,
-    }  # fmt: skip
-    do("add_query_records", ["queries.added"], hall, json={"records": [record]})
     do("delete_queries", ["queries.removed"], {}, params={"map": "hall"})
 
     for kind, body in (

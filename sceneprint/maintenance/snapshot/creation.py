@@ -19,7 +19,7 @@ import secrets
 import sqlite3
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -41,7 +41,6 @@ from sceneprint.maintenance.snapshot.files import (
     BLOBS,
     DAMAGED,
     DATABASE,
-    INCREMENTAL,
     MANIFEST,
     MANIFEST_BYTES,
     ArchiveMember,
@@ -57,7 +56,6 @@ from sceneprint.maintenance.snapshot.files import (
     put_new,
     staging,
 )
-from sceneprint.maintenance.snapshot.increments import BaseArchives
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs as Store
 from sceneprint.store import Blobs as StoredBlobs
@@ -175,9 +173,7 @@ class Snapshot:
     damaged: list[LostBlob]
 
 
-def take_snapshot(
-    settings: Settings, path: Path, progress: Progress | None = None, since: Sequence[Path] = ()
-) -> Snapshot:
+def take_snapshot(settings: Settings, path: Path, progress: Progress | None = None) -> Snapshot:
     """Write all that must not be lost into one archive; service and workers may go on.
 
     It holds what was acknowledged before this was called, and perhaps some that came later. A blob
@@ -188,25 +184,21 @@ def take_snapshot(
     settings : whose database and blobs are taken
     path : of the archive; nothing is overwritten
     progress : told of bytes done and bytes in all
-    since : archives whose blobs are left out; the snapshot cannot be restored without them
 
     Raises
     ------
-    SnapshotError : the path is taken, or there is no room; or one of `since` is no archive.
+    SnapshotError : the path is taken, or there is no room.
     UnusableStore, NewerSchema : the database is missing, damaged, or a later version's.
     OSError : the archive's folder is missing or cannot be written.
     """
     with database_copy.open_source(settings.database) as source:
         if path.exists():
             raise _exists_error(path)
-        with opened_blobs(settings) as blobs, BaseArchives(since) as bases:
-            return _create(source, blobs, path, progress or (lambda _done, _total: None), bases)
+        with opened_blobs(settings) as blobs:
+            return _create(source, blobs, path, progress or (lambda _done, _total: None))
 
 
-def _create(
-    source: database_copy.Source, blobs: Store, path: Path, progress: Progress,
-    bases: BaseArchives,
-) -> Snapshot:  # fmt: skip
+def _create(source: database_copy.Source, blobs: Store, path: Path, progress: Progress) -> Snapshot:
     folder = path.absolute().parent
     with (
         full_disk_explained(path),
@@ -224,12 +216,12 @@ def _create(
             progress(done, max(2 * source.bytes, done))
 
         source.copy(database, written)
+        database_copy.forget_answers(database)
         with database_copy.open_copy(database) as copy:
             draft = _draft(copy, source.place, begun, database.stat().st_size)
-            if bases.known:
-                draft = draft.model_copy(update={"version": INCREMENTAL, "since": bases.known})
-            wanted, count = _wanted(copy, bases)
-            total = draft.database.bytes + total_bytes(blobs, wanted(), count)
+            count = database_copy.count_referred(copy)
+            wanted = database_copy.referred(copy)
+            total = draft.database.bytes + total_bytes(blobs, wanted, count)
             check_room(folder, total, "the snapshot")  # room for the copy is taken already
             archive = workplace / "archive"
             # private: it has all pictures, and the hashes of keys
@@ -238,22 +230,12 @@ def _create(
                     file, int(begun.timestamp()),
                     lambda done: progress(ahead + min(done, total), ahead + total),
                 )  # fmt: skip
-                manifest, damaged = _write(writer, draft, database, copy, blobs, wanted())
+                manifest, damaged = _write(writer, draft, database, copy, blobs)
         try:
             put_new(archive, path)
         except FileExistsError as error:
             raise _exists_error(path) from error
     return Snapshot(path, manifest, damaged)
-
-
-def _wanted(
-    copy: sqlite3.Connection, bases: BaseArchives
-) -> tuple[Callable[[], Iterable[str]], int]:
-    """Digests of the blobs that are to be taken along, in order, and how many they are."""
-    if not bases.known:
-        return lambda: database_copy.referred(copy), database_copy.count_referred(copy)
-    new = [one for one in database_copy.referred(copy) if not bases.holds(one)]
-    return lambda: new, len(new)
 
 
 def _draft(copy: sqlite3.Connection, source: str, begun: datetime, size: int) -> SnapshotManifest:
@@ -280,7 +262,7 @@ def _draft(copy: sqlite3.Connection, source: str, begun: datetime, size: int) ->
 
 def _write(
     writer: ArchiveWriter, draft: SnapshotManifest, database: Path, copy: sqlite3.Connection,
-    blobs: Store, wanted: Iterable[str],
+    blobs: Store,
 ) -> tuple[SnapshotManifest, list[LostBlob]]:  # fmt: skip
     """All members; the manifest's place is kept until its content is known."""
     writer.add(MANIFEST, MANIFEST_BYTES, iter([bytes(MANIFEST_BYTES)]))
@@ -293,7 +275,7 @@ def _write(
 
     writer.add(DATABASE, draft.database.bytes, hashing())
     damaged, count, size = [], 0, 0
-    for one in copied_blobs(blobs, wanted):
+    for one in copied_blobs(blobs, database_copy.referred(copy)):
         if isinstance(one, Untaken):
             of = database_copy.uses(copy, one.digest)
             damaged.append(LostBlob(digest=one.digest, why=one.why, of=of))

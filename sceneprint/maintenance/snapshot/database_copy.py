@@ -11,7 +11,7 @@ import hashlib
 import json
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -329,29 +329,22 @@ def _check(file: sqlite3.Connection, form: Form, known: tuple[int, str]) -> None
 
 #: Seconds to wait for whoever recovers the database.
 BUSY_S = 30.0
-#: What every blob that has to be there is for: (digest, number of the frame, upload | geometry);
-#: and of those that are of jobs: (digest, number of the job, job).
-_USES = (
+#: The frames that blobs belong to: (digest, number of the frame, role).
+_USES_OF_FRAMES = (
     "SELECT blob AS digest, number, 'upload' AS role FROM frames WHERE state NOT IN"
     f" ('{FrameState.DELETED}', '{FrameState.REDUNDANT}')"
     " UNION ALL SELECT geometry, frame_number, 'geometry' FROM signatures"
+    " UNION ALL SELECT blob, frame_number, 'deleted' FROM deleted_frames WHERE blob IS NOT NULL"
 )
+#: The jobs: (digest, number of the job, role).
 _USES_OF_JOBS = "SELECT blob AS digest, job_number AS number, 'job' AS role FROM job_files"
-#: And of surfaces: (digest, number of the map, surface).
+#: The surfaces: (digest, number of the map, role).
 _USES_OF_SURFACES = " UNION ALL ".join(
     f"SELECT {column} AS digest, map_number AS number, 'surface' AS role FROM surface_tiles"
     f" WHERE {column} IS NOT NULL"
     for column in ("blob", "draft")
 )
-#: Those of jobs, surfaces, deleted frames that can be restored and kept answers, by the tables that
-#: have them: an older database has none of these.
-_MORE_USES = {
-    "job_files": _USES_OF_JOBS,
-    "surface_tiles": _USES_OF_SURFACES,
-    "deleted_frames": "SELECT blob AS digest, frame_number AS number, 'deleted' AS role"
-    " FROM deleted_frames WHERE blob IS NOT NULL",
-    "kept_answers": "SELECT blob AS digest, number, 'answer' AS role FROM kept_answers",
-}
+_USES = " UNION ALL ".join([_USES_OF_FRAMES, _USES_OF_JOBS, _USES_OF_SURFACES])
 
 
 @dataclass(frozen=True)
@@ -440,6 +433,18 @@ def copy_database(source: Path, to: Path) -> None:
         ) from error
     if sealed is not None:
         sealed.check(before)
+
+
+def forget_answers(path: Path) -> None:
+    """Let no query of a copy have an answer in a file, as the archive has none of these.
+
+    Where the copy is damaged, whoever reads it says so.
+    """
+    with suppress(sqlite3.Error), closing(_connect(path, "mode=rw")) as file:
+        file.execute("DELETE FROM queries WHERE NOT listed AND kept_at IS NULL")
+        file.execute(
+            "UPDATE queries SET bytes = 0, shown = NULL WHERE bytes > 0 AND kept_at IS NULL"
+        )
 
 
 @contextmanager
@@ -535,69 +540,44 @@ def counts(connection: sqlite3.Connection) -> dict[str, Any]:
 
 
 def referred(connection: sqlite3.Connection) -> Iterator[str]:
-    """Digests of all blobs that have to be there, each once, in order."""
+    """Yield the digests of all blobs that have to be there, each once, in order."""
     # as text, whatever a database that somebody has edited holds
-    told = "CAST(digest AS TEXT) AS digest"
-    asked = f"SELECT DISTINCT {told} FROM ({_every(connection)}) ORDER BY 1"
+    asked = f"SELECT DISTINCT CAST(digest AS TEXT) AS digest FROM ({_USES}) ORDER BY 1"
     for (digest,) in connection.execute(asked):
         yield digest
 
 
-def _every(connection: sqlite3.Connection) -> str:
-    return " UNION ALL ".join([_USES, *_more_uses(connection).values()])
-
-
-def _more_uses(connection: sqlite3.Connection) -> dict[str, str]:
-    """Those of `_MORE_USES` whose table a database of this version has."""
-    asked = "SELECT name FROM sqlite_master WHERE type = 'table'"
-    there = {name for (name,) in connection.execute(asked)}
-    return {table: told for table, told in _MORE_USES.items() if table in there}
-
-
 def count_referred(connection: sqlite3.Connection) -> int:
-    """How many they are."""
-    asked = f"SELECT count(DISTINCT digest) FROM ({_every(connection)})"
+    """Return how many blobs `referred` yields."""
+    asked = f"SELECT count(DISTINCT digest) FROM ({_USES})"
     return int(connection.execute(asked).fetchone()[0])
 
 
 def uses(connection: sqlite3.Connection, digest: str) -> tuple[BlobUse, ...]:
-    """Whose a blob is."""
-    more = _more_uses(connection)
-    used = " UNION ALL ".join([_USES, *(more[one] for one in ("deleted_frames",) if one in more)])
+    """Return what a blob is used for."""
     rows = connection.execute(
         "SELECT maps.name, frames.id, used.role FROM"
-        f" ({used}) AS used JOIN frames ON frames.number = used.number"
+        f" ({_USES_OF_FRAMES}) AS used JOIN frames ON frames.number = used.number"
         " JOIN maps ON maps.number = frames.map_number WHERE CAST(digest AS TEXT) = ?"
         " ORDER BY frames.number",
         (digest,),
     )
     found = [BlobUse(map=name, frame=frame, role=role) for name, frame, role in rows]
-    if "job_files" in more:
-        rows = connection.execute(
-            "SELECT maps.name, jobs.id FROM"
-            f" ({_USES_OF_JOBS}) AS used JOIN jobs ON jobs.number = used.number"
-            " JOIN maps ON maps.number = jobs.map_number WHERE CAST(digest AS TEXT) = ?"
-            " ORDER BY jobs.number",
-            (digest,),
-        )
-        found += [BlobUse(map=name, job=job, role="job") for name, job in rows]
-    if "surface_tiles" in more:
-        rows = connection.execute(
-            f"SELECT DISTINCT maps.name FROM ({_USES_OF_SURFACES}) AS used"
-            " JOIN maps ON maps.number = used.number WHERE CAST(digest AS TEXT) = ?"
-            " ORDER BY maps.name",
-            (digest,),
-        )
-        found += [BlobUse(map=name, role="surface") for (name,) in rows]
-    if "kept_answers" in more:
-        rows = connection.execute(
-            "SELECT maps.name, kept_answers.id FROM kept_answers JOIN kept_answer_maps AS of"
-            " ON of.kept_number = kept_answers.number"
-            " JOIN maps ON maps.number = of.map_number WHERE CAST(blob AS TEXT) = ?"
-            " ORDER BY kept_answers.number, maps.number",
-            (digest,),
-        )
-        found += [BlobUse(map=name, query=query, role="answer") for name, query in rows]
+    rows = connection.execute(
+        "SELECT maps.name, jobs.id FROM"
+        f" ({_USES_OF_JOBS}) AS used JOIN jobs ON jobs.number = used.number"
+        " JOIN maps ON maps.number = jobs.map_number WHERE CAST(digest AS TEXT) = ?"
+        " ORDER BY jobs.number",
+        (digest,),
+    )
+    found += [BlobUse(map=name, job=job, role="job") for name, job in rows]
+    rows = connection.execute(
+        f"SELECT DISTINCT maps.name FROM ({_USES_OF_SURFACES}) AS used"
+        " JOIN maps ON maps.number = used.number WHERE CAST(digest AS TEXT) = ?"
+        " ORDER BY maps.name",
+        (digest,),
+    )
+    found += [BlobUse(map=name, role="surface") for (name,) in rows]
     return tuple(found)
 
 

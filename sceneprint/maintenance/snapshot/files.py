@@ -174,11 +174,10 @@ class ArchiveReader:
 # manifest.json   this; as many bytes as MANIFEST_BYTES, so that it can be written last
 # sceneprint.db   the database, SQLite, in one file
 # blobs/DIGEST    every blob it refers to, ordered by digest, which is the SHA-256 of the content;
-#                 of an incremental one, those that no archive holds that it was taken since
 # damaged.jsonl   the blobs that were missing or damaged when it was taken, and whose they are
 
 #: Of the archive and of what it means. Raise it when either changes.
-VERSION, INCREMENTAL = 1, 2
+VERSION = 1
 MANIFEST_BYTES = 2048
 #: Most bytes of a manifest that are read, of whatever version.
 LONGEST = 1 << 20
@@ -217,8 +216,7 @@ class BlobUse(_Record):
     map: str
     frame: str | None = None
     job: str | None = None
-    query: str | None = None
-    role: Literal["upload", "geometry", "job", "surface", "deleted", "answer"]
+    role: Literal["upload", "geometry", "job", "surface", "deleted"]
 
 
 class LostBlob(_Record):
@@ -229,20 +227,11 @@ class LostBlob(_Record):
     of: tuple[BlobUse, ...]
 
 
-class BaseArchive(_Record):
-    """An archive that another one was taken since."""
-
-    created_at: datetime
-    #: Of its database, by which it is known.
-    sha256: str = Field(pattern="^[0-9a-f]{64}$")
-
-
 class SnapshotManifest(_Record):
     """What is in a snapshot."""
 
     format: Literal["sceneprint-snapshot"] = "sceneprint-snapshot"
-    #: Of an incremental one 2: versions that know none refuse it.
-    version: Literal[1, 2] = 1
+    version: Literal[1] = 1
     #: When it was begun; its state is not older.
     created_at: datetime
     #: The version that wrote it.
@@ -258,8 +247,6 @@ class SnapshotManifest(_Record):
     damaged: Damaged
     #: Of the archive.
     bytes: int
-    #: Archives that hold the other blobs, in the order of their checksums; none: it holds all.
-    since: tuple[BaseArchive, ...] = ()
 
     @property
     def n_frames(self) -> int:
@@ -274,8 +261,7 @@ def manifest_bytes(manifest: SnapshotManifest) -> bytes:
     ------
     ValueError : it is longer than the place that is kept for it.
     """
-    left_out = None if manifest.since else {"since"}
-    record: dict[str, Any] = json.loads(manifest.model_dump_json(exclude=left_out))
+    record: dict[str, Any] = json.loads(manifest.model_dump_json())
     text = json.dumps(record | {"sha256": _checksum(record)}, indent=1).encode()
     if len(text) >= MANIFEST_BYTES:
         raise ValueError(f"the manifest has {len(text)} bytes, and room for {MANIFEST_BYTES - 1}")
@@ -293,7 +279,7 @@ def read_manifest(data: bytes, place: str) -> SnapshotManifest:
     Raises
     ------
     DamagedSnapshot : no snapshot, or damaged.
-    SnapshotError : of a later version.
+    SnapshotError : of another version.
     """
     try:
         record = json.loads(data)
@@ -303,10 +289,10 @@ def read_manifest(data: bytes, place: str) -> SnapshotManifest:
         if checksum != _checksum(record):
             raise ValueError("its checksum does not fit")
         version = record.get("version")
-        if version not in (VERSION, INCREMENTAL):
+        if version != VERSION:
             raise SnapshotError(
                 f"{place}: a snapshot of version {version!r:.20}, and this sceneprint reads "
-                f"up to {INCREMENTAL}. Restore it with the sceneprint that took it."
+                f"{VERSION}. Restore it with the sceneprint that took it."
             )
         return SnapshotManifest.model_validate_json(json.dumps(record))
     except (ValueError, ValidationError, RecursionError) as error:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
 from itertools import islice
@@ -54,7 +54,6 @@ from sceneprint.store.blobs.object_store import BucketOwner
 from sceneprint.store.database import Database, open_database, reach_database
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint.store.postgres.connection import allow
-from sceneprint.store.postgres.vectors import drop_tables
 from sceneprint.store.tables import metadata, secrets
 
 # A SQLite file written into the empty database of a fleet, in one transaction.
@@ -80,7 +79,6 @@ def copy_into(connection: Connection, file: sqlite3.Connection) -> None:
     """
     allow(connection, 0)
     check_empty(connection)
-    drop_tables(connection)  # of vectors, which a copy of signatures does not make
     for name in _OF_ITSELF:
         connection.exec_driver_sql(f"DELETE FROM {name}")
     # foreign keys ask for the order
@@ -151,8 +149,8 @@ def _count_on(connection: Connection, name: str, given: int) -> None:
 # What of an embedded store PostgreSQL would refuse, found before anything is moved.
 #
 # SQLite keeps what it is given: a text that is longer than its column, a zero byte in it, a number
-# where a text should be. What comes in through the service today is refused there; files of earlier
-# versions, or that somebody has edited, may hold such rows all the same.
+# where a text should be. The service refuses such values; a file that somebody has edited may hold
+# them all the same.
 
 #: Rows that are named one by one.
 _SHOWN = 6
@@ -267,9 +265,8 @@ _STAGING = ".restoring-"
 
 
 def restore_to_fleet(
-    archive: Path, settings: Settings, progress: Progress | None = None,
-    since: Sequence[Path] = (),
-) -> Snapshot:  # fmt: skip
+    archive: Path, settings: Settings, progress: Progress | None = None
+) -> Snapshot:
     """Put all of a snapshot into an empty database and where blobs are kept, or no row of it.
 
     Parameters
@@ -277,7 +274,6 @@ def restore_to_fleet(
     archive : of `take_snapshot`
     settings : whose database is PostgreSQL; its schema is made where there is none
     progress : told of bytes done and bytes in all; the archive is read twice
-    since : the archives that it was taken since
 
     Raises
     ------
@@ -296,7 +292,7 @@ def restore_to_fleet(
     make_folder(settings.data_dir)
     with full_disk_explained(settings.data_dir), staging(settings.data_dir, _STAGING) as made:
         snapshot = unpack(
-            archive, made, lambda done, total: tell(done, 2 * total), with_blobs=False, since=since
+            archive, made, lambda done, total: tell(done, 2 * total), with_blobs=False
         )
         path = made / DATABASE
         _bring_here(path)
@@ -308,7 +304,7 @@ def restore_to_fleet(
             try:
                 with _marked(settings, database, owner):
                     _fill(
-                        database, file, settings, snapshot, since,
+                        database, file, settings, snapshot,
                         lambda done, total: tell(total + done, 2 * total),
                     )  # fmt: skip
             finally:
@@ -347,7 +343,7 @@ def _check_target(database: Database) -> None:
 
 
 def _bring_here(path: Path) -> None:
-    """Bring a database of an earlier version to the schema of this one."""
+    """Bring a database to the schema of this version."""
     url = URL.create("sqlite", database=str(path))
     open_database(url.render_as_string(hide_password=False)).close()
 
@@ -379,7 +375,7 @@ def _marked(settings: Settings, database: Database, owner: str) -> Iterator[None
 
 def _fill(
     database: Database, file: sqlite3.Connection, settings: Settings, snapshot: Snapshot,
-    since: Sequence[Path], tell: Progress,
+    tell: Progress,
 ) -> None:  # fmt: skip
     with database.write() as connection:  # who keeps the blobs may ask whose they are
         check_empty(connection)
@@ -388,14 +384,12 @@ def _fill(
     with closing(blobs), blobs.kept():
         lost = {one.digest for one in snapshot.damaged}
         wanted = (digest for digest in referred(file) if digest not in lost)
-        _put_all(blobs, snapshot.path, since, wanted, tell)
+        _put_all(blobs, snapshot.path, wanted, tell)
         with database.write() as connection:
             copy_into(connection, file)
 
 
-def _put_all(
-    blobs: Blobs, archive: Path, since: Sequence[Path], wanted: Iterable[str], tell: Progress
-) -> None:
+def _put_all(blobs: Blobs, archive: Path, wanted: Iterable[str], tell: Progress) -> None:
     """Keep all blobs, a few at once: each waits for its disk, or for the network.
 
     The archive may have been changed, or be another one, since it was verified.
@@ -411,7 +405,7 @@ def _put_all(
             require(one.result() == waiting.pop(one))
 
     with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="put") as pool:
-        for digest, size, chunks in blobs_of(archive, since, wanted, tell):
+        for digest, size, chunks in blobs_of(archive, wanted, tell):
             if size > _LARGE:
                 with blobs.incoming() as blob:
                     for chunk in chunks:

@@ -14,7 +14,7 @@ import os
 import shutil
 import sqlite3
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -43,7 +43,6 @@ from sceneprint.maintenance.snapshot.files import (
     read_manifest,
     staging,
 )
-from sceneprint.maintenance.snapshot.increments import BaseArchives
 from sceneprint.store.blobs.folder import is_digest
 
 # An archive read once from end to end, each part of it checked against all others.
@@ -52,10 +51,7 @@ from sceneprint.store.blobs.folder import is_digest
 # So nothing in the archive chooses where anything is written: what is not expected is refused.
 
 
-def unpack(
-    archive: Path, folder: Path, progress: Progress | None, *, with_blobs: bool,
-    since: Sequence[Path] = (),
-) -> Snapshot:  # fmt: skip
+def unpack(archive: Path, folder: Path, progress: Progress | None, *, with_blobs: bool) -> Snapshot:
     """Verify an archive, and write what is in it into a folder, durable.
 
     Parameters
@@ -64,29 +60,26 @@ def unpack(
     folder : empty; where this raises, what is in it is of no use
     progress : told of bytes done and bytes in all
     with_blobs : whether to write them; they are verified all the same
-    since : the archives that it was taken since
 
     Raises
     ------
-    SnapshotError : it is none, of a later version, or damaged; or there is no room; or `since` are
-        others.
+    SnapshotError : it is none, of another version, or damaged; or there is no room.
     NewerSchema : a later version wrote its database.
     """
     if not archive.is_file():
         raise SnapshotError(f"{archive}: there is no such file. Name a snapshot.")
-    with archive.open("rb") as file, BaseArchives(since) as bases:
+    with archive.open("rb") as file:
         total = os.fstat(file.fileno()).st_size
         reader = ArchiveReader(
             file, archive, lambda done: None if progress is None else progress(done, total)
         )
         manifest = _manifest(reader, archive)
-        bases.require(manifest, archive)
         wanted = manifest.database.bytes + (manifest.blobs.bytes if with_blobs else 0)
         check_room(folder.parent, wanted, "what is in the snapshot")
         _write_database(reader, manifest, folder / DATABASE)
         with _checked(reader, manifest, archive, folder / DATABASE) as copy:
             place = folder / BLOBS if with_blobs else None
-            missing = _blobs(reader, manifest, copy, place, bases)
+            missing = _blobs(reader, manifest, copy, place)
             damaged = _damaged(reader, manifest, missing)
         if reader.next() is not None:
             raise reader.damaged("a member follows the last one")
@@ -95,21 +88,21 @@ def unpack(
 
 
 def blobs_of(
-    archive: Path, since: Sequence[Path], wanted: Iterable[str], progress: Progress
+    archive: Path, wanted: Iterable[str], progress: Progress
 ) -> Iterator[tuple[str, int, Iterator[bytes]]]:
-    """Blobs in archives that `unpack` has verified: digest, size, and bytes in parts.
+    """Yield digest, size and bytes in parts of the blobs of an archive that `unpack` has verified.
 
     Parameters
     ----------
-    archive, since : see `unpack`
+    archive : see `unpack`
     wanted : the digests of all that it refers to, in order
     progress : told of bytes done and bytes in all
 
     Raises
     ------
-    DamagedSnapshot : they are not what was verified.
+    DamagedSnapshot : it is not what was verified.
     """
-    with archive.open("rb") as file, BaseArchives(since) as bases:
+    with archive.open("rb") as file:
         total = os.fstat(file.fileno()).st_size
         reader = ArchiveReader(file, archive, lambda done: progress(done, total))
         member = reader.next()
@@ -117,16 +110,13 @@ def blobs_of(
             reader.skip(member[1])
             member = reader.next()
         for digest in wanted:
-            own = member is not None and member[0] == f"{BLOBS}{digest}"
-            size = member[1] if own and member is not None else bases.size(digest)
-            chunks = reader.content(size or 0) if own else bases.take(digest)
-            if size is None or chunks is None:
+            if member is None or member[0] != f"{BLOBS}{digest}":
                 raise DamagedSnapshot(f"{archive} was changed while it was restored. Try again.")
-            yield digest, size, chunks
+            chunks = reader.content(member[1])
+            yield digest, member[1], chunks
             for _ in chunks:  # to its end, whoever has read how much
                 pass
-            if own:
-                member = reader.next()
+            member = reader.next()
 
 
 def _manifest(reader: ArchiveReader, archive: Path) -> SnapshotManifest:
@@ -185,7 +175,7 @@ def _checked(
 
 def _blobs(
     reader: ArchiveReader, manifest: SnapshotManifest, copy: sqlite3.Connection,
-    folder: Path | None, bases: BaseArchives,
+    folder: Path | None,
 ) -> list[str]:  # fmt: skip
     """Take the blobs that the database refers to, in its order; returns those that are missing."""
     missing, count, size = [], 0, 0
@@ -194,11 +184,6 @@ def _blobs(
         for digest in database_copy.referred(copy):
             # what is no digest would choose where it is written: nothing is there for it
             if member is None or member[0] != f"{BLOBS}{digest}" or not is_digest(digest):
-                chunks = bases.take(digest) if is_digest(digest) else None
-                if chunks is not None:
-                    if files.write(Path(digest[:2], digest), chunks) != digest:
-                        raise reader.damaged(f"the blob {digest[:12]} is damaged in an earlier one")
-                    continue
                 missing.append(digest)
                 if len(missing) > manifest.damaged.count:
                     raise reader.damaged("a blob is missing, or another one is there")
@@ -366,32 +351,28 @@ def _named(names: list[str]) -> str:
     return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"
 
 
-def verify_snapshot(
-    archive: Path, progress: Progress | None = None, since: Sequence[Path] = ()
-) -> Snapshot:
+def verify_snapshot(archive: Path, progress: Progress | None = None) -> Snapshot:
     """Read all of an archive and check it; its database is unpacked in a temporary folder.
 
     Parameters
     ----------
     archive : of `take_snapshot`
     progress : told of bytes done and bytes in all
-    since : the archives that it was taken since
 
     Raises
     ------
-    SnapshotError : it is none, of a later version, or damaged; or there is no room to check it.
+    SnapshotError : it is none, of another version, or damaged; or there is no room to check it.
     NewerSchema : a later version wrote its database.
     """
     with TemporaryDirectory(prefix="sceneprint-verify-") as name:
         folder = Path(name)
         with full_disk_explained(folder):
-            return unpack(archive, folder, progress, with_blobs=False, since=since)
+            return unpack(archive, folder, progress, with_blobs=False)
 
 
 def restore_snapshot(
-    archive: Path, folder: Path, *, replace: bool = False, progress: Progress | None = None,
-    since: Sequence[Path] = (),
-) -> tuple[Snapshot, Path | None]:  # fmt: skip
+    archive: Path, folder: Path, *, replace: bool = False, progress: Progress | None = None
+) -> tuple[Snapshot, Path | None]:
     """Make a data folder of an archive, all of it or nothing.
 
     Parameters
@@ -400,7 +381,6 @@ def restore_snapshot(
     folder : to be made, or empty
     replace : move what is there aside; it is never removed
     progress : told of bytes done and bytes in all
-    since : the archives that it was taken since
 
     Returns
     -------
@@ -416,7 +396,7 @@ def restore_snapshot(
     """
     target = RestoreTarget(folder, replace=replace)
     with full_disk_explained(folder), target.staging() as made:
-        snapshot = unpack(archive, made, progress, with_blobs=True, since=since)
+        snapshot = unpack(archive, made, progress, with_blobs=True)
         return snapshot, target.put(made, blobs=BLOBS.rstrip("/"), database=DATABASE)
 
 
@@ -438,7 +418,7 @@ def renew_copy(
     """Make a data folder a copy of a snapshot, all of it or nothing.
 
     The copy that is there goes, unless frames were added to it since: then it is moved aside. The
-    new copy has the records of queries that were asked of the one before, and none of the service.
+    new copy has none of the service's queries.
 
     Parameters
     ----------
@@ -468,9 +448,9 @@ def renew_copy(
     target = RestoreTarget(folder, replace=True)
     with full_disk_explained(folder), target.staging() as made:
         snapshot = unpack(archive, made, progress, with_blobs=True)
-        own = before is not None and bool(before.get("own_queries"))
-        _replace_queries(made / DATABASE, folder / DATABASE if own else None)
-        record = {"snapshot_id": snapshot_id, "frames": _frames_of(made), "own_queries": True}
+        with closing(sqlite3.connect(made / DATABASE)) as database, database:
+            database.execute("DELETE FROM queries")
+        record = {"snapshot_id": snapshot_id, "frames": _frames_of(made)}
         write_durable(made / _COPY, json.dumps(record).encode(), folder_is_new=False)
         aside = target.put(made, blobs=BLOBS.rstrip("/"), database=DATABASE)
     if aside is not None and before is not None and before["frames"] == _frames_of(aside):
@@ -491,37 +471,6 @@ def _read_copy(folder: Path) -> dict[str, object] | None:
             f"{folder / _COPY} is damaged. Move the folder away, or name another with --data."
         )
     return record
-
-
-def _replace_queries(made: Path, before: Path | None) -> None:
-    """Let a copy's records of queries be those of an earlier copy.
-
-    Parameters
-    ----------
-    made : database of the copy, as the service had it
-    before : that of the earlier copy; None where there is none, or its records are the service's
-    """
-    with closing(sqlite3.connect(made)) as database:
-        with database:
-            database.execute("DELETE FROM query_records")
-        if before is None or not before.is_file():
-            return
-        database.execute("ATTACH ? AS before", (str(before),))
-        columns = [  # the two may have been written by different versions
-            [row[1] for row in database.execute(f"PRAGMA {one}.table_info(query_records)")]
-            for one in ("main", "before")
-        ]
-        names = [one for one in columns[0] if one in columns[1] and one != "number"]
-        names.remove("map_number")
-        with database:  # of a map that was made anew since, none
-            database.execute(
-                f"INSERT INTO query_records (map_number, {', '.join(names)}) "
-                f"SELECT own.number, {', '.join(f'query.{one}' for one in names)} "
-                "FROM before.query_records AS query "
-                "JOIN before.maps AS held ON held.number = query.map_number "
-                "JOIN maps AS own ON own.name = held.name AND own.created_at = held.created_at "
-                "ORDER BY query.number"
-            )
 
 
 def _frames_of(folder: Path) -> list[int]:

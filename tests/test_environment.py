@@ -1,0 +1,151 @@
+"""How `make` installs: locks that agree, uv or else pip, packages that type checkers find."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Sequence
+from itertools import chain
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+INSTALL = ROOT / "tools/install"
+
+
+def names_of(requirements: Sequence[str]) -> list[str]:
+    return [re.split(r"[<>=;\[ ]", requirement)[0] for requirement in requirements]
+
+
+def locked(path: Path) -> dict[str, str]:
+    """Version and hashes of each package of a lock; each has a hash at least."""
+    text = path.read_text()
+    assert "://" not in text
+    hashed = r"((?:\\\n    --hash=sha256:[0-9a-f]{64} ?)+)"
+    entries = re.findall(rf"^([\w.-]+)(?:\[.*\])?==(\S+).*?{hashed}$", text, re.M)
+    assert len(entries) == len(re.findall(r"^\S", text, re.M))
+    return {name: f"{version} {hashes}" for name, version, hashes in entries}
+
+
+def test_every_dependency_has_a_reason_and_is_locked() -> None:
+    read = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    project, groups = read["project"], read["dependency-groups"]
+    extras, runtime = project["optional-dependencies"], project["dependencies"]
+    reasons = (ROOT / "docs/dependencies.md").read_text()
+    named = names_of([*runtime, *chain(*extras.values(), *groups.values())])
+    assert [name for name in named if name not in reasons] == []
+    running = [one for one in runtime if not one.startswith("open3d")]
+    wanted = {
+        "requirements.lock": running + extras["build"] + extras["ros"],
+        "requirements-dev.lock": runtime + extras["dev"],
+        "requirements-tools.lock": groups["tools"],
+        "requirements-uv.lock": groups["uv"],
+    }
+    locks = {name: locked(ROOT / name) for name in wanted}
+    ours = "sceneprint-client"  # installed from this checkout
+    for name, requirements in wanted.items():
+        assert set(names_of(requirements)) - {ours} <= set(locks[name]), name
+    assert locks["requirements.lock"].items() <= locks["requirements-dev.lock"].items()
+    assert {"open3d", "pytest", "uv", ours} & set(locks["requirements.lock"]) == set()
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Path:
+    """Stand-ins of the programs that `tools/install` calls: each call is a line of `calls`."""
+    call = f'echo "${{0##*/}} $*" >> "{tmp_path}/calls"'
+    scripts = {
+        "environment/bin/python": 'case "$*" in *" -r $BROKEN"*) exit 1 ;; esac',
+        "environment/bin/pip": "",
+        "environment/bin/uv": 'case "$*" in *" -r $UV_FAILS"*) exit 1 ;; esac',
+        "python-3.10": 'case "$2" in *version*) echo 3.10 ;; esac',
+        "python-3.11-without-venv": 'case "$2" in *version*) echo 3.11 ;; *) exit 1 ;; esac',
+    }
+    for name, script in scripts.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"#!/bin/sh\n{call}\n{script}\n")
+        path.chmod(0o755)
+    (tmp_path / "some.lock").write_text("numpy==2.0 \\\n    --hash=sha256:00\n")
+    return tmp_path
+
+
+def install(
+    machine: Path, python: str, environment: str, **variables: str
+) -> tuple[subprocess.CompletedProcess[str], list[str]]:
+    """Run `tools/install` and return what it did and each program that it called."""
+    done = subprocess.run(
+        [INSTALL, f"./{python}", environment, "some.lock", "own"], cwd=machine, text=True,
+        capture_output=True, env={**os.environ, "BROKEN": "none", "UV_FAILS": "none", **variables},
+    )  # fmt: skip
+    calls = machine / "calls"
+    return done, calls.read_text().splitlines() if calls.exists() else []
+
+
+EDITABLE = "--no-deps --no-build-isolation --config-settings editable_mode=compat -e own"
+
+
+def test_uv_installs_the_lock_and_then_our_packages(machine: Path) -> None:
+    done, calls = install(machine, "python", "environment")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "Installing some.lock into environment: 1 packages\n"
+    bootstrap, *by_uv = calls
+    assert bootstrap.startswith("python -m pip ")
+    assert bootstrap.endswith("requirements-uv.lock")
+    uv = "uv pip install --python environment/bin/python"
+    assert by_uv == [f"{uv} --require-hashes -r some.lock", f"{uv} {EDITABLE}"]
+
+
+@pytest.mark.parametrize(
+    ("variables", "reason"),
+    [
+        ({"BROKEN": f"{INSTALL.parent}/../requirements-uv.lock"}, "uv cannot be installed"),
+        ({"UV_FAILS": "some.lock"}, "uv failed"),
+    ],
+)
+def test_pip_installs_where_uv_does_not(
+    machine: Path, variables: dict[str, str], reason: str
+) -> None:
+    done, calls = install(machine, "python", "environment", **variables)
+    assert done.returncode == 0, done.stderr
+    assert f"{reason} (see above): pip is used, which takes minutes" in done.stdout
+    pip = "python -m pip --disable-pip-version-check install"
+    assert calls[-2:] == [f"{pip} --require-hashes -r some.lock", f"{pip} {EDITABLE}"]
+
+
+@pytest.mark.parametrize(
+    ("python", "message"),
+    [
+        ("python-3.10", "sceneprint needs Python 3.11 or later, and ./python-3.10 is Python 3.10."),
+        ("python-3.11-without-venv", "On Debian or Ubuntu: apt install python3-venv"),
+        ("absent", "./absent does not run. Install Python 3.11 or later"),
+    ],
+)
+def test_a_python_that_cannot_do_it_is_named(machine: Path, python: str, message: str) -> None:
+    done, calls = install(machine, python, "new")
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert not (machine / "new").exists()
+    assert [one for one in calls if "install" in one] == []
+
+
+def test_type_checkers_find_the_client(tmp_path: Path) -> None:
+    """As of a user's script in the environment of `make demo`."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from sceneprint_client import Client\n\n\n"
+        "def status(client: Client) -> int:\n"
+        '    return client.query("hall", "frame.png")\n'
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--config-file=", "--cache-dir=cache", script],
+        cwd=tmp_path, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.stdout.splitlines() == [
+        'script.py:5: error: Incompatible return value type (got "Answer", expected "int")'
+        "  [return-value]",
+        "Found 1 error in 1 file (checked 1 source file)",
+    ], done.stderr
