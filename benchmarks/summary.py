@@ -15,8 +15,8 @@ HEAD = [
     "| its processors, ms | eight clients / one |",
     "|---|---|--:|--:|--:|--:|--:|--:|",
 ]  # fmt: skip
-#: What one core of the machine of version 0.1 could reach, milliseconds: estimates from the
-#: number of operations and the bytes that have to be read.
+#: What one core of an early machine could reach, milliseconds: estimates from the number of
+#: operations and the bytes that have to be read.
 LIMITS = {"sign, with geometry": "18.5", "retrieve": "1.5", "diversify": "0.2", "validate": "16"}
 
 

@@ -55,7 +55,7 @@ def nearest_folder(folder: Path) -> Path:
 
 
 def warn_if_public(folder: Path) -> None:
-    """Log that users outside its group may read a data folder, as one of version 0.2."""
+    """Log a warning if users outside the group of a data folder may read it."""
     mode = public_mode(folder)
     if mode is not None:
         log.warning(

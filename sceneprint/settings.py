@@ -51,10 +51,6 @@ class Settings(BaseSettings):
     #: Where snapshots taken over the service are kept, likewise; default: `snapshots` in the data
     #: folder.
     snapshot_url: str | None = None
-    #: Who searches: this node, PostgreSQL with pgvector, or (`auto`) PostgreSQL for maps of which
-    #: this node would have to read much first. `qdrant`: this node, with Qdrant's engine; needs
-    #: the extra `qdrant`.
-    search: Literal["auto", "local", "database", "qdrant"] = "auto"
     #: Folder of search indexes, of this machine alone. Deleting it loses nothing but minutes;
     #: default: `index` in the data folder.
     index_dir: Path | None = None
@@ -154,13 +150,6 @@ class Settings(BaseSettings):
     #: Seconds after which no byte of a deleted frame is left in the caches of this node.
     purge_s: float = Field(default=3600.0, ge=1, le=31_536_000)
 
-    @field_validator("search")
-    @classmethod
-    def _can_search(cls, given: str) -> str:
-        if given == "qdrant" and find_spec("qdrant_edge") is None:
-            raise ValueError("it needs Qdrant's engine: run `pip install 'sceneprint[qdrant]'`")
-        return given
-
     @field_validator("replica_url")
     @classmethod
     def _has_primary(cls, given: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
@@ -177,12 +166,7 @@ class Settings(BaseSettings):
 
     @field_validator("index_url")
     @classmethod
-    def _is_shared(cls, given: str | None, info: ValidationInfo) -> str | None:
-        if given is not None and info.data.get("search") == "qdrant":
-            raise ValueError(
-                "indexes that Qdrant searches are not shared; leave it out, or choose another "
-                "SCENEPRINT_SEARCH"
-            )
+    def _is_shared(cls, given: str | None) -> str | None:
         if given is not None and given.startswith("memory:"):
             raise ValueError("memory:/// is inside one process; use file:///folder")
         return given

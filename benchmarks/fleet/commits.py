@@ -219,7 +219,7 @@ def index(writer: Writer, work: tuple[JobRow, FrameRow]) -> None:
     """Write the signature of a claimed frame, as a worker does."""
     held, frame = work
     with writer.database.write(map_number=frame.map_number, single=True) as connection:
-        if not index_claimed_frame(connection, held, frame, "map", MADE, single=True):
+        if not index_claimed_frame(connection, held, frame, "map", MADE):
             raise RuntimeError("a frame was not indexed")
 
 

@@ -32,14 +32,13 @@ from sceneprint.models import read_model
 from sceneprint.settings import Settings
 from sceneprint.store.database import Database
 from sceneprint.store.events import number_events
-from sceneprint.store.postgres import vectors
 from sceneprint_client.api import NewMap, Query
 from sceneprint_client.frame_files import meta_of
 
 BEGIN, END = "<!-- fleet-costs:begin -->", "<!-- fleet-costs:end -->"
 MAP = "costs"
 #: Commits that are timed, and vectors that are linked.
-COMMITS, VECTORS, DIMENSION = 300, 30_000, 384
+COMMITS = 300
 
 
 def measure(folder: Path, data: Path, n: int, model: str) -> Costs:
@@ -81,7 +80,6 @@ def measure(folder: Path, data: Path, n: int, model: str) -> Costs:
             pair.primary.execute("ALTER SYSTEM SET synchronous_standby_names = ''")
             pair.primary.execute("SELECT pg_reload_conf()")
             alone = _commits(engine.store.database)
-            linked = _linked(engine.store.database)
     finally:
         pair.end()
         objects.kill()
@@ -96,7 +94,6 @@ def measure(folder: Path, data: Path, n: int, model: str) -> Costs:
         tables={name: size for name, size in grown.items() if size >= 10},
         blobs=(uploads / n, (kept - uploads) / n),
         commit_ms={"alone": alone, "with a synchronous standby": synchronous},
-        linked=linked,
         memory=memory_of(folder, frames),
     )
 
@@ -187,41 +184,6 @@ def _commits(database: Database) -> tuple[float, float]:
     return p50, p99
 
 
-def _linked(database: Database) -> tuple[float, float, float] | None:
-    """Vectors a second that enter the graph; bytes a vector of the table, and of the graph.
-
-    None where the database has no pgvector.
-    """
-    from sqlalchemy import text
-
-    drawn = np.rint(np.random.default_rng(0).normal(size=(VECTORS, DIMENSION)) * 28).astype(int)
-    size = text("SELECT pg_total_relation_size('vectors_timed')")
-    with database.write(unchecked=True) as connection:
-        if vectors.make_table(connection, DIMENSION) is not None:
-            return None
-        connection.execute(
-            text(f"CREATE TABLE vectors_timed (LIKE vectors_{DIMENSION} INCLUDING INDEXES)")
-        )
-        insert = text("INSERT INTO vectors_timed VALUES (:n, '', 0, CAST(:vector AS halfvec))")
-        rows = [{"n": i, "vector": f"[{','.join(map(str, one))}]"}
-                for i, one in enumerate(drawn.clip(-127, 127).tolist())]  # fmt: skip
-        for i in range(0, VECTORS, 1000):
-            connection.execute(insert, rows[i : i + 1000])
-        plain = int(connection.execute(size).scalar_one())
-        begun = time.perf_counter()
-        connection.execute(
-            text(
-                "CREATE INDEX ON vectors_timed USING hnsw (vector halfvec_l2_ops) "
-                f"WITH (m = {vectors.LINKS}, ef_construction = {vectors.LOOKED_AT})"
-            )
-        )
-        seconds = time.perf_counter() - begun
-        graph = int(connection.execute(size).scalar_one()) - plain
-        connection.execute(text("DROP TABLE vectors_timed"))
-        vectors.drop_tables(connection)
-    return VECTORS / seconds, plain / VECTORS, graph / VECTORS
-
-
 def table(found: Costs) -> list[str]:
     """The figures as lines of Markdown."""
     lines = [
@@ -254,12 +216,6 @@ def table(found: Costs) -> list[str]:
     ]
     for name, (p50, p99) in found.commit_ms.items():
         lines.append(f"| smallest write in its turn, {name}: p50, p99 | {p50:.1f}, {p99:.1f} ms |")
-    if found.linked is not None:
-        rate, plain, graph = found.linked
-        lines.append(
-            f"| `halfvec({DIMENSION})`: vectors entering the graph (HNSW); bytes of each in table, "
-            f"of graph | {rate:,.0f} a second; {plain:,.0f}, {graph:,.0f} |"
-        )
     for name, size in sorted(found.memory.items()):
         lines.append(f"| memory of a {name}'s own, after some work | {size / 1e6:,.0f} MB |")
     return [*lines, ""]

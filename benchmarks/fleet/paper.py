@@ -36,7 +36,6 @@ class Costs:
     tables : bytes a frame of tables with their indexes, by name
     blobs : bytes a frame of uploads, and of geometry artifacts
     commit_ms : p50 and p99 of the smallest write in its turn, without and with a standby
-    linked : vectors a second that enter the graph (HNSW), and bytes a vector of table and graph
     memory : bytes that a service and a worker have for themselves, after some work
     """
 
@@ -49,7 +48,6 @@ class Costs:
     tables: Mapping[str, float]
     blobs: tuple[float, float]
     commit_ms: Mapping[str, tuple[float, float]]
-    linked: tuple[float, float, float] | None
     memory: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -125,15 +123,6 @@ def _of_frames(found: Costs, frames: int) -> list[str]:
         f"| keeping them | ${GB_MONTH:g} a GB and month | "
         f"${frames * blobs / 1e9 * GB_MONTH:,.0f} a month |",
     ]
-    if found.linked is not None:
-        speed, plain, graph = found.linked
-        lines += [
-            "| vectors and their graph in the database, to be held in its memory | "
-            f"{plain:,.0f} + {graph:,.0f} bytes a frame | "
-            f"{frames * (plain + graph) / 1e9:.0f} GB |",
-            f"| linking all of them anew, one processor | {speed:,.0f} a second | "
-            f"{frames / speed / 3600:.1f} h |",
-        ]
     return [
         *lines,
         f"| index of a node that asks one map of {each:,.0f} frames: memory of each process, "

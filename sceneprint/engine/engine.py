@@ -46,7 +46,7 @@ from sceneprint.engine.sessions.session_differences import (
 )
 from sceneprint.engine.signers import Signers, warm
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
-from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
+from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.engine.upkeep.purge import Purging, Retention
 from sceneprint.errors import ModelError
 from sceneprint.geometry.kernel import Cores
@@ -115,8 +115,7 @@ class Engine:
         self._shared = open_shared(self.store, settings)
         self._upkeep = Upkeep(self.store, self.signers, settings, self._shared)
         self._reencoding = Reencodings(self.store, self._upkeep)
-        self._readers = Readers(self.signers, settings.indexes, settings.search, self._shared)
-        self._vector_tables = VectorTables(self.signers, settings.search)
+        self._readers = Readers(self.signers, settings.indexes, self._shared)
         self.kept_answers = KeptAnswers(self.store, settings)
         self.kept = open_results(
             settings, self.store.blobs, lambda kept: ResultValidity(self.store).asked(kept),
@@ -399,7 +398,6 @@ class Engine:
         self._reencoding.run()
         self.retiring.run()
         published = self._upkeep.run()
-        self._vector_tables.run()
         self.operations.tidy()
         self.audit.tidy()
         self.history.tidy()

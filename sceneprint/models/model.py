@@ -43,12 +43,12 @@ from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Ambi
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.types import Floats32
 
-#: Of the file and of what the numbers in it mean. Raise it when code changes signatures. Models
-#: without a whitening keep the schema, and so the ids, that version 0.1 gave them.
+#: Of the file and of what the numbers in it mean, for models with a whitening and for those that
+#: store psi. They are part of a model's id. Raise one when code changes its signatures.
 SCHEMA_VERSION, PSI_SCHEMA_VERSION = 3, 2
 
-#: Groups of which a file, and an id, hold only the numbers that differ from their defaults: they
-#: came after the first models, which know nothing of them. So their defaults never change.
+#: Groups of which a file, and an id, hold only the numbers that differ from their defaults. A new
+#: number in them leaves the ids of existing models as they are, so their defaults never change.
 SPARSE = ("cloud", "validation")
 
 T = TypeVar("T")

@@ -178,8 +178,6 @@ def _check_cloud(p: CloudParameters) -> None:
 
 #: Names of the models that ship with the package, the default first.
 PRESETS = ("depth", "lidar", "paper")
-#: Presets of earlier versions, and what takes their place.
-FORMER_PRESETS = {"compact": "depth"}
 #: A model of the most components fits; a larger file is refused unread.
 MAXIMUM_BYTES = 16 << 20
 
@@ -225,11 +223,6 @@ def read_model(model: str | Path) -> Model:
         source = resources.files("sceneprint") / "presets" / f"{model}.safetensors"
         return parse_model(source.read_bytes(), f"preset {model}")
     path = Path(model)
-    if str(model) in FORMER_PRESETS and not path.exists():
-        raise UnreadableModel(
-            f"There is no preset {model!r} any more. Use {FORMER_PRESETS[str(model)]!r} instead. "
-            "Maps made with it are still served, and `sceneprint reencode` moves them."
-        )
     try:
         if path.stat().st_size > MAXIMUM_BYTES:
             raise UnreadableModel(

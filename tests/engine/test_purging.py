@@ -23,18 +23,14 @@ from sceneprint.engine.upkeep.purge import Purging
 from sceneprint.errors import BusyIndex, UnknownJob, UnknownQuery
 from sceneprint.index import newest, newest_number
 from sceneprint.index.generation_files import building
-from sceneprint.models import read_model
 from sceneprint.store.frames import delete_frame, write_frame
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.postgres.vectors import table_of
 from sceneprint.store.signatures import stored_vector
 from sceneprint_client.api import NewMap, Query
 from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.surface import NewReconstruction
 
-#: Where PostgreSQL keeps the vectors of signatures.
-VECTORS = table_of(read_model("depth").signature_bytes)
 #: Bytes of a piece that is looked for, and pieces of each thing.
 PIECE, MANY = 24, 40
 
@@ -57,7 +53,7 @@ def files(folder: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def rows(engine: Engine) -> Iterator[tuple[str, bytes]]:
-    """All tables of a server's database, those of vectors with them, as bytes and as text."""
+    """All tables of a server's database, as bytes and as text."""
     if engine.store.database.is_sqlite:
         return  # it is one of the files
     with engine.store.database.read() as connection:
@@ -82,7 +78,7 @@ def places(engine: Engine, folder: Path, wanted: list[bytes]) -> set[str]:
 def lived_in(make_engine, store_url, uploads, work_off, tmp_path):
     """A map whose index was published twice."""
     (tmp_path / "data" / "blobs").mkdir(parents=True)  # of a database that is there nobody makes it
-    given = {"database_url": store_url, "tail_frames": 2, "search": "database"}
+    given = {"database_url": store_url, "tail_frames": 2}
     engine = make_engine(tmp_path / "data", **given)
     engine.create_map(NewMap(name="hall", model="depth"))
     for one in uploads[:6]:
@@ -108,12 +104,10 @@ def secret(lived_in, ids, uploads):
     generation = newest(folder, row.model_id, len(vectors[0]))
     assert generation is not None
     assert len(generation) == len(numbers)
-    numbers_of = (np.frombuffer(vectors[0], np.uint8).astype(int) - 128).tolist()
     return {
         "upload": pieces(uploads[0].data, [one.data for one in uploads[1:]]),
         "signature": pieces(vectors[0], vectors[1:]),
         "artifact": pieces(artifacts[0], artifacts[1:]),
-        "vector": [",".join(map(str, numbers_of[:PIECE])).encode()],
         "tag": [b"by-the-door"],
     }
 
@@ -136,8 +130,6 @@ def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
     assert found["upload"] == {"blobs"}
     assert found["signature"] == {truth, "queries", "index .faiss"}
     assert found["artifact"] == {"blobs", "queries"}
-    is_sqlite = engine.store.database.is_sqlite
-    assert found["vector"] == (set() if is_sqlite else {f"table {VECTORS}"})
 
     with engine.store.database.write() as connection:  # of the others, which stay
         row = find_map(connection, "hall")

@@ -283,15 +283,3 @@ def test_paths_that_hold_no_model(tmp_path: Path) -> None:
         file.truncate(17 << 20)
     with pytest.raises(UnreadableModel, match="more than any model has"):
         read_model(large)
-
-
-def test_a_former_preset_names_its_successor() -> None:
-    with pytest.raises(UnreadableModel, match=r"no preset 'compact' any more. Use 'depth'"):
-        read_model("compact")
-
-
-def test_models_of_version_0_1_keep_their_ids() -> None:
-    """Maps of earlier versions hold them: signatures of another id are never compared."""
-    model = read_model("paper")
-    assert model.id.startswith("c8883ac257b4")
-    assert (model.unrelated_distance, model.levels) == (2206302.5, (0, 1, 2, 3))

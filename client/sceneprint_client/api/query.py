@@ -414,7 +414,7 @@ class Query(Given):
     exact: bool = Field(
         default=False,
         description="Compare every frame of the map that passes the filter. Most queries do so "
-        "anyway: only in a large map, or where PostgreSQL searches, are some left out.",
+        "anyway: only in a large map are some left out.",
     )
     filter: Filter | None = Field(
         default=None,

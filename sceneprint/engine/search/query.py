@@ -224,11 +224,6 @@ def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
     return sensor_frame(ids[0], a.kind), sensor_frame(ids[1], b.kind)
 
 
-#: Maps that `*` asks at once where the database searches: by one statement, whatever their number.
-#: Otherwise this node holds what is asked, and there are MOST_MAPS.
-FLEET_MAPS = 1000
-
-
 class Queries:
     """Asks one or more maps of one model.
 
@@ -337,7 +332,7 @@ class Queries:
                         "the query again."
                     )
                 check_model(asked.model_id, row.model_id)
-            views = self._readers.views(connection, database, rows)
+            views = [self._readers.view(connection, row) for row in rows]
         places = [SearchedMap(row, view) for row, view in zip(rows, views, strict=True)]
         for place in places:
             check_model(place.view.model_id, asked.model_id)
@@ -382,16 +377,13 @@ class Queries:
             return list(dict.fromkeys(query.maps))
         with self._store.database.read() as connection:
             names = [row.name for row in list_maps(connection) if may_read(row.name)]
-            most = MOST_MAPS
-            if len(names) > most and self._readers.asks_database(connection):
-                most = FLEET_MAPS
         if not names:
             raise UnknownMap("There is no map to search yet. Create one, or name an existing one.")
-        if len(names) > most:
+        if len(names) > MOST_MAPS:
             raise InvalidRequest(
-                f"There are {len(names)} maps, but a query can search at most {most}. Name the "
-                "maps to search.",
-                (("maps", f"more than {most}"),),
+                f"There are {len(names)} maps, but a query can search at most {MOST_MAPS}. Name "
+                "the maps to search.",
+                (("maps", f"more than {MOST_MAPS}"),),
             )
         return names
 
