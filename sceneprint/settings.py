@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import unquote, urlsplit
@@ -86,9 +85,6 @@ class Settings(BaseSettings):
     import_bytes: int = Field(default=4 << 30, ge=1024)
     #: Seconds for a body of hardly any bytes; each MiB of it may take 4 s more.
     body_s: float = Field(default=30.0, ge=1, le=3600)
-    #: Collector of OpenTelemetry that is sent spans of requests and jobs, over HTTP: such as
-    #: http://127.0.0.1:4318. Needs the extra `traces`; default: nothing is traced.
-    traces_url: str | None = Field(default=None, pattern=r"^https?://[^\s/@]+(/\S*)?$")
     #: Ask callers for a key on a loopback address as well, as behind a proxy.
     require_keys: bool = False
     #: Requests a second of each tenant, weighted by work, over five seconds; 0 for no limit.
@@ -168,13 +164,6 @@ class Settings(BaseSettings):
     def _holds_objects(cls, given: SecretStr | str | None) -> SecretStr | str | None:
         if given is not None:
             _require_objects(given if isinstance(given, str) else given.get_secret_value())
-        return given
-
-    @field_validator("traces_url")
-    @classmethod
-    def _can_trace(cls, given: str | None) -> str | None:
-        if given is not None and find_spec("opentelemetry") is None:
-            raise ValueError("it needs OpenTelemetry: run `pip install 'sceneprint[traces]'`")
         return given
 
     @field_validator("cors_origins", mode="before")

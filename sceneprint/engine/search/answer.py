@@ -52,7 +52,6 @@ from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.localization import PoseEstimate, PosePrior, QueryFrame, unconfirmed
 from sceneprint.models import Model
 from sceneprint.pipeline import PairMatch, searched
-from sceneprint.process import record_span
 from sceneprint.store import Store, behind_s
 from sceneprint.store.maps import frames_of
 from sceneprint.store.tables import FrameRow
@@ -71,7 +70,6 @@ class _Clock:
     def stage(self, name: str) -> None:
         now = time.perf_counter()
         self.spent[name] = round(1e3 * (now - self._since), 2)
-        record_span(name, now - self._since)
         self._since = now
 
 
