@@ -153,8 +153,7 @@ MOST_ROWS = 2560
 
 #: Percentiles of depth that are called near and far: a stray sample must not darken all others.
 _RANGE = (1.0, 99.0)
-#: matplotlib's viridis at equal steps: between them it is straight to 6 of 255. The library
-#: itself takes a third of a second to load.
+#: The colour map viridis at equal steps: between them it is straight to 6 of 255.
 _VIRIDIS = np.array(
     [
         (68, 1, 84), (72, 24, 106), (71, 45, 123), (66, 64, 134), (59, 82, 139), (51, 99, 141),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import shutil
 from collections import Counter
 from collections.abc import Callable
@@ -13,14 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from sqlalchemy import select
 
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import Work, cancel
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.maps.map_coverage import CoverageHandler, frames_to_query
-from sceneprint.engine.maps.map_plans import COLOURS, FOOTER, WIDTH
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.lab.synth import SynthRoom
 from sceneprint.settings import Settings
@@ -308,24 +305,6 @@ def test_cells_that_became_better_are_told(engine: Engine, work_off: WorkOff, ro
     for other, why in ((rooms.whole, "session of"), (wider.coverage_id, "0.5 m and 1 m")):
         with pytest.raises(InvalidRequest, match=why):
             engine.coverage.changes("hall", other, before.coverage_id)
-
-
-def test_the_plan_is_drawn_in_the_colours_of_its_cells(engine: Engine, rooms: Rooms) -> None:
-    output = engine.coverage.picture("hall", rooms.whole)
-    pixels = np.asarray(Image.open(io.BytesIO(output.make())).convert("RGB"))
-    assert pixels.shape[1] == WIDTH
-    plan, legend = pixels[:-FOOTER], pixels[-FOOTER:]
-    shown = {name for name, colour in COLOURS.items() if (plan == colour).all(axis=2).sum() > 20}
-    assert shown == {"ambiguous"}
-    assert all((legend == colour).all(axis=2).any() for colour in COLOURS.values())
-    other = engine.coverage.picture("hall", rooms.whole, rooms.parents[1])
-    assert other.tag != output.tag
-    first = engine.coverage.frames("hall", rooms.whole, limit=1).items[0]
-    engine.delete_frame("hall", first.frame_id)
-    assert engine.coverage.picture("hall", rooms.whole).tag != output.tag
-    assert engine.coverage.picture("hall", rooms.whole, rooms.parents[1]).tag == other.tag
-    with pytest.raises(InvalidRequest, match="no plan of parent frame 'x'"):
-        engine.coverage.picture("hall", rooms.whole, "x")
 
 
 def test_what_cannot_be_measured_is_refused(
