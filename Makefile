@@ -14,8 +14,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Bytecode is kept: the tests start hundreds of processes, and each would parse our modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 # Tests wait for real processes half of their time: twice as many as there are processors.
-export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
-	'import os; print(2 * len(os.sched_getaffinity(0)))')
+export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell echo $$((2 * $$(env -u OMP_NUM_THREADS nproc))))
 
 .PHONY: help demo test pytest test-thorough test-portable test-postgres lint kernels bytecode goldens format bench \
 	screenshots docs docs-serve soak siege fleet models lock sbom advisories dist clean

@@ -119,14 +119,10 @@ class Settings(BaseSettings):
     scrub_s: float = Field(default=3600.0, ge=1, le=31_536_000)
     #: Stored bytes that workers read each second, to see that they are sound, MB; 0: none are read.
     scrub_mb_per_s: float = Field(default=1.0, ge=0, le=10_000)
-    #: Room for answers that can be looked at afterwards, bytes; the oldest are removed. 0 for none.
-    query_bytes: int = Field(default=256 << 20, ge=0)
-    #: Seconds for which an answer can be looked at afterwards.
-    query_s: float = Field(default=3600.0, ge=1, le=31_536_000)
-    #: Answers of a map that are kept until somebody releases them; more are refused.
-    kept_answers: int = Field(default=1000, ge=0, le=1_000_000)
-    #: Room for those of a map, bytes.
-    kept_bytes: int = Field(default=256 << 20, ge=0)
+    #: Days for which queries are listed, and their answers can be looked at; 0: none is stored.
+    answer_days: float = Field(default=30.0, ge=0, le=36_500)
+    #: Room for answers, bytes; the oldest are removed first. 0: none is stored.
+    answer_bytes: int = Field(default=256 << 20, ge=0)
     #: Seconds for which deleted frames can be restored; 0: a deletion is for good at once.
     undo_s: float = Field(default=600.0, ge=0, le=31_536_000)
     #: Uploads of deleted frames of a map that are kept for it, bytes; more are deleted for good.
@@ -140,10 +136,6 @@ class Settings(BaseSettings):
     #: Days for which lines of the audit log are kept; of each tenant at most 200,000 changes and as
     #: many refusals.
     audit_kept_days: float = Field(default=365.0, gt=0, le=36_500)
-    #: Days for which a small record of each query is kept; 0: none is written.
-    history_days: float = Field(default=30.0, ge=0, le=36_500)
-    #: Newest records of queries of each map that are kept, some 600 bytes each.
-    history_queries: int = Field(default=100_000, ge=1, le=100_000_000)
     #: Who begins the fused surface of a map: workers, as frames come, or whoever asks for it.
     #: Deleted frames are always taken out of one that there is.
     surfaces: Literal["auto", "asked"] = "auto"

@@ -28,7 +28,6 @@ from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.signatures import stored_vector
 from sceneprint_client.api import NewMap, Query
-from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.surface import NewReconstruction
 
 #: Bytes of a piece that is looked for, and pieces of each thing.
@@ -118,24 +117,28 @@ def asked(engine: Engine, frame_id: str, uploads) -> tuple[str, str, str]:
     own = engine.query_frame("hall", frame_id, options)
     other = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, options)
     assert frame_id in {match.frame_id for match in other.matches}
-    fused = engine.reconstructions.begin(engine.kept.find(own.query_id), NewReconstruction())
+    fused = engine.reconstructions.begin(engine.query_log.find(own.query_id), NewReconstruction())
     return own.query_id, other.query_id, fused.job_id
 
 
 def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
     engine, frame_id = lived_in, ids(lived_in)[0]
     own, shows, fused = asked(engine, frame_id, uploads)
+    third = engine.query_frame("hall", frame_id, Query(seed=1)).query_id
+    for one in (shows, third):
+        assert engine.query_log.keep(one, None).kept_at is not None
     truth = "sceneprint.db" if engine.store.database.is_sqlite else "table signatures"
     found = {what: places(engine, tmp_path, wanted) for what, wanted in secret.items()}
     assert found["upload"] == {"blobs"}
-    assert found["signature"] == {truth, "queries", "index .faiss"}
-    assert found["artifact"] == {"blobs", "queries"}
+    is_sqlite = engine.store.database.is_sqlite
+    answers = {"queries", "sceneprint.db" if is_sqlite else "table queries"}  # one is kept
+    assert found["signature"] == {truth, *answers, "index .faiss"}
+    assert found["artifact"] == {"blobs", *answers}
 
     with engine.store.database.write() as connection:  # of the others, which stay
         row = find_map(connection, "hall")
         for name in ids(engine)[1:]:
             write_frame(connection, row, find_frame(connection, row, name), {"tags": []})
-    assert engine.kept_answers.keep(engine.kept, shows, KeepOptions()).kept
     engine.delete_frame("hall", frame_id)
     assert places(engine, tmp_path, secret["upload"]) == {"blobs"}  # it can be restored
     with pytest.raises(UnknownQuery):
@@ -158,7 +161,7 @@ def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
 def test_no_byte_of_a_map_is_left(lived_in, secret, ids, uploads, tmp_path):
     engine, frame_id = lived_in, ids(lived_in)[0]
     _, shows, _ = asked(engine, frame_id, uploads)
-    engine.kept_answers.keep(engine.kept, shows, KeepOptions())
+    engine.query_log.keep(shows, None)
     engine.delete_frame("hall", ids(engine)[1])
     engine.delete_map("hall")
     engine.publish_due()
@@ -222,7 +225,7 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
     second = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2, purge_s=1)
     workers = [
         Purging(
-            one.store, one._upkeep, one.kept, one.kept_answers, one.undo, one.reconstructions,
+            one.store, one._upkeep, one.query_log, one.undo, one.reconstructions,
             one.differences, 0.0,
         )
         for one in (second, second)

@@ -291,8 +291,8 @@ class Deadline:
     """
 
     def __init__(self, milliseconds: int | None, since: float | None = None) -> None:
-        since = time.perf_counter() if since is None else since
-        self._ends = None if milliseconds is None else since + milliseconds / 1e3
+        self.since = time.perf_counter() if since is None else since
+        self._ends = None if milliseconds is None else self.since + milliseconds / 1e3
         self._longest, self._began = FIRST_S, 0.0
         self.reached: bool | None = None if milliseconds is None else False
 
