@@ -179,7 +179,7 @@ def test_the_index_of_the_documentation_names_every_page() -> None:
 def test_documented_commands_are_known() -> None:
     lines = commands_of(STARTED + LIBRARY)
     commands = [line.split()[1:] for line in lines if line.startswith(".venv/bin/sceneprint ")]
-    assert len(commands) == len(lines) == 22
+    assert len(commands) == len(lines) == 21
     known = parser()
     for command in commands:
         assert known.parse_args(command).command == command[0]

@@ -317,9 +317,8 @@ def test_what_cannot_be_measured_is_refused(
     with pytest.raises(ValueError, match="leaves out the whole session already"):
         NewMapCoverage(other_sessions=True, not_within_s=3.0)
     queued = engine.coverage.begin("hall", NewMapCoverage(every=6))
-    for ask in (engine.coverage.picture, lambda *of: engine.coverage.changes(*of, of[1])):
-        with pytest.raises(NotIndexed, match="is queued"):
-            ask("hall", queued.coverage_id)
+    with pytest.raises(NotIndexed, match="is queued"):
+        engine.coverage.changes("hall", queued.coverage_id, queued.coverage_id)
     with pytest.raises(UnknownJob, match="no coverage"):
         engine.coverage.get("pair", queued.coverage_id)
     cancel(engine.store, queued.coverage_id)
