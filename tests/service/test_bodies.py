@@ -157,9 +157,9 @@ def test_what_is_as_large_as_may_be_is_read(narrow, refused):
     body += b" " * (LIMIT - len(body))  # behind the end, and so without effect
     headers = {"content-type": X}
     full = narrow.client.post("/v1/maps/hall/frames", content=body, headers=headers)
-    refused(full, 422, "unreadable-frame", "neither PNG nor NPY")
+    refused(full, 422, "unreadable-frame")
     streamed = narrow.client.post("/v1/maps/hall/frames", content=iter([body]), headers=headers)
-    refused(streamed, 422, "unreadable-frame", "neither PNG nor NPY")
+    refused(streamed, 422, "unreadable-frame")
     over = narrow.client.post("/v1/maps/hall/frames", content=iter([body, b" "]), headers=headers)
     refused(over, 413, "too-large")
 
