@@ -143,7 +143,7 @@ def test_what_is_no_archive_is_refused_at_the_door(
 ) -> None:
     client.create_map(map_name, model="depth")
     for data, reason in (
-        (b"no archive at all", ""),
+        (b"no archive at all", None),
         (packed(rooms).getvalue()[:-400], "ends early"),
     ):
         with pytest.raises(UnreadableArchive, match=reason):
