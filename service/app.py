@@ -217,11 +217,11 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
     # lead whoever follows it, with a key, to where Host says, and behind a proxy away from TLS
     app = FastAPI(
         title="sceneprint", version=__version__, description=DESCRIPTION, lifespan=lifespan,
-        redirect_slashes=False, docs_url=None, redoc_url=None,
+        redirect_slashes=False, docs_url=None, redoc_url=None, openapi_url=None,
     )  # fmt: skip
     for router in (*ROUTERS, admin.router):  # as they are: `include_router` would make each anew
         app.router.routes.extend(router.routes)
-    app.include_router(static_files.routes())
+    app.include_router(static_files.routes(lambda: openapi_of(app)))
     app.include_router(dashboard.routes(dashboard.files_in(dashboard.PAGES)))
     problems.install(app)
     app.add_middleware(

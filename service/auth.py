@@ -44,6 +44,7 @@ from service.limits import (
     Gate,
     Holdings,
     RateLimits,
+    SharedLooks,
     TokenBucket,
     Turns,
     enforce_rate_limit,
@@ -83,6 +84,8 @@ LOOKUPS = 4
 #: Turns of requests that work in shared threads, such as lists: they compete for one interpreter,
 #: so that one beside another tenant has one.
 READS, READS_BESIDE = 8, 1
+#: Maximum age of what `/readyz` says, seconds.
+READY_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +106,7 @@ class Context:
     reads : turns of requests that work in shared threads
     spool : bodies that are kept on disk until they are read
     lookups : threads that look keys up
+    looks : at the state of the service, shared by those who ask for it
     """
 
     engine: Engine
@@ -118,6 +122,7 @@ class Context:
     reads: Turns = field(default_factory=lambda: Turns(READS, READS_BESIDE, rests=True))
     spool: BodySpool = field(default_factory=BodySpool)
     lookups: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(LOOKUPS))
+    looks: SharedLooks = field(default_factory=lambda: SharedLooks(READY_S))
 
     async def run(self, do: Callable[..., T], *given: object, patient: bool = False) -> T:
         """Do it in a shared thread, when it is the tenant's turn; not while a turn is held.

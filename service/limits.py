@@ -19,12 +19,12 @@ import re
 import tempfile
 import threading
 import time
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, defaultdict
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 import anyio
 from anyio import to_thread
@@ -121,6 +121,50 @@ class Turns:
             self._timer = None
         else:
             self._timer = asyncio.get_running_loop().call_later(rest_s, self._admit)
+
+
+class SharedLooks:
+    """Results of slow looks that concurrent requests share.
+
+    Parameters
+    ----------
+    most_s : maximum age of a result, seconds, counted from the beginning of its look
+    """
+
+    def __init__(self, most_s: float) -> None:
+        self._most_s = most_s
+        self._locks = defaultdict[str, asyncio.Lock](asyncio.Lock)
+        self._found: dict[str, tuple[float, Any]] = {}
+
+    async def get(self, name: str, look: Callable[[], T]) -> T:
+        """Return what a look found, or raise what it raised.
+
+        Who waits while another request looks holds no thread.
+
+        Parameters
+        ----------
+        name : of the look
+        look : called in a thread where no result of this name is young enough
+        """
+        arrived = time.monotonic()
+        async with self._locks[name]:
+            began, found = self._found.get(name, (-math.inf, None))
+            # a look that began after the request arrived is new enough, however long it took
+            if began < arrived and time.monotonic() - began > self._most_s:
+                began = time.monotonic()
+                found = await to_thread.run_sync(_outcome, look)
+                self._found[name] = began, found
+        if isinstance(found, Exception):
+            raise found.with_traceback(None)
+        return cast(T, found)
+
+
+def _outcome(do: Callable[[], object]) -> object:
+    """Return what a call returns, or the exception that it raises."""
+    try:
+        return do()
+    except Exception as error:
+        return error
 
 
 class Gate:

@@ -46,8 +46,9 @@ _METHODS = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"
 _HUNG_UP = 499
 #: Refusals that come late to who does not stop.
 _HELD_BACK = (401, 403, 429)
-#: What machines ask every few seconds: not traced, and in the log at DEBUG alone.
-_PROBES = ("/healthz", "/readyz", "/metrics")
+#: What machines request every few seconds, or anybody without a key: not traced, and in the log at
+#: DEBUG alone.
+_PROBES = ("/healthz", "/readyz", "/metrics", "/openapi.json")
 #: Requests that are answered at once, those that wait or stream among them.
 _MOST_AT_ONCE = 900
 

@@ -1,4 +1,4 @@
-"""Static files as they are sent, packed once, and the page `/docs` made of them.
+"""Static files as they are sent, compressed once: the page `/docs`, and the OpenAPI document.
 
 `/docs` is Swagger UI on the service's own OpenAPI document, with nothing from elsewhere: its files
 are those that the package fastapi-offline brings along.
@@ -6,13 +6,18 @@ are those that the package fastapi-offline brings along.
 
 from __future__ import annotations
 
+import asyncio
 import gzip
 import hashlib
+import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
+from anyio import to_thread
 from fastapi import APIRouter, Request, Response
 from starlette.exceptions import HTTPException
 
@@ -24,6 +29,7 @@ KINDS = {
     ".css": "text/css; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
     ".svg": "image/svg+xml",
+    ".json": "application/json",
 }
 
 
@@ -55,16 +61,24 @@ def pack_file(suffix: str, plain: bytes) -> StaticFile:
     return StaticFile(KINDS[suffix], plain, gzip.compress(plain, 9, mtime=0), tag)
 
 
-def answer_file(request: Request, file: StaticFile, policy: str) -> Response:
-    """A file with its content security policy; 304 where the browser has it."""
+def answer_file(request: Request, file: StaticFile, policy: str | None = None) -> Response:
+    """Answer with a file, or with 304 where the caller has it.
+
+    Parameters
+    ----------
+    request : whose `If-None-Match` and `Accept-Encoding` count
+    file : that is sent
+    policy : its content security policy; default: the one that allows nothing
+    """
     packs = "gzip" in request.headers.get("accept-encoding", "")
     tag = f"{file.tag}-gzip" if packs else file.tag
     headers = {
         "ETag": f'"{tag}"',
         "Cache-Control": "no-cache",  # asked again each time: another version may serve by now
-        "Content-Security-Policy": policy,
         "Vary": "Accept-Encoding",
     }
+    if policy is not None:
+        headers["Content-Security-Policy"] = policy
     if is_known(request, tag):
         return Response(status_code=304, headers=headers)
     if packs:
@@ -106,9 +120,26 @@ _START = """SwaggerUIBundle({
 _LIBRARY = ("swagger-ui.css", "swagger-ui-bundle.js")
 
 
-def routes() -> APIRouter:
-    """Routes of the page and its files."""
+def routes(document: Callable[[], dict[str, Any]]) -> APIRouter:
+    """Return the routes of the page, its files and the OpenAPI document.
+
+    Parameters
+    ----------
+    document : makes the OpenAPI document, which takes a while; called by the first request for it
+    """
     router = APIRouter(include_in_schema=False)
+    rendered: list[StaticFile] = []
+    rendering = asyncio.Lock()
+
+    def render() -> StaticFile:
+        return pack_file(".json", json.dumps(document(), separators=(",", ":")).encode())
+
+    @router.api_route("/openapi.json", methods=["GET", "HEAD"])
+    async def openapi(request: Request) -> Response:
+        async with rendering:
+            if not rendered:
+                rendered.append(await to_thread.run_sync(render))
+        return answer_file(request, rendered[0])
 
     @router.api_route("/docs", methods=["GET", "HEAD"])
     def page(request: Request) -> Response:

@@ -12,6 +12,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, Field, ValidationError
 
 from sceneprint import __version__
+from sceneprint.engine import Engine
 from sceneprint.engine.admin import operations
 from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.maps import map_lifecycle
@@ -74,26 +75,33 @@ async def healthz() -> Health:
     "/readyz", responses=declared(), response_model_exclude_defaults=True,
     openapi_extra={"security": [{}]},  # besides a key: none
 )  # fmt: skip
-def readyz(here: Here, asking: Guest) -> Readiness:
+async def readyz(here: Here, asking: Guest) -> Readiness:
     """Answers while the database and the object store do; 503 while one does not, while kernels are
-    being compiled, and for good once a later version has migrated the store. No key is asked for.
+    being compiled, and for good once a later version has migrated the store. Requires no key. The
+    answer is at most a second old.
     """
-    here.engine.signers.require_kernels(LOOK_S)
-    frames = jobs = None
-    here.engine.store.blobs.check()
-    here.engine.store.database.require_schema()
-    if asking is not None and asking.reads_every:
-        frames, jobs = here.engine.counts()
-    else:  # whoever shows no key has nothing counted: that takes the longer the more there is
-        with here.engine.store.database.read() as connection:
-            newest_number(connection)
+    found = await here.looks.get("readiness", partial(_look, here.engine))
+    # who shows no key has nothing counted: that takes the longer the more there is
+    if asking is None or not asking.reads_every:
+        return found
+    frames, jobs = await here.looks.get("counts", here.engine.counts)
+    return found.model_copy(update={"frames": frames, "jobs": jobs})
+
+
+def _look(engine: Engine) -> Readiness:
+    """Check that the service can work; raises what it cannot do without."""
+    engine.signers.require_kernels(LOOK_S)
+    engine.store.blobs.check()
+    engine.store.database.require_schema()
+    with engine.store.database.read() as connection:
+        newest_number(connection)
     return Readiness(
         status="ready",
         version=__version__,
-        read_only=here.engine.store.read_only,
-        frames=frames,
-        jobs=jobs,
-        replica=_replica(here.engine.operations.statistics.replica()),
+        read_only=engine.store.read_only,
+        frames=None,
+        jobs=None,
+        replica=_replica(engine.operations.statistics.replica()),
     )
 
 

@@ -18,10 +18,13 @@ def shaken(begin, make_map, small_shots):
     return server
 
 
-def test_a_database_that_vanishes_is_told_of_and_comes_back(shaken, small_shots, refused, truth):
+def test_a_database_that_vanishes_is_told_of_and_comes_back(
+    shaken, small_shots, refused, truth, until
+):
     path = "/v1/maps/hall/frames"
     with truth(shaken.folder) as connection:
         connection.exec_driver_sql("ALTER TABLE jobs RENAME TO away")
+    until(lambda: shaken.client.get("/readyz").status_code == 503)
     for answer in (
         shaken.client.get("/readyz"),
         shaken.client.get(path),
@@ -36,7 +39,7 @@ def test_a_database_that_vanishes_is_told_of_and_comes_back(shaken, small_shots,
     assert shaken.client.get("/healthz").json()["status"] == "ok"
     with truth(shaken.folder) as connection:
         connection.exec_driver_sql("ALTER TABLE away RENAME TO jobs")
-    assert shaken.client.get("/readyz").json()["status"] == "ready"
+    until(lambda: shaken.client.get("/readyz").status_code == 200)
     sent = shaken.client.post(path, **small_shots[2].form(), headers={"Prefer": "wait=60"})
     assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
     assert len(shaken.workers) == 1
