@@ -168,8 +168,6 @@ MADE_OF_ANYTHING = (
 OF_ALL = (
     "GET /v1/keys", "POST /v1/keys", "DELETE /v1/keys/{key_name}", "GET /v1/audit", "GET /metrics",
     "POST /v1/keys/{key_name}/rotate",
-    "POST /v1/snapshots", "GET /v1/snapshots", "GET /v1/snapshots/{snapshot_id}",
-    "DELETE /v1/snapshots/{snapshot_id}",
 )  # fmt: skip
 #: Answered to anybody with a key, and by what the key may read.
 BY_KEY = (
@@ -557,6 +555,6 @@ def test_what_is_not_noted_is_said(operations):
         "begin_difference", "delete_difference",
         "begin_surface", "delete_surface",
         "reconstruct", "delete_reconstruction",
-        "add_import", "take_snapshot", "delete_snapshot", "delete_queries",
+        "add_import", "delete_queries",
         "add_query_records",
     }  # fmt: skip
