@@ -458,7 +458,7 @@ _READING = frozenset(("GET", "HEAD", "OPTIONS"))
 #: What is asked much and changes no map, and uploads, which are many: frames and events tell of
 #: them.
 UNNOTED = frozenset(
-    ("add_frame", "put_frame", "add_batch", "ask", "ask_several", "ask_again", "localize",
+    ("add_frame", "put_frame", "add_batch", "ask", "ask_several", "localize",
      "localize_sequence", "compare")
 )  # fmt: skip
 

@@ -10,6 +10,7 @@ from sqlalchemy import (
     Connection,
     delete,
     func,
+    or_,
     select,
     union,
     update,
@@ -27,7 +28,6 @@ from sceneprint.store.tables import (
     frame_tags,
     frames,
     job_files,
-    kept_answers,
     maps,
     now,
     signatures,
@@ -100,6 +100,12 @@ def delete_frame(
     return delete_frames(connection, row, [frame.number], deletion=deletion)
 
 
+def not_purged() -> ColumnElement[bool]:
+    """Return the condition that a frame exists, or was deleted and can be restored."""
+    restorable = frames.c.number.in_(select(deleted_frames.c.frame_number))
+    return or_(frames.c.state != FrameState.DELETED, restorable)
+
+
 def refers_to(connection: Connection, blob: str) -> bool:
     """Whether anything refers to a blob; see `referred_blobs`."""
     return bool(referred_blobs(connection, [blob]))
@@ -107,7 +113,7 @@ def refers_to(connection: Connection, blob: str) -> bool:
 
 def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
     """Those of some blobs, a thousand at most, that a frame which is there or can be restored, a
-    signature, a job, a tile or a kept answer refers to.
+    signature, a job or a tile refers to.
     """
     referring = (
         (frames.c.blob, frames.c.state.not_in(ROOMLESS)),
@@ -116,7 +122,6 @@ def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
         (surface_tiles.c.blob,),
         (surface_tiles.c.draft,),
         (deleted_frames.c.blob,),
-        (kept_answers.c.blob,),
     )
     asked = (select(column).where(column.in_(blobs), *more) for column, *more in referring)
     return set(connection.execute(union(*asked)).scalars())

@@ -39,7 +39,6 @@ from sqlalchemy import (
     bindparam,
     cast,
     extract,
-    false,
     func,
     literal,
     literal_column,
@@ -413,18 +412,18 @@ former_maps = Table(
     Index(None, "number"),
 )
 
-#: What came of each query, in short, for some time.
-query_records = Table(
-    "query_records",
+#: Queries and their outcomes, for some time, and their answers while there is room.
+queries = Table(
+    "queries",
     metadata,
     Column("number", WHOLE, primary_key=True),
-    Column("id", _string(32), nullable=False),  # of the answer
+    Column("id", _string(32), nullable=False, unique=True),  # of the answer
     Column("at", Float, nullable=False),  # when the query came
     Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
-    Column("maps", JSON(none_as_null=True)),  # names of all that were asked; null: this one alone
+    Column("maps", JSON(none_as_null=True)),  # names of all maps searched; null: this one alone
     Column("robot", _string(128)),
     Column("session", _string(128)),
-    Column("key_id", _string(32)),  # of the key that was shown
+    Column("key_id", _string(32)),  # of the key that the request came with
     Column("status", _string(16), nullable=False),
     Column("cause", _string(64)),
     Column("reason", TEXT, nullable=False),
@@ -435,22 +434,29 @@ query_records = Table(
     Column("alternatives", WHOLE, nullable=False),
     Column("milliseconds", Float, nullable=False),
     Column("kind", _string(8)),
-    Column("frame_map", _string(63)),  # the stored frame that was asked for
+    Column("frame_map", _string(63)),  # the stored frame that was the query
     Column("frame_id", _string(64)),
-    Column("kept", Boolean, nullable=False),  # whether its answer was to be kept
-    # a robot answered it itself, and sent the record later
-    Column("offline", Boolean, nullable=False, server_default=false()),
+    Column("listed", Boolean, nullable=False),  # false: stored only to look at its answer
+    Column("kept_at", Float),  # since when the answer is kept; null: it expires
+    Column("title", _string(200)),  # of a kept answer
+    Column("shown", JSON(none_as_null=True)),  # numbers of the frames that the answer shows
+    Column("bytes", BigInteger, nullable=False),  # of the answer; 0: it is not stored
+    Column("answer", LargeBinary),  # of a kept one; others are files, see `answer_files`
     Index(None, "at", "number"),
     Index(None, "map_number", "at", "number"),
     Index(None, "map_number", "status", "at", "number"),
     Index(None, "robot", "at", "number"),
-    Index(None, "key_id"),
     sqlite_autoincrement=True,
 )
-#: Records that robots send, each once.
+#: Stored answers by age, and kept ones: few among many rows.
 Index(
-    "ix_query_records_offline", query_records.c.map_number, query_records.c.id, unique=True,
-    sqlite_where=literal_column("offline = 1"), postgresql_where=literal_column("offline"),
+    "ix_queries_stored", queries.c.at, queries.c.number, queries.c.bytes,
+    sqlite_where=literal_column("bytes > 0"), postgresql_where=literal_column("bytes > 0"),
+)  # fmt: skip
+Index(
+    "ix_queries_kept", queries.c.map_number, queries.c.at, queries.c.number,
+    sqlite_where=literal_column("kept_at IS NOT NULL"),
+    postgresql_where=literal_column("kept_at IS NOT NULL"),
 )  # fmt: skip
 
 #: The fused surface of a map: where its making stands.
@@ -527,44 +533,6 @@ surface_touches = Table(
     "surface_touches",
     metadata,
     Column("tile_number", WHOLE, ForeignKey("surface_tiles.number"), primary_key=True),
-    Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
-    Index(None, "frame_number"),
-)
-
-#: Answers of queries that are kept until they are released; the blob is as `stored_results` has it.
-kept_answers = Table(
-    "kept_answers",
-    metadata,
-    Column("number", WHOLE, primary_key=True),
-    Column("id", _string(32), nullable=False, unique=True),  # of the answer
-    Column("blob", _string(64), nullable=False),
-    Column("bytes", BigInteger, nullable=False),
-    Column("title", _string(200)),
-    Column("kept_at", Float, nullable=False),
-    Column("until", Float),  # null: until it is released
-    Column("at", Float, nullable=False),  # when the query came; this and the next: as `record`
-    Column("status", _string(16), nullable=False),
-    Column("robot", _string(128)),
-    Column("record", JSON, nullable=False),  # what lists tell of the query
-    Index(None, "blob"),
-    Index(None, "at", "number"),
-    sqlite_autoincrement=True,
-)
-
-#: The maps that a kept answer was asked of: it goes with any of them, and counts in each.
-kept_answer_maps = Table(
-    "kept_answer_maps",
-    metadata,
-    Column("kept_number", WHOLE, ForeignKey("kept_answers.number"), primary_key=True),
-    Column("map_number", WHOLE, ForeignKey("maps.number"), primary_key=True),
-    Index(None, "map_number", "kept_number"),
-)
-
-#: The frames that a kept answer shows: it goes with any of them.
-kept_answer_frames = Table(
-    "kept_answer_frames",
-    metadata,
-    Column("kept_number", WHOLE, ForeignKey("kept_answers.number"), primary_key=True),
     Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
     Index(None, "frame_number"),
 )

@@ -119,7 +119,7 @@ def metrics(here: Here) -> Response:
     """Figures for Prometheus; a key, where one is asked for, must have `read` for `*`."""
     figures = here.engine.operations.statistics.figures()
     held, spool = here.requests.by_tenant(), here.spool.by_tenant()
-    text = here.metrics.text(figures, here.feed.streams, here.engine.history.lost, held, spool)
+    text = here.metrics.text(figures, here.feed.streams, here.engine.query_log.lost, held, spool)
     return Response(text, media_type=CONTENT_TYPE_LATEST)
 
 

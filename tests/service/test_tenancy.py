@@ -116,5 +116,6 @@ def test_an_answer_goes_with_its_map_and_with_its_frame(house, refused, small_sh
         for place in ("", "/points", "/question", "/preview.png", "/similarities"):
             answer = house.ask("robot", "GET", f"/v1/queries/{asked[1]}{place}")
             refused(answer, 404, "unknown-query")
-        again = house.ask("robot", "POST", f"/v1/queries/{asked[1]}/again", json={})
-        refused(again, 404, "unknown-query")
+        body = {"maps": ["alpha"], "query_id": asked[1]}
+        again = house.ask("robot", "POST", "/v1/queries", json=body)
+        refused(again, 404, "unknown-query" if made_anew else "unknown-map")

@@ -27,10 +27,9 @@ from sceneprint.store.tables import MapRow, metadata
 
 TABLES = [
     "audit", "audit_chains", "deleted_frames", "deletions", "doomed", "events", "former_maps",
-    "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs", "kept_answer_frames",
-    "kept_answer_maps", "kept_answers", "keys", "maps", "models", "pending_events",
-    "query_records", "samples",
-    "schema_range", "scrubs", "secrets", "signatures", "surface_frames",
+    "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs", "keys", "maps",
+    "models", "pending_events", "queries", "samples", "schema_range",
+    "scrubs", "secrets", "signatures", "surface_frames",
     "surface_tiles", "surface_touches", "surfaces", "tenants",
 ]  # fmt: skip
 
