@@ -46,6 +46,7 @@ from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.surface.coverage import added_areas, observed_volume, of_views, share_seen
 from sceneprint.geometry.surface.depth_image import doubled
 from sceneprint.store import Store, queue
+from sceneprint.store.audit_log import record_change
 from sceneprint.store.frames import not_purged
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.store.tables import JobRow, frames, maps
@@ -328,6 +329,7 @@ class ReconstructionJobs:
         """Remove a reconstruction, whatever has become of it; UnknownJob where there is none."""
         with self._store.database.write() as connection:
             blobs = queue.remove_job(connection, _find(connection, job_id))
+            record_change(connection, "job.removed", None, job_id, kind=KIND)
         collect_deleted_blobs(self._store, blobs)
 
     def forget(self) -> int:

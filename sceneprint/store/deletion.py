@@ -21,7 +21,6 @@ from sqlalchemy import (
     and_,
     bindparam,
     delete,
-    insert,
     literal,
     literal_column,
     not_,
@@ -34,7 +33,7 @@ from sqlalchemy import (
 from sqlalchemy.dialects import postgresql, sqlite
 
 from sceneprint.store.database import Database
-from sceneprint.store.events import events_table, record_event, remember
+from sceneprint.store.events import record_event, record_events, remember
 from sceneprint.store.maps import ROOMLESS, count_on, next_revision
 from sceneprint.store.queue import cancel_jobs
 from sceneprint.store.tables import (
@@ -44,6 +43,7 @@ from sceneprint.store.tables import (
     deleted_frames,
     deletions,
     doomed,
+    event_values,
     frame_tags,
     frames,
     job_files,
@@ -117,13 +117,10 @@ def delete_frames(
         ),
         [{"of": n, "at": last - len(living) + i} for i, n in enumerate(living, 1)],
     )  # fmt: skip
-    at, data = time.time(), {} if reason is None else {"reason": reason}
-    connection.execute(
-        insert(events_table(connection)),
-        [
-            {"at": at, "kind": "frame.deleted", "map": row.name, "frame_id": one.id, "data": data}
-            for one in found
-        ],
+    data = {} if reason is None else {"reason": reason}
+    record_events(
+        connection,
+        [event_values("frame.deleted", row.name, one.id, None, data) for one in found],
     )
     return blobs
 

@@ -208,6 +208,10 @@ def write_frame(
     return frame_of(connection, frame.number)
 
 
+#: Columns of a map whose new values are in the audit log.
+_LIMITS = ("quota_frames", "quota_bytes", "retention_days")
+
+
 def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) -> MapRow:
     """Change columns of a map: title, quotas, retention, up."""
     changed = {name: new for name, new in values.items() if getattr(row, name) != new}
@@ -215,5 +219,6 @@ def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) ->
         return row
     connection.execute(update(maps).where(maps.c.number == row.number).values(**changed))
     # not what they are: who may read the map sees it there
-    record_event(connection, "map.edited", row.name, fields=sorted(changed))
+    limits = {name: changed[name] for name in _LIMITS if name in changed}
+    record_event(connection, "map.edited", row.name, details=limits, fields=sorted(changed))
     return find_map(connection, row.name)

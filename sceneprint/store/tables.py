@@ -46,7 +46,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from sceneprint.process import current_tenant, request_id, traceparent
+from sceneprint.process import current_actor, current_tenant, request_id, traceparent
 from sceneprint_client.api import FrameState, JobState
 from sceneprint_client.api.frames import Kind
 
@@ -332,39 +332,22 @@ idempotency = Table(
     Index(None, "created_at"),
 )
 
-#: Who changed what.
+#: Who changed what, a line for each change; append-only.
 audit = Table(
     "audit",
     metadata,
     Column("number", WHOLE, primary_key=True),
     Column("at", Float, nullable=False),
-    Column("actor", _string(128), nullable=False),
+    Column("actor", _string(128), nullable=False),  # name of the key; "" where none is required
     Column("address", _string(64)),
-    Column("action", _string(64), nullable=False),
+    Column("tenant", _string(128), nullable=False),
+    Column("action", _string(32), nullable=False),
     Column("map", _string(63)),
     Column("target", _string(128)),
     Column("request_id", _string(64)),
     Column("data", JSON, nullable=False),
-    # the chain that the line is part of, its place there, and its hash; null: of before version 0.3
-    Column("tenant", _string(128)),
-    Column("refused", Boolean),
-    Column("sequence", WHOLE),
-    Column("hash", _string(64)),
-    Index("uq_audit_tenant_refused_sequence", "tenant", "refused", "sequence", unique=True),
-    Index(None, "at"),
+    Index(None, "tenant", "number"),
     sqlite_autoincrement=True,
-)
-
-#: Chains of the audit log: changes and refusals of each tenant. What was pruned ends in `anchor`.
-audit_chains = Table(
-    "audit_chains",
-    metadata,
-    Column("tenant", _string(128), primary_key=True),
-    Column("refused", Boolean, primary_key=True),
-    Column("pruned", WHOLE, nullable=False),  # place of the last line that is gone; 0: none is
-    Column("anchor", _string(64), nullable=False),  # hash of that line
-    Column("last", WHOLE, nullable=False),  # place of the newest line
-    Column("head", _string(64), nullable=False),  # its hash
 )
 
 #: One row: the oldest revision whose processes may write to this schema.
@@ -827,6 +810,23 @@ def request_data() -> dict[str, Any] | None:
     if (parent := traceparent()) is not None:
         data["traceparent"] = parent
     return data
+
+
+def audit_values(
+    action: str, map_name: str | None, target: str | None, data: dict[str, Any]
+) -> dict[str, Any] | None:
+    """Return the columns of a line of the audit log for a change by the current actor.
+
+    None of a worker: what it carries out has a line from when it was requested.
+    """
+    actor = current_actor()
+    if actor is None:
+        return None
+    return {
+        "at": time.time(), "actor": actor.name, "address": actor.address,
+        "tenant": current_tenant(), "action": action, "map": map_name, "target": target,
+        "request_id": request_id(), "data": data,
+    }  # fmt: skip
 
 
 def event_values(

@@ -259,4 +259,5 @@ def delete_queries(
 ) -> None:
     """Remove all past queries of a map with their answers. Requires `admin` of the map."""
     asking.require(map_name, "admin")
+    here.engine.audit.record("queries.removed", map_name)
     here.engine.query_log.remove_of_map(map_name)

@@ -34,6 +34,7 @@ from sceneprint.errors import (
     UnusableStore,
 )
 from sceneprint.store import Store, queue
+from sceneprint.store.audit_log import record_change
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map, map_of, require_bytes
@@ -184,6 +185,7 @@ class Tasks:
             number = None if row is None else row.number
             job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
             queue.add_files(connection, job.number, files)
+            record_change(connection, "job.queued", map_name, job.id, kind=kind)
             if once is not None:
                 once.keep(connection, {"job_id": job.id})
         self._bell.ring()
@@ -389,4 +391,5 @@ class MapJobs:
         """
         with self.store.database.write() as connection:
             blobs = remove_job(connection, self.find(connection, map_name, job_id))
+            record_change(connection, "job.removed", map_name, job_id, kind=self.kind)
         collect_deleted_blobs(self.store, blobs)

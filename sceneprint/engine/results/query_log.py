@@ -37,6 +37,7 @@ from sceneprint.errors import (
 from sceneprint.settings import Settings
 from sceneprint.store import Store
 from sceneprint.store.answer_files import AnswerFiles
+from sceneprint.store.audit_log import record_change
 from sceneprint.store.deletion import DAY_S, remove_in_blocks
 from sceneprint.store.frame_queries import QueryOrigin
 from sceneprint.store.maps import find_map, list_maps
@@ -532,6 +533,7 @@ class QueryLog:
                 self._require_room(connection, row)
                 keep_answer(connection, row.number, data, read_clock(connection))
             set_title(connection, row.number, title)
+            record_change(connection, "answer.kept", row.map, query_id)
         if row.kept_at is None:
             self._delete_files([query_id])
         return self.record(query_id)
@@ -555,6 +557,7 @@ class QueryLog:
         self._files.put(query_id, self._data(row))
         with self._store.database.write() as connection:
             release_answer(connection, row.number)
+            record_change(connection, "answer.released", row.map, query_id)
 
     # removed
 
