@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from sceneprint.atomic_files import check_writable, make_folder, write_whole
+from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli import positive, whole_number
 from sceneprint.cli.options import (
     add_service_options,
@@ -649,82 +649,45 @@ def _restore_to_folder(
     return snapshot, f"is restored to {one_line(str(settings.data_dir))}", aside
 
 
-# `sceneprint pull`: a robot's copy of all maps, to localise without network.
+# `sceneprint pull`: maps of a service in a robot's folder, to localise without network.
 
 
 def add_pull(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "pull",
-        help="copy all maps of a service to this machine, to localise without network",
-        description="Download the newest snapshot that a service keeps, verify it, and make it "
-        "the data folder, all or nothing; without a newer one, nothing is downloaded. It replaces "
-        "the copy pulled before, which is moved aside only if frames were added to it, and "
-        "nothing else. Stop every process that uses the folder first. The key must be an "
-        "administrator's. The copy holds all frames and the hashes of keys: protect it. With "
-        "--map, only these maps, without uploads and keys: only what is new is downloaded, a key "
-        "that may read them suffices, and programs may use the folder meanwhile.",
+        help="copy maps of a service to this machine, to localise without network",
+        description="Bring a folder to the maps that a service has now: the rows and signatures of "
+        "their frames, and the artifacts that validation compares. Only what is new is downloaded, "
+        "each map in one transaction. The key must be able to read the maps. Programs may use the "
+        "folder meanwhile.",
     )
     command.add_argument(
-        "--map", action="append", metavar="NAME", help="only this map; may be repeated"
-    )
+        "--map", action="append", metavar="NAME",
+        help="only this map; may be repeated (default: all maps that the key may read)",
+    )  # fmt: skip
     add_data_option(command)
     add_service_options(command)
     command.set_defaults(run=run_pull)
 
 
 def run_pull(options: argparse.Namespace) -> int:
-    """Bring a copy up to date; returns 1 where blobs were damaged when the snapshot was taken."""
-    from sceneprint.errors import SnapshotError
-    from sceneprint.maintenance.snapshot.files import staging
-    from sceneprint.maintenance.snapshot.restoration import renew_copy, snapshot_of_copy
+    """Bring maps of a robot's store to what the service has now."""
+    from sceneprint.engine.maps.map_copy import claim_folder, pull_map
+    from sceneprint.store import open_store
 
-    settings, start = settings_of(options), time.perf_counter()
+    settings = settings_of(options)
     if settings.database_url is not None or settings.blob_url is not None:
         raise InvalidRequest(
             "SCENEPRINT_DATABASE_URL or SCENEPRINT_BLOB_URL is set, but a copy lies in its data "
             "folder. Unset them."
         )
     folder = settings.data_dir.absolute()
-    if options.map:
-        return _pull_maps(options, settings, folder)
-    held = snapshot_of_copy(folder)
-    with ended_by_signals(), open_client(options) as client:
-        newest = next(iter(client.snapshots()), None)
-        if newest is None:
-            raise SnapshotError(
-                "The service keeps no snapshot. Let it take one: `sceneprint snapshot --url`, or "
-                "POST /v1/snapshots."
-            )
-        if newest.snapshot_id == held:
-            print(f"{one_line(str(folder))} is a copy of {held}, the newest snapshot")
-            return 0
-        make_folder(folder.parent)
-        with staging(folder.parent, f".{folder.name}.pulling-") as scratch:
-            client.download_snapshot(newest.snapshot_id, scratch / "copy.tar")
-            with byte_progress("restore") as progress:
-                snapshot, aside = renew_copy(
-                    scratch / "copy.tar", folder, newest.snapshot_id, progress=progress
-                )
-    print(
-        f"{one_line(str(folder))} is a copy of {newest.snapshot_id}: {contents(snapshot)} in "
-        f"{time.perf_counter() - start:.1f} s"
-    )
-    if aside is not None:
-        print(f"frames were added to the copy before: {one_line(str(aside))}", file=sys.stderr)
-    return 1 if name_damaged(snapshot, "They cannot be found by queries of the copy.") else 0
-
-
-def _pull_maps(options: argparse.Namespace, settings: Settings, folder: Path) -> int:
-    """Bring maps of a robot's store to what the service has now."""
-    from sceneprint.engine.maps.map_copy import claim_folder, pull_map
-    from sceneprint.store import open_store
-
     claim_folder(folder)
     with ended_by_signals(), open_client(options) as client:
         store = open_store(settings.database, settings.blobs)
         try:
-            for name in dict.fromkeys(options.map):
+            for name in dict.fromkeys(options.map or [one.name for one in client.maps()]):
                 start = time.perf_counter()
                 with tqdm(desc=name, unit="frame", disable=None) as bar:
 
