@@ -232,26 +232,12 @@ def test_two_paths_keep_their_names_apart(rooms: Path, model_file: Path, tmp_pat
     assert "is also the name of" in done.stderr
 
 
-def test_picture_shows_depth_normals_and_levels(
-    rooms: Path, model_file: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "new" / "frame.png"
-    run("picture", rooms, "--frame", 3, "--out", out, "--model", model_file)
-    with Image.open(out) as image:
-        pixels = np.asarray(image.convert("RGB"))
-    assert min(pixels.shape[:2]) > 500
-    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 1000
-    done = run("picture", rooms, "--frame", 4, "--out", out, "--model", model_file, expect=2)
-    assert "Choose --frame from 0 to 3" in done.stderr
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["sign", "/nowhere/at/all"], "no such file or folder"),
         (["sign", "README.md"], "There is no intrinsics.json here"),
         (["sign", "{rooms}", "--model", "/nowhere.safetensors"], "Give one of the presets"),
-        (["picture", "/nowhere", "--out", "x.png"], "no such file or folder"),
         (["train", "--out", "{tmp}/m", "--rooms", "1", "--jobs", "1"], "fewer than two places"),
         (["synth", "/dev/null/x"], "/dev/null"),
     ],

@@ -102,7 +102,6 @@ OF_A_MAP = {
     "GET /v1/reconstructions/{job_id}": Case(),
     "DELETE /v1/reconstructions/{job_id}": Case("write"),
     "GET /v1/reconstructions/{job_id}/mesh.ply": Case(),
-    "GET /v1/reconstructions/{job_id}/picture.png": Case(),
     "POST /v1/maps/{map_name}/associations": Case("write", body={"sessions": ["{session}"]}),
     "GET /v1/maps/{map_name}/associations": Case(),
     "GET /v1/maps/{map_name}/associations/{job_id}": Case(),
@@ -115,7 +114,6 @@ OF_A_MAP = {
     "DELETE /v1/maps/{map_name}/coverage/{job_id}": Case("write"),
     "GET /v1/maps/{map_name}/coverage/{job_id}/frames": Case(),
     "GET /v1/maps/{map_name}/coverage/{job_id}/changes": Case(query={"since": "{coverage}"}),
-    "GET /v1/maps/{map_name}/coverage/{job_id}/plan.png": Case(),
     "POST /v1/maps/{map_name}/differences": Case(
         "write", body={"before": "{session}", "after": "{session}-2"}
     ),
