@@ -1,4 +1,4 @@
-"""`sceneprint reconstruct` and `sceneprint snapshot --url` against a real service."""
+"""`sceneprint reconstruct` against a real service."""
 
 from __future__ import annotations
 
@@ -65,15 +65,3 @@ def test_what_cannot_be_reconstructed(sceneprint: Run, service_url: str, walk: P
     assert "6 frames found. Name a single frame file." in said.stderr
     said = sceneprint("reconstruct", "nothing", "nobody", expect=2)
     assert "There is no frame 'nobody'" in said.stderr
-
-
-def test_a_snapshot_of_a_service(
-    sceneprint: Run, service_url: str, tmp_path: Path, data_folder: Path
-) -> None:
-    archive = tmp_path / "all.tar"
-    said = sceneprint("snapshot", "--url", service_url, "--out", archive)
-    assert re.match(rf"{archive}: \d+ maps, \d+ frames, \d+ blobs, [\d.]+ MB in", said.stdout)
-    assert "is complete" in sceneprint("restore", archive, "--verify-only").stdout
-    assert list((data_folder / "snapshots").glob("*.tar"))
-    said = sceneprint("snapshot", "--url", service_url, "--data", tmp_path, expect=2)
-    assert "Give only one of them" in said.stderr

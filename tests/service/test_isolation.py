@@ -149,8 +149,6 @@ MADE_OF_ANYTHING = (
 OF_ALL = (
     "GET /v1/keys", "POST /v1/keys", "DELETE /v1/keys/{key_name}", "GET /v1/audit", "GET /metrics",
     "POST /v1/keys/{key_name}/rotate",
-    "POST /v1/snapshots", "GET /v1/snapshots", "GET /v1/snapshots/{snapshot_id}",
-    "DELETE /v1/snapshots/{snapshot_id}",
 )  # fmt: skip
 #: Answered to anybody with a key, and by what the key may read.
 BY_KEY = (
@@ -186,7 +184,7 @@ class There:
         jobs = [one for kind, one in kinds.items() if f"/{kind}" in operation]
         return {
             "map_name": self.map, "frame_id": self.frame, "query_id": self.query,
-            "job_id": (jobs or [self.job])[0], "key_name": "keeper", "snapshot_id": self.job,
+            "job_id": (jobs or [self.job])[0], "key_name": "keeper",
             "digest": self.artifact if "/artifacts/" in operation else self.tile,
         }[what]  # fmt: skip
 
