@@ -113,7 +113,7 @@ def test_no_call_gets_by_without_a_key(
             if isinstance(found, Iterator):
                 next(found)
 
-        with pytest.raises(KeyRequired, match="requires a key"):
+        with pytest.raises(KeyRequired):
             call()
         asked.append(name)
     assert len(asked) > 50

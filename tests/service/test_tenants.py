@@ -65,7 +65,7 @@ def test_two_authorization_headers_are_refused_whoever_sends_them(shared, refuse
         headers = [("Authorization", f"Bearer {shared.secrets['one']}"),
                    ("Authorization", "Bearer made-up")]  # fmt: skip
         answer = shared.server.client.get(path, headers=headers)
-        refused(answer, 400, "ambiguous-key", "more than one Authorization header")
+        refused(answer, 400, "ambiguous-key")
 
 
 def test_keys_of_a_tenant_share_its_streams_and_leave_some_to_others(shared, until):
