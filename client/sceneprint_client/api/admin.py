@@ -391,8 +391,7 @@ KINDS = {
     "frame.restored": "Its deletion was undone; what was indexed is signed again.",
     "query.answered": (
         "A query was answered, or failed; `data` has `query_id`, `status`, `robot`, `pose` where "
-        "it was found, and more of its record; `offline` where a robot answered it itself, and "
-        "sent the record later."
+        "it was found, and more about it."
     ),
     "import.done": "An archive was imported, as far as it could be; `data` is its result.",
     "association.found": "A job that looked for associations is over; `data` is its result.",
