@@ -154,7 +154,7 @@ class StopSignal:
 
 #: Variables that hold a secret; the variable with `_FILE` at its end names a file instead.
 SECRETS = (
-    "SCENEPRINT_DATABASE_URL", "SCENEPRINT_REPLICA_URL", "PGPASSWORD", "AWS_ACCESS_KEY_ID",
+    "SCENEPRINT_DATABASE_URL", "PGPASSWORD", "AWS_ACCESS_KEY_ID",
     "AWS_SECRET_ACCESS_KEY", "AZURE_STORAGE_ACCOUNT_KEY",
 )  # fmt: skip
 #: A secret is one line; a larger file is another one.

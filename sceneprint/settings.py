@@ -40,10 +40,6 @@ class Settings(BaseSettings):
     data_dir: Path = Field(default_factory=default_data_dir)
     #: SQLAlchemy URL of the database; default: SQLite in the data folder.
     database_url: SecretStr | None = None
-    #: SQLAlchemy URL of a read replica of it, of PostgreSQL, that queries are answered from.
-    replica_url: SecretStr | None = None
-    #: Seconds that the replica may be behind; farther behind, the database itself is asked.
-    replica_lag_s: float = Field(default=5.0, ge=0, le=3600)
     #: Where blobs are kept: s3://bucket/prefix, gs://, az://, file:/// or memory:///; default:
     #: `blobs` in the data folder. Credentials come from the environment of the cloud, never here.
     blob_url: SecretStr | None = None
@@ -132,13 +128,6 @@ class Settings(BaseSettings):
     surfaces: Literal["auto", "asked"] = "auto"
     #: Seconds after which no byte of a deleted frame is left in the caches of this node.
     purge_s: float = Field(default=3600.0, ge=1, le=31_536_000)
-
-    @field_validator("replica_url")
-    @classmethod
-    def _has_primary(cls, given: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
-        if given is not None and info.data.get("database_url") is None:
-            raise ValueError("a replica needs its primary in SCENEPRINT_DATABASE_URL")
-        return given
 
     @field_validator("tls_key")
     @classmethod
