@@ -13,7 +13,6 @@ from sqlalchemy import ColumnElement, Connection, delete, func, insert, or_, sel
 
 from sceneprint.store.query_records import WantedRecords
 from sceneprint.store.tables import (
-    deleted_frames,
     frames,
     kept_answer_frames,
     kept_answer_maps,
@@ -169,11 +168,10 @@ def spent_answers(connection: Connection, limit: int) -> list[int]:
     """Numbers of kept answers whose time is over, and of those that show a frame which was deleted
     and cannot be restored any more.
     """
-    restorable = select(deleted_frames.c.frame_number)
     gone = (
         select(kept_answer_frames.c.kept_number)
         .join(frames, frames.c.number == kept_answer_frames.c.frame_number)
-        .where(frames.c.state == FrameState.DELETED, frames.c.number.not_in(restorable))
+        .where(frames.c.state == FrameState.DELETED, frames.c.deletion.is_(None))
     )
     spent = or_(_c.until <= now(connection), _c.number.in_(gone))
     return list(connection.execute(select(_c.number).where(spent).limit(limit)).scalars())

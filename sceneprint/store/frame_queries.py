@@ -31,7 +31,6 @@ from sceneprint.store.tables import (
     FrameRow,
     MapRow,
     count_rows,
-    deleted_frames,
     frame_rows,
     frame_tags,
     frames,
@@ -260,6 +259,8 @@ def _listing_conditions(map_number: int, wanted: FrameListing) -> list[ColumnEle
         found += _begins(c.name, wanted.name)
     if wanted.find is not None:
         found.append(_known_as(map_number, wanted.find))
+    if wanted.state == FrameState.DELETED and found:
+        found.append(c.deletion.is_(None))  # nothing is told of what a tombstone has
     return found
 
 
@@ -571,9 +572,7 @@ def _posed_in(map_number: int, session: str) -> list[ColumnElement[bool]]:
 def any_gone(connection: Connection, numbers: Iterable[int]) -> bool:
     """Whether any of some frames is not there any more, and cannot be restored either."""
     own = set(numbers)
-    there = (frames.c.state != FrameState.DELETED) | frames.c.number.in_(
-        select(deleted_frames.c.frame_number)
-    )
+    there = (frames.c.state != FrameState.DELETED) | frames.c.deletion.is_not(None)
     asked = select(frames.c.number).where(there)
     return len(own) > sum(1 for _ in rows_among(connection, asked, frames.c.number, own))
 

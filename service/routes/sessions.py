@@ -60,7 +60,7 @@ async def delete_session_frames(
     """Delete all frames of a session.
 
     A call ends after ten seconds: repeat it while `remaining` is not 0. Ten minutes by default,
-    POST /v1/maps/{map_name}/restore undoes it.
+    POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes it.
     """
     request.state.audited = {"session": session, "robot": robot}
     async with here.uploads.place():
@@ -70,8 +70,8 @@ async def delete_session_frames(
                 here.engine.store,
                 map_name,
                 session,
+                here.engine.tombstones,
                 robot,
-                undo=here.engine.undo_limits,
             )
         )
 

@@ -140,7 +140,7 @@ def test_an_answer_goes_with_a_frame_that_it_shows(
     keep(full, asked)
     full.delete_frame("hall", shown)
     assert full.kept_answers.remove_spent() == 0  # its deletion can be undone
-    full.undo.restore_one("hall", shown)
+    full.tombstones.restore_one("hall", shown)
     assert full.kept_answers.remove_spent() == 0
     make_engine(undo_s=0).delete_frame("hall", shown)
     full.kept_answers.release(asked)
@@ -152,7 +152,7 @@ def test_an_answer_that_shows_a_purged_frame_is_removed(full: Engine, asked: str
     shown = full.inspection.answer(asked).matches[0].frame_id
     keep(full, asked)
     full.delete_frame("hall", shown)
-    full.undo.purge(everything=True)
+    full.tombstones.purge(everything=True)
     assert full.kept_answers.remove_spent() == 1
     expire(full)
     with pytest.raises(UnknownQuery):

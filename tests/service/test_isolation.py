@@ -61,7 +61,7 @@ OF_A_MAP = {
         "write", body={"frame_ids": ["{frame}"], "add_tags": ["x"]}
     ),
     "POST /v1/maps/{map_name}/frames/{frame_id}/restore": Case("write"),
-    "POST /v1/maps/{map_name}/restore": Case("write", body={"frame_ids": ["{frame}"]}),
+    "POST /v1/maps/{map_name}/deletions/{deletion_id}/restore": Case("write"),
     "GET /v1/maps/{map_name}/deletions": Case(),
     "GET /v1/maps/{map_name}/frames/{frame_id}/cloud.ply": Case(),
     "GET /v1/maps/{map_name}/frames/{frame_id}/preview.png": Case(),
@@ -162,7 +162,7 @@ MADE_OF_ANYTHING = (
     "PUT /v1/maps/{map_name}/frames/{frame_id}", "POST /v1/maps/{map_name}/associations",
     "POST /v1/maps/{map_name}/coverage", "POST /v1/maps/{map_name}/differences",
     "POST /v1/maps/{map_name}/frames/delete", "POST /v1/maps/{map_name}/frames/edit",
-    "POST /v1/maps/{map_name}/restore", "POST /v1/maps/{map_name}/queries/records",
+    "POST /v1/maps/{map_name}/queries/records",
 )  # fmt: skip
 #: The operator's: 403 for who has a map, whatever is asked for.
 OF_ALL = (
@@ -205,7 +205,8 @@ class There:
         jobs = [one for kind, one in kinds.items() if f"/{kind}" in operation]
         return {
             "map_name": self.map, "frame_id": self.frame, "query_id": self.query,
-            "job_id": (jobs or [self.job])[0], "key_name": "keeper", "snapshot_id": self.job,
+            "deletion_id": "1", "job_id": (jobs or [self.job])[0], "key_name": "keeper",
+            "snapshot_id": self.job,
             "digest": self.artifact if "/artifacts/" in operation else self.tile,
         }[what]  # fmt: skip
 
@@ -549,7 +550,7 @@ def test_what_is_not_noted_is_said(operations):
     assert names - UNNOTED == {
         "create_key", "rotate_key", "revoke_key",
         "create_map", "patch_map", "delete_map", "patch_frame",
-        "delete_frames", "edit_frames", "restore_frames", "restore_frame", "keep_answer",
+        "delete_frames", "edit_frames", "restore_deletion", "restore_frame", "keep_answer",
         "release_answer",
         "delete_frame", "patch_session", "delete_session_frames", "cancel_job", "retry_job",
         "retry_dead_jobs", "reencode", "cancel_reencoding",

@@ -26,7 +26,7 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.tables import MapRow, metadata
 
 TABLES = [
-    "audit", "audit_chains", "deleted_frames", "deletions", "doomed", "events", "former_maps",
+    "audit", "audit_chains", "doomed", "events", "former_maps",
     "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs", "kept_answer_frames",
     "kept_answer_maps", "kept_answers", "keys", "maps", "models", "pending_events",
     "query_records", "samples",

@@ -37,7 +37,7 @@ from sceneprint.store import Blobs, Store
 from sceneprint.store.blobs.object_client import ListedObject, Objects
 from sceneprint.store.blobs.object_store import ObjectBlobs
 from sceneprint.store.frame_queries import QueryOrigin
-from sceneprint.store.tables import deleted_frames, frames, maps
+from sceneprint.store.tables import frames, maps
 from sceneprint.types import Bytes, Floats
 from sceneprint_client.api import Answer, FrameState, Query
 
@@ -509,7 +509,7 @@ class ResultValidity:
         self._store = store
         self._there: ColumnElement[bool] = frames.c.state != FrameState.DELETED
         if restorable:
-            self._there |= frames.c.number.in_(select(deleted_frames.c.frame_number))
+            self._there |= frames.c.deletion.is_not(None)
         self._maps: dict[str, float | None] = {}  # when they were made, seconds since 1970
         self._frames: dict[tuple[str, str], float | None] = {}  # when they were received
 

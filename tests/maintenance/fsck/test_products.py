@@ -19,7 +19,6 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.queue import JobFile, add_files, files_of, find_job
 from sceneprint.store.surface_rows import add_surface, find_surface, tiles_to_rebuild, write_tile
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, NewMap
-from sceneprint_client.api.listing import RestoreOptions
 
 
 @pytest.fixture
@@ -143,7 +142,7 @@ def kept(settings: Settings) -> tuple[str, str, str]:
             )
             keep_answer(connection, new, None, None)
         engine.delete_frame("hall", frame.frame_id)
-        (deletion,) = engine.undo.list_all("hall", None, 9).items
+        (deletion,) = engine.tombstones.list_all("hall", None, 9).items
     return new.id, blob, deletion.deletion_id
 
 
@@ -156,7 +155,7 @@ def test_a_snapshot_has_kept_answers_and_what_can_be_restored(settings, kept, tm
     assert list(fsck(again, grace_s=0)) == []
     with Engine(again) as engine:
         assert engine.store.blobs.get(kept[1]) == b"an answer"
-        done = engine.undo.restore("hall", RestoreOptions(deletion_id=kept[2]))
+        done = engine.tombstones.restore("hall", kept[2])
         assert done.frames == 1
         assert [one.robot for one in engine.list_frames("hall").items] == ["r1"]
     assert list(fsck(again, grace_s=0)) == []
