@@ -14,16 +14,16 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Bytecode is kept: the tests start hundreds of processes, and each would parse our modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 # Tests wait for real processes half of their time: twice as many as there are processors.
-export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
-	'import os; print(2 * len(os.sched_getaffinity(0)))')
+export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell echo $$((2 * $$(env -u OMP_NUM_THREADS nproc))))
 
-.PHONY: help demo test pytest test-thorough test-postgres lint kernels bytecode goldens format bench screenshots docs \
-	docs-serve soak siege fleet models lock sbom advisories dist clean
+.PHONY: help demo test pytest test-thorough test-portable test-postgres lint kernels bytecode goldens format bench \
+	screenshots docs docs-serve soak siege fleet models lock sbom advisories dist clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
 	@echo "make test    lint, types, import contracts and the tests"
 	@echo "make test-thorough  tests that make test leaves out, as they take minutes or seldom fail"
+	@echo "make test-portable  numeric tests as other processors compute them, one after another [TARGET=generic]"
 	@echo "make test-postgres  the tests of what stands on the database, on PostgreSQL"
 	@echo "make goldens  what tests/golden freezes, after an intended change; read the diff"
 	@echo "make lint    lint, types and import contracts only, of the dashboard's JavaScript too"
@@ -82,6 +82,10 @@ pytest: kernels bytecode
 # What takes long and seldom breaks: the image built step by step, whole recordings, benchmarks.
 test-thorough: $(STAMP) kernels
 	$(BIN)/python -m pytest -n auto --dist loadfile -m thorough
+
+# Bounds that hold on this processor alone show here; the script says what each target changes.
+test-portable: $(STAMP)
+	$(BIN)/python tools/portable_tests.py $(TARGET)
 
 # What PostgreSQL does as well, on it: tests/on_postgres leads each process there.
 test-postgres: $(STAMP) kernels

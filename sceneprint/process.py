@@ -29,6 +29,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
@@ -373,6 +374,49 @@ def merged(parts: list[Mapping[str, int]]) -> dict[int, int]:
         for place, number in part.items():
             total[int(place)] += int(number)
     return dict(total)
+
+
+# Who makes changes: set for a request or a command, and written to the audit log with each change.
+
+#: Name of the actor of a command on the data folder; no key may have it.
+COMMAND = "command"
+
+
+@dataclass(frozen=True)
+class Actor:
+    """Who makes changes.
+
+    Parameters
+    ----------
+    name : of the key; "" where the service requires none; COMMAND of a command
+    address : of the client's connection; None of a command
+    """
+
+    name: str
+    address: str | None = None
+
+
+_actor: ContextVar[Actor | None] = ContextVar("actor", default=None)
+
+
+def set_actor(actor: Actor | None) -> None:
+    """Set who makes the changes of this task, and of the threads it begins."""
+    _actor.set(actor)
+
+
+@contextmanager
+def acting_as(name: str) -> Iterator[None]:
+    """Make the changes of the block as this actor."""
+    before = _actor.set(Actor(name))
+    try:
+        yield
+    finally:
+        _actor.reset(before)
+
+
+def current_actor() -> Actor | None:
+    """Return who makes changes; None of a worker, which carries out what somebody else started."""
+    return _actor.get()
 
 
 # Whose work this is: set once for a request or a job, known wherever it is charged.

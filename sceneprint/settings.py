@@ -51,10 +51,6 @@ class Settings(BaseSettings):
     #: Where snapshots taken over the service are kept, likewise; default: `snapshots` in the data
     #: folder.
     snapshot_url: str | None = None
-    #: Who searches: this node, PostgreSQL with pgvector, or (`auto`) PostgreSQL for maps of which
-    #: this node would have to read much first. `qdrant`: this node, with Qdrant's engine; needs
-    #: the extra `qdrant`.
-    search: Literal["auto", "local", "database", "qdrant"] = "auto"
     #: Folder of search indexes, of this machine alone. Deleting it loses nothing but minutes;
     #: default: `index` in the data folder.
     index_dir: Path | None = None
@@ -123,14 +119,10 @@ class Settings(BaseSettings):
     scrub_s: float = Field(default=3600.0, ge=1, le=31_536_000)
     #: Stored bytes that workers read each second, to see that they are sound, MB; 0: none are read.
     scrub_mb_per_s: float = Field(default=1.0, ge=0, le=10_000)
-    #: Room for answers that can be looked at afterwards, bytes; the oldest are removed. 0 for none.
-    query_bytes: int = Field(default=256 << 20, ge=0)
-    #: Seconds for which an answer can be looked at afterwards.
-    query_s: float = Field(default=3600.0, ge=1, le=31_536_000)
-    #: Answers of a map that are kept until somebody releases them; more are refused.
-    kept_answers: int = Field(default=1000, ge=0, le=1_000_000)
-    #: Room for those of a map, bytes.
-    kept_bytes: int = Field(default=256 << 20, ge=0)
+    #: Days for which queries are listed, and their answers can be looked at; 0: none is stored.
+    answer_days: float = Field(default=30.0, ge=0, le=36_500)
+    #: Room for answers, bytes; the oldest are removed first. 0: none is stored.
+    answer_bytes: int = Field(default=256 << 20, ge=0)
     #: Seconds for which deleted frames can be restored; 0: a deletion is for good at once.
     undo_s: float = Field(default=600.0, ge=0, le=31_536_000)
     #: Days for which rows of deleted and of redundant frames, and of their jobs, stay.
@@ -142,22 +134,11 @@ class Settings(BaseSettings):
     #: Days for which lines of the audit log are kept; of each tenant at most 200,000 changes and as
     #: many refusals.
     audit_kept_days: float = Field(default=365.0, gt=0, le=36_500)
-    #: Days for which a small record of each query is kept; 0: none is written.
-    history_days: float = Field(default=30.0, ge=0, le=36_500)
-    #: Newest records of queries of each map that are kept, some 600 bytes each.
-    history_queries: int = Field(default=100_000, ge=1, le=100_000_000)
     #: Who begins the fused surface of a map: workers, as frames come, or whoever asks for it.
     #: Deleted frames are always taken out of one that there is.
     surfaces: Literal["auto", "asked"] = "auto"
     #: Seconds after which no byte of a deleted frame is left in the caches of this node.
     purge_s: float = Field(default=3600.0, ge=1, le=31_536_000)
-
-    @field_validator("search")
-    @classmethod
-    def _can_search(cls, given: str) -> str:
-        if given == "qdrant" and find_spec("qdrant_edge") is None:
-            raise ValueError("it needs Qdrant's engine: run `pip install 'sceneprint[qdrant]'`")
-        return given
 
     @field_validator("replica_url")
     @classmethod
@@ -175,12 +156,7 @@ class Settings(BaseSettings):
 
     @field_validator("index_url")
     @classmethod
-    def _is_shared(cls, given: str | None, info: ValidationInfo) -> str | None:
-        if given is not None and info.data.get("search") == "qdrant":
-            raise ValueError(
-                "indexes that Qdrant searches are not shared; leave it out, or choose another "
-                "SCENEPRINT_SEARCH"
-            )
+    def _is_shared(cls, given: str | None) -> str | None:
         if given is not None and given.startswith("memory:"):
             raise ValueError("memory:/// is inside one process; use file:///folder")
         return given

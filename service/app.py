@@ -40,7 +40,7 @@ from sceneprint_client.api.listing import (
     MapEdit,
     SessionEdit,
 )
-from sceneprint_client.api.results import KeepOptions, NewQueryRecords
+from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.sessions import NewAssociation, NewDifference
 from sceneprint_client.api.surface import NewReconstruction
 from service import dashboard, problems, static_files
@@ -98,7 +98,6 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
                 (NewMapCoverage, "validation"),
                 (NewDifference, "validation"),
                 (NewModel, "validation"),
-                (NewQueryRecords, "validation"),
                 (NewReconstruction, "validation"),
                 (Problem, "serialization"),
             ],
@@ -123,7 +122,7 @@ ROUTERS = (
     maps.router, frames.router, selections.router, frame_data.router, frame_data.points_router,
     maps.edits_router, copies.router,
     sessions.router, frames.imports_router, queries.router,
-    results.history_router, results.offline_router,
+    results.history_router,
     results.router,
     queries.similarity_router, sessions.associations_router, coverage.router, differences.router,
     surface.router,

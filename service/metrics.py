@@ -193,7 +193,7 @@ class Metrics:
             buckets=_SECONDS, registry=self.registry,
         )  # fmt: skip
         self._lost = Counter(
-            "sceneprint_query_records_lost", "Records of queries that could not be written.",
+            "sceneprint_queries_lost", "Queries that could not be logged.",
             registry=self.registry,
         )  # fmt: skip
         self._told_lost = 0
@@ -271,7 +271,7 @@ class Metrics:
         ----------
         figures : of the store
         streams : of events that are open
-        lost : records of queries since this process began
+        lost : queries since this process began
         held, spool : requests in progress, and bytes of bodies on disk, by tenant
         """
         self._by_tenant.tell(held, spool, figures.waiting)

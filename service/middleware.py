@@ -13,9 +13,9 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from sceneprint.errors import AmbiguousKey, Busy, SceneprintError
-from sceneprint.process import NOBODY, name_request, name_span, set_tenant, span
+from sceneprint.process import NOBODY, name_request, name_span, set_actor, set_tenant, span
 from sceneprint.settings import Settings
-from service.auth import address_of, note
+from service.auth import REFUSED, address_of, record_refusal
 from service.browser_security import (
     Headers,
     Origins,
@@ -92,6 +92,7 @@ class RequestMiddleware:
         request_id = given.decode() if _ID.fullmatch(given) else uuid.uuid4().hex
         name_request(request_id)
         set_tenant(NOBODY)  # until its key is known: see `auth.caller`
+        set_actor(None)
         own: Headers = [(b"x-request-id", request_id.encode())]
         own += self._origins.headers(headers.get(b"origin"))
         state = scope.setdefault("state", {})
@@ -109,17 +110,15 @@ class RequestMiddleware:
             if message["type"] == "http.response.start":
                 status = message["status"]
                 standing: RateState | None = state.get("rate")
-                said = [
-                    *message["headers"],
-                    *own,
-                    *([] if standing is None else standing.headers()),
-                ]
+                said = [*message["headers"], *own]
+                said += [] if standing is None else standing.headers()
                 message["headers"] = said + security_headers(said)
                 _call(at_answer)  # the note has a turn of its own
                 if status in _HELD_BACK and not self._alone:
                     whose = state.get("tenant") or network_of(address_of(Request(scope)))
                     await self._delays.wait(whose)
-                await note(scope, status, said)
+                if status in REFUSED:
+                    await record_refusal(scope, status)
             await send(message)
 
         self._at_once += 1
@@ -185,7 +184,7 @@ class RequestMiddleware:
         method = scope["method"] if scope["method"] in _METHODS else "other"
         tenant = scope["state"].get("tenant", NOBODY)
         self._metrics.request(method, route, status, seconds, received, tenant)
-        if status in (401, 403):
+        if status in REFUSED:
             self._note_refusal(scope, request_id, status)
         about: dict[str, str | int] = {
             "http.request.method": method, "http.route": route,

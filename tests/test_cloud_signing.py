@@ -182,7 +182,7 @@ def test_little_is_signed_all_the_same(
     assert len(geometry.patches) > 0
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(0, 400),

@@ -26,7 +26,7 @@ RETIRED = {
     "truth": "database check", "accepting": "compatibility", "happenings": "event cursor",
     "belonging": "patch lookup", "growing": "append buffer", "rivals": "ambiguity",
     "switches": "reencoding", "agreement": "overlap", "choosing": "search routing",
-    "surroundings": "patch descriptors", "stored": "pgvector search", "once": "idempotency",
+    "surroundings": "patch descriptors", "once": "idempotency",
     "remembered": "signature cache", "slowness": "body timeout", "healing": "repair",
     "raw": "binary body", "sweeping": "blob garbage collection", "Around": "RequestMiddleware",
     "retiring": "retention", "members": "archive entries", "replaying": "idempotent replay",

@@ -45,17 +45,19 @@ def test_scenes_and_lengths_are_the_presets_own() -> None:
     assert preset_parameters("paper")[0] == ModelParameters()
 
 
-def test_neighbours_in_a_hall_are_nearest(trained: Model) -> None:
-    """Of a walk of 30 m, the scan one step away is nearer in signature than those far off."""
+def test_scans_of_one_part_of_a_hall_are_nearer_than_others(trained: Model) -> None:
+    """Along a walk of 30 m, signatures of scans within 5 m differ less than those further off."""
     sensor = Spinning(rings=32, azimuth_step=0.01)
     walk = synthesise_survey(4, 3, 21, along_path=True, kind="hall", sensor=sensor).clouds
     signer = open_signer(trained, cached=False)
-    signed = [sign(cloud, signer) for cloud in walk[::4]]
-    beside = sign(walk[9], signer)
     at = np.stack([cloud.pose[:2, 3] for cloud in walk if cloud.pose is not None])
-    apart = np.linalg.norm(at[::4] - at[9], axis=1)
-    found = int(np.argmin([distance(beside, one) for one in signed]))
-    assert apart[found] < 5.0 < np.median(apart)  # 1.5 or 4.5 m; the others are 7 to 16 m off
+    signed, ratios = [sign(cloud, signer) for cloud in walk[::4]], []
+    for number in (7, 9, 11):
+        beside = sign(walk[number], signer)
+        differ = np.array([distance(beside, one) for one in signed], float)
+        near = np.linalg.norm(at[::4] - at[number], axis=1) < 5.0  # two of six
+        ratios.append(differ[near].mean() / differ[~near].mean())
+    assert np.mean(ratios) < 0.75  # 0.665 to 0.68 on four targets of `make test-portable`
 
 
 def test_the_preset_ships_as_its_recipe_says() -> None:

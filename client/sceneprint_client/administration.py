@@ -15,7 +15,7 @@ import httpx
 
 from sceneprint_client.api import Job, Page
 from sceneprint_client.api.admin import (
-    Audited,
+    AuditLine,
     Event,
     EventPage,
     Key,
@@ -96,7 +96,7 @@ class AdminMethods(JobMethods):
         """What this client's key may do."""
         return self._ask(Me, "GET", "/v1/keys/me")
 
-    def audit(self, actor: str | None = None, map_name: str | None = None) -> Iterator[Audited]:
+    def audit(self, actor: str | None = None, map_name: str | None = None) -> Iterator[AuditLine]:
         """Who changed what, newest first.
 
         Parameters
@@ -104,7 +104,7 @@ class AdminMethods(JobMethods):
         actor : name of the key that made the changes; default: any, or none
         map_name : the map that was changed; default: any, or none
         """
-        return self._items(Page[Audited], "/v1/audit", actor=actor, map=map_name)
+        return self._items(Page[AuditLine], "/v1/audit", actor=actor, map=map_name)
 
     # events and figures
 

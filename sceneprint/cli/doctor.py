@@ -228,10 +228,7 @@ SELECT current_setting('server_version') AS version,
   current_setting('max_connections')::int
     - current_setting('superuser_reserved_connections')::int AS connections,
   (SELECT count(*) FROM pg_stat_activity WHERE backend_type = 'client backend') AS taken,
-  pg_is_in_recovery() AS standby,
-  (SELECT extversion FROM pg_extension WHERE extname = 'vector') AS vector,
-  (SELECT default_version FROM pg_available_extensions WHERE name = 'vector') AS installable,
-  has_database_privilege(current_database(), 'CREATE') AS creates
+  pg_is_in_recovery() AS standby
 """
 _BEHIND = """
 SELECT pg_is_in_recovery(), CASE WHEN pg_last_wal_receive_lsn() = pg_last_wal_replay_lsn() THEN 0
@@ -280,7 +277,6 @@ def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
     yield Check("ok", "database server", text)
     yield _durability(told)
     yield _connections(told, settings)
-    yield _vector(told, settings)
     yield _clock(before, there, after, settings)
 
 
@@ -322,23 +318,6 @@ def _connections(told: Mapping[str, object], settings: Settings) -> Check:
     if taken + wanted > most:
         return Check("note", "connections", f"{text}. Raise max_connections, or run fewer workers.")
     return Check("ok", "connections", text)
-
-
-def _vector(told: Mapping[str, object], settings: Settings) -> Check:
-    wanted = settings.search == "database"
-    if told["vector"] is not None:
-        return Check("ok", "pgvector", f"{told['vector']}")
-    if told["installable"] is not None and told["creates"]:
-        text = f"{told['installable']} is installed; the first use enables it (CREATE EXTENSION)"
-        return Check("ok", "pgvector", text)
-    why = "not installed" if told["installable"] is None else "this user may not enable it"
-    text = (
-        f"{why}: each node loads the index of every map that it searches, and waits for it at "
-        "startup; everything else works. Run CREATE EXTENSION vector in this database"
-    )
-    verdict: Verdict = "WRONG" if wanted else "note"
-    return Check(verdict, "pgvector", f"{text}." if not wanted else f"{text}, or set "
-                   "SCENEPRINT_SEARCH=auto.")  # fmt: skip
 
 
 def _clock(before: float, there: float, after: float, settings: Settings) -> Check:

@@ -29,6 +29,7 @@ from sceneprint.cli.options import (
 )
 from sceneprint.cli.serve import add_data_option, settings_of
 from sceneprint.errors import InvalidRequest
+from sceneprint.process import COMMAND, acting_as
 
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
@@ -140,7 +141,7 @@ def run_fsck(options: argparse.Namespace) -> int:
     if options.json is not None:
         check_writable(options.json)
     counts, outcomes = Counter[str](), []
-    with ended_by_signals(), _progress_bar() as progress:
+    with acting_as(COMMAND), ended_by_signals(), _progress_bar() as progress:
         for outcome in fsck(
             settings_of(options), map_name=options.map, repair=options.repair,
             quick=options.quick, progress=progress, counts=counts,
@@ -150,8 +151,8 @@ def run_fsck(options: argparse.Namespace) -> int:
             tqdm.write(_line(outcome))
     repaired = sum(each.done is not None for each in outcomes)
     if repaired:
-        with Engine(settings_of(options)) as engine:
-            engine.audit.command("fsck --repair", map_name=options.map, repaired=repaired)
+        with acting_as(COMMAND), Engine(settings_of(options)) as engine:
+            engine.audit.record("store.repaired", options.map, repaired=repaired)
     if options.json is not None:
         record = {"checked": dict(counts), "findings": [_record(each) for each in outcomes]}
         write_whole(options.json, (json.dumps(record, indent=1) + "\n").encode())
@@ -811,10 +812,8 @@ def run_thin(options: argparse.Namespace) -> int:
             if proposal.losses:
                 print("nothing was deleted; add --yes to delete them")
             return 0
-        with _Bar("delete") as bar:
+        with acting_as(COMMAND), _Bar("delete") as bar:
             deleted = carry_out(engine, proposal, bar.tell)
-        if deleted:
-            engine.audit.command("thin", map_name=options.map, deleted=deleted)
     left = len(proposal.losses) - deleted
     why = (
         f", {left} were not: they, or the frames that stand for them, are already gone"
@@ -938,13 +937,11 @@ def run_reencode(options: argparse.Namespace) -> int:
 
     settings = settings_of(options)
     require_database(settings)
-    with Engine(settings) as engine:
+    with acting_as(COMMAND), Engine(settings) as engine:
         if options.model is not None:
             told = engine.reencode(options.map, options.model)
-            engine.audit.command("reencode --model", map_name=options.map, model=str(options.model))
         elif options.cancel:
             told = map_lifecycle.cancel_reencoding(engine.store, options.map)
-            engine.audit.command("reencode --cancel", map_name=options.map)
         else:
             told = engine.get_map(options.map)
         if options.wait and told.reencoding is not None:

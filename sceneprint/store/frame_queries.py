@@ -25,6 +25,7 @@ from sqlalchemy import (
     union,
 )
 
+from sceneprint.store.frames import not_purged
 from sceneprint.store.maps import ROOMLESS
 from sceneprint.store.tables import (
     FRAME_COLUMNS,
@@ -572,8 +573,7 @@ def _posed_in(map_number: int, session: str) -> list[ColumnElement[bool]]:
 def any_gone(connection: Connection, numbers: Iterable[int]) -> bool:
     """Whether any of some frames is not there any more, and cannot be restored either."""
     own = set(numbers)
-    there = (frames.c.state != FrameState.DELETED) | frames.c.deletion.is_not(None)
-    asked = select(frames.c.number).where(there)
+    asked = select(frames.c.number).where(not_purged())
     return len(own) > sum(1 for _ in rows_among(connection, asked, frames.c.number, own))
 
 

@@ -27,7 +27,6 @@ from sceneprint.store.tables import (
     frame_tags,
     frames,
     job_files,
-    kept_answers,
     maps,
     now,
     signatures,
@@ -93,6 +92,11 @@ def delete_frame(
     return delete_frames(connection, row, [frame.number], deletion=deletion)
 
 
+def not_purged() -> ColumnElement[bool]:
+    """Return the condition that a frame exists, or was deleted and can be restored."""
+    return or_(frames.c.state != FrameState.DELETED, frames.c.deletion.is_not(None))
+
+
 def refers_to(connection: Connection, blob: str) -> bool:
     """Whether anything refers to a blob; see `referred_blobs`."""
     return bool(referred_blobs(connection, [blob]))
@@ -100,15 +104,14 @@ def refers_to(connection: Connection, blob: str) -> bool:
 
 def is_frame_id(connection: Connection, frame_id: str) -> bool:
     """Return whether a frame of any map that is there, or a tombstone, has an id."""
-    there = or_(frames.c.state != FrameState.DELETED, frames.c.deletion.is_not(None))
     of_any = frames.c.map_number.in_(select(maps.c.number))  # as the index of ids begins
-    asked = select(frames.c.number).where(of_any, frames.c.id == frame_id, there).limit(1)
+    asked = select(frames.c.number).where(of_any, frames.c.id == frame_id, not_purged()).limit(1)
     return connection.execute(asked).first() is not None
 
 
 def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
     """Those of some blobs, a thousand at most, that a frame which is there or a tombstone, a
-    signature, a job, a tile or a kept answer refers to.
+    signature, a job or a tile refers to.
     """
     has_upload = or_(frames.c.state.not_in(ROOMLESS), frames.c.deletion.is_not(None))
     referring = (
@@ -117,7 +120,6 @@ def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
         (job_files.c.blob,),
         (surface_tiles.c.blob,),
         (surface_tiles.c.draft,),
-        (kept_answers.c.blob,),
     )
     asked = (select(column).where(column.in_(blobs), *more) for column, *more in referring)
     return set(connection.execute(union(*asked)).scalars())
@@ -204,6 +206,10 @@ def write_frame(
     return frame_of(connection, frame.number)
 
 
+#: Columns of a map whose new values are in the audit log.
+_LIMITS = ("quota_frames", "quota_bytes", "retention_days")
+
+
 def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) -> MapRow:
     """Change columns of a map: title, quotas, retention, up."""
     changed = {name: new for name, new in values.items() if getattr(row, name) != new}
@@ -211,5 +217,6 @@ def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) ->
         return row
     connection.execute(update(maps).where(maps.c.number == row.number).values(**changed))
     # not what they are: who may read the map sees it there
-    record_event(connection, "map.edited", row.name, fields=sorted(changed))
+    limits = {name: changed[name] for name in _LIMITS if name in changed}
+    record_event(connection, "map.edited", row.name, details=limits, fields=sorted(changed))
     return find_map(connection, row.name)

@@ -8,7 +8,7 @@ from typing import Any
 from fastapi import Request, Response
 
 from sceneprint.engine.reconstruction import MEDIA_TYPES, MESH, PICTURE
-from sceneprint.engine.results.stored_results import StoredResult, unknown_query
+from sceneprint.engine.results.query_log import StoredAnswer, unknown_query
 from sceneprint.errors import DamagedBlob
 from sceneprint.store.queue import unknown_job
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
@@ -43,9 +43,9 @@ async def reconstruct(
     A worker does it, with Open3D. The answer may expire meanwhile. Ask under `Location` until
     `state` is `succeeded`; then mesh.ply and picture.png are there. It takes the scope `write`.
     """
-    kept = await here.run(lambda: _stored_answer(here, asking, query_id))
+    stored = await here.run(lambda: _stored_answer(here, asking, query_id))
     wanted = await read_record(request, NewReconstruction, "The reconstruction", optional=True)
-    made = await here.run(lambda: here.engine.reconstructions.begin(kept, wanted))
+    made = await here.run(lambda: here.engine.reconstructions.begin(stored, wanted))
     response.headers["Location"] = f"/v1/reconstructions/{made.job_id}"
     return made
 
@@ -91,17 +91,17 @@ def delete_reconstruction(job_id: str, here: Here, asking: Asking) -> None:
     here.engine.reconstructions.delete(job_id)
 
 
-def _stored_answer(here: Context, asking: Caller, query_id: str) -> StoredResult:
+def _stored_answer(here: Context, asking: Caller, query_id: str) -> StoredAnswer:
     """The answer, for who may read the maps that it was asked of, and write to those it names."""
-    kept = here.engine.kept.find(query_id)
-    answer = kept.answer
+    stored = here.engine.query_log.find(query_id)
+    answer = stored.answer
     matched = {match.map for match in answer.matches}
     asked = {*answer.maps, *([] if answer.frame is None else [answer.frame.map])}
     if not all(asking.may("read", name) for name in asked | matched):
         raise unknown_query(query_id)
     for name in sorted(matched):
         asking.require(name, "write")
-    return kept
+    return stored
 
 
 def _find_reconstruction(here: Context, asking: Caller, job_id: str) -> Reconstruction:

@@ -55,14 +55,13 @@ _Robot = Annotated[Label | None, Query(description="Only frames of this robot; d
 
 @router.delete("/sessions", responses=declared(404, 422), dependencies=[Depends(may_write)])
 async def delete_session_frames(
-    map_name: str, session: _SessionName, request: Request, here: Here, robot: _Robot = None
+    map_name: str, session: _SessionName, here: Here, robot: _Robot = None
 ) -> SessionChange:
     """Delete all frames of a session.
 
     A call ends after ten seconds: repeat it while `remaining` is not 0. Ten minutes by default,
     POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes it.
     """
-    request.state.audited = {"session": session, "robot": robot}
     async with here.uploads.place():
         return await here.uploads.run(
             partial(
@@ -102,9 +101,6 @@ async def patch_session(
     A call ends after ten seconds: repeat it with `after` while `remaining` is not 0.
     """
     edit = await read_record(request, SessionEdit, "The edit of the session")
-    request.state.audited = {"session": session, "robot": robot} | edit.model_dump(
-        exclude_defaults=True
-    )
     async with here.uploads.place():
         return await here.uploads.run(
             partial(edit_session, here.engine.store, map_name, session, edit, robot, after)

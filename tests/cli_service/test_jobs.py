@@ -66,21 +66,6 @@ def test_dead_jobs_are_listed_and_tried_again(
     assert ids[:3] == [again, *dead]
 
 
-def test_what_has_lost_its_upload_cannot_be_tried_again(
-    sceneprint: Run, dead: tuple[str, str], data_folder: Path
-) -> None:
-    with Engine(Settings(data_dir=data_folder)) as engine, engine.store.database.read() as base:
-        asked = (
-            "SELECT f.blob FROM frames f JOIN jobs j ON j.frame_number = f.number "
-            f"WHERE j.id = '{dead[0]}'"
-        )
-        engine.store.blobs.remove(base.exec_driver_sql(asked).scalar_one())
-    said = sceneprint("jobs", "--retry-dead", expect=2)
-    assert "is missing from the data folder" in said[1]
-    assert said[0] == "0 jobs queued again, 1 cannot be retried\n"
-    assert "is missing from the data folder" in sceneprint("jobs", "--retry", dead[0], expect=2)[1]
-
-
 def test_one_job_is_cancelled_or_tried_again(sceneprint: Run, dead: tuple[str, str]) -> None:
     said = sceneprint("jobs", "--cancel", dead[1], expect=2)
     assert said[1].startswith(f"sceneprint jobs: Job {dead[1]} is succeeded: ")

@@ -228,8 +228,8 @@ def test_keys_are_made_shown_once_and_withdrawn(station, page, settle, axe):
     settle(page)
     rows = page.locator("tbody tr")
     newest, before = (rows.nth(i).inner_text().split("\t") for i in range(2))
-    assert newest[1:5] == ["no key required", "me (refused)", "–", "–"]  # with the revoked key
-    assert before[1:5] == ["no key required", "revoke key", "–", "robot/7"]
+    assert newest[1:5] == ["no key required", "refused", "–", "–"]  # with the revoked key
+    assert before[1:5] == ["no key required", "key.revoked", "–", "robot/7"]
     assert axe(page) == []
 
 

@@ -168,13 +168,13 @@ def test_mutations() -> None:
     assert min(frames, errors) > 50  # both ends were reached
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(max_size=300), st.sampled_from([b"", GOOD_NPY[:8], GOOD_NPY[:10], GOOD_NPY[:128]]))
 def test_any_bytes(data: bytes, start: bytes) -> None:
     frame_or_error(start + data)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.text(max_size=200), st.binary(max_size=20))
 def test_any_header(header: str, data: bytes) -> None:
     frame_or_error(npy_with(header, data))
@@ -184,7 +184,7 @@ def test_any_header(header: str, data: bytes) -> None:
 any_values = st.lists(st.floats(width=64), min_size=12, max_size=12)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(any_values, st.sampled_from(["<f2", "<f4", ">f8"]))
 def test_any_values(values: list[float], dtype: str) -> None:
     with np.errstate(all="ignore"):

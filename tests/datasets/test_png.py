@@ -223,14 +223,14 @@ def test_mutations() -> None:
     assert min(frames, errors) > 50  # both ends were reached
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(max_size=300), st.sampled_from([b"", PNG_SIGNATURE, GOOD_PNG[:33]]))
 def test_any_bytes(data: bytes, start: bytes) -> None:
     frame_or_error(start + data)
     frame_or_error(repaired(start + data))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.tuples(st.integers(0, 9), st.integers(0, 9)),
     st.binary(max_size=200),

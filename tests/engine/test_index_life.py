@@ -75,16 +75,6 @@ def test_a_flipped_byte_of_an_index_is_found_and_healed(
         assert ask(engine, uploads) == (wanted, 2)
 
 
-def test_an_index_is_verified_when_it_is_opened(
-    data: Path, make_engine: Make, uploads: Any
-) -> None:
-    wanted, _ = ask(make_engine(data), uploads)
-    assert make_engine(data, tail_frames=1).publish_due() == 1
-    (path,) = data.glob("index/hall-*/*.faiss")
-    flip(path, path.stat().st_size - 5 * LENGTH)
-    assert ask(make_engine(data), uploads) == (wanted, 0)
-
-
 def test_who_scrubs_leaves_a_mark_and_nobody_else_does_for_a_while(
     data: Path, make_engine: Make
 ) -> None:
@@ -142,21 +132,6 @@ def test_a_tail_in_a_file_is_as_one_in_memory(
     np.testing.assert_array_equal(late.tail().signatures, rows[200:])
     np.testing.assert_array_equal(late.tail().keys, np.arange(200, 300))
     assert list(tmp_path.glob("index/*")) == []  # nothing to be left behind
-
-
-def test_who_published_it_finds_a_damaged_manifest(
-    data: Path, make_engine: Make, uploads: Any
-) -> None:
-    builder = make_engine(data, tail_frames=1, scrub_s=1)
-    wanted, _ = ask(builder, uploads)
-    assert builder.publish_due() == 1
-    (path,) = data.glob("index/hall-*/*.json")
-    flip(path, 40)
-    (data / "index" / ".scrubbed").unlink(missing_ok=True)
-    builder._upkeep._scrubber._looked = -1e9
-    assert until_healed(builder) == 1
-    assert ask(make_engine(data), uploads)[0] == wanted
-    assert newest(path.parent, builder.get_map("hall").model_id, LENGTH) is not None
 
 
 def test_a_damaged_index_is_read_once_and_not_with_every_query(

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from sqlalchemy import select
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
@@ -19,67 +15,11 @@ from sceneprint.engine.search import local_index, verification
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import UnknownMap
-from sceneprint.geometry.rigid import difference
 from sceneprint.pipeline import associate
-from sceneprint.store.tables import frames, signatures
 from sceneprint_client.api import NewMap, Query
 
 Ids = Callable[[Engine], list[str]]
 R = Query(stages=("retrieve",), k=50)
-
-
-def damage_artifact(engine: Engine, frame_id: str, how: str) -> None:
-    with engine.store.database.read() as connection:
-        digest = connection.execute(
-            select(signatures.c.geometry)
-            .join(frames, frames.c.number == signatures.c.frame_number)
-            .where(frames.c.id == frame_id)
-        ).scalar_one()
-    path = Path(engine.settings.blob_dir) / digest[:2] / digest
-    if how == "missing":
-        path.unlink()
-    else:
-        data = bytearray(path.read_bytes())
-        data[len(data) // 2] ^= 1
-        path.write_bytes(data)
-
-
-@pytest.mark.parametrize("how", ["missing", "flipped"])
-def test_a_damaged_artifact_costs_its_match_and_no_other(
-    full: Engine, uploads: Any, ids: Ids, how: str
-) -> None:
-    names = ids(full)
-    before = full.query_frame("hall", names[7], Query())
-    bad = before.matches[1].frame_id
-    damage_artifact(full, bad, how)
-    full.store.geometries.forget_older(0)  # as after a while
-    after = full.query_frame("hall", names[7], Query())
-    assert after.status == "found"
-    told = {m.frame_id: m for m in after.matches}
-    assert told[bad].validation.status == "skipped"
-    assert told[bad].transform is None
-    reason = {"missing": "cannot be read (No such file", "flipped": "is damaged: its content has"}
-    assert reason[how] in told[bad].validation.reason
-    assert after.matches[-1].frame_id == bad  # after all that were tried
-    was = {m.frame_id: m for m in before.matches}
-    assert set(told) == set(was)
-    assert [m.frame_id for m in after.matches[:4]] == [
-        m.frame_id for m in before.matches[:5] if m.frame_id != bad
-    ]
-    for m in after.matches[:4]:  # what guided them may be another now
-        free: dict[str, Any] = {"validation": None, "transform": None, "predicted": None}
-        free |= {"pose_in_map": None, "uncertainty": None}
-        assert m.model_copy(update=free) == was[m.frame_id].model_copy(update=free)
-        assert m.validation.status == "accepted"
-        there, then = (np.array(one.transform.matrix) for one in (m, was[m.frame_id]))
-        metres, radians = difference(there, then)
-        assert metres < 0.02
-        assert radians < math.radians(1.0)
-    assert after.counts.accepted == 4
-    assert (after.location.support, before.location.support) == (4, 5)
-    # the query's own is made again at once
-    assert full.query_frame("hall", bad, Query()).status == "found"
-    assert full.query_frame("hall", bad, R).matches[0].validation.reason == "not requested"
 
 
 def test_what_is_deleted_while_a_query_runs_is_not_told(
@@ -145,17 +85,6 @@ def test_matches_that_are_deleted_while_they_are_validated_are_not_found(
     answer = empty.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query())
     assert (answer.status, answer.matches, answer.location) == ("not_found", [], None)
     assert (answer.counts.validated, answer.counts.accepted) == (0, 0)
-
-
-def test_maps_are_never_mixed(full: Engine, uploads: Any, work_off: Any) -> None:
-    full.create_map(NewMap(name="other", model="depth"))
-    added, _ = full.add_frame("other", uploads[5].data, uploads[5].meta)
-    work_off(full)
-    for name, count in (("other", 1), ("hall", 12)):
-        answer = full.queries.upload([name], uploads[5].data, uploads[5].meta, R)
-        assert (answer.counts.map, {m.map for m in answer.matches}) == (count, {name})
-        assert answer.matches[0].distance == 0
-        assert (added.frame_id in [m.frame_id for m in answer.matches]) == (name == "other")
 
 
 def test_queries_beside_deletions_and_publishing_see_one_state(

@@ -5,17 +5,13 @@ from __future__ import annotations
 import shutil
 import threading
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import select, update
 
 from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index
-from sceneprint.store.signatures import changes_since
-from sceneprint.store.tables import frames, signatures
 from sceneprint_client.api import Answer, JobState, NewMap, Query
 
 Make = Callable[..., Engine]
@@ -169,57 +165,6 @@ def test_a_map_made_anew_has_none_of_the_old_frames(
         answer = ask(engine, uploads, 7)
         assert found(answer) == [(added.frame_id, 0)]
         assert answer.index_generation == 0
-
-
-def test_an_index_of_a_later_state_than_the_database_is_not_used(
-    data: Path, make_engine: Make, uploads: Any, more: Any, put_back: Any
-) -> None:
-    """The database was put back from a copy, the index was not."""
-    engine = make_engine(data, tail_frames=5)
-    before = found(ask(engine, uploads))
-    engine.close()
-    kept = Path(shutil.copytree(data, data.with_name("kept")))
-    make_engine(kept).close()
-    engine = make_engine(data, tail_frames=5)
-    more(engine, 2)
-    assert engine.publish_due() == 1
-    engine.close()
-    put_back(kept, data)
-    engine = make_engine(data, tail_frames=5)
-    answer = ask(engine, uploads)
-    assert found(answer) == before
-    assert answer.index_generation == 0
-    assert engine.publish_due() == 1
-    answer = ask(make_engine(data, tail_frames=5), uploads)
-    assert (found(answer), answer.index_generation) == (before, 2)
-
-
-def test_a_damaged_signature_costs_no_more_than_its_frame(
-    data: Path, make_engine: Make, uploads: Any, more: Any, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
-) -> None:  # fmt: skip
-    monkeypatch.setattr(local_index, "changes_since", partial(changes_since, limit=4))
-    engine = make_engine(data, tail_frames=5)
-    ask(engine, uploads)
-    assert make_engine(data, tail_frames=5).publish_due() == 1
-    bad = more(engine, 6)[5]
-    number = select(frames.c.number).where(frames.c.id == bad).scalar_subquery()
-    with engine.store.database.write() as connection:
-        connection.execute(
-            update(signatures).where(signatures.c.frame_number == number).values(vector=b"?")
-        )
-    answer = ask(engine, uploads)  # all but that one
-    assert bad not in [match.frame_id for match in answer.matches]
-    assert answer.counts.map == 17
-    passed_over = [r for r in caplog.records if "skipped" in r.message]
-    assert [r.__dict__["frame_id"] for r in passed_over] == [bad]
-    engine.delete_frame("hall", bad)
-    wanted = truth(make_engine, uploads, data, tmp_path)
-    assert len(wanted) == 17
-    assert found(answer) == wanted
-    answer = ask(engine, uploads)
-    assert found(answer) == wanted
-    assert answer.index_generation == 1
 
 
 def test_a_crowd_at_a_cold_engine_is_served(data: Path, make_engine: Make, ids: Ids) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from sqlalchemy import update
 
@@ -231,25 +230,3 @@ def test_a_model_of_another_version_keeps_its_index(
     other = make_engine(tail_frames=1)
     assert other.publish_due() == 0
     assert len(list(folder.glob("*.json"))) == 1
-
-
-def test_purging_leaves_no_byte_of_what_was_deleted(
-    make_engine: Make, uploads: Any, work_off: Any
-) -> None:
-    engine = make_engine(tail_frames=2)
-    engine.create_map(NewMap(name="hall", model="depth"))
-    names = fill(engine, uploads, work_off, range(5))
-    assert engine.publish_due() == 1
-    (folder,) = engine.settings.indexes.glob("hall*")
-    (path,) = folder.glob("*.faiss")
-    number = engine.view("hall")[2].generation.keys[1]
-    row = engine.view("hall")[2].generation.vectors_of(np.array([number])).tobytes()
-    assert row in path.read_bytes()
-    assert engine.purging.now().indexes == 0  # nothing was deleted
-    engine.delete_frame("hall", names[1])
-    assert engine.purging.now().indexes == 1
-    assert all(row not in one.read_bytes() for one in folder.iterdir())
-    assert engine.purging.now().indexes == 0
-    answer = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, ALL)
-    assert names[1] not in [one.frame_id for one in answer.matches]
-    assert answer.counts.map == 4

@@ -1,7 +1,4 @@
-"""Eq. (1) and Eq. (2) worked by hand; `test_mutations.py` shows that these checks can fail.
-
-Each check takes the module under test, so that it can be run on a mutated copy.
-"""
+"""Eq. (1) and Eq. (2) worked by hand; each check takes the module under test."""
 
 from __future__ import annotations
 

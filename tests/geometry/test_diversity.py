@@ -66,7 +66,7 @@ def test_greedy_equals_the_determinants(seed: int, p: DiversityParameters) -> No
     assert found.indices.tolist() == naive_greedy(to_query, among, 6, p)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 30), k=st.integers(1, 12))
 def test_first_is_top_ranked_and_the_order_is_that_of_the_ranking(
     seed: int, n: int, k: int

@@ -104,7 +104,7 @@ FLOATS = hnp.arrays(
 )
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=50)
 @given(FLOATS)
 def test_normalised_has_unit_norm_and_the_same_signs(phi: Floats) -> None:
     result = normalised(phi)
@@ -213,7 +213,7 @@ def test_quantise_by_hand() -> None:
     assert stored.tolist() == expected
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=50)
 @given(st.integers(0, 10**6), st.integers(1, 400), st.floats(1e-4, 1e-2))
 def test_bytes_stand_for_the_signature(seed: int, n: int, step: float) -> None:
     rng = np.random.default_rng(seed)

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sceneprint import types
 from sceneprint.geometry.registration import overlap as module
 from sceneprint.geometry.registration.overlap import OverlapParameters, overlap_counts, sampled
+from sceneprint.geometry.surface import camera
 from sceneprint.types import Floats, Floats32, Surface
 
 P = OverlapParameters()
@@ -46,7 +48,11 @@ def oracle(source: Floats32, target: Surface, T: Floats, p: OverlapParameters) -
 
 
 def test_by_hand(validation_goldens: ModuleType) -> None:
+    validation_goldens.check_cameras(types)
+    validation_goldens.check_projecting(camera)
+    validation_goldens.check_targets(module)
     validation_goldens.check_agreement(module)
+    validation_goldens.check_agreement_of_clouds(module)
     validation_goldens.check_sampling(module)
 
 

@@ -184,7 +184,7 @@ length = st.one_of(st.floats(1.0, 100.0), st.floats(1e-3, 1e7))
 centre = st.one_of(st.floats(-10, 20), st.floats(-1e7, 1e7))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(length, length, centre, centre, st.lists(coefficient, min_size=5, max_size=5))
 def test_any_camera_gives_samples_or_nothing(
     fx: float, fy: float, cx: float, cy: float, k: list[float]

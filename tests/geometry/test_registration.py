@@ -70,6 +70,7 @@ def room_surface(small_model: Model) -> Surface:
 
 def test_by_hand(validation_goldens: ModuleType) -> None:
     validation_goldens.check_registration(module)
+    validation_goldens.check_registration_of_clouds(module)
 
 
 def test_one_step_equals_the_oracle(scenes: ModuleType) -> None:

@@ -90,7 +90,7 @@ SIGNATURES = st.integers(1, 70).flatmap(
 )
 
 
-@settings(max_examples=80, deadline=None, derandomize=True)
+@settings(max_examples=80)
 @given(SIGNATURES)
 def test_is_a_metric(triple: tuple[bytes, bytes, bytes]) -> None:
     x, y, z = (np.frombuffer(b, np.uint8) for b in triple)
@@ -187,7 +187,7 @@ def full_sort(values: Ints64, size: int) -> list[int]:
     return sorted(range(len(values)), key=lambda i: (int(values[i]), i))[:size]
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=200)
 @given(values=st.lists(st.integers(0, 6), max_size=40), size=st.integers(0, 45))
 def test_ranking_equals_a_full_sort(values: list[int], size: int) -> None:
     """Few values, hence many ties, also at the cut."""

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from types import ModuleType
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry import rigid
 from sceneprint.geometry.rigid import (
     difference,
     inverse,
@@ -41,10 +39,6 @@ def fitted(a: Floats, b: Floats, weights: Floats | None = None) -> Floats:
 def assert_rotation(R: Floats) -> None:
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1.0, abs=1e-12)
-
-
-def test_by_hand(validation_goldens: ModuleType) -> None:
-    validation_goldens.check_rigid(rigid)
 
 
 def test_inverse_equals_numpys() -> None:

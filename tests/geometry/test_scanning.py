@@ -53,7 +53,7 @@ def test_any_length(width: int, n: int) -> None:
 
 
 @every_width
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(n_queries=st.integers(0, 10), n_rows=st.integers(0, 40), seed=st.integers(0, 9))
 def test_any_number_of_queries_and_rows(width: int, n_queries: int, n_rows: int, seed: int) -> None:
     """Rows in any order, some of them twice; full blocks, and what is left of them."""

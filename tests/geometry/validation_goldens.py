@@ -1,8 +1,4 @@
-"""Validation worked by hand; `test_validation_mutations.py` shows that these checks can fail.
-
-Each check takes the module under test, so that it can be run on a mutated copy. All scenes are a
-few points, so that kernels run uncompiled as well.
-"""
+"""Validation worked by hand, on scenes of a few points; each check takes the module under test."""
 
 from __future__ import annotations
 
@@ -93,43 +89,6 @@ def quarter(axis: int, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> F
     T[b, a], T[a, b] = 1.0, -1.0
     T[:3, 3] = shift
     return T
-
-
-def check_rigid(module: ModuleType) -> None:
-    about_z = quarter(2, (1.0, 2.0, 3.0))  # x goes to y
-    assert module.moved(about_z, np.array([[1.0, 0, 0], [0, 0, 5]])).tolist() == [
-        [1, 3, 3],
-        [1, 2, 8],
-    ]
-    assert module.inverse(about_z)[:3].tolist() == [[0, 1, 0, -2], [-1, 0, 0, 1], [0, 0, 1, -3]]
-    for axis in range(3):
-        assert module.rotation_angle(quarter(axis)[:3, :3]) == math.pi / 2
-    half = np.diag([1.0, -1.0, -1.0])
-    assert module.rotation_angle(half) == math.pi
-    assert module.rotation_angle(np.eye(3)) == 0.0
-    metres, radians = module.difference(about_z, quarter(2, (1.0, 5.0, 7.0)))
-    assert (metres, radians) == (5.0, 0.0)
-    metres, radians = module.difference(about_z, quarter(0, (1.0, 5.0, 7.0)) @ about_z)
-    assert (round(metres**2, 9), radians) == (1 + 0 + 36, math.pi / 2)
-    # the nearest rotation of a mirror image is none
-    found = module.nearest_rotation(np.diag([3.0, 2.0, -1.0]))
-    np.testing.assert_allclose(found, np.eye(3), atol=1e-12)
-    result = np.empty((3, 3))
-    for axis, omega in enumerate(np.eye(3) * (math.pi / 2)):
-        module.turned(np.eye(3), omega, result)
-        np.testing.assert_allclose(result, quarter(axis)[:3, :3], atol=1e-12)
-    module.turned(quarter(0)[:3, :3], np.array([0.0, 0.0, math.pi / 2]), result)
-    np.testing.assert_allclose(result, [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-12)
-    a = np.array([[1.0, 0, 0], [0, 2, 0], [0, 0, 3], [1, 1, 0]])
-    for axis, second in product(range(3), range(3)):
-        R = quarter(axis)[:3, :3] @ quarter(second)[:3, :3]
-        module.rotation_of_covariance((a @ R.T).T @ a, result)
-        np.testing.assert_allclose(result, R, atol=1e-12)
-    x = np.empty(2)
-    # 4 x + 2 y = 10, 2 x + 10 y = 14: (2, 1)
-    assert module.solve_positive(np.array([[4.0, 2], [2, 10]]), np.array([10.0, 14]), x)
-    np.testing.assert_allclose(x, [2, 1], atol=1e-12)
-    assert not module.solve_positive(np.array([[1.0, 2], [2, 4]]), np.ones(2), x)
 
 
 def check_cameras(module: ModuleType) -> None:

@@ -76,7 +76,7 @@ def test_a_map_in_parts_is_searched_as_one(
     assert {hits.keys.dtype, hits.distances.dtype} == {np.dtype(np.int64)}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     n=st.integers(0, 12),
     size=st.integers(0, 14),
@@ -110,7 +110,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Generation, Tail, 
     return made, tail, frozenset([6, 9, 363, 5000])
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     among=st.none() | st.sets(st.integers(0, 640), max_size=300),
     size=st.integers(0, 130),
@@ -159,7 +159,7 @@ def test_rows_that_may_not_be_found_are_not_read(
     assert sum(read) == 3
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     kinds=st.integers(1, 30),
     n=st.integers(1, 300),

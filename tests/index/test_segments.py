@@ -115,7 +115,7 @@ def test_what_is_open_stays_open(walk: Walk, published: Publish, tmp_path: Path)
     assert (len(first.segments[0]), len(third.segments[0])) == (100, 99)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(data=st.data(), flat=st.sampled_from([0, 1 << 30]), seed=st.integers(0, 999))
 def test_any_history_is_searched_as_one_map(
     tmp_path_factory: pytest.TempPathFactory, nearest: Nearest, data: Any, flat: int, seed: int

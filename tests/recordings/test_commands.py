@@ -169,23 +169,6 @@ def test_keyframes_are_uploaded_and_the_rest_is_counted(
     assert f"left out: {FRAMES - 1} between keyframes" in done.stderr
 
 
-def test_queries_with_a_bag_answer_as_with_the_folder(
-    sceneprint: Run, maps: tuple[str, str], folder: Path, recording: Path
-) -> None:
-    by_path = {}
-    for path in (folder, recording):
-        done = sceneprint(
-            "query", "folder", path, "--frame", 3, "--keyframe-m", 0, "--json", "--k", 2
-        )
-        by_path[path] = json.loads(done.stdout)
-    a, b = by_path[folder], by_path[recording]
-    assert b["name"] == "lab/000003"
-    assert [one["frame_id"] for one in a["matches"]] == [one["frame_id"] for one in b["matches"]]
-    assert a["location"]["pose"] == b["location"]["pose"] | {
-        "child_frame": a["location"]["pose"]["child_frame"]
-    }
-
-
 def test_localize_and_sequences_of_a_bag(
     sceneprint: Run, maps: tuple[str, str], recording: Path
 ) -> None:
@@ -195,26 +178,6 @@ def test_localize_and_sequences_of_a_bag(
     assert done.stdout.startswith("lab/000004: found")
     done = sceneprint("query", "bag", recording, "--frame", 99, expect=2)
     assert "Set --frame to an index from 0 to" in done.stderr
-
-
-def test_signatures_of_a_bag_are_those_of_the_folder(
-    sceneprint: Run, folder: Path, recording: Path, tmp_path: Path
-) -> None:
-    for name, path in (("a", folder), ("b", recording)):
-        sceneprint("sign", path, "--out", tmp_path / name, "--keyframe-m", 0)
-    a, b = (sorted((tmp_path / name).rglob("*.sig")) for name in "ab")
-    assert [one.read_bytes() for one in a] == [one.read_bytes() for one in b]
-    assert len(a) == FRAMES
-
-
-def test_an_evaluation_of_a_bag(sceneprint: Run, recording: Path, tmp_path: Path) -> None:
-    figures = tmp_path / "figures.json"
-    done = sceneprint(
-        "evaluate", recording, "--db", "0:6", "--queries", "6:8", "--keyframe-m", 0,
-        "--jobs", 1, "--json", figures,
-    )  # fmt: skip
-    assert json.loads(figures.read_text())
-    assert done.stderr.count("frames of /camera/depth/image_raw taken") == 1
 
 
 def test_each_bag_of_a_folder_is_a_session(sceneprint: Run, bags: Path, service_url: str) -> None:

@@ -150,7 +150,7 @@ def unpacked(packed: bytes) -> bytes:
     return bytes(out)
 
 
-@settings(max_examples=80, deadline=None, derandomize=True)
+@settings(max_examples=80)
 @given(
     st.lists(st.tuples(st.binary(max_size=12), st.integers(0, 300)), max_size=8).map(
         lambda parts: b"".join(part * n for part, n in parts)[:4000]
@@ -162,7 +162,7 @@ def test_packing_round(lzf: Callable[[bytes], bytes], data: bytes) -> None:
     assert inflate(np.frombuffer(packed, np.uint8), len(data)).tobytes() == data
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150)
 @given(st.binary(max_size=60), st.integers(0, 5))
 def test_any_bytes_inflate_as_the_format_says(packed: bytes, beyond: int) -> None:
     try:

@@ -44,7 +44,7 @@ def test_the_document_is_whole(document):
             place = place[step]
         assert isinstance(place, dict)
     names = [operation["operationId"] for operation in operations(document).values()]
-    assert len(names) == len(set(names)) == 110
+    assert len(names) == len(set(names)) == 106
     used = {reference.rpartition("/")[2] for reference in found}
     assert set(document["components"]["schemas"]) == used  # nothing that nothing refers to
 
@@ -95,7 +95,7 @@ def test_bodies_that_are_read_by_hand_are_described(document):
     assert list(upload["content"]) == ["multipart/form-data", *raw]
     form = upload["content"]["multipart/form-data"]["schema"]
     assert form["required"] == ["frame", "meta"]
-    assert sorted(form["properties"]) == ["frame", "if_novel", "meta", "priority", "signed"]
+    assert sorted(form["properties"]) == ["frame", "if_novel", "meta", "priority"]
     query = operations(document)["post", "/v1/maps/{map_name}/queries"]["requestBody"]
     options = {"k", "stages", "exact", "filter", "seed", "candidates", "diversity", "validation",
                "prior", "deadline_ms", "explain", "explain_frame", "keep",

@@ -62,29 +62,6 @@ def test_a_disk_that_takes_no_blobs_takes_no_frames(shaken, small_shots, refused
     assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
 
 
-def test_one_damaged_artifact_costs_its_frame_and_not_the_answer(
-    shaken, small_shots, refused, rows
-):
-    frames = shaken.client.get("/v1/maps/hall/frames").json()["items"]
-    first = frames[0]["frame_id"]
-    asked = "SELECT geometry FROM signatures ORDER BY frame_number LIMIT 1"
-    ((blob,),) = rows(shaken.folder, asked)
-    artifact = shaken.folder / "blobs" / blob[:2] / blob
-    content = artifact.read_bytes()
-    artifact.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    answer = shaken.client.post("/v1/maps/hall/queries", **small_shots[1].form())
-    assert answer.status_code == 200
-    told = {match["frame_id"]: match["validation"] for match in answer.json()["matches"]}
-    assert told[first]["status"] == "skipped"
-    assert "is damaged" in told[first]["reason"]
-    assert answer.json()["status"] == "found"
-    own = shaken.client.post("/v1/maps/hall/queries", json={"frame_id": first})
-    assert (own.status_code, own.json()["status"]) == (200, "found")
-    [event] = shaken.client.get("/v1/events?kind=frame.damaged").json()["items"]
-    assert (event["map"], event["frame_id"]) == ("hall", first)
-    artifact.write_bytes(content)
-
-
 def test_what_nobody_thought_of_is_told_by_its_id_alone(shaken, refused, truth):
     with truth(shaken.folder) as connection:
         connection.exec_driver_sql("UPDATE maps SET model_id = model_id, created_at = 1e30")

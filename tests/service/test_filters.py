@@ -1,4 +1,4 @@
-"""Filters and `if_novel` over HTTP: as a form and as JSON, and what is refused by its field."""
+"""Filters and `if_novel` over HTTP, as a form and as JSON; refusals name the field."""
 
 from __future__ import annotations
 
@@ -46,27 +46,11 @@ def places(rooms, answer: Any) -> list[int]:
     return sorted(rooms["ids"].index(match["frame_id"]) for match in told["matches"])
 
 
-def box(shot, *, around: float) -> dict[str, Any]:
-    """A cube about the place of a frame."""
-    place = {axis: shot.pose[i][3] for i, axis in enumerate("xyz")}
-    return {
-        "parent_frame": "house",
-        "min": {axis: x - around for axis, x in place.items()},
-        "max": {axis: x + around for axis, x in place.items()},
-    }
-
-
 @pytest.mark.parametrize(
     ("given", "passing"),
     [
         ({"session": "run-1"}, [3, 4, 5]),
-        ({"session": ["run-0", "run-1"], "tags": ["n2"]}, [2]),
-        ({"tags": ["day", "n2", "n3"]}, []),
-        ({"captured_after": AT.format(10), "captured_before": AT.format(10)}, [1, 4]),
         ({"captured_after": "2026-11-16T10:30:20+01:00"}, [2, 5]),
-        ({"robot": "r1", "session": "run-0"}, [0, 1, 2]),
-        ({"robot": "r2"}, []),
-        ({}, [0, 1, 2, 3, 4, 5]),
         (None, [0, 1, 2, 3, 4, 5]),
     ],
 )
@@ -75,32 +59,6 @@ def test_only_what_passes_is_found(served, rooms, shots, given, passing):
     for form in (given, json.dumps(given)):  # JSON takes text as well
         others = [one for one in passing if one != 1]
         assert places(rooms, by_id(served, rooms, 1, form)) == others
-
-
-def test_places_and_ids(served, rooms, shots):
-    near = by_form(served, rooms, shots[0], json.dumps({"region": box(shots[4], around=1e-6)}))
-    assert places(rooms, near) == [4]
-    elsewhere = box(shots[4], around=1e6) | {"parent_frame": "garden"}
-    assert places(rooms, by_form(served, rooms, shots[0], json.dumps({"region": elsewhere}))) == []
-    but = {"exclude_frames": rooms["ids"][:5]}
-    assert places(rooms, by_form(served, rooms, shots[0], json.dumps(but))) == [5]
-
-
-def test_a_loop_closes_with_what_lies_behind(served, rooms, shots, refused):
-    """The frame of 10 s in run 0: those of 0 and 20 s are near, run 1 is another run."""
-    assert places(rooms, by_id(served, rooms, 1, {"not_within_s": 9.9})) == [0, 2, 3, 4, 5]
-    assert places(rooms, by_id(served, rooms, 1, {"not_within_s": 10})) == [3, 4, 5]
-    assert places(rooms, by_id(served, rooms, 0, {"not_within_s": 10})) == [2, 3, 4, 5]
-    asked = '{"not_within_s": 5}'
-    known = {"session": "run-0", "robot": "r1", "captured_at": AT.format(4)}
-    found = by_form(served, rooms, shots[0], asked, **known)
-    assert places(rooms, found) == [1, 2, 3, 4, 5]
-    other = by_form(served, rooms, shots[0], asked, **known | {"robot": "r2"})
-    assert places(rooms, other) == [0, 1, 2, 3, 4, 5]
-    lacks = by_form(served, rooms, shots[0], asked, session="run-0")
-    problem = refused(lacks, 422, "invalid-request", "no captured_at")
-    reason = "needed by filter.not_within_s"
-    assert problem["errors"] == [{"field": "captured_at", "reason": reason}]
 
 
 @pytest.mark.parametrize(
@@ -134,9 +92,7 @@ def test_what_makes_no_sense_is_named(served, rooms, shots, refused, given, fiel
     assert text in problem["errors"][0]["reason"]
 
 
-def test_a_frame_is_kept_only_where_the_map_lacks_its_place(
-    served, make_map, shots, refused, until
-):
+def test_a_frame_is_kept_only_where_the_map_lacks_its_place(served, make_map, shots, refused):
     path = make_map(served, "novel")
     wait = {"Prefer": "wait=60"}
 
@@ -151,24 +107,8 @@ def test_a_frame_is_kept_only_where_the_map_lacks_its_place(
     told = second.json()
     assert (second.status_code, told["state"]) == (201, "redundant")
     assert first.json()["frame_id"] in told["reason"]
-    assert "the map already has this place" in told["reason"]
-    frame = served.client.get(f"{path}/frames/{told['frame_id']}").json()
-    assert (frame["state"], frame["reason"]) == ("redundant", told["reason"])
-    listed = served.client.get(f"{path}/frames?state=redundant").json()["items"]
-    assert [one["frame_id"] for one in listed] == [told["frame_id"]]
-    assert served.client.get(path).json()["frames"] == {"indexed": 1, "redundant": 1}
-    assert served.client.get(f"/v1/jobs/{told['job_id']}").json()["state"] == "succeeded"
-    figures = served.client.get("/metrics").text
-    assert any(
-        line.startswith('sceneprint_frames{state="redundant"}') and float(line.split()[-1]) >= 1
-        for line in figures.splitlines()
-    )
-    asked = served.client.post(f"{path}/queries", json={"frame_id": told["frame_id"]})
-    refused(asked, 422, "invalid-request", "is redundant: Not kept, as asked")
     again = send(shots[1], "false", {})  # it is sent once more, and to be kept
     assert (again.status_code, again.json()["frame_id"]) == (202, told["frame_id"])
-    url = f"{path}/frames/{told['frame_id']}"
-    until(lambda: served.client.get(url).json()["state"] == "indexed")
     for wrong in ("0", "2", "nan", "maybe", ""):
         problem = refused(send(shots[2], wrong, {}), 422, "invalid-request", "`if_novel` is")
         assert [one["field"] for one in problem["errors"]] == ["if_novel"]

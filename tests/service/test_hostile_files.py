@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import shutil
-import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs import lifecycle
-from sceneprint.errors import NewerSchema, UnusableStore
+from sceneprint.errors import UnusableStore
 from sceneprint.settings import Settings
-from sceneprint_client import Client
-from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
+from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap
 
-BIN = Path(sys.executable).parent
 HALL = "/v1/maps/hall"
 NEAREST = {"stages": ["retrieve"], "k": 9, "exact": True}
 
@@ -55,10 +49,6 @@ def folder(stored, tmp_path) -> Path:
     return Path(shutil.copytree(stored, tmp_path / "data"))
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
 def found(answer: dict[str, Any]) -> list[tuple[str, int]]:
     return [(match["frame_id"], match["distance"]) for match in answer["matches"]]
 
@@ -67,48 +57,6 @@ def nearest(server, frame_id: str) -> dict[str, Any]:
     answer = server.client.post(f"{HALL}/queries", json={"frame_id": frame_id, **NEAREST})
     assert answer.status_code == 200, answer.text
     return dict(answer.json())
-
-
-@pytest.mark.thorough
-def test_an_index_that_is_damaged_changes_no_answer(folder, tmp_path, begin):
-    """Each file of the newest generation while a service uses it, and at its next start."""
-    with opened(folder, index_dir=tmp_path / "none") as engine:  # by the database alone
-        frames = [frame.frame_id for frame in engine.list_frames("hall").items[::4]]
-        right = [
-            found(engine.query_frame("hall", one, Query.model_validate(NEAREST)).model_dump())
-            for one in frames
-        ]
-    assert [len(matches) for matches in right] == [8, 8, 8]
-    server = begin("--workers", "0", folder=folder)
-    assert nearest(server, frames[0])["index_generation"] == 2
-    newest, _ = sorted(folder.glob("index/hall-*/*.json"), reverse=True)
-    older = {path.name: path.read_bytes() for path in newest.parent.iterdir() if path.is_file()}
-    for kind in ("json", "faiss", "rows", "code", "segment"):
-        for path in newest.parent.glob(f"*.{kind}"):
-            other = path.with_suffix(".other")  # a mapped file is replaced: it is never changed
-            other.write_bytes(bytes(len(older[path.name])))
-            other.replace(path)
-        assert [found(nearest(server, one)) for one in frames] == right, kind
-    assert server.end(signal.SIGTERM) == 0
-    server = begin("--workers", "0", folder=folder)
-    answers = [nearest(server, one) for one in frames]
-    assert [found(answer) for answer in answers] == right
-    assert {answer["index_generation"] for answer in answers} == {0}
-    told = [line["message"] for line in server.log() if line["level"] == "warning"]
-    assert any(newest.name in one for one in told)
-    server.end(signal.SIGTERM)
-    for name, data in older.items():  # all but the newest manifest and what FAISS had
-        if name != newest.name and not name.endswith(".faiss"):
-            (newest.parent / name).write_bytes(data)
-    with opened(folder) as engine:
-        answer = engine.query_frame("hall", frames[0], Query.model_validate(NEAREST))
-        assert (found(answer.model_dump()), answer.index_generation) == (right[0], 0)
-    for name, data in older.items():
-        if name != newest.name:
-            (newest.parent / name).write_bytes(data)
-    with opened(folder) as engine:
-        answer = engine.query_frame("hall", frames[0], Query.model_validate(NEAREST))
-        assert (found(answer.model_dump()), answer.index_generation) == (right[0], 1)
 
 
 def test_blobs_that_are_missing_cost_what_needs_them(
@@ -139,29 +87,6 @@ def test_blobs_that_are_missing_cost_what_needs_them(
     assert not (folder / "blobs").exists()  # a disk that was unmounted comes back, with its blobs
     (folder / "away").rename(folder / "blobs")
     assert server.client.post(f"{HALL}/frames", **small_shots[20].form()).status_code == 202
-
-
-def test_an_upload_that_is_missing_fails_after_its_tries(folder, small_shots, rows, truth):
-    shot = small_shots[30]
-    with opened(folder) as engine:
-        added, _ = engine.add_frame("hall", shot.png, meta_of(shot))
-        ((blob,),) = rows(folder, f"SELECT blob FROM frames WHERE id = '{added.frame_id}'")
-        (folder / "blobs" / blob[:2] / blob).unlink()
-        states = []
-        for _ in range(3):
-            work = engine.claim("w")
-            assert work is not None
-            states.append(engine.run(work))
-            due(truth, folder)
-        assert states == [JobState.QUEUED, JobState.QUEUED, JobState.DEAD]
-        frame = engine.get_frame("hall", added.frame_id)
-        assert frame.state == FrameState.FAILED
-        assert f"The blob {blob[:12]} cannot be read (No such file or directory)" in frame.reason
-        again, new = engine.add_frame("hall", shot.png, meta_of(shot))
-        assert (again.frame_id, new) == (added.frame_id, True)
-        work = engine.claim("w")
-        assert work is not None
-        assert engine.run(work) == JobState.SUCCEEDED
 
 
 def due(truth, folder):
@@ -211,21 +136,3 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
         work = engine.claim("w")
         assert work is not None
         assert engine.run(work) == JobState.SUCCEEDED
-
-
-@pytest.mark.parametrize("command", ["serve", "work"])
-def test_the_folder_of_a_later_version_is_left_alone(command, folder, truth):
-    with truth(folder) as connection:
-        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
-        connection.exec_driver_sql("UPDATE schema_range SET least_revision = '9999'")
-    before = contents(folder)
-    start = [BIN / "sceneprint", command, "--data", folder]
-    done = subprocess.run(start, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    (line,) = done.stderr.splitlines()
-    assert line.startswith(f"sceneprint {command}: ")
-    assert "has schema 9999, which this version of sceneprint does not know" in line
-    assert line.endswith("Use that version, or another data folder.")
-    with pytest.raises(NewerSchema):
-        Client.embedded(folder)
-    assert contents(folder) == before

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from sceneprint.engine import Engine
-from sceneprint.engine.jobs.lifecycle import cancel, worker_died
-from sceneprint.settings import Settings
-
 
 @pytest.fixture(scope="module")
 def idle(begin):
@@ -54,40 +50,7 @@ def test_what_is_over_cannot_be_cancelled(served, make_map, small_shots, refused
     refused(answer, 409, "job-over", "is succeeded")
 
 
-def test_dead_jobs_are_listed_with_their_tracebacks(idle, make_map, small_shots, refused):
-    path, client = make_map(idle, "dead"), idle.client
-    with Engine(Settings(data_dir=idle.folder)) as engine:
-        for job in client.get("/v1/jobs", params={"state": "queued"}).json()["items"]:
-            cancel(engine.store, job["job_id"])  # of other tests
-        ids = [sent(idle, path, shot)["job_id"] for shot in small_shots[2:5]]
-        for number in range(1, 4):
-            work = engine.claim("w")
-            for failure in range(3):
-                token = work.job.token - failure  # as if three had died over it
-                worker_died(engine.store, work.job.id, token, f"died {number}", "T", counts=True)
-    # two of the three deaths were of workers that had lost it
-    found = client.get("/v1/jobs", params={"state": "dead", "limit": 2}).json()
-    assert [job["job_id"] for job in found["items"]] == ids[:0:-1]
-    assert [(job["error"], job["traceback"]) for job in found["items"]] == [
-        ("died 3", "T"),
-        ("died 2", "T"),
-    ]
-    asked = {"state": "dead", "limit": 2, "cursor": found["next_cursor"]}
-    rest = client.get("/v1/jobs", params=asked).json()
-    assert ([job["job_id"] for job in rest["items"]], rest["next_cursor"]) == (ids[:1], None)
-    assert client.get("/v1/jobs").json()["items"][0]["job_id"] == ids[2]
-    for wrong in ({"state": "asleep"}, {"limit": 0}, {"cursor": "x"}):
-        refused(client.get("/v1/jobs", params=wrong), 422, "invalid-request")
-    again = client.post(f"/v1/jobs/{ids[0]}/retry").json()
-    dead = client.get("/v1/jobs", params={"state": "dead"}).json()["items"]
-    assert [job["followed_by"] for job in dead] == [None, None, again["job_id"]]
-    for job in (*dead, again):
-        told = client.get(f"/v1/jobs/{job['job_id']}").json()["followed_by"]
-        assert told == job["followed_by"]
-    refused(client.post(f"/v1/jobs/{again['job_id']}/retry"), 409, "cannot-retry")
-
-
-@pytest.mark.parametrize("given", ["11", "-11", "1.0", "high", "", "1e1", "٣", "0x1"])
+@pytest.mark.parametrize("given", ["11", "1.0", "high", "", "٣"])
 def test_a_priority_is_a_small_whole_number(idle, make_map, small_shots, refused, given):
     path = f"/v1/maps/{idle.client.get('/v1/maps').json()['items'][0]['name']}"
     form = small_shots[9].form()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from datetime import datetime
 
 import pytest
@@ -36,9 +34,7 @@ def test_a_slug_is_a_name(served, name):
     assert served.client.delete(f"/v1/maps/{name}").status_code == 204
 
 
-@pytest.mark.parametrize(
-    "name", ["../x", "%2e%2e", "..", ".", "", "a" * 64, "-a", "_a", "A", "é", "a b", "a/b", "a\n"]
-)  # fmt: skip
+@pytest.mark.parametrize("name", ["../x", "", "a" * 64, "é"])
 def test_what_is_no_slug_is_no_name(served, refused, name):
     problem = refused(
         served.client.post("/v1/maps", json={"name": name}), 422, "invalid-request", "name: "
@@ -142,74 +138,3 @@ def test_pages_hold_every_frame_once_and_in_order(served, make_map, small_shots,
         answer = served.client.get(f"{path}/frames", params=wrong)
         problem = refused(answer, 422, "invalid-request")
         assert [one["field"] for one in problem["errors"]] == list(wrong)
-
-
-def test_a_deleted_frame_is_found_no_more_and_may_come_again(
-    served, make_map, small_shots, refused
-):
-    path = make_map(served, "fleeting")
-    ids = []
-    for shot in small_shots[:3]:
-        sent = served.client.post(f"{path}/frames", **shot.form(), headers={"Prefer": "wait=50"})
-        ids.append(sent.json()["frame_id"])
-
-    def found() -> list[str]:
-        asked = small_shots[1].form()
-        asked["data"]["stages"] = "retrieve"
-        answer = served.client.post(f"{path}/queries", **asked)
-        return [one["frame_id"] for one in answer.json()["matches"]]
-
-    assert found()[0] == ids[1]
-    assert sorted(found()) == sorted(ids)
-    gone = served.client.delete(f"{path}/frames/{ids[1]}")
-    assert (gone.status_code, gone.content) == (204, b"")
-    assert sorted(found()) == sorted([ids[0], ids[2]])
-    told = served.client.get(f"{path}/frames/{ids[1]}").json()
-    assert (told["state"], told["content_id"]) == ("deleted", None)
-    refused(served.client.delete(f"{path}/frames/{ids[1]}"), 404, "unknown-frame", ids[1])
-    asked = {"frame_id": ids[1]}
-    answer = served.client.post(f"{path}/queries", json=asked)
-    problem = refused(answer, 422, "invalid-request", "is deleted")
-    assert problem["errors"] == [{"field": "frame_id", "reason": "is deleted"}]
-
-    back = served.client.post(
-        f"{path}/frames", **small_shots[1].form(), headers={"Prefer": "wait=50"}
-    )
-    assert back.status_code == 201
-    assert back.json()["frame_id"] not in ids
-    assert found()[0] == back.json()["frame_id"]
-
-
-def test_a_deleted_map_takes_all_with_it(
-    served, make_map: Callable[..., str], small_shots, refused
-):
-    path = make_map(served, "doomed")
-    sent = served.client.post(
-        f"{path}/frames", **small_shots[5].form(), headers={"Prefer": "wait=50"}
-    ).json()
-    assert served.client.delete(path).status_code == 204
-    answers = (
-        served.client.get(path),
-        served.client.delete(path),
-        served.client.get(f"{path}/frames"),
-        served.client.get(f"{path}/frames/{sent['frame_id']}"),
-        served.client.post(f"{path}/frames", **small_shots[5].form()),
-        served.client.post(f"{path}/queries", json={"frame_id": sent["frame_id"]}),
-    )
-    for answer in answers:
-        refused(answer, 404, "unknown-map", "There is no map 'doomed'")
-    refused(served.client.get(f"/v1/jobs/{sent['job_id']}"), 404, "unknown-job", sent["job_id"])
-    make_map(served, "doomed")  # of that name, and empty
-    asked = small_shots[5].form()
-    answer = served.client.post(f"{path}/queries", **asked).json()
-    assert (answer["status"], answer["matches"], answer["counts"]["map"]) == ("not_found", [], 0)
-    assert json.loads(asked["data"]["meta"])["intrinsics"]["width"] == 160
-
-
-@pytest.mark.parametrize("when", ["0001-01-01T00:00:00+14:00", "9999-12-31T23:59:59-14:00"])
-def test_a_time_that_is_none_in_utc_spoils_no_page(served, small_shots, refused, when):
-    served.client.post("/v1/maps", json={"name": "times", "model": "depth"})
-    sent = served.client.post("/v1/maps/times/frames", **small_shots[90].form(captured_at=when))
-    problem = refused(sent, 422, "invalid-request", "captured_at")
-    assert [one["field"] for one in problem["errors"]] == ["captured_at"]
-    assert served.client.get("/v1/maps/times/frames").json()["items"] == []

@@ -155,29 +155,6 @@ def test_what_cannot_be_made_is_refused(served, shown, refused, query, field):
     assert [one["field"] for one in problem["errors"]] == [field]
 
 
-def test_what_is_not_indexed_or_not_there(served, make_map, shoot, room_frames, refused):
-    path = make_map(served, "unshown")
-    lens = room_frames[0].intrinsics
-    depth = np.zeros((lens.height, lens.width), np.float32)
-    depth[100:105, 100:106] = 2.0
-    bare = served.client.post(
-        f"{path}/frames", **shoot(depth, lens).form(), headers={"Prefer": "wait=50"}
-    ).json()
-    assert bare["state"] == "rejected"
-    frame = f"{path}/frames/{bare['frame_id']}"
-    for name in FILES:
-        if name != "upload":
-            refused(served.client.get(f"{frame}/{name}"), 409, "not-indexed", "is rejected")
-    assert served.client.get(f"{frame}/upload").status_code == 200
-    assert served.client.delete(frame).status_code == 204
-    for name in FILES:
-        refused(served.client.get(f"{frame}/{name}"), 404, "unknown-frame", "was deleted")
-        refused(served.client.get(f"{path}/frames/x/{name}"), 404, "unknown-frame")
-        refused(served.client.get(f"/v1/maps/nowhere/frames/x/{name}"), 404, "unknown-map")
-    for name in ("sessions", "trajectory?session=s"):
-        refused(served.client.get(f"/v1/maps/nowhere/{name}"), 404, "unknown-map")
-
-
 def test_lists_by_metadata(served, shown, refused):
     path, ids = shown
 
@@ -200,27 +177,6 @@ def test_lists_by_metadata(served, shown, refused):
                 "content_id=abc", "has_pose=perhaps", "limit=0"):  # fmt: skip
         problem = refused(served.client.get(f"{path}/frames?{bad}"), 422, "invalid-request")
         assert bad.partition("=")[0] in problem["errors"][0]["field"]
-
-
-def test_a_map_tells_how_it_grew(served, shown, refused):
-    path, ids = shown
-    told = served.client.get(f"{path}/growth?by=hour&last=2").json()
-    assert (told["map"], told["by"], told["indexed"], told["before"]) == (
-        path.rpartition("/")[2], "hour", 3, 0
-    )  # fmt: skip
-    first, last = (datetime.fromisoformat(one["at"]) for one in told["buckets"])
-    assert (last - first).total_seconds() == 3600
-    counted = [0, 0]
-    for one in ids:
-        at = served.client.get(f"{path}/frames/{one}").json()["indexed_at"]
-        counted[datetime.fromisoformat(at) >= last] += 1
-    assert [one["indexed"] for one in told["buckets"]] == counted
-    assert told["buckets"][-1]["total"] == 3
-    assert len(served.client.get(f"{path}/growth").json()["buckets"]) == 30
-    for bad in ("by=week", "last=0", "last=401", "lst=3"):
-        name = bad.partition("=")[0]
-        refused(served.client.get(f"{path}/growth?{bad}"), 422, "invalid-request", f"{name}: ")
-    refused(served.client.get("/v1/maps/nowhere/growth"), 404, "unknown-map")
 
 
 def test_sessions_and_a_trajectory(served, shown, refused):

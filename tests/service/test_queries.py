@@ -70,10 +70,6 @@ def apart(A: np.ndarray, B: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(D[:3, 3])), float(np.degrees(np.arccos(cosine)))
 
 
-def timeless(answer: dict[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in answer.items() if k not in ("query_id", "milliseconds")}
-
-
 def test_a_view_is_found_with_its_pose(served, rooms, moved):
     answer = asked(served, rooms, moved, seed=7)
     assert (answer["status"], answer["seed"], answer["exact"]) == ("found", 7, True)
@@ -103,77 +99,6 @@ def test_a_view_is_found_with_its_pose(served, rooms, moved):
     spent = [answer["milliseconds"][stage] for stage in STAGES]
     assert sum(spent[:-1]) == pytest.approx(spent[-1], abs=0.05)
     assert all(value >= 0 for value in spent)
-
-
-def test_a_view_that_shares_too_little_is_not_found(served, rooms, shots):
-    answer = asked(served, rooms, shots[2])
-    assert (answer["status"], answer["location"]) == ("not_found", None)
-    assert (answer["counts"]["accepted"], answer["counts"]["validated"]) == (0, 4)
-    for match in answer["matches"]:
-        assert match["validation"]["status"] == "rejected"
-        assert len(match["validation"]["reason"]) > 10
-
-
-def test_the_same_question_has_the_same_answer(served, rooms, moved):
-    first = asked(served, rooms, moved, seed=3)
-    again = asked(served, rooms, moved, seed=3)
-    assert timeless(first) == timeless(again)
-    assert first["query_id"] != again["query_id"]
-    scanned = asked(served, rooms, moved, seed=3, exact="true")
-    assert timeless(scanned) == timeless(first)  # so small a map is always scanned
-
-
-def test_a_frame_of_the_map_finds_others_and_not_itself(served, rooms, shots):
-    own = rooms["ids"][0]
-    reply = served.client.post(f"{rooms['path']}/queries", json={"frame_id": own, "seed": 4})
-    assert reply.status_code == 200
-    answer = reply.json()
-    found = [match["frame_id"] for match in answer["matches"]]
-    assert sorted(found) == sorted(rooms["ids"][1:])
-    assert (answer["counts"]["map"], answer["counts"]["ranked"], answer["seed"]) == (3, 3, 4)
-    for match in answer["matches"]:
-        if match["transform"] is not None:
-            assert match["transform"]["child_frame"] == f"{own}.optical"
-    uploaded = asked(served, rooms, shots[0], seed=4)  # the same frame from outside finds it
-    assert uploaded["matches"][0]["frame_id"] == own
-    assert uploaded["matches"][0]["distance"] == 0
-    assert uploaded["matches"][0]["similarity"] == 1.0
-
-
-def test_stages_and_k_are_as_asked(served, rooms, moved):
-    plain = asked(served, rooms, moved, stages="retrieve", k=2)
-    assert (plain["status"], plain["location"]) == ("unvalidated", None)
-    assert [match["rank"] for match in plain["matches"]] == [1, 2]
-    for match in plain["matches"]:
-        assert match["validation"] == {
-            "status": "skipped", "strength": None, "reason": "not requested", "residual": None,
-            "overlap": None, "plane_overlap": None, "free_space_violations": None,
-            "planes": None, "plane_violations": None, "inliers": None, "ambiguity": None,
-            "search": None, "directions": [], "tilt_deg": None,
-        }  # fmt: skip
-        assert (match["selected"], match["diversity_gain"]) == (None, None)
-        assert (match["transform"], match["pose_in_map"]) == (None, None)
-    distances = [match["distance"] for match in plain["matches"]]
-    assert distances == sorted(distances)
-    diverse = asked(served, rooms, moved, stages="retrieve, diversify", k=3)
-    assert [match["selected"] for match in diverse["matches"]] == [True] * 3
-    assert diverse["matches"][0]["diversity_gain"] == 1.0
-    assert (diverse["counts"]["selected"], diverse["counts"]["validated"]) == (3, 0)
-    told = []
-    for stages in ("retrieve, diversify", ["retrieve", "diversify"]):  # JSON takes text as well
-        body = {"frame_id": rooms["ids"][0], "k": 2, "stages": stages}
-        reply = served.client.post(f"{rooms['path']}/queries", json=body)
-        assert (reply.status_code, reply.json()["counts"]["selected"]) == (200, 2)
-        told.append(timeless(reply.json()))
-    assert told[0] == told[1]
-    checked = asked(served, rooms, moved, stages="retrieve,validate", k=1)
-    assert checked["counts"]["accepted"] == 1
-    assert checked["counts"]["selected"] == 0
-    skipped = [m for m in checked["matches"] if m["validation"]["status"] == "skipped"]
-    assert {m["validation"]["reason"] for m in skipped} <= {
-        "enough matches were accepted before it"
-    }
-    assert len(skipped) == 4 - checked["counts"]["validated"]
 
 
 def test_what_is_asked_is_not_kept(served, rooms, moved):

@@ -52,8 +52,8 @@ class Twin:
 
     def ask(self, key: str, method: str, path: str, **request: Any) -> Any:
         answer = self.house.ask(key, method, path, **request)
-        # records of queries are written when there is time, and their events tell when that was
-        assert self.house.engine.history.flush(60)
+        # queries are logged when there is time, and their events have that time
+        assert self.house.engine.query_log.flush(60)
         return answer
 
     def disturb(self) -> None:

@@ -14,13 +14,11 @@ import sceneprint_client
 from sceneprint import errors
 from sceneprint.cli import COMMANDS
 from sceneprint.settings import Settings
-from sceneprint_client import Client, Tracker
+from sceneprint_client import Client
 from service.problems import type_of as problem_type
 from tools.site import http_pages
-from tools.site.client_page import documented, public_methods, signature
 from tools.site.code_pages import commands, metric_families, read_settings
 from tools.site.error_page import kinds, remedy, status
-from tools.site.http_pages import operations, type_of
 from tools.site.markup import cell
 from tools.site.reference import GeneratedPage, api_document, generated_pages
 
@@ -113,32 +111,6 @@ def test_every_record_has_its_fields(
     assert r"Page\[Frame\]" in found
 
 
-@pytest.mark.parametrize(
-    ("schema", "words"),
-    [
-        ({"type": "string", "format": "date-time"}, "string (date-time)"),
-        ({"type": "integer", "minimum": 1, "maximum": 50}, "integer (at least 1, at most 50)"),
-        ({"anyOf": [{"type": "number"}, {"type": "null"}]}, "number or null"),
-        ({"type": "array", "items": {"$ref": "#/c/s/Page_Map_"}},
-         r"list of [Page\[Map\]](records.md#page-map)"),
-        ({"type": "array", "prefixItems": [{"type": "number"}, {"type": "string"}]},
-         "list of number, string"),
-        ({"type": "object", "additionalProperties": {"type": "integer"}}, "object of integer"),
-        ({"type": "string", "format": "binary"}, "file"),
-        ({"contentSchema": {"$ref": "#/c/s/Filter"}}, "[Filter](records.md#filter) as JSON"),
-        ({"const": 1}, "`1`"),
-        ({}, "anything"),
-    ],
-)  # fmt: skip
-def test_types_are_written_in_words(schema: dict[str, Any], words: str) -> None:
-    assert type_of(schema) == words
-
-
-def test_operations_of_one_resource_have_anchors_of_their_own(document: dict[str, Any]) -> None:
-    found = [(one.resource, one.anchor) for one in operations(document)]
-    assert len(set(found)) == len(found)
-
-
 def test_every_setting_is_listed_with_its_type_default_and_meaning(
     pages: dict[str, GeneratedPage],
 ) -> None:
@@ -222,43 +194,3 @@ def test_everything_that_the_client_offers_is_described(pages: dict[str, Generat
     assert "embedded(path: str | Path) -> Self" in methods["embedded"]
     assert ["`UnknownMap`, `UnknownFrame`", "it does not exist."] in rows(methods["query"])
     assert set(sections(found["Tracker"], 3)) >= {"update"}
-
-
-def test_signatures_are_written_as_in_the_source() -> None:
-    def short(a: int, *, b: str = "x", **more: object) -> list[str]:
-        """Nothing."""
-        return [f"{a}{b}{more}"]
-
-    assert signature("short", short) == (
-        "short(a: int, *, b: str = 'x', **more: object) -> list[str]"
-    )
-    long = signature("upload", public_methods(Client)["upload"]).splitlines()
-    assert long[:2] == ["upload(", "    map_name: str,"]
-    assert long[-1].startswith(") -> ")
-    assert "    *," in long
-    assert signature("Tracker", Tracker.__init__).startswith("Tracker(\n    client: ")
-
-
-def test_docstrings_become_text_and_tables() -> None:
-    def function() -> None:
-        """Do it.
-
-            code = 1
-
-        Parameters
-        ----------
-        a, b : what is
-            given
-        c : another
-
-        Raises
-        ------
-        Refused to happen.
-        """
-
-    assert documented(function) == (
-        "Do it.\n\n```python\ncode = 1\n```\n\n"
-        "**Parameters**\n\n| name | meaning |\n|---|---|\n"
-        "| `a`, `b` | what is given |\n| `c` | another |\n\n"
-        "**Raises**: Refused to happen.\n"
-    )

@@ -26,11 +26,10 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.tables import MapRow, metadata
 
 TABLES = [
-    "audit", "audit_chains", "doomed", "events", "former_maps",
-    "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs", "kept_answer_frames",
-    "kept_answer_maps", "kept_answers", "keys", "maps", "models", "pending_events",
-    "query_records", "samples",
-    "schema_range", "scrubs", "secrets", "signatures", "surface_frames",
+    "audit", "doomed", "events", "former_maps",
+    "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs", "keys", "maps",
+    "models", "pending_events", "queries", "samples", "schema_range",
+    "scrubs", "secrets", "signatures", "surface_frames",
     "surface_tiles", "surface_touches", "surfaces", "tenants",
 ]  # fmt: skip
 

@@ -75,36 +75,28 @@ class Me(ApiRecord):
     expires_at: datetime | None = Field(default=None, description="Null: it does not expire.")
 
 
-class Audited(ApiRecord):
-    """A change and who made it, or what somebody was refused."""
+class AuditLine(ApiRecord):
+    """A change and who made it, or a request that was refused."""
 
+    number: int = Field(description="Grows with each line, and may leave gaps.")
     at: datetime
     actor: str | None = Field(
-        description="Name of the key that was shown; null where none was asked for; `command` for "
-        "a command on the data folder."
+        description="Name of the key; null where the service requires none; `command` for a "
+        "command on the data folder."
     )
     address: str | None = Field(
         description="Where the request came from; behind a proxy, the proxy's."
     )
-    action: str = Field(description="The operation, such as `delete_map`.")
-    map: str | None = Field(description="That was changed.")
-    target: str | None = Field(description="What was changed in it, or of no map: an id or name.")
+    tenant: str = Field(description="Of the key; empty where there is none.")
+    action: str = Field(
+        description="The kind of the change's event, such as `map.deleted`, or an action without "
+        "an event, such as `job.cancelled`; `refused` for a request that was refused (401 or 403) "
+        "and changed nothing."
+    )
+    map: str | None = Field(description="Name of the map that was changed.")
+    target: str | None = Field(description="What was changed: the id or name.")
     request_id: str | None = Field(description="As in the log.")
-    data: dict[str, Any] = Field(description="More of what was changed, by the operation.")
-    refused: bool = Field(
-        default=False, description="Whether it was refused (401 or 403) and nothing was changed."
-    )
-    tenant: str | None = Field(
-        default=None,
-        description="In whose chain the line is; null: a line of before version 0.3, in none.",
-    )
-    sequence: int | None = Field(
-        default=None, description="Place in the chain of the tenant's changes, or of refusals."
-    )
-    hash: str | None = Field(
-        default=None,
-        description="SHA-256 of the hash before it in its chain and of the line, as hexadecimal.",
-    )
+    data: dict[str, Any] = Field(description="More, by action.")
 
 
 # How a service does, and what it signs with, as JSON.

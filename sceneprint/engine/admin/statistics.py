@@ -25,7 +25,7 @@ from sceneprint.engine.serializers import when
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
 from sceneprint.index.generation_files import (
     GenerationManifest,
-    allocated,
+    bytes_of,
     manifests,
     read_manifest,
 )
@@ -118,7 +118,7 @@ def sizes(settings: Settings, store: Store) -> Sizes:
     return Sizes(
         database=_of_database(store.database),
         blobs=_of_blobs(blobs) if isinstance(blobs, Path) else _of_objects(store),
-        index=sum(_files_of(settings.indexes, deep=True)),
+        index=bytes_of(settings.indexes),
         free=free,
         disk=disk,
     )
@@ -135,7 +135,7 @@ def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRo
     return Sizes(
         database=signed * total // share,
         blobs=(uploads + artifacts) * total // share,
-        index=sum(_files_of(index_folder(indexes, row), deep=True)),
+        index=bytes_of(index_folder(indexes, row)),
         free=None,
         disk=None,
     )
@@ -189,14 +189,12 @@ def _of_blobs(folder: Path) -> int:
     return total
 
 
-def _files_of(folder: Path, *, deep: bool = False) -> Iterator[int]:
-    """Bytes of the files of a folder; with `deep`, what those of an index take of the disk."""
+def _files_of(folder: Path) -> Iterator[int]:
+    """Yield the bytes of each file of a folder."""
     try:
         for one in os.scandir(folder):
             if one.is_file(follow_symlinks=False):
-                yield allocated(one) if deep else _size(one)
-            elif deep and one.is_dir(follow_symlinks=False):
-                yield from _files_of(Path(one.path), deep=True)
+                yield _size(one)
     except OSError:
         return  # removed meanwhile, or not there yet
 

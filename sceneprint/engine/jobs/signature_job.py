@@ -240,9 +240,7 @@ def _index_alone(store: Store, work: lifecycle.Work, result: Made) -> bool:
     if store.database.is_sqlite or work.frame.novelty is not None:
         return False
     with store.database.write(map_number=work.frame.map_number, single=True) as connection:
-        is_indexed = index_claimed_frame(
-            connection, work.job, work.frame, work.map.name, made, single=True
-        )
+        is_indexed = index_claimed_frame(connection, work.job, work.frame, work.map.name, made)
     if is_indexed:  # a deletion may have removed it before the commit: from now on none does
         store.blobs.ensure(made.geometry, result.artifact)
     return is_indexed
@@ -319,7 +317,7 @@ def look(database: Database, readers: Readers, row: MapRow, made: StoredSignatur
             raise errors.LostLease(str(error)) from error
         if now.number != row.number or now.model_id != made.model_id:
             return None
-        (view,) = readers.views(connection, database, [now])
+        view = readers.view(connection, now)
     hits = view.search(_vector(made), 1, dead=view.dead)
     if len(hits) == 0:
         return Look(view.revision, None)

@@ -35,6 +35,7 @@ from sceneprint.errors import (
     UnusableStore,
 )
 from sceneprint.store import Store, queue
+from sceneprint.store.audit_log import record_change
 from sceneprint.store.deletion import make_room
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import IdempotentRequest
@@ -193,6 +194,7 @@ class Tasks:
             number = None if row is None else row.number
             job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
             queue.add_files(connection, job.number, files)
+            record_change(connection, "job.queued", map_name, job.id, kind=kind)
             if once is not None:
                 once.keep(connection, {"job_id": job.id})
         collect_deleted_blobs(self._store, gone)
@@ -400,4 +402,5 @@ class MapJobs:
         """
         with self.store.database.write() as connection:
             blobs = remove_job(connection, self.find(connection, map_name, job_id))
+            record_change(connection, "job.removed", map_name, job_id, kind=self.kind)
         collect_deleted_blobs(self.store, blobs)

@@ -391,9 +391,8 @@ def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
     selected = bool(at) and at[0] in asking.tried.chosen
     validation, T = _aligned(asking, part, row)
     if missed:
-        index = "the index" if view.kind == "local" else "pgvector in the database"
         lost: Lost | None = "shortlist"
-        reason = f"{index} missed it, although its rank is {rank}; query with `exact`"
+        reason = f"the index missed it, although its rank is {rank}; query with `exact`"
     else:
         lost, reason = _lost(asking, row, rank, passes, bool(at), selected)
     early = lost not in (None, "validation")

@@ -216,6 +216,7 @@ def _create(source: database_copy.Source, blobs: Store, path: Path, progress: Pr
             progress(done, max(2 * source.bytes, done))
 
         source.copy(database, written)
+        database_copy.forget_answers(database)
         with database_copy.open_copy(database) as copy:
             draft = _draft(copy, source.place, begun, database.stat().st_size)
             count = database_copy.count_referred(copy)

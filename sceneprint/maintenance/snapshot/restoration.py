@@ -418,7 +418,7 @@ def renew_copy(
     """Make a data folder a copy of a snapshot, all of it or nothing.
 
     The copy that is there goes, unless frames were added to it since: then it is moved aside. The
-    new copy has the records of queries that were asked of the one before, and none of the service.
+    new copy has none of the service's queries.
 
     Parameters
     ----------
@@ -448,7 +448,8 @@ def renew_copy(
     target = RestoreTarget(folder, replace=True)
     with full_disk_explained(folder), target.staging() as made:
         snapshot = unpack(archive, made, progress, with_blobs=True)
-        _replace_queries(made / DATABASE, None if before is None else folder / DATABASE)
+        with closing(sqlite3.connect(made / DATABASE)) as database, database:
+            database.execute("DELETE FROM queries")
         record = {"snapshot_id": snapshot_id, "frames": _frames_of(made)}
         write_durable(made / _COPY, json.dumps(record).encode(), folder_is_new=False)
         aside = target.put(made, blobs=BLOBS.rstrip("/"), database=DATABASE)
@@ -470,37 +471,6 @@ def _read_copy(folder: Path) -> dict[str, object] | None:
             f"{folder / _COPY} is damaged. Move the folder away, or name another with --data."
         )
     return record
-
-
-def _replace_queries(made: Path, before: Path | None) -> None:
-    """Let a copy's records of queries be those of an earlier copy.
-
-    Parameters
-    ----------
-    made : database of the copy, as the service had it
-    before : that of the earlier copy; None where there is none
-    """
-    with closing(sqlite3.connect(made)) as database:
-        with database:
-            database.execute("DELETE FROM query_records")
-        if before is None or not before.is_file():
-            return
-        database.execute("ATTACH ? AS before", (str(before),))
-        columns = [  # the two may have been written by different versions
-            [row[1] for row in database.execute(f"PRAGMA {one}.table_info(query_records)")]
-            for one in ("main", "before")
-        ]
-        names = [one for one in columns[0] if one in columns[1] and one != "number"]
-        names.remove("map_number")
-        with database:  # of a map that was made anew since, none
-            database.execute(
-                f"INSERT INTO query_records (map_number, {', '.join(names)}) "
-                f"SELECT own.number, {', '.join(f'query.{one}' for one in names)} "
-                "FROM before.query_records AS query "
-                "JOIN before.maps AS held ON held.number = query.map_number "
-                "JOIN maps AS own ON own.name = held.name AND own.created_at = held.created_at "
-                "ORDER BY query.number"
-            )
 
 
 def _frames_of(folder: Path) -> list[int]:

@@ -1,0 +1,91 @@
+"""Run the tests whose values depend on floating point as other processors would compute them.
+
+    python tools/portable_tests.py [--list] [TARGET ...]
+
+Sums of other lengths of vectors, products that are fused or not, and functions of another branch of
+the C library differ in the last bits. A target takes features from this processor where libraries
+choose by them: numba's machine code, numpy's loops, the BLAS of numpy, SciPy and FAISS, and glibc's
+exp, sin and so on. A bound that only one of them meets is too tight.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDERS = (
+    "geometry", "models", "index", "evaluation", "synth", "scans", "datasets", "recordings",
+    "engine",
+)  # fmt: skip
+FILES = (
+    "artifacts", "artifacts_clouds", "cloud_signing", "clouds", "fusion", "golden", "graphs",
+    "guided", "localization", "lookalikes", "pipeline", "points", "quality", "retrieve",
+    "same_as_evaluate", "training", "training_lidar", "vistas",
+)  # fmt: skip
+#: Loops that numpy chooses by this processor: all but those of its oldest x86-64.
+NUMPY_LOOPS = (
+    "from numpy._core._multiarray_umath import __cpu_dispatch__ as d, __cpu_features__ as has; "
+    "print(*(name for name in d if has[name]))"
+)
+KERNELS = (
+    "from sceneprint.cli.options import prepare_presets; from sceneprint.settings import Settings; "
+    "prepare_presets(Settings(), clouds=True)"
+)
+
+
+def generic() -> dict[str, str]:
+    """Return the environment of an x86-64 processor without AVX and FMA."""
+    loops = subprocess.run(
+        [sys.executable, "-c", NUMPY_LOOPS], capture_output=True, text=True, check=True
+    )
+    return {
+        "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "FAISS_SIMD_LEVEL": "NONE",
+        "NPY_DISABLE_CPU_FEATURES": loops.stdout.strip(),
+        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4,-AVX512F",
+    }  # fmt: skip
+
+
+def targets() -> dict[str, dict[str, str]]:
+    """Return the environment of each target by its name."""
+    cores = ["Haswell", "Zen", "Prescott"]
+    if "avx512dq" in Path("/proc/cpuinfo").read_text():  # OpenBLAS takes our word for it
+        cores.append("SkylakeX")
+    blas = {f"OpenBLAS-{core}": {"OPENBLAS_CORETYPE": core} for core in cores}
+    return {"as-is": {}, "generic": generic(), **blas, "one-core": {}}
+
+
+def run(name: str, environment: dict[str, str]) -> bool:
+    """Run the tests of one target; returns whether all passed."""
+    paths = [f"tests/{one}" for one in FOLDERS] + [f"tests/test_{one}.py" for one in FILES]
+    every = os.sched_getaffinity(0)
+    processes = 2 if name == "one-core" else 2 * len(every)
+    print(f"== {name} {environment}", flush=True)
+    try:
+        if name == "one-core":
+            os.sched_setaffinity(0, {min(every)})
+        whole = os.environ | environment
+        subprocess.run([sys.executable, "-c", KERNELS], check=True, cwd=ROOT, env=whole)
+        command = [sys.executable, "-m", "pytest", "-q", "-n", str(processes),
+                   "--dist", "loadfile", "--no-loadscope-reorder", *paths]  # fmt: skip
+        return subprocess.run(command, check=False, cwd=ROOT, env=whole).returncode == 0
+    finally:
+        os.sched_setaffinity(0, every)
+
+
+def main(arguments: list[str]) -> int:
+    """Run the targets that are named, or all; 1 where a test of one failed."""
+    known = targets()
+    if "--list" in arguments or set(arguments) - set(known):
+        print(*known, sep="\n")
+        return 0 if arguments == ["--list"] else 2
+    results = {name: run(name, known[name]) for name in arguments or known}
+    for name, passed in results.items():
+        print(f"{'passed' if passed else 'FAILED'}  {name}")
+    return 0 if all(results.values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
