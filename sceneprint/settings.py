@@ -23,7 +23,7 @@ def default_data_dir() -> Path:
     return Path(platformdirs.user_data_dir("sceneprint", appauthor=False))
 
 
-#: Where blobs and snapshots may be, by what their URL begins with.
+#: Where blobs and indexes may be, by what their URL begins with.
 OBJECT_SCHEMES = ("s3", "gs", "az", "file", "memory")
 
 
@@ -48,9 +48,6 @@ class Settings(BaseSettings):
     #: Where blobs are kept: s3://bucket/prefix, gs://, az://, file:/// or memory:///; default:
     #: `blobs` in the data folder. Credentials come from the environment of the cloud, never here.
     blob_url: SecretStr | None = None
-    #: Where snapshots taken over the service are kept, likewise; default: `snapshots` in the data
-    #: folder.
-    snapshot_url: str | None = None
     #: Folder of search indexes, of this machine alone. Deleting it loses nothing but minutes;
     #: default: `index` in the data folder.
     index_dir: Path | None = None
@@ -113,8 +110,6 @@ class Settings(BaseSettings):
     decoder_s: float = Field(default=30.0, ge=0.1, le=3600)
     #: Frames newer than the index above which a worker publishes a new one.
     tail_frames: int = Field(default=1000, ge=1, le=100_000)
-    #: Snapshots taken over the service that are kept; the oldest are removed.
-    snapshots_kept: int = Field(default=5, ge=1, le=1000)
     #: Seconds after which a worker reads all index files again, to see that they are sound.
     scrub_s: float = Field(default=3600.0, ge=1, le=31_536_000)
     #: Stored bytes that workers read each second, to see that they are sound, MB; 0: none are read.
@@ -161,7 +156,7 @@ class Settings(BaseSettings):
             raise ValueError("memory:/// is inside one process; use file:///folder")
         return given
 
-    @field_validator("blob_url", "snapshot_url", "index_url")
+    @field_validator("blob_url", "index_url")
     @classmethod
     def _holds_objects(cls, given: SecretStr | str | None) -> SecretStr | str | None:
         if given is not None:
@@ -248,11 +243,6 @@ class Settings(BaseSettings):
         if given.startswith("file:"):
             return Path(unquote(urlsplit(given).path))
         return self.data_dir
-
-    @property
-    def snapshot_dir(self) -> Path:
-        """Folder of snapshots taken over the service."""
-        return self.data_dir / "snapshots"
 
     @property
     def bell_dir(self) -> Path:

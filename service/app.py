@@ -127,7 +127,7 @@ ROUTERS = (
     queries.similarity_router, sessions.associations_router, coverage.router, differences.router,
     surface.router,
     reconstructions.router, jobs.router,
-    jobs.events_router, admin.operations_router, admin.snapshots_router, admin.keys_router,
+    jobs.events_router, admin.operations_router, admin.keys_router,
 )  # fmt: skip
 #: Uploads that are in hand at once, so that one wait for the disk is enough for all of them.
 UPLOADS = 12

@@ -23,7 +23,6 @@ from starlette.types import Message, Scope
 from threadpoolctl import threadpool_limits
 
 from sceneprint.engine import Engine
-from sceneprint.maintenance.snapshot.creation import LONGEST_S, SNAPSHOT, snapshot_handler
 from sceneprint.settings import Settings
 from service.app import create_app
 
@@ -83,7 +82,6 @@ class LocalService(httpx.BaseTransport):
         except BaseException:
             self.close()
             raise
-        self._engine.tasks.register(SNAPSHOT, snapshot_handler(settings), LONGEST_S)
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         """Ask the application; the response streams."""

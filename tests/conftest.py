@@ -67,7 +67,7 @@ LONG = (
     "test_connections.py", "test_kill.py", "test_tracker.py", "test_purging.py",
     "test_associations.py", "test_evaluate.py", "test_equal_rooms.py", "test_shared_rates.py",
     "test_sequences.py", "test_inspecting.py",
-    "test_reencoding_switch.py", "test_decoders.py", "test_benchmarks.py", "test_tenancy.py",
+    "test_reencoding_switch.py", "test_decoders.py", "test_tenancy.py",
     "test_bench_rows.py", "test_same_as_evaluate.py", "test_soak.py", "test_tour.py",
     "test_docs.py", "test_examples.py", "test_limits.py", "test_fleet.py",
 )  # fmt: skip

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import disk, readiness, registration, scan, search, service
+from benchmarks.machine import peak_megabytes_of_signing
 from benchmarks.pairs import FramePair, pairs_among
 from sceneprint.formats.artifact import write_geometry
 from sceneprint.formats.dataset import Camera, find_sequences, write_depth_png, write_intrinsics
@@ -155,3 +156,13 @@ def test_a_start_is_measured_with_and_without_the_index(building: Path) -> None:
     assert set(found.signed) == {1, 2}
     assert min(found.signed.values()) > 0
     assert f"**{found.signed[2] / found.signed[1]:.2f}** times" in readiness.table(found)[-2]
+
+
+@pytest.mark.parametrize("preset", ["paper", "depth"])
+def test_signing_stays_under_its_memory(
+    preset: str, room_frames: tuple[DepthFrame, ...], tmp_path: Path
+) -> None:
+    """The budget is 700 MB; a process that has done its imports alone needs over 50."""
+    write_intrinsics(tmp_path, Camera(room_frames[0].intrinsics))
+    write_depth_png(tmp_path / "frame.png", room_frames[0].depth, 1000.0)
+    assert 50 < peak_megabytes_of_signing(tmp_path, preset) < 700

@@ -22,7 +22,7 @@ RETIRED = {
     "marks": "bucket owner", "kept": "stored result", "keeping": "stored result",
     "former": "tombstone", "again": "rerun", "parts": "job output", "shown": "result validity",
     "seals": "opaque id", "sides": "association plan", "concluding": "association result",
-    "racks": "snapshot storage", "shelf": "snapshot catalog", "endings": "job outcome",
+    "endings": "job outcome",
     "truth": "database check", "accepting": "compatibility", "happenings": "event cursor",
     "belonging": "patch lookup", "growing": "append buffer", "rivals": "ambiguity",
     "switches": "reencoding", "agreement": "overlap", "choosing": "search routing",

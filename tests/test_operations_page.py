@@ -117,9 +117,6 @@ def test_dashboards_ask_for_what_there_is():
         check(expression)
         named |= {re.sub(r"_(bucket|sum|count)$", "", name) for name, _ in queried(expression)}
     assert named == set(families())  # all is shown somewhere
-    assert {name: len(each["panels"]) for name, each in DASHBOARDS.items()} == {
-        "fleet": 21, "tenants": 6,
-    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", DASHBOARDS)

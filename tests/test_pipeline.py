@@ -216,7 +216,7 @@ def test_the_package_says_what_it_offers() -> None:
 def test_importing_loads_nothing_heavy() -> None:
     code = (
         "import sys, sceneprint\n"
-        "heavy = {'numpy', 'numba', 'sklearn', 'open3d', 'matplotlib', 'PIL', 'pydantic'}\n"
+        "heavy = {'numpy', 'numba', 'sklearn', 'open3d', 'PIL', 'pydantic'}\n"
         "sys.exit(', '.join(heavy & set(sys.modules)) or 0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

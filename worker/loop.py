@@ -21,8 +21,6 @@ from sceneprint.engine import Engine
 from sceneprint.engine.engine import open_engine
 from sceneprint.errors import NewerSchema, SceneprintError, StoreAway
 from sceneprint.maintenance.scrub import Scrub
-from sceneprint.maintenance.snapshot.creation import LONGEST_S as SNAPSHOT_S
-from sceneprint.maintenance.snapshot.creation import SNAPSHOT, snapshot_handler
 from sceneprint.process import (
     StopSignal,
     limit_memory,
@@ -82,7 +80,6 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
         engine.bell.listen() as listener,
     ):
         engine.warm()
-        engine.tasks.register(SNAPSHOT, snapshot_handler(settings), SNAPSHOT_S)
         limit_memory(settings.worker_bytes)
         worker = Worker(engine, listener, trace, stop)
         engine.operations.statistics.began(worker.name)
@@ -139,8 +136,7 @@ class Worker:
             return True
         held = claimed.job
         asked = held.data or {}
-        usual_s = self._engine.settings.job_s
-        seconds = self._engine.tasks.longest_s(held.kind, usual_s)
+        seconds = self._engine.settings.job_s
         with (
             of_request(asked.get("request_id")),
             span(

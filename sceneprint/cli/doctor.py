@@ -182,7 +182,7 @@ def _wrong(text: str) -> Check:
 
 
 def object_stores(settings: Settings) -> Iterator[Check]:
-    """Findings about the stores of blobs and of snapshots, where they are in none of the folders.
+    """Yield findings about the stores of blobs and of indexes that are in no folder.
 
     Parameters
     ----------
@@ -191,7 +191,6 @@ def object_stores(settings: Settings) -> Iterator[Check]:
     blobs = None if settings.blob_url is None else settings.blob_url.get_secret_value()
     for subject, setting, url in (
         ("blobs", "SCENEPRINT_BLOB_URL", blobs),
-        ("snapshots", "SCENEPRINT_SNAPSHOT_URL", settings.snapshot_url),
         ("indexes", "SCENEPRINT_INDEX_URL", settings.index_url),
     ):
         if url is not None:

@@ -1,7 +1,7 @@
 """Reconstructions: the accepted matches of an answer, fused to a surface by a worker.
 
 StoredAnswer, NewReconstruction  --begin-->  job
-job  --_fuse, in a worker-->  mesh.ply, picture.png, Coverage
+job  --_fuse, in a worker-->  mesh.ply, Coverage
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ from sceneprint.fusion import (
     FusionParameters,
     fuse,
     open3d,
-    reconstruction_picture,
     within,
 )
 from sceneprint.geometry.rigid import inverse
@@ -64,7 +63,7 @@ from sceneprint_client.api.surface import (
 
 # Views of an answer fused: their depth out of the store, the surface, its figures, its files.
 #
-# data of a job, geometry of the query  --fused-->  coverage, PLY, PNG
+# data of a job, geometry of the query  --fused-->  coverage, PLY
 
 Source = Literal["upload", "geometry"]
 Strength = Literal["strong", "weak"]
@@ -91,7 +90,7 @@ class JobView:
 def fused(
     store: Store, views: Sequence[JobView], query: Geometry | None, own: JobView | None,
     wanted: NewReconstruction, model_id: str, parent_frame: str, asked_at: float,
-) -> tuple[Coverage, bytes, bytes]:  # fmt: skip
+) -> tuple[Coverage, bytes]:  # fmt: skip
     """Fuse the matches of an answer, and what the query saw.
 
     Parameters
@@ -109,7 +108,6 @@ def fused(
     -------
     coverage : what became of the views
     ply : surface or cloud, in the query's camera frame, coloured by view
-    png : its picture
 
     Raises
     ------
@@ -164,10 +162,7 @@ def fused(
         mesh.points, mesh.normals, colours, mesh.triangles if as_mesh else None,
         comments=(comment,),
     )  # fmt: skip
-    named = f"{len(frames)} views, {coverage.area_m2:.1f} m², {volume:.1f} m³ observed"
-    explained = f"{coverage.query_explained:.0%} of the query explained"
-    title = named if query is None else f"{named}; {explained}"
-    return coverage, ply, reconstruction_picture(mesh, first, frames, added, title)
+    return coverage, ply
 
 
 def _own(
@@ -241,9 +236,9 @@ def _fused_view(view: JobView | None, frame: DepthFrame, source: Source) -> Fuse
 
 
 KIND = "reconstruct"
-#: Files of such a job: what the query saw, until it is fused; and what is made.
-QUERY, MESH, PICTURE = "query.geometry", "mesh.ply", "picture.png"
-MEDIA_TYPES = {MESH: "application/ply", PICTURE: "image/png"}
+#: Files of such a job: what the query saw, until it is fused; and the surface.
+QUERY, MESH = "query.geometry", "mesh.ply"
+MEDIA_TYPE = "application/ply"
 #: The query itself is where it is.
 _STILL = np.eye(4).tolist()
 
@@ -306,8 +301,8 @@ class ReconstructionJobs:
             job = _find(connection, job_id)
             return _reconstruction_record(job, queue.files_of(connection, job.number))
 
-    def file(self, job_id: str, name: str) -> queue.JobFile:
-        """A file that a reconstruction made.
+    def mesh(self, job_id: str) -> queue.JobFile:
+        """Return the file of the surface.
 
         Raises
         ------
@@ -316,11 +311,11 @@ class ReconstructionJobs:
         """
         with self._store.database.read() as connection:
             job = _find(connection, job_id)
-            found = queue.files_of(connection, job.number).get(name)
-        if found is None or name not in MEDIA_TYPES:
+            found = queue.files_of(connection, job.number).get(MESH)
+        if found is None:
             why = f": {job.error}" if job.error else "."
             raise NotIndexed(
-                f"Reconstruction {job_id} is {job.state}, and {name} exists once it has "
+                f"Reconstruction {job_id} is {job.state}, and {MESH} exists once it has "
                 f"succeeded{why}"
             )
         return found
@@ -349,14 +344,11 @@ class ReconstructionJobs:
         wanted = NewReconstruction.model_validate(data["request"])
         views = [JobView(**view) for view in data["views"]]
         own = None if data["own"] is None else JobView(**data["own"])
-        coverage, ply, png = fused(
+        coverage, ply = fused(
             self._store, views, self._query_of(task), own, wanted, data["model_id"],
             data["parent_frame"], data["asked_at"],
         )  # fmt: skip
-        files = [
-            queue.JobFile(name, self._store.blobs.put(content), len(content), MEDIA_TYPES[name])
-            for name, content in ((MESH, ply), (PICTURE, png))
-        ]
+        files = [queue.JobFile(MESH, self._store.blobs.put(ply), len(ply), MEDIA_TYPE)]
         return SliceResult(
             over=True,
             progress={"done": len(views), "total": len(views)},
@@ -437,7 +429,7 @@ def _find(connection: Connection, job_id: str) -> JobRow:
 
 def _reconstruction_record(job: JobRow, files: dict[str, queue.JobFile]) -> Reconstruction:
     data, done = job.data or {}, job.state == JobState.SUCCEEDED
-    made = [files[name] for name in MEDIA_TYPES if name in files]
+    made = [files[MESH]] if MESH in files else []
     return Reconstruction(
         job_id=job.id,
         query_id=data["query_id"],

@@ -14,13 +14,11 @@ from pydantic import BaseModel, Field, ValidationError
 from sceneprint import __version__
 from sceneprint.engine import Engine
 from sceneprint.engine.admin import operations
-from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.maps import map_lifecycle
 from sceneprint.errors import InvalidRequest, UnsupportedType
-from sceneprint.maintenance.snapshot.creation import SNAPSHOT, SnapshotCatalog
 from sceneprint.store.audit_log import AuditFilter
 from sceneprint.store.events import newest_number
-from sceneprint_client.api import Job, JobState, Map, Page
+from sceneprint_client.api import Map, Page
 from sceneprint_client.api.admin import (
     AuditLine,
     Key,
@@ -30,13 +28,11 @@ from sceneprint_client.api.admin import (
     NewKey,
     NewModel,
     ReplicaSeen,
-    SnapshotFile,
     Stats,
 )
 from service.auth import Asking, Guest, Here, administers, may_admin, reads_every, v1_router
 from service.bodies import media_type, read_json
 from service.problems import declared, invalid
-from service.responses import files, send_file
 
 router = APIRouter(tags=["operations"])
 
@@ -329,54 +325,3 @@ def _wanted(given: object) -> NewModel:
         return NewModel.model_validate(given)
     except ValidationError as error:
         raise invalid(error, "The model") from error
-
-
-# Snapshots of the data folder, taken by a worker while all goes on.
-
-snapshots_router = v1_router("/snapshots", "operations", administers)
-
-
-@snapshots_router.post("", status_code=202, responses=declared())
-def take_snapshot(here: Here, response: Response) -> Job:
-    """Have a snapshot taken of all maps: database and blobs, one state of both, in one archive.
-
-    Ask for the job until it has succeeded: `result` is the snapshot then. One that waits its turn
-    already is not queued twice. Restoring is for the operator: `sceneprint restore`.
-    """
-    waiting = lifecycle.list_jobs(here.engine.store, JobState.QUEUED, limit=1, kind=SNAPSHOT).items
-    job = waiting[0] if waiting else here.engine.tasks.begin(SNAPSHOT, None, {})[0]
-    response.headers["Location"] = f"/v1/jobs/{job.job_id}"
-    return job
-
-
-@snapshots_router.get("", responses=declared())
-def list_snapshots(here: Here) -> Page[SnapshotFile]:
-    """Snapshots that were taken over the service, the newest first: all in one page."""
-    return Page[SnapshotFile](items=list(SnapshotCatalog(here.engine.settings).list()))
-
-
-@snapshots_router.get(
-    "/{snapshot_id}",
-    response_class=Response,
-    responses=files(["application/x-tar"], "The archive, for `sceneprint restore`."),
-)
-def get_snapshot(snapshot_id: str, request: Request, here: Here) -> Response:
-    """The archive. It holds all frames and the hashes of keys: keep it as you keep the folder.
-
-    With `Range` a download goes on where it broke off.
-    """
-    shelf = SnapshotCatalog(here.engine.settings)
-    found = shelf.find(snapshot_id)
-    name = f"sceneprint-{snapshot_id}.tar"
-    return send_file(
-        request, lambda: shelf.open(snapshot_id), "application/x-tar", found.sha256, name
-    )
-
-
-@snapshots_router.delete("/{snapshot_id}", status_code=204, responses=declared(404))
-def delete_snapshot(snapshot_id: str, here: Here) -> None:
-    """Remove a snapshot. A download that is under way goes on."""
-    shelf = SnapshotCatalog(here.engine.settings)
-    shelf.find(snapshot_id)
-    here.engine.audit.record("snapshot.deleted", target=snapshot_id)  # before it is gone
-    shelf.delete(snapshot_id)

@@ -87,13 +87,13 @@ def test_a_server_that_cannot_be_asked(url: str, said: str) -> None:
 def test_object_stores(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = Settings(
         data_dir=tmp_path, database_url=None, blob_url=SecretStr(f"{bucket}/blobs"),
-        snapshot_url=f"file://{tmp_path}/kept",
+        index_url=f"file://{tmp_path}/kept",
     )  # fmt: skip
-    blobs, snapshots = object_stores(settings)
-    assert (blobs.verdict, snapshots.verdict) == ("ok", "ok")
+    blobs, indexes = object_stores(settings)
+    assert (blobs.verdict, indexes.verdict) == ("ok", "ok")
     assert blobs.text.startswith(f"{bucket}/blobs: written, read and removed in ")
     assert "AWS_... in the environment" in blobs.text
     assert not any(path.is_file() for path in tmp_path.rglob("*"))
-    lost = Settings(data_dir=tmp_path, database_url=None, snapshot_url=f"{bucket}-none")
+    lost = Settings(data_dir=tmp_path, database_url=None, index_url=f"{bucket}-none")
     [found] = object_stores(lost)
-    assert (found.verdict, found.subject) == ("WRONG", "snapshots")
+    assert (found.verdict, found.subject) == ("WRONG", "indexes")

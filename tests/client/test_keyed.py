@@ -73,7 +73,7 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Cl
 GIVEN: dict[str, Any] = {
     "map_name": "hall", "name": "hall", "frame_id": ID, "job_id": ID, "query_id": ID,
     "association_id": ID, "coverage_id": ID, "difference_id": ID, "before": "s", "after": "t",
-    "since": ID, "snapshot_id": ID, "session": "s",
+    "since": ID, "session": "s",
     "changes": {"title": "x"},
     "model": "depth", "grants": {"*": "read"}, "query": ID, "job_ids": [ID],
     "digest": ID, "records": [{}], "frame_ids": [ID],
@@ -113,7 +113,7 @@ def test_no_call_gets_by_without_a_key(
             if isinstance(found, Iterator):
                 next(found)
 
-        with pytest.raises(KeyRequired, match="requires a key"):
+        with pytest.raises(KeyRequired):
             call()
         asked.append(name)
     assert len(asked) > 50

@@ -125,9 +125,9 @@ def test_edits(client: Client, map_name: str, ids: list[str]) -> None:
     )
     assert (after.tags, after.robot, after.captured_at) == (["é"], None, START)
     assert after == client.frame(map_name, ids[0])
-    with pytest.raises(PreconditionFailed, match="was edited"):
+    with pytest.raises(PreconditionFailed):
         client.edit_frame(map_name, ids[0], {"tags": []}, before.etag)
-    with pytest.raises(InvalidRequest, match="part of the identity of the frame"):
+    with pytest.raises(InvalidRequest):
         client.edit_frame(map_name, ids[0], {"depth_scale": 1})
     assert listed(client, map_name, tags="é") == ids[:1]
     told = client.map(map_name)

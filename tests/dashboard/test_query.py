@@ -564,4 +564,3 @@ def test_an_answer_is_reconstructed(station, page, ask, settle, with_open3d):
     page.reload()  # the address has it
     settle(page)
     expect(mesh).to_be_visible()
-    assert card.locator("canvas").get_attribute("aria-label").startswith("The fused surface")

@@ -110,11 +110,6 @@ def test_each_change_has_its_lines(recorder: Recorder, small_shots: Any, until: 
     do("delete_surface", ["surface.removed"], hall)
     do("begin_surface", ["surface.requested"], hall)
 
-    snapshot = job_of(do("take_snapshot", ["job.queued"], {}))["job_id"]
-    until(lambda: state(snapshot) == "succeeded")
-    listed = client.get("/v1/snapshots").json()["items"][0]["snapshot_id"]
-    do("delete_snapshot", ["snapshot.deleted"], {"snapshot_id": listed})
-
     key = {"key_name": "robot"}
     do("create_key", ["key.created"], {}, json={"name": "robot", "grants": {"hall": "read"}})
     do("rotate_key", ["key.rotated"], key)

@@ -118,7 +118,7 @@ def test_bodies_that_are_read_by_hand_are_described(document):
     assert by_form["diversity"]["contentSchema"] == {"$ref": "#/components/schemas/Diversity"}
     several = operations(document)["post", "/v1/queries"]["requestBody"]["content"]
     assert several["multipart/form-data"]["schema"]["required"] == ["frame", "maps", "meta"]
-    assert several["application/json"]["schema"]["required"] == ["maps", "frame"]
+    assert several["application/json"]["schema"]["required"] == ["maps"]
     pair = operations(document)["post", "/v1/similarity"]["requestBody"]["content"]
     parts = set(pair["multipart/form-data"]["schema"]["properties"])
     assert parts >= {"a", "b", "meta_a", "meta_b", "frame_a", "frame_b", "validate", "model"}

@@ -102,7 +102,6 @@ OF_A_MAP = {
     "GET /v1/reconstructions/{job_id}": Case(),
     "DELETE /v1/reconstructions/{job_id}": Case("write"),
     "GET /v1/reconstructions/{job_id}/mesh.ply": Case(),
-    "GET /v1/reconstructions/{job_id}/picture.png": Case(),
     "POST /v1/maps/{map_name}/associations": Case("write", body={"sessions": ["{session}"]}),
     "GET /v1/maps/{map_name}/associations": Case(),
     "GET /v1/maps/{map_name}/associations/{job_id}": Case(),
@@ -115,7 +114,6 @@ OF_A_MAP = {
     "DELETE /v1/maps/{map_name}/coverage/{job_id}": Case("write"),
     "GET /v1/maps/{map_name}/coverage/{job_id}/frames": Case(),
     "GET /v1/maps/{map_name}/coverage/{job_id}/changes": Case(query={"since": "{coverage}"}),
-    "GET /v1/maps/{map_name}/coverage/{job_id}/plan.png": Case(),
     "POST /v1/maps/{map_name}/differences": Case(
         "write", body={"before": "{session}", "after": "{session}-2"}
     ),
@@ -151,8 +149,6 @@ MADE_OF_ANYTHING = (
 OF_ALL = (
     "GET /v1/keys", "POST /v1/keys", "DELETE /v1/keys/{key_name}", "GET /v1/audit", "GET /metrics",
     "POST /v1/keys/{key_name}/rotate",
-    "POST /v1/snapshots", "GET /v1/snapshots", "GET /v1/snapshots/{snapshot_id}",
-    "DELETE /v1/snapshots/{snapshot_id}",
 )  # fmt: skip
 #: Answered to anybody with a key, and by what the key may read.
 BY_KEY = (
@@ -189,7 +185,6 @@ class There:
         return {
             "map_name": self.map, "frame_id": self.frame, "query_id": self.query,
             "deletion_id": "1", "job_id": (jobs or [self.job])[0], "key_name": "keeper",
-            "snapshot_id": self.job,
             "digest": self.artifact if "/artifacts/" in operation else self.tile,
         }[what]  # fmt: skip
 

@@ -268,10 +268,10 @@ def test_a_key_is_made_shown_once_used_and_revoked(walled, refused):
     assert [key["name"] for key in rest["items"]] == ["reader", "robot/7 é", "watcher", "writer"]
     assert made["secret"] not in str(listed) + str(rest)
     again = walled.ask("boss", "POST", "/v1/keys", json=new)
-    refused(again, 409, "conflict", "There is a key named")
+    refused(again, 409, "conflict")
     gone = walled.ask("boss", "DELETE", answer.headers["location"])
     assert gone.status_code == 204
-    refused(walled.ask("new", "GET", "/v1/keys/me"), 401, "key-required", "unknown, revoked or")
+    refused(walled.ask("new", "GET", "/v1/keys/me"), 401, "key-required")
     refused(walled.ask("boss", "DELETE", answer.headers["location"]), 404, "unknown-key")
 
 

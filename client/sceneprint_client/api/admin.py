@@ -337,11 +337,11 @@ class Job(ApiRecord):
     job_id: str
     kind: str = Field(
         description="`sign`, `import`, `associate`, `coverage`, `difference`, `surface`, "
-        "`reconstruct`, `snapshot`, or `reencode`: that one signs an indexed frame once more, with "
+        "`reconstruct`, or `reencode`: that one signs an indexed frame once more, with "
         "the model to come or as what was made of it is damaged."
     )
     state: JobState
-    map: str | None = Field(description="That it is about; null for `snapshot`.")
+    map: str | None = Field(description="The map that it works on.")
     frame_id: str | None = Field(description="That it signs; null where it is of no single one.")
     priority: int = Field(description="Jobs of a greater one are done first.")
     attempts: int
@@ -448,19 +448,3 @@ class EventPage(Page[Event]):
         description="Id of the newest event of your maps, of whatever kind, when this was asked; "
         "0 where there was none yet: what follows it is told by a stream with this as `after`."
     )
-
-
-# Snapshots that a service has taken, as JSON.
-
-
-class SnapshotFile(ApiRecord):
-    """One state of the data folder in an archive, which `sceneprint restore` puts back."""
-
-    snapshot_id: str
-    created_at: datetime = Field(description="Its state is not older.")
-    bytes: int
-    sha256: str = Field(description="Of the archive.")
-    maps: int
-    frames: int
-    blobs: int
-    damaged: int = Field(description="Blobs that were missing or damaged, and are not in it.")

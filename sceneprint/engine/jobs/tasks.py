@@ -29,7 +29,6 @@ from sceneprint.errors import (
     MissingDependency,
     NotFound,
     SceneprintError,
-    SnapshotError,
     StoreError,
     UnknownJob,
     UnusableStore,
@@ -121,7 +120,7 @@ log = logging.getLogger(__name__)
 #: Seconds of a slice at most, and between two looks whether another job waits that goes before.
 SLICE_S, LOOK_S = 15.0, 0.1
 #: Errors that trying again cannot help: what was asked for cannot be done.
-HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, SnapshotError)
+HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency)
 
 
 def ends_within(is_over: IsOver, seconds: float) -> IsOver:
@@ -136,23 +135,15 @@ class Tasks:
     def __init__(self, store: Store, bell: Wakeup) -> None:
         self._store, self._bell = store, bell
         self._handlers: dict[str, Handler] = {}
-        self._longest: dict[str, float] = {}
 
-    def register(self, kind: str, handler: Handler, longest_s: float | None = None) -> None:
+    def register(self, kind: str, handler: Handler) -> None:
         """Let jobs of a kind be done by this process.
 
         Parameters
         ----------
         kind, handler : see there
-        longest_s : that a slice may take, where that may be more than of other kinds
         """
         self._handlers[kind] = handler
-        if longest_s is not None:
-            self._longest[kind] = longest_s
-
-    def longest_s(self, kind: str, usual_s: float) -> float:
-        """Seconds after which a slice of that kind of job does not end any more."""
-        return max(self._longest.get(kind, 0.0), usual_s)
 
     def begin(
         self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
@@ -212,7 +203,6 @@ class Tasks:
         start, job = time.perf_counter(), task.job
         state: JobState | None
         try:
-            longest_s = self.longest_s(job.kind, longest_s)
             with renewed(self._store, task.job, lease_s, longest_s):
                 handler = self._handlers.get(job.kind)
                 if handler is None:

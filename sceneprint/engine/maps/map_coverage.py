@@ -1,4 +1,4 @@
-"""Coverage of maps: jobs begun, done in slices, listed, read, drawn, compared and removed.
+"""Coverage of maps: jobs begun, done in slices, listed, read, compared and removed.
 
     frames, in the order of runs  -->  an item each  --coverage_plans-->  plans, counts
 
@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,18 +18,15 @@ import numpy as np
 from sqlalchemy import Connection
 
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, MapJobs, SliceResult, Tasks, ends_within
-from sceneprint.engine.maps.map_frames import Output
 from sceneprint.engine.maps.map_plans import (
-    DrawnFrame,
     QueriedPosition,
-    coverage_picture,
     coverage_plans,
     plan_changes,
 )
 from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.search.up_vectors import parent_axes
-from sceneprint.engine.serializers import job_progress, model_label, tag_of, when
+from sceneprint.engine.serializers import job_progress, model_label, when
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import (
     DamagedBlob,
@@ -40,7 +36,7 @@ from sceneprint.errors import (
     UnknownFrame,
     UnreadableGeometry,
 )
-from sceneprint.geometry.rigid import difference, moved
+from sceneprint.geometry.rigid import difference
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import (
     PathFrame,
@@ -50,7 +46,7 @@ from sceneprint.store.frame_queries import (
     stops_of,
 )
 from sceneprint.store.frames import count_states
-from sceneprint.store.maps import find_map, geometry_blobs, living_frame, living_map, model_names
+from sceneprint.store.maps import find_map, living_frame, living_map, model_names
 from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.queue import items_of
 from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
@@ -71,8 +67,6 @@ from sceneprint_client.api.coverage import (
 
 #: Items that are read at once.
 _BLOCK = 500
-#: Frames whose surfaces a plan shows, at most.
-_SEEN_FRAMES = 48
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,39 +159,6 @@ class CoverageJobs:
         more = str(found[limit - 1].number) if len(found) > limit else None
         return Page[CoverageFrame](items=found[:limit], next_cursor=more)
 
-    def picture(self, map_name: str, job_id: str, parent: str | None = None) -> Output[bytes]:
-        """A plan as a PNG, with the queried frames that are still there.
-
-        Parameters
-        ----------
-        map_name, job_id : of the coverage job
-        parent : frame of the plan; default: that of most queried frames
-
-        Raises
-        ------
-        UnknownMap, UnknownJob : there is none.
-        NotIndexed : it did not succeed, or no queried frame has a pose.
-        InvalidRequest : it has no plan of that parent frame.
-        """
-        with self._store.database.read() as connection:
-            measured = self._measured(connection, map_name, job_id)
-            items = _frame_items(connection, measured.job, 0, measured.result.frames)
-            plan = _chosen_plan(measured.plans, parent)
-            items = [item for item in items if item["parent"] == plan.parent_frame]
-            stops = stops_of(connection, _numbers(items))
-            own = [item["frame"] for item in items if item["frame"] in stops]
-            row = find_map(connection, map_name)
-            blobs = geometry_blobs(connection, _spread(own, _SEEN_FRAMES), row.model_id)
-        drawn = [_drawn_frame(item, stops, plan) for item in items if item["frame"] in stops]
-        tag = tag_of("coverage", job_id, plan.parent_frame, [repr(one) for one in drawn])
-        title = f"Coverage of {map_name}, parent frame {plan.parent_frame}"
-
-        def make() -> bytes:
-            points = self._points([(stops[number], blob) for number, blob in blobs.items()], plan)
-            return coverage_picture(plan, measured.result, drawn, points, title)
-
-        return Output(tag, make)
-
     def changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
         """A result compared with an earlier one of the same map and the same options.
 
@@ -222,18 +183,6 @@ class CoverageJobs:
             trends={name: trends[name] for name in CELL_TRENDS}, result_before=before.result,
             result_after=after.result, plans=plans,
         )  # fmt: skip
-
-    def _points(self, seen: Sequence[tuple[PathFrame, str]], plan: CoveragePlan) -> Floats:
-        """(n, 2) what frames see, along the axes of a plan; without those that are damaged."""
-        axes, found = np.array([plan.x_axis, plan.y_axis]), [np.empty((0, 2))]
-        for stop, blob in seen:
-            if stop.pose is None or stop.parent != plan.parent_frame:
-                continue  # edited since
-            with suppress(DamagedBlob, UnreadableGeometry):
-                surface = self._store.geometries.read(blob).surface
-                points = surface.points[surface.valid].astype(np.float64)
-                found.append(moved(np.array(stop.pose), points) @ axes.T)
-        return np.concatenate(found)
 
     def _measured(self, connection: Connection, map_name: str, job_id: str) -> _Measured:
         job = self._jobs.find(connection, map_name, job_id)
@@ -279,21 +228,6 @@ def _require_comparable(before: _Measured, after: _Measured) -> None:
             )
 
 
-def _chosen_plan(plans: Sequence[CoveragePlan], parent: str | None) -> CoveragePlan:
-    for plan in plans:
-        if parent in (None, plan.parent_frame):
-            return plan
-    if not plans:
-        raise NotIndexed(
-            "There is no plan, as no queried frame has a pose. Upload frames with poses."
-        )
-    names = ", ".join(plan.parent_frame for plan in plans)
-    raise InvalidRequest(
-        f"There is no plan of parent frame {parent!r:.80}. Choose from {names!r:.400}.",
-        (("parent_frame", "no such plan"),),
-    )
-
-
 def _coverage_record(
     job: JobRow, map_name: str, plans: list[CoveragePlan] | None = None
 ) -> MapCoverage:
@@ -321,11 +255,6 @@ def _frame_items(
     return items_of(connection, job.number, first, limit)
 
 
-def _spread(numbers: Sequence[int], most: int) -> list[int]:
-    """At most so many of some numbers, evenly spaced."""
-    return list(numbers[:: -(-len(numbers) // most) or 1])
-
-
 def _numbers(items: Sequence[dict[str, Any]]) -> set[int]:
     """Numbers of the frames that items name."""
     return {number for item in items for number in (item["frame"], *item["look_alikes"])}
@@ -341,22 +270,6 @@ def _frame_record(number: int, item: dict[str, Any], stops: dict[int, PathFrame]
         position=None if at is None else Vector(x=at[0], y=at[1], z=at[2]),
         look_alikes=[stops[one].id for one in item["look_alikes"] if one in stops],
         **{name: item[name] for name in same},
-    )  # fmt: skip
-
-
-def _drawn_frame(
-    item: dict[str, Any], stops: dict[int, PathFrame], plan: CoveragePlan
-) -> DrawnFrame:
-    """A queried frame on its plan, with where its look-alikes of the same plan were taken."""
-    axes = np.array([plan.x_axis, plan.y_axis])
-    others = [stops[one] for one in item["look_alikes"] if one in stops]
-    return DrawnFrame(
-        tuple((axes @ item["at"]).tolist()), item["outcome"],
-        tuple(
-            tuple((axes @ np.array(other.pose)[:3, 3]).tolist())
-            for other in others
-            if other.pose is not None and other.parent == plan.parent_frame
-        ),
     )  # fmt: skip
 
 
