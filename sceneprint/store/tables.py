@@ -143,7 +143,6 @@ frames = Table(
     Index(None, "map_number", "content_id"),
     Index(None, "map_number", "revision"),
     Index(None, "map_number", "number"),
-    Index(None, "map_number", "indexed_at"),
     Index(  # all that a filter asks about: rows need not be read for it
         "ix_frames_searched",
         "map_number",

@@ -79,7 +79,6 @@ OF_A_MAP = {
     ),
     "DELETE /v1/maps/{map_name}/sessions": Case("write", query={"session": "{session}"}),
     "GET /v1/maps/{map_name}/trajectory": Case(query={"session": "{session}"}),
-    "GET /v1/maps/{map_name}/growth": Case(query={"by": "hour"}),
     "POST /v1/maps/{map_name}/queries": Case(body={"frame_id": "{frame}"}),
     "POST /v1/maps/{map_name}/localize": Case(body={"frame_id": "{frame}"}),
     "POST /v1/maps/{map_name}/localize/sequence": Case(),
