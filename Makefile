@@ -14,14 +14,13 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Bytecode is kept: the tests start hundreds of processes, and each would parse our modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 # Tests wait for real processes half of their time: twice as many as there are processors.
-export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
-	'import os; print(2 * len(os.sched_getaffinity(0)))')
+export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell echo $$((2 * $$(env -u OMP_NUM_THREADS nproc))))
 
 .PHONY: help demo test pytest test-thorough test-portable test-postgres lint kernels bytecode goldens format bench \
 	screenshots docs docs-serve soak siege fleet models lock sbom advisories dist clean
 
 help:
-	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
+	@echo "make demo    find frames among others with their pose [DATASET=folder]"
 	@echo "make test    lint, types, import contracts and the tests"
 	@echo "make test-thorough  tests that make test leaves out, as they take minutes or seldom fail"
 	@echo "make test-portable  numeric tests as other processors compute them, one after another [TARGET=generic]"
@@ -51,7 +50,7 @@ $(STAMP): $(RUNTIME) requirements-dev.lock
 	@touch $@
 
 demo: $(RUNTIME)
-	$(BIN)/sceneprint demo --out demo $(if $(DATASET),--dataset "$(DATASET)")
+	$(BIN)/sceneprint demo $(if $(DATASET),--dataset "$(DATASET)")
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -177,8 +176,8 @@ dist: $(STAMP)
 	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist dist/*.tar.gz
 	@tools/install $(PYTHON) dist/try requirements.lock
 	dist/try/bin/python -m pip install --quiet --no-deps dist/*.whl
-	cd dist && try/bin/sceneprint demo --out demo
-	@rm -rf dist/try dist/demo && ls -l dist
+	cd dist && try/bin/sceneprint demo
+	@rm -rf dist/try && ls -l dist
 
 clean:
-	rm -rf $(VENV) build client/build dist out demo *.egg-info client/*.egg-info tools/javascript/node_modules
+	rm -rf $(VENV) build client/build dist out *.egg-info client/*.egg-info tools/javascript/node_modules

@@ -9,12 +9,11 @@ import sys
 import tempfile
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks import dashboard, disk, dpp, readiness, registration, scan, search, service, summary
+from benchmarks import dashboard, disk, readiness, registration, scan, search, service, summary
 from benchmarks.encode import EncodeFigures, measure
 from benchmarks.machine import (
     Machine,
@@ -104,7 +103,6 @@ class Rows:
 
     encode: dict[str, tuple[EncodeFigures, float]]
     scan: list[scan.ScanFigures]
-    dpp: dpp.DppFigures
     registration: registration.RegistrationFigures
     search: list[search.SearchFigures]
     service: service.ServiceFigures
@@ -132,7 +130,7 @@ def page(machine: Machine, rows: Rows, start: float) -> str:
     lines += readiness.table(rows.readiness) if rows.readiness is not None else []
     lines += dashboard.table(rows.dashboard)
     lines += [line for one in rows.scan for line in scan.table(one)] + search.table(rows.search)
-    lines += dpp.table(rows.dpp) + registration.table(rows.registration)
+    lines += registration.table(rows.registration)
     lines += disk.table(rows.disk) if rows.disk is not None else []
     return "\n".join([*lines, f"`import sceneprint`: {start:.2f} s.", END])
 
@@ -152,7 +150,6 @@ def measure_all(n_frames: int, n_pairs: int) -> Rows:
     return Rows(
         encode={p: (measure(frames, s), peak_memory(frames, p)) for p, s in signers.items()},
         scan=[scan.measure(*size) for size in scan.SCANNED],
-        dpp=dpp.measure(),
         registration=registration.measure(pairs, signers[PRESETS[0]].model),
         search=[search.measure(n, flat_bytes=kind) for n, kind in SEARCHED],
         service=served,
@@ -181,7 +178,6 @@ def main() -> int:
         "import_seconds": start,
         "encode": {p: asdict(f) | {"peak_megabytes": m} for p, (f, m) in rows.encode.items()},
         "scan": [asdict(one) for one in rows.scan],
-        "dpp": asdict(rows.dpp),
         "registration": asdict(rows.registration),
         "search": [asdict(one) for one in rows.search],
         "service": asdict(rows.service),
@@ -192,10 +188,7 @@ def main() -> int:
     options.json.write_text(json.dumps(result, indent=1) + "\n")
     if options.page is not None:
         before, rest = options.page.read_text().split(BEGIN)
-        number, today = version("sceneprint"), f"{datetime.now(UTC):%Y-%m-%d}"
-        own = summary.version_of(number, today, rows.encode[PRESETS[0]][0], rows.service)
-        text = before + section + rest.split(END)[1]
-        options.page.write_text(summary.with_version(text, own))
+        options.page.write_text(before + section + rest.split(END)[1])
     return 0
 
 

@@ -119,7 +119,7 @@ def fill(client: httpx.Client, data: Path, made: list[Shot]) -> None:
 
 
 def views(client: httpx.Client, made: list[Shot]) -> list[View]:
-    """Have all frames signed, ask, associate, make keys and a snapshot; the pages of all that."""
+    """Have all frames signed, ask, associate, make keys; the pages of all that."""
     wait(client, f"/v1/maps/{MAP}", {"indexed"})
     wait(client, f"/v1/maps/{BOXES}", {"indexed"})
     wait(client, f"/v1/maps/{SIDES}", {"indexed"})
@@ -128,11 +128,9 @@ def views(client: httpx.Client, made: list[Shot]) -> list[View]:
     client.post("/v1/keys", json={"name": "operator", **whole}).raise_for_status()
     few = {"name": "robot-7", "grants": {MAP: "write", HALL: "read"}}
     key = client.post("/v1/keys", json=few).raise_for_status().json()["secret"]
-    snapshot = client.post("/v1/snapshots").raise_for_status().json()["job_id"]
     both = {"sessions": ["room-0/ann", "room-0/bob"]}
     found = client.post(f"/v1/maps/{MAP}/associations", json=both).raise_for_status().json()
-    for job in (snapshot, found["association_id"]):
-        _done(client, job)
+    _done(client, found["association_id"])
     for name in (MAP, HALL, SIDES):
         fuse(client, name)
     for name in (MAP, SIDES):
@@ -227,7 +225,7 @@ def _views(
     yield View("overlay-rival", f"{rival}&pose=rival", tall=True)
     yield from (paths, operations)
     yield View("operations-map", f"#/operations?map={HALL}", tall=True)
-    for tab in ("jobs", "events", "keys", "audit", "snapshots"):
+    for tab in ("jobs", "events", "keys", "audit"):
         yield View(tab, f"#/operations?tab={tab}")
     yield View("new-map", "#/", press=("New map",))
     yield View("new-key", "#/operations?tab=keys", press=("Create a key",))

@@ -3,8 +3,7 @@
     python examples/offline_robot.py drives/mapping office --spool office.spool
     python examples/offline_robot.py drives/mapping office --spool office.spool --copy copy
 
-With `--copy`, a folder that `sceneprint pull` made, it also localises by itself, and the records of
-these queries go to the service's history later.
+With `--copy`, a folder that `sceneprint pull` made, it also localises by itself.
 
 `frames_of` stands for a camera: put your own there. While the service cannot be reached the
 program goes on; each frame is on disk before the next is taken, so a crash or an empty battery
@@ -44,8 +43,6 @@ def upload_waiting(client: Client, spool: Spool, map_name: str) -> bool:
         print(f"offline, {spool.status().waiting} frames wait: {error}")
         return False
     print(f"uploaded {report.received}, already there {report.there}, refused {report.refused}")
-    if report.queries:
-        print(f"the history has {report.queries} records of queries more")
     return True
 
 
@@ -73,12 +70,11 @@ def main() -> None:
             spool.add(frame, meta)
             if robot is not None and number % TRY_EVERY == 1:
                 localise(robot, options.map, frame, meta)
-                spool.add_queries(robot)
             if number % TRY_EVERY == 0:
                 upload_waiting(client, spool, options.map)
         upload_waiting(client, spool, options.map)
         for refusal in spool.refusals():
-            print(f"{refusal.name or refusal.query_id}: {refusal.reason}")
+            print(f"{refusal.name}: {refusal.reason}")
         now = spool.status()
     print(f"{now.uploaded} uploaded, {now.waiting} wait, {now.thinned} thinned")
 

@@ -6,6 +6,8 @@
       x BusyIndex               another process is building this index
       x StoreError
         - LostLease             the job has been given to another worker
+        - SnapshotError         a snapshot cannot be taken, or not be restored there
+          - DamagedSnapshot     its bytes are not those that were written
       x TrainingError           too little data, or parameters that cannot be fitted
 
 They are the same classes: `except sceneprint.errors.UnknownMap` catches what a client raises.
@@ -18,7 +20,6 @@ from sceneprint_client.errors import (
     Conflict,
     DamagedBlob,
     DamagedSignature,
-    DamagedSnapshot,
     DatasetError,
     Forbidden,
     ForeignOrigin,
@@ -47,7 +48,6 @@ from sceneprint_client.errors import (
     SceneprintError,
     ServiceError,
     SlowBody,
-    SnapshotError,
     StoreAway,
     StoreError,
     StoreFull,
@@ -60,7 +60,6 @@ from sceneprint_client.errors import (
     UnknownMap,
     UnknownQuery,
     UnknownSession,
-    UnknownSnapshot,
     UnknownTenant,
     Unreachable,
     UnreadableArchive,
@@ -128,7 +127,6 @@ __all__ = [
     "UnknownMap",
     "UnknownQuery",
     "UnknownSession",
-    "UnknownSnapshot",
     "UnknownTenant",
     "Unreachable",
     "UnreadableArchive",
@@ -159,6 +157,14 @@ class BusyIndex(SceneprintError):
 
 class LostLease(StoreError):
     """The job's lease ran out, and it has been given to another worker."""
+
+
+class SnapshotError(StoreError):
+    """A snapshot cannot be taken, or cannot be restored there."""
+
+
+class DamagedSnapshot(SnapshotError):
+    """The bytes of a snapshot are not those that were written."""
 
 
 class TrainingError(SceneprintError):

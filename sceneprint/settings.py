@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import unquote, urlsplit
@@ -23,7 +22,7 @@ def default_data_dir() -> Path:
     return Path(platformdirs.user_data_dir("sceneprint", appauthor=False))
 
 
-#: Where blobs and snapshots may be, by what their URL begins with.
+#: Where blobs and indexes may be, by what their URL begins with.
 OBJECT_SCHEMES = ("s3", "gs", "az", "file", "memory")
 
 
@@ -41,20 +40,9 @@ class Settings(BaseSettings):
     data_dir: Path = Field(default_factory=default_data_dir)
     #: SQLAlchemy URL of the database; default: SQLite in the data folder.
     database_url: SecretStr | None = None
-    #: SQLAlchemy URL of a read replica of it, of PostgreSQL, that queries are answered from.
-    replica_url: SecretStr | None = None
-    #: Seconds that the replica may be behind; farther behind, the database itself is asked.
-    replica_lag_s: float = Field(default=5.0, ge=0, le=3600)
     #: Where blobs are kept: s3://bucket/prefix, gs://, az://, file:/// or memory:///; default:
     #: `blobs` in the data folder. Credentials come from the environment of the cloud, never here.
     blob_url: SecretStr | None = None
-    #: Where snapshots taken over the service are kept, likewise; default: `snapshots` in the data
-    #: folder.
-    snapshot_url: str | None = None
-    #: Who searches: this node, PostgreSQL with pgvector, or (`auto`) PostgreSQL for maps of which
-    #: this node would have to read much first. `qdrant`: this node, with Qdrant's engine; needs
-    #: the extra `qdrant`.
-    search: Literal["auto", "local", "database", "qdrant"] = "auto"
     #: Folder of search indexes, of this machine alone. Deleting it loses nothing but minutes;
     #: default: `index` in the data folder.
     index_dir: Path | None = None
@@ -90,9 +78,6 @@ class Settings(BaseSettings):
     import_bytes: int = Field(default=4 << 30, ge=1024)
     #: Seconds for a body of hardly any bytes; each MiB of it may take 4 s more.
     body_s: float = Field(default=30.0, ge=1, le=3600)
-    #: Collector of OpenTelemetry that is sent spans of requests and jobs, over HTTP: such as
-    #: http://127.0.0.1:4318. Needs the extra `traces`; default: nothing is traced.
-    traces_url: str | None = Field(default=None, pattern=r"^https?://[^\s/@]+(/\S*)?$")
     #: Ask callers for a key on a loopback address as well, as behind a proxy.
     require_keys: bool = False
     #: Requests a second of each tenant, weighted by work, over five seconds; 0 for no limit.
@@ -117,20 +102,14 @@ class Settings(BaseSettings):
     decoder_s: float = Field(default=30.0, ge=0.1, le=3600)
     #: Frames newer than the index above which a worker publishes a new one.
     tail_frames: int = Field(default=1000, ge=1, le=100_000)
-    #: Snapshots taken over the service that are kept; the oldest are removed.
-    snapshots_kept: int = Field(default=5, ge=1, le=1000)
     #: Seconds after which a worker reads all index files again, to see that they are sound.
     scrub_s: float = Field(default=3600.0, ge=1, le=31_536_000)
     #: Stored bytes that workers read each second, to see that they are sound, MB; 0: none are read.
     scrub_mb_per_s: float = Field(default=1.0, ge=0, le=10_000)
-    #: Room for answers that can be looked at afterwards, bytes; the oldest are removed. 0 for none.
-    query_bytes: int = Field(default=256 << 20, ge=0)
-    #: Seconds for which an answer can be looked at afterwards.
-    query_s: float = Field(default=3600.0, ge=1, le=31_536_000)
-    #: Answers of a map that are kept until somebody releases them; more are refused.
-    kept_answers: int = Field(default=1000, ge=0, le=1_000_000)
-    #: Room for those of a map, bytes.
-    kept_bytes: int = Field(default=256 << 20, ge=0)
+    #: Days for which queries are listed, and their answers can be looked at; 0: none is stored.
+    answer_days: float = Field(default=30.0, ge=0, le=36_500)
+    #: Room for answers, bytes; the oldest are removed first. 0: none is stored.
+    answer_bytes: int = Field(default=256 << 20, ge=0)
     #: Seconds for which deleted frames can be restored; 0: a deletion is for good at once.
     undo_s: float = Field(default=600.0, ge=0, le=31_536_000)
     #: Uploads of deleted frames of a map that are kept for it, bytes; more are deleted for good.
@@ -144,29 +123,11 @@ class Settings(BaseSettings):
     #: Days for which lines of the audit log are kept; of each tenant at most 200,000 changes and as
     #: many refusals.
     audit_kept_days: float = Field(default=365.0, gt=0, le=36_500)
-    #: Days for which a small record of each query is kept; 0: none is written.
-    history_days: float = Field(default=30.0, ge=0, le=36_500)
-    #: Newest records of queries of each map that are kept, some 600 bytes each.
-    history_queries: int = Field(default=100_000, ge=1, le=100_000_000)
     #: Who begins the fused surface of a map: workers, as frames come, or whoever asks for it.
     #: Deleted frames are always taken out of one that there is.
     surfaces: Literal["auto", "asked"] = "auto"
     #: Seconds after which no byte of a deleted frame is left in the caches of this node.
     purge_s: float = Field(default=3600.0, ge=1, le=31_536_000)
-
-    @field_validator("search")
-    @classmethod
-    def _can_search(cls, given: str) -> str:
-        if given == "qdrant" and find_spec("qdrant_edge") is None:
-            raise ValueError("it needs Qdrant's engine: run `pip install 'sceneprint[qdrant]'`")
-        return given
-
-    @field_validator("replica_url")
-    @classmethod
-    def _has_primary(cls, given: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
-        if given is not None and info.data.get("database_url") is None:
-            raise ValueError("a replica needs its primary in SCENEPRINT_DATABASE_URL")
-        return given
 
     @field_validator("tls_key")
     @classmethod
@@ -177,28 +138,16 @@ class Settings(BaseSettings):
 
     @field_validator("index_url")
     @classmethod
-    def _is_shared(cls, given: str | None, info: ValidationInfo) -> str | None:
-        if given is not None and info.data.get("search") == "qdrant":
-            raise ValueError(
-                "indexes that Qdrant searches are not shared; leave it out, or choose another "
-                "SCENEPRINT_SEARCH"
-            )
+    def _is_shared(cls, given: str | None) -> str | None:
         if given is not None and given.startswith("memory:"):
             raise ValueError("memory:/// is inside one process; use file:///folder")
         return given
 
-    @field_validator("blob_url", "snapshot_url", "index_url")
+    @field_validator("blob_url", "index_url")
     @classmethod
     def _holds_objects(cls, given: SecretStr | str | None) -> SecretStr | str | None:
         if given is not None:
             _require_objects(given if isinstance(given, str) else given.get_secret_value())
-        return given
-
-    @field_validator("traces_url")
-    @classmethod
-    def _can_trace(cls, given: str | None) -> str | None:
-        if given is not None and find_spec("opentelemetry") is None:
-            raise ValueError("it needs OpenTelemetry: run `pip install 'sceneprint[traces]'`")
         return given
 
     @field_validator("cors_origins", mode="before")
@@ -269,11 +218,6 @@ class Settings(BaseSettings):
         if given.startswith("file:"):
             return Path(unquote(urlsplit(given).path))
         return self.data_dir
-
-    @property
-    def snapshot_dir(self) -> Path:
-        """Folder of snapshots taken over the service."""
-        return self.data_dir / "snapshots"
 
     @property
     def bell_dir(self) -> Path:

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import threading
 from collections.abc import AsyncIterator
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
+from contextlib import asynccontextmanager, nullcontext
 from typing import Any
 
 from anyio import to_thread
@@ -18,7 +18,6 @@ from sceneprint import __version__
 from sceneprint.engine import Engine
 from sceneprint.engine.compilation import compile_kernels
 from sceneprint.errors import SceneprintError
-from sceneprint.process import tracing
 from sceneprint.settings import Settings
 from sceneprint.store.database_errors import open_patiently
 from sceneprint_client.api import (
@@ -41,7 +40,7 @@ from sceneprint_client.api.listing import (
     RestoreOptions,
     SessionEdit,
 )
-from sceneprint_client.api.results import KeepOptions, NewQueryRecords
+from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.sessions import NewAssociation, NewDifference
 from sceneprint_client.api.surface import NewReconstruction
 from service import dashboard, problems, static_files
@@ -67,7 +66,6 @@ from service.routes import (
     sessions,
     surface,
 )
-from service.shared_rates import SharedRates, sharing
 
 # The OpenAPI document: FastAPI's, and the records that only bodies of our own reading use.
 
@@ -100,7 +98,6 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
                 (NewMapCoverage, "validation"),
                 (NewDifference, "validation"),
                 (NewModel, "validation"),
-                (NewQueryRecords, "validation"),
                 (NewReconstruction, "validation"),
                 (Problem, "serialization"),
             ],
@@ -125,12 +122,12 @@ ROUTERS = (
     maps.router, frames.router, selections.router, frame_data.router, frame_data.points_router,
     maps.edits_router, copies.router,
     sessions.router, frames.imports_router, queries.router,
-    results.history_router, results.offline_router,
+    results.history_router,
     results.router,
     queries.similarity_router, sessions.associations_router, coverage.router, differences.router,
     surface.router,
     reconstructions.router, jobs.router,
-    jobs.events_router, admin.operations_router, admin.snapshots_router, admin.keys_router,
+    jobs.events_router, admin.operations_router, admin.keys_router,
 )  # fmt: skip
 #: Uploads that are in hand at once, so that one wait for the disk is enough for all of them.
 UPLOADS = 12
@@ -203,12 +200,8 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
             )  # fmt: skip
             loading = warming(engine) if warm else nullcontext()
             app.state.refusals = RefusalFilter()
-            shared: AbstractAsyncContextManager[None] = nullcontext()
-            if not engine.store.database.is_sqlite:  # which has one service
-                shared = sharing(SharedRates(engine.store.database, limits))
-            async with housekeeping(engine, figures.sampler), shared, loading:
-                with tracing(settings.traces_url, "sceneprint-service", __version__):
-                    yield
+            async with housekeeping(engine, figures.sampler), loading:
+                yield
             feed.close()
         finally:
             await to_thread.run_sync(engine.close)

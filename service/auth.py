@@ -1,7 +1,7 @@
-"""Who asks, what they may, and what is noted of it: one path for all routes.
+"""Who asks, and what they may: one path for all routes.
 
     request  --caller-->  Caller, with the Context of the service  --may_read | may_write-->  a map
-    answer  --note-->  a line of the audit log, where it tells of a change or a refusal
+    refusal  --record_refusal-->  a line of the audit log
 
 What depends on nothing slow is asked in the event loop: a thread's turn comes late where many
 are at work.
@@ -21,7 +21,6 @@ from enum import Enum
 from functools import partial, wraps
 from inspect import iscoroutinefunction
 from typing import Annotated, Any, TypeVar, cast
-from urllib.parse import unquote
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, Request, Response
@@ -31,8 +30,7 @@ from starlette.types import Scope as AsgiScope
 
 from sceneprint.engine import Engine
 from sceneprint.errors import Forbidden, KeyRequired, SceneprintError
-from sceneprint.process import NOBODY, current_tenant, set_tenant
-from sceneprint.store.audit_chain import KeyChange
+from sceneprint.process import NOBODY, Actor, current_tenant, set_actor, set_tenant
 from sceneprint.store.maps import unknown_map
 from sceneprint.store.queue import unknown_job
 from sceneprint_client.api import Job, Page
@@ -169,7 +167,6 @@ class Caller:
     expires_at : of the key, seconds since 1970; None: never
     key_id : of the key; None where none is asked for
     tenant : of the key; NOBODY where none is asked for
-    changed : maps of which more than reading was asked, for the audit log
     created_at : of the key, seconds since 1970; None where none is asked for
     """
 
@@ -178,7 +175,6 @@ class Caller:
     expires_at: float | None = None
     key_id: str | None = None
     tenant: str = NOBODY
-    changed: set[str] = field(default_factory=set, compare=False)
     created_at: float | None = None
 
     def may(self, scope: Scope, map_name: str = EVERY) -> bool:
@@ -197,14 +193,11 @@ class Caller:
             raise unknown_map(map_name)
         if not self.may(scope, map_name):
             raise _forbidden(self, scope, f"map {map_name!r:.80}")
-        if scope != "read":
-            self.changed.add(map_name)
 
     def require_new(self, map_name: str) -> None:
         """See that the caller may make a map of a name; Forbidden, be it there or not."""
         if not self.may("admin", map_name):
             raise _forbidden(self, "admin", f"a map named {map_name!r:.80}")
-        self.changed.add(map_name)
 
     def require_every(self, scope: Scope) -> None:
         """See that the caller may do that with all maps, and with what is of none; Forbidden."""
@@ -224,8 +217,6 @@ class Caller:
             raise unknown_job(job.job_id)
         if not self.may(scope, of):
             raise _forbidden(self, scope, f"job {job.job_id}")
-        if scope != "read" and job.map is not None:
-            self.changed.add(job.map)
         return job
 
     def readable(self, names: Iterable[str]) -> list[str]:
@@ -260,9 +251,8 @@ async def caller(
     RateLimited, Busy : its tenant asks too often, or too much at once.
     """
     if not requires_key(request, here):
-        found = anybody()
-        request.state.changed = found.changed
-        return found
+        set_actor(Actor("", address_of(request) or None))
+        return anybody()
     if given is None:
         raise KeyRequired(_why(request, here))
     key = await to_thread.run_sync(here.engine.find_key, given.credentials, limiter=here.lookups)
@@ -270,12 +260,11 @@ async def caller(
         enforce_rate_limit(request, here.limits.failed_keys, network_of(address_of(request)))
         raise KeyRequired(_REFUSED_KEY)
     request.state.caller, request.state.tenant = key.name, key.tenant
-    found = Caller(
+    set_actor(Actor(key.name, address_of(request) or None))
+    await _admit(request, here, key.tenant)
+    return Caller(
         key.name, key.grants, key.expires_at, key.id, key.tenant, created_at=key.created_at
     )
-    request.state.changed = found.changed
-    await _admit(request, here, key.tenant)
-    return found
 
 
 async def _admit(request: Request, here: Context, tenant: str) -> None:
@@ -452,16 +441,7 @@ def _forbidden(asking: Caller, scope: Scope, what: str) -> Forbidden:
     )
 
 
-# The audit log: which requests are noted, and what is noted of them.
-
-_READING = frozenset(("GET", "HEAD", "OPTIONS"))
-#: What is asked much and changes no map, and uploads, which are many: frames and events tell of
-#: them.
-UNNOTED = frozenset(
-    ("add_frame", "put_frame", "add_batch", "ask", "ask_several", "ask_again", "localize",
-     "localize_sequence", "compare")
-)  # fmt: skip
-
+# Refused requests in the audit log.
 
 #: Statuses of what was refused for who asked.
 REFUSED = (401, 403)
@@ -499,80 +479,29 @@ class RefusalFilter:
         return self._passed_over.pop(whose, 0)
 
 
-async def note(scope: AsgiScope, status: int, headers: list[tuple[bytes, bytes]]) -> None:
-    """Note an answer that tells of a change or a refusal, before it is sent: who has it finds the
-    line.
-
-    An answer is not held back by a log that cannot be written.
+async def record_refusal(scope: AsgiScope, status: int) -> None:
+    """Write a line of the audit log for a refused request before it is answered, unless there were
+    too many. An answer is not held back by a log that cannot be written.
     """
-    if status in REFUSED:
-        change = _refusal(scope, status)
-    elif scope["method"] not in _READING and 200 <= status < 300:
-        change = _change(scope, status, headers)
-    else:
+    state: dict[str, Any] = scope["state"]
+    client = scope.get("client")
+    actor = Actor(state.get("caller", ""), None if client is None else client[0])
+    missed = scope["app"].state.refusals.count(actor.name, actor.address or "")
+    if missed is None:
         return
-    if change is None:
-        return
+    path: dict[str, str] = scope.get("path_params", {})
+    targets = [value for name, value in path.items() if name != "map_name"]
+    data: dict[str, Any] = {"status": status}
+    data["operation"] = getattr(scope.get("route"), "name", None) or "request"
+    if missed:
+        data["not_noted_before"] = missed
     context: Context = scope["app"].state.context
+    write = partial(
+        context.engine.audit.record_refusal, actor, state.get("tenant", NOBODY),
+        path.get("map_name"), targets[-1] if targets else None, state["request_id"], **data,
+    )  # fmt: skip
     try:
         # however long its turn takes: who asks much must not get rid of what is noted
-        await context.run(context.engine.audit.note, change, patient=True)
+        await context.run(write, patient=True)
     except SceneprintError as error:
-        log.error("audit entry not written", extra={"action": change.action, "error": str(error)})
-
-
-def _change(scope: AsgiScope, status: int, headers: list[tuple[bytes, bytes]]) -> KeyChange | None:
-    action = getattr(scope.get("route"), "name", None)
-    if action is None or action in UNNOTED:
-        return None
-    state: dict[str, Any] = scope["state"]
-    given: dict[str, str] = scope.get("path_params", {})
-    map_name, target = given.get("map_name"), None
-    for name, value in given.items():
-        target = value if name != "map_name" else target
-    made = [unquote(one) for one in _location(headers).split("/")[2:]]
-    if len(made) >= 2 and made[0] == "maps" and map_name is None:
-        map_name = made[1]
-    elif len(made) >= 2 and target is None:
-        target = made[-1]
-    changed = state.get("changed", ())
-    if map_name is None and len(changed) == 1:
-        (map_name,) = changed
-    client = scope.get("client")
-    return KeyChange(
-        action,
-        state.get("caller", ""),
-        None if client is None else client[0],
-        map_name,
-        target,
-        state["request_id"],
-        {"status": status, **state.get("audited", {})},
-        tenant=state.get("tenant"),
-    )
-
-
-def _refusal(scope: AsgiScope, status: int) -> KeyChange | None:
-    """What is noted of a refusal; None where there were too many."""
-    state: dict[str, Any] = scope["state"]
-    client, caller = scope.get("client"), state.get("caller", "")
-    address = None if client is None else client[0]
-    before = scope["app"].state.refusals.count(caller, address or "")
-    if before is None:
-        return None
-    given: dict[str, str] = scope.get("path_params", {})
-    target = [value for name, value in given.items() if name != "map_name"]
-    return KeyChange(
-        getattr(scope.get("route"), "name", None) or "request",
-        caller,
-        address,
-        given.get("map_name"),
-        target[-1] if target else None,
-        state["request_id"],
-        {"status": status} | ({"not_noted_before": before} if before else {}),
-        tenant=state.get("tenant"),
-        refused=True,
-    )
-
-
-def _location(headers: list[tuple[bytes, bytes]]) -> str:
-    return next((value.decode() for name, value in headers if name == b"location"), "")
+        log.error("audit entry not written", extra={"action": "refused", "error": str(error)})

@@ -698,7 +698,7 @@ def _plain(part: object) -> object:
     if isinstance(part, bytes):
         return hashlib.sha256(part).hexdigest()
     if isinstance(part, BaseModel):
-        # a field that a later version adds must not make a request of before another one
+        # a field that a later version adds leaves the fingerprint of a request without it as it is
         return part.model_dump(mode="json", exclude_defaults=True)
     if isinstance(part, list | tuple):
         return [_plain(one) for one in part]

@@ -23,7 +23,6 @@ from starlette.types import Message, Scope
 from threadpoolctl import threadpool_limits
 
 from sceneprint.engine import Engine
-from sceneprint.maintenance.snapshot.creation import LONGEST_S, SNAPSHOT, snapshot_handler
 from sceneprint.settings import Settings
 from service.app import create_app
 
@@ -43,7 +42,7 @@ def embedded_settings(path: Path) -> Settings:
     decoded here: no other process is started.
     """
     settings = Settings(
-        data_dir=path.absolute(), database_url=None, replica_url=None, index_dir=None,
+        data_dir=path.absolute(), database_url=None, index_dir=None,
         host="127.0.0.1", require_keys=False, cors_origins=(), requests_per_s=0,
         waiting=_MOST_WAITING, wait_s=_LONGEST_WAIT_S, event_streams=_MOST_STREAMS, decoders=0,
     )  # fmt: skip
@@ -83,7 +82,6 @@ class LocalService(httpx.BaseTransport):
         except BaseException:
             self.close()
             raise
-        self._engine.tasks.register(SNAPSHOT, snapshot_handler(settings), LONGEST_S)
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         """Ask the application; the response streams."""

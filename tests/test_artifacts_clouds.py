@@ -215,7 +215,7 @@ def test_every_damaged_byte_is_noticed() -> None:
             with pytest.raises(UnreadableGeometry):
                 read_geometry(bytes(damaged))
         for length in (0, 4, HEAD, HEAD + BODY - 1, HEAD + BODY, len(data) - 1):
-            with pytest.raises(UnreadableGeometry, match="Sign the frame again"):
+            with pytest.raises(UnreadableGeometry):
                 read_geometry(data[:length])
 
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import disk, dpp, readiness, registration, scan, search, service
+from benchmarks import disk, readiness, registration, scan, search, service
+from benchmarks.machine import peak_megabytes_of_signing
 from benchmarks.pairs import FramePair, pairs_among
 from sceneprint.formats.artifact import write_geometry
 from sceneprint.formats.dataset import Camera, find_sequences, write_depth_png, write_intrinsics
-from sceneprint.geometry.retrieval.ranking import distances, diversify, pairwise_distances, rank
 from sceneprint.models import Model
 from sceneprint.pipeline import open_signer, prepare
 from sceneprint.types import DepthFrame, Floats, Intrinsics
@@ -45,27 +44,6 @@ def test_scan_compares_a_read_and_four_scans() -> None:
     text = "\n".join(scan.table(found))
     assert "5 signatures of 64 bytes" in text
     assert all(f"| {name} | " in text for name in found.milliseconds)
-
-
-@pytest.mark.parametrize("size", [20, 60])
-def test_both_selections_are_the_same(size: int) -> None:
-    found = dpp.measure(size=size, k=6, length=2048, runs=1)
-    assert found.agrees
-    assert (found.ranking, found.selected) == (size, 6)
-    assert min(found.pairwise, found.greedy, found.naive, found.share) > 0
-    text = "\n".join(dpp.table(found))
-    assert f"6 of a ranking of {size}" in text
-    assert "differ" not in text
-    assert "differ" in "\n".join(dpp.table(replace(found, agrees=False)))
-
-
-def test_naive_selection_finds_the_largest_determinant() -> None:
-    database = dpp.views(12, 512)
-    ranking = rank(distances(database[6], database, "l2"), 12, 1.0)
-    among = pairwise_distances(database[ranking.indices], "l2")
-    found = dpp.naive_selection(ranking, among, 4)
-    assert found == diversify(ranking.distances, among, 4).indices.tolist()
-    assert found[0] == 0
 
 
 def test_pairs_by_hand() -> None:
@@ -178,3 +156,13 @@ def test_a_start_is_measured_with_and_without_the_index(building: Path) -> None:
     assert set(found.signed) == {1, 2}
     assert min(found.signed.values()) > 0
     assert f"**{found.signed[2] / found.signed[1]:.2f}** times" in readiness.table(found)[-2]
+
+
+@pytest.mark.parametrize("preset", ["paper", "depth"])
+def test_signing_stays_under_its_memory(
+    preset: str, room_frames: tuple[DepthFrame, ...], tmp_path: Path
+) -> None:
+    """The budget is 700 MB; a process that has done its imports alone needs over 50."""
+    write_intrinsics(tmp_path, Camera(room_frames[0].intrinsics))
+    write_depth_png(tmp_path / "frame.png", room_frames[0].depth, 1000.0)
+    assert 50 < peak_megabytes_of_signing(tmp_path, preset) < 700

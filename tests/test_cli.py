@@ -18,8 +18,12 @@ import pytest
 from PIL import Image
 
 from sceneprint import cli
+from sceneprint.cli import main
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.lab.synth import synthesise_survey
 from sceneprint.models import Model, save_model
 from sceneprint.pipeline import Signer, sign
+from sceneprint.types import Cloud
 
 CAMERA = {"width": 160, "height": 120, "fx": 146, "fy": 146, "cx": 80, "cy": 60}
 
@@ -232,26 +236,12 @@ def test_two_paths_keep_their_names_apart(rooms: Path, model_file: Path, tmp_pat
     assert "is also the name of" in done.stderr
 
 
-def test_picture_shows_depth_normals_and_levels(
-    rooms: Path, model_file: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "new" / "frame.png"
-    run("picture", rooms, "--frame", 3, "--out", out, "--model", model_file)
-    with Image.open(out) as image:
-        pixels = np.asarray(image.convert("RGB"))
-    assert min(pixels.shape[:2]) > 500
-    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 1000
-    done = run("picture", rooms, "--frame", 4, "--out", out, "--model", model_file, expect=2)
-    assert "Choose --frame from 0 to 3" in done.stderr
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["sign", "/nowhere/at/all"], "no such file or folder"),
         (["sign", "README.md"], "There is no intrinsics.json here"),
         (["sign", "{rooms}", "--model", "/nowhere.safetensors"], "Give one of the presets"),
-        (["picture", "/nowhere", "--out", "x.png"], "no such file or folder"),
         (["train", "--out", "{tmp}/m", "--rooms", "1", "--jobs", "1"], "fewer than two places"),
         (["synth", "/dev/null/x"], "/dev/null"),
     ],
@@ -306,3 +296,22 @@ def test_a_command_waits_for_no_other() -> None:
         "sceneprint.engine",
     } & of_serve == set()
     assert {"numpy", "sceneprint.cli.serve"} & loaded("--version") == set()
+
+
+def test_sites_are_written_as_clouds_with_poses(tmp_path: Path) -> None:
+    out = tmp_path / "sites"
+    arguments = ["--rooms", "1", "--views", "2", "--seed", "5", "--jobs", "1"]
+    assert main(["synth", str(out), "--sensor", "lidar", *arguments]) == 0
+    made = synthesise_survey(5, 0, 2)
+    (sequence,) = find_sequences(out)
+    read = [reference.read() for reference in sequence.frames]
+    assert [path.name for path in sorted((out / "site-000").glob("*.ply"))] == [
+        "scan-000000.ply",
+        "scan-000001.ply",
+    ]
+    for cloud, one in zip(read, made.clouds, strict=True):
+        assert isinstance(cloud, Cloud)
+        np.testing.assert_array_equal(cloud.points, one.points)
+        assert cloud.pose is not None
+        assert one.pose is not None
+        np.testing.assert_allclose(cloud.pose, one.pose, atol=1e-6)

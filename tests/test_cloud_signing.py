@@ -156,7 +156,7 @@ DEGENERATE: dict[str, tuple[Callable[[], Floats], str]] = {
     "one point": (lambda: np.ones((5000, 3)), "fill 1 voxels"),
     "one line": (lambda: np.linspace([2, -2, 0], [2, 2, 0], 5000), "lie on no surface"),
     "one ray": (lambda: np.linspace([0, 0, 0.5], [0, 0, 9], 5000), "voxels"),
-    "millimetres": (lambda: wall() * 1000, "if the coordinates are millimetres"),
+    "millimetres": (lambda: wall() * 1000, "millimetres"),
     "at the viewpoint": (lambda: np.zeros((5000, 3)), "0 of its 5000 points"),
     "far away": (lambda: wall() + 9000, "0 of its 14400 points"),
 }

@@ -58,9 +58,11 @@ def machine(tmp_path: Path) -> Path:
     """Stand-ins of the programs that `tools/install` calls: each call is a line of `calls`."""
     call = f'echo "${{0##*/}} $*" >> "{tmp_path}/calls"'
     scripts = {
-        "environment/bin/python": 'case "$*" in *" -r $BROKEN"*) exit 1 ;; esac',
+        "environment/bin/python": 'case "$*" in *" -r $BROKEN"*) exit 1 ;; esac\n'
+        'case "$*" in *"config get"*) echo $MIRROR ;; esac',
         "environment/bin/pip": "",
-        "environment/bin/uv": 'case "$*" in *" -r $UV_FAILS"*) exit 1 ;; esac',
+        "environment/bin/uv": 'case "$*" in *" -r $UV_FAILS"*) exit 1 ;; esac\n'
+        "echo from $UV_DEFAULT_INDEX",
         "python-3.10": 'case "$2" in *version*) echo 3.10 ;; esac',
         "python-3.11-without-venv": 'case "$2" in *version*) echo 3.11 ;; *) exit 1 ;; esac',
     }
@@ -77,12 +79,13 @@ def install(
     machine: Path, python: str, environment: str, **variables: str
 ) -> tuple[subprocess.CompletedProcess[str], list[str]]:
     """Run `tools/install` and return what it did and each program that it called."""
+    inherited = {key: value for key, value in os.environ.items() if "INDEX" not in key}
     done = subprocess.run(
         [INSTALL, f"./{python}", environment, "some.lock", "own"], cwd=machine, text=True,
-        capture_output=True, env={**os.environ, "BROKEN": "none", "UV_FAILS": "none", **variables},
+        capture_output=True, env={**inherited, "BROKEN": "none", "UV_FAILS": "none", **variables},
     )  # fmt: skip
-    calls = machine / "calls"
-    return done, calls.read_text().splitlines() if calls.exists() else []
+    calls = (machine / "calls").read_text().splitlines() if (machine / "calls").exists() else []
+    return done, [call for call in calls if "install" in call]
 
 
 EDITABLE = "--no-deps --no-build-isolation --config-settings editable_mode=compat -e own"
@@ -91,12 +94,26 @@ EDITABLE = "--no-deps --no-build-isolation --config-settings editable_mode=compa
 def test_uv_installs_the_lock_and_then_our_packages(machine: Path) -> None:
     done, calls = install(machine, "python", "environment")
     assert done.returncode == 0, done.stderr
-    assert done.stdout == "Installing some.lock into environment: 1 packages\n"
+    assert done.stdout.splitlines()[0] == "Installing some.lock into environment: 1 packages"
     bootstrap, *by_uv = calls
     assert bootstrap.startswith("python -m pip ")
     assert bootstrap.endswith("requirements-uv.lock")
     uv = "uv pip install --python environment/bin/python"
     assert by_uv == [f"{uv} --require-hashes -r some.lock", f"{uv} {EDITABLE}"]
+
+
+@pytest.mark.parametrize(
+    ("variables", "index"),
+    [
+        ({}, ""),
+        ({"MIRROR": "http://a"}, "http://a"),
+        ({"MIRROR": "http://a", "PIP_INDEX_URL": "http://b"}, "http://b"),
+        ({"PIP_INDEX_URL": "http://b", "UV_DEFAULT_INDEX": "http://c"}, "http://c"),
+    ],
+)
+def test_uv_takes_the_index_of_pip(machine: Path, variables: dict[str, str], index: str) -> None:
+    done, _ = install(machine, "python", "environment", **variables)
+    assert done.stdout.splitlines()[1:] == [f"from {index}".strip()] * 2
 
 
 @pytest.mark.parametrize(
@@ -129,7 +146,7 @@ def test_a_python_that_cannot_do_it_is_named(machine: Path, python: str, message
     assert done.returncode == 2
     assert message in done.stderr
     assert not (machine / "new").exists()
-    assert [one for one in calls if "install" in one] == []
+    assert calls == []
 
 
 def test_type_checkers_find_the_client(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from benchmarks.fleet.failover_client import FailoverClient, RequestLog
 from benchmarks.fleet.faults import CUT_OFF, FROZEN, PRIMARY, Promotion, schedule
 from benchmarks.fleet.lock_samples import LockSampler, LockShares
 from benchmarks.fleet.postgres import NoServer, binaries
-from benchmarks.fleet.qdrant_search import measure as measure_qdrant
 from benchmarks.fleet.recordings import GRIDS, walks
 from benchmarks.fleet.robots import Kept, Listener
 from benchmarks.fleet.run import FleetFigures, Plan, drive
@@ -228,12 +227,3 @@ def figures(found: Found, **changed: Any) -> FleetFigures:
 def test_what_is_wrong_fails(found: dict[str, Any], changed: dict[str, Any], sound: bool) -> None:
     whole: dict[str, Any] = {"acknowledged": 9, "indexed": 9, "looked_for": 9, "found": 9}
     assert figures(Found(**whole | found), **changed).sound is sound
-
-
-@pytest.mark.thorough
-def test_our_own_search_and_qdrant_are_measured(tmp_path: Path) -> None:
-    """It ends with an error where their answers differ."""
-    told = measure_qdrant("depth", 600, tmp_path)
-    assert [one.publish_s > 0 for one in told.nodes] == [True, True]
-    assert told.nodes[1].bytes_per_frame > told.nodes[0].bytes_per_frame > told.signature_bytes
-    assert told.ratio > 0

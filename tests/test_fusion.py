@@ -9,15 +9,10 @@ import pytest
 
 from sceneprint.errors import InvalidRequest, UselessFrame
 from sceneprint.fusion import (
-    PALETTE,
     FusionParameters,
     fuse,
-    reconstruction_picture,
-    rendered,
-    viewpoint,
     within,
 )
-from sceneprint.geometry.rigid import levelling
 from sceneprint.geometry.surface.coverage import (
     TriangleMesh,
     added_areas,
@@ -169,50 +164,6 @@ def test_the_observed_volume_is_that_of_the_view_cone(around: list[DepthFrame]) 
     whole, _ = observed_volume([*around, *(view(yaw) for yaw in (45, 135, 225, 315))])
     assert whole == pytest.approx(8 * ROOM.prod(), rel=0.08)
     assert observed_volume([])[0] == 0.0
-
-
-def test_the_picture_shows_the_room_from_above_without_what_faces_away(
-    around: list[DepthFrame], room: tuple[TriangleMesh, float]
-) -> None:
-    mesh, voxel = room
-    first = of_views(mesh, around, 2 * voxel)
-    assert levelling(mesh.normals) == pytest.approx(np.eye(3), abs=0.02)
-    eye = viewpoint(mesh, np.zeros((1, 3)), 200, 160)
-    picture = rendered(mesh, first, [], eye).astype(int)
-    corners = eye.pixels(mesh.points)
-    assert corners[:, 0].min() > 0  # all is in view
-    assert corners[:, 0].max() < 199
-    assert corners[:, 1].min() > 0
-    assert corners[:, 1].max() < 159
-    assert (picture[0] == 255).all()
-    assert (picture[:, 0] == 255).all()
-
-    def colour_at(point: tuple[float, float, float]) -> int:
-        """Which view's colour has the pixel of a point, by its hue."""
-        x, y = np.rint(eye.pixels(np.array([point], float))[0, :2]).astype(int)
-        pixel = picture[y, x] - picture[y, x].mean()
-        hues = PALETTE.astype(float) - PALETTE.mean(axis=1, keepdims=True)
-        return int(np.linalg.norm(hues / 255 - pixel / 255, axis=1).argmin())
-
-    def view_at(point: tuple[float, float, float]) -> int:
-        return int(first[np.linalg.norm(mesh.points - point, axis=1).argmin()])
-
-    # the floor, through the ceiling, and the wall that is farther from the viewer
-    for point in ((0, ROOM[1], 0.2), (0.3, 0.2, ROOM[2])):
-        assert colour_at(point) == view_at(point)
-    drawn = rendered(mesh, first, around, eye)
-    x, y = np.rint(eye.pixels(np.zeros((1, 3)))[0, :2]).astype(int)
-    around_camera = (slice(y - 6, y + 7), slice(x - 6, x + 7))
-    assert (drawn[around_camera] != picture[around_camera]).any()
-
-
-def test_the_picture_is_a_png(around: list[DepthFrame], room: tuple[TriangleMesh, float]) -> None:
-    mesh, voxel = room
-    first = of_views(mesh, around, 2 * voxel)
-    added = added_areas(mesh, first, len(around)).tolist()
-    png = reconstruction_picture(mesh, first, around, added, "a $room")
-    assert png[:8] == b"\x89PNG\r\n\x1a\n"
-    assert png == reconstruction_picture(mesh, first, around, added, "a $room")
 
 
 def test_without_open3d_the_message_names_the_packages() -> None:

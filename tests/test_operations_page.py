@@ -12,7 +12,7 @@ import pytest
 from sceneprint.cli import parser
 from sceneprint.settings import Settings
 from sceneprint_client.api import AnswerStatus, FrameState, JobState
-from sceneprint_client.api.admin import KINDS, MISSED, ReplicaSeen
+from sceneprint_client.api.admin import KINDS, MISSED
 from service.metrics import Metrics
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -37,7 +37,6 @@ def families() -> dict[str, set[str]]:
     """Names of all that is told to Prometheus, with their labels."""
     found: dict[str, set[str]] = {}
     metrics = Metrics()
-    metrics._tell_replica(ReplicaSeen(used=True, behind_s=0.5))  # told only where there is one
     for collector in metrics.registry._collector_to_names:  # also those without data
         labels = set(getattr(collector, "_labelnames", ()))
         for family in collector.describe():
@@ -117,9 +116,6 @@ def test_dashboards_ask_for_what_there_is():
         check(expression)
         named |= {re.sub(r"_(bucket|sum|count)$", "", name) for name, _ in queried(expression)}
     assert named == set(families())  # all is shown somewhere
-    assert {name: len(each["panels"]) for name, each in DASHBOARDS.items()} == {
-        "fleet": 21, "tenants": 6,
-    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", DASHBOARDS)

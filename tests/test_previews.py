@@ -43,18 +43,6 @@ def test_depth_by_hand() -> None:
     assert two[0, 50].tolist() == [33, 145, 140]  # half way
 
 
-def test_depth_is_viridis() -> None:
-    """As the library has it, from far to near, to 6 of 255."""
-    from matplotlib import colormaps
-
-    z = np.linspace(1.0, 3.0, 401)
-    colours, text = depth_view(surface([z.tolist()]))
-    near, far = float(text["near_m"]), float(text["far_m"])
-    place = np.clip((far - z) / (far - near), 0, 1)
-    expected = 255 * np.array(colormaps["viridis"](place))[:, :3]
-    assert np.abs(colours[0] - expected).max() < 7
-
-
 def test_nothing_seen_is_grey_throughout() -> None:
     blank = surface([[0.0, 0.0]])
     colours, text = depth_view(blank)

@@ -191,7 +191,7 @@ def test_prepare_is_sign_and_geometry_of_one_look(
 
 def test_prepare_of_nothing(small_signer: Signer) -> None:
     k = Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)
-    with pytest.raises(UselessFrame, match="every depth sample is missing"):
+    with pytest.raises(UselessFrame):
         prepare(DepthFrame(np.zeros((48, 64), np.float32), k), small_signer)
 
 

@@ -33,7 +33,7 @@ def test_kills_lose_nothing(
     found = kill(tmp_path, shots(frames), n_kills=n_kills, seed=2)
     assert sum(found.kills.values()) == n_kills
     assert (found.acknowledged, found.deleted) == (frames, frames // 10)
-    assert (found.lost, found.doubled, found.half_written) == (0, 0, 0)
+    assert (found.lost, found.doubled, found.separated, found.half_written) == (0, 0, 0, 0)
     assert found.queries == queries
     assert (found.differing, found.wrong) == (0, 0)
 
@@ -59,7 +59,7 @@ def test_clocks_that_jump_lose_nothing(tmp_path: Path) -> None:
 def state(**changed: Any) -> State:
     same: dict[str, Any] = {
         "contents": {"f0": "c0", "f1": "c1"}, "signatures": {"c0": b"0", "c1": b"1"},
-        "doubled": 0, "tries": 1, "answers": {"c0 ranked": [1]},
+        "doubled": 0, "tries": 1, "separated": 0, "answers": {"c0 ranked": [1]},
     }  # fmt: skip
     return State(**same | changed)
 
@@ -72,6 +72,7 @@ def state(**changed: Any) -> State:
         ({"contents": {"f0": "c0", "f1": "c1", "f2": "c2"}}, {"lost": 1}),  # it was deleted
         ({"contents": {"f0": "c0", "f1": "c1", "f9": "c9"}}, {"doubled": 1}),  # nobody's
         ({"doubled": 2}, {"doubled": 2}),
+        ({"separated": 3}, {"separated": 3}),
         ({"signatures": {"c0": b"0", "c1": b"other"}}, {"differing": 1}),
         ({"signatures": {"c0": b"0"}}, {"differing": 1}),
         ({"answers": {"c0 ranked": [2]}}, {"wrong": 1}),
@@ -82,7 +83,7 @@ def test_what_is_lost_is_counted(changed: dict[str, Any], counted: dict[str, int
     plan = Plan(range(3))
     plan.acknowledged, plan.deleted = {0: "f0", 1: "f1", 2: "f2"}, {"f2"}
     found = figures(Counter(service=1), plan, 0, 0, state(**changed), state(), 1.0)
-    names = ("lost", "doubled", "half_written", "differing", "wrong")
+    names = ("lost", "doubled", "separated", "half_written", "differing", "wrong")
     told = {name: getattr(found, name) for name in names}
     assert told == dict.fromkeys(names, 0) | counted
 
@@ -132,7 +133,7 @@ def test_a_frame_beyond_the_last_match_is_not_missed() -> None:
 def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    of_kills = KillFigures({"service": 3, "a writer": 1}, 9, 1, 0, 0, 0, 2, 0, 40, 0, 5, 3, 60.0)
+    of_kills = KillFigures({"service": 3, "a writer": 1}, 9, 1, 0, 0, 0, 0, 2, 0, 40, 0, 5, 3, 60.0)
     lines = table(of_kills, CrowdFigures(8, 8, 120, 5, 6, 7))
     put_between(page, BEGIN, END, lines)
     text = page.read_text()

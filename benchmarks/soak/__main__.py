@@ -35,6 +35,7 @@ def table(kills: KillFigures, crowded: CrowdFigures) -> list[str]:
         f"| uploads acknowledged, of them deleted again | {kills.acknowledged}, {kills.deleted} |",
         f"| **lost** | **{kills.lost}** |",
         f"| **signed or stored twice with effect** | **{kills.doubled}** |",
+        f"| **changes without their event or audit line** | **{kills.separated}** |",
         f"| **half-written, by `sceneprint fsck`** | **{kills.half_written}** |",
         f"| files that nothing refers to (fsck removes them) | {kills.leftovers} |",
         f"| signatures other than those of the undisturbed run | {kills.differing} |",
@@ -122,7 +123,7 @@ def main() -> int:
     print("\n".join(lines))
     if options.page is not None:
         put_between(options.page, BEGIN, END, lines)
-    lost = of_kills.lost + of_kills.doubled + of_kills.half_written
+    lost = of_kills.lost + of_kills.doubled + of_kills.separated + of_kills.half_written
     wrong = of_kills.differing + of_kills.wrong + len(of_crowd.wrong) + len(of_crowd.errors)
     wrong += of_clocks is not None and not of_clocks.sound
     idle = 0 in (of_crowd.uploads, of_crowd.deletions, of_crowd.answers)  # nothing was tried

@@ -5,19 +5,22 @@ Frames have other ids and numbers in every run; their content has not.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import Connection, func, select
 
 from benchmarks.soak.load import MAP
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
-from sceneprint.store.tables import frames, jobs, maps, signatures
+from sceneprint.store.tables import audit, events, frames, jobs, maps, signatures
 from sceneprint_client import Client
 from sceneprint_client.api import Answer
 
+#: Kinds of events of what clients change.
+CHANGES = ("map.created", "frame.received", "frame.deleted")
 #: Frames that are looked up: so many of them for their ranking, so many validated too.
 RANKED, VALIDATED = 40, 8
 
@@ -32,6 +35,7 @@ class State:
     signatures : by content
     doubled : frames beyond one of a content, and signatures beyond one of a frame
     tries : most tries of a job
+    separated : changes with an event but no line of the audit log, or the other way round
     answers : of queries with exact=true, by the content that was asked for
     """
 
@@ -39,6 +43,7 @@ class State:
     signatures: dict[str, bytes]
     doubled: int
     tries: int
+    separated: int
     answers: dict[str, Any]
 
 
@@ -53,6 +58,7 @@ def state_of(data: Path, url: str | None) -> State:
             .order_by(frames.c.content_id)
         ).all()
         tries = int(connection.execute(select(func.max(jobs.c.attempts))).scalar_one())
+        separated = _separated(connection)
     contents = {row.id: row.content_id for row in rows}
     client = Client.embedded(data) if url is None else Client(url)
     with client:
@@ -75,8 +81,20 @@ def state_of(data: Path, url: str | None) -> State:
         signatures={row.content_id: bytes(row.vector) for row in rows},
         doubled=2 * len(rows) - len(contents) - len(set(contents.values())),
         tries=tries,
+        separated=separated,
         answers=answers,
     )
+
+
+def _separated(connection: Connection) -> int:
+    """Count the changes of clients to the map whose event or line of the audit log is missing."""
+    columns = events.c.kind, events.c.map, events.c.frame_id
+    asked = select(*columns).where(events.c.map == MAP, events.c.kind.in_(CHANGES))
+    told = Counter(tuple(one) for one in connection.execute(asked))
+    columns = audit.c.action, audit.c.map, audit.c.target
+    asked = select(*columns).where(audit.c.map == MAP, audit.c.action.in_(CHANGES))
+    lines = Counter(tuple(one) for one in connection.execute(asked))
+    return (told - lines).total() + (lines - told).total()
 
 
 def _told(answer: Answer, contents: dict[str, str]) -> dict[str, Any]:

@@ -46,6 +46,7 @@ class KillFigures:
     lost : acknowledged frames that are not indexed in the end, and deleted ones that are
     doubled : frames with more than one signature, contents with more than one frame, and frames
         that nobody was told of
+    separated : changes whose event or line of the audit log is missing
     half_written : findings of `sceneprint fsck` other than files that nothing refers to
     leftovers : files that nothing refers to
     differing : frames whose signature is not that of the undisturbed run
@@ -60,6 +61,7 @@ class KillFigures:
     deleted: int
     lost: int
     doubled: int
+    separated: int
     half_written: int
     leftovers: int
     differing: int
@@ -127,6 +129,7 @@ def figures(
         deleted=len(plan.deleted),
         lost=len(kept - indexed) + len(resurrected),
         doubled=found.doubled + len(indexed - kept - plan.deleted),
+        separated=found.separated,
         half_written=half_written,
         leftovers=leftovers,
         differing=sum(

@@ -1,21 +1,14 @@
-"""A service as its operator sees it: keys, changes, events, figures, models, snapshots."""
+"""A service as its operator sees it: keys, changes, events, figures, models."""
 
 from __future__ import annotations
 
-import hashlib
-import os
-import secrets
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
-from pathlib import Path
-from typing import BinaryIO
 from urllib.parse import quote
 
-import httpx
-
-from sceneprint_client.api import Job, Page
+from sceneprint_client.api import Page
 from sceneprint_client.api.admin import (
-    Audited,
+    AuditLine,
     Event,
     EventPage,
     Key,
@@ -24,21 +17,18 @@ from sceneprint_client.api.admin import (
     ModelInfo,
     NewKey,
     Scope,
-    SnapshotFile,
     Stats,
 )
 from sceneprint_client.api.base import checked
-from sceneprint_client.errors import DamagedSnapshot, InvalidRequest, SnapshotError, Unreachable
-from sceneprint_client.http import PAGE, error_of, follow_stream, given, snapshot_path
+from sceneprint_client.errors import InvalidRequest
+from sceneprint_client.http import PAGE, follow_stream, given
 from sceneprint_client.jobs import JobMethods
 
 _EVENTS = "/v1/events"
-#: Times that a download goes on where it broke off.
-_DOWNLOADS = 5
 
 
 class AdminMethods(JobMethods):
-    """Keys, events, figures, models and snapshots of a service."""
+    """Keys, events, figures and models of a service."""
 
     def create_key(
         self, name: str, grants: Mapping[str, Scope], expires_at: datetime | None = None,
@@ -96,7 +86,7 @@ class AdminMethods(JobMethods):
         """What this client's key may do."""
         return self._ask(Me, "GET", "/v1/keys/me")
 
-    def audit(self, actor: str | None = None, map_name: str | None = None) -> Iterator[Audited]:
+    def audit(self, actor: str | None = None, map_name: str | None = None) -> Iterator[AuditLine]:
         """Who changed what, newest first.
 
         Parameters
@@ -104,7 +94,7 @@ class AdminMethods(JobMethods):
         actor : name of the key that made the changes; default: any, or none
         map_name : the map that was changed; default: any, or none
         """
-        return self._items(Page[Audited], "/v1/audit", actor=actor, map=map_name)
+        return self._items(Page[AuditLine], "/v1/audit", actor=actor, map=map_name)
 
     # events and figures
 
@@ -180,101 +170,3 @@ class AdminMethods(JobMethods):
     def models(self) -> list[ModelInfo]:
         """Models for maps: those that ship, and those that maps have or had."""
         return self._ask(Page[ModelInfo], "GET", "/v1/models").items
-
-    # snapshots
-
-    def take_snapshot(self, *, wait_s: float | None = None) -> Job:
-        """Take a snapshot of all maps: one state of database and uploads, in one archive.
-
-        Parameters
-        ----------
-        wait_s : seconds to wait for it; default: none
-
-        Returns
-        -------
-        job : `result` is a SnapshotFile once it has succeeded
-
-        Raises
-        ------
-        Forbidden : the key is not an administrator's.
-        """
-        job = self._ask(Job, "POST", "/v1/snapshots")
-        if wait_s is None:
-            return job
-        return self.wait([job.job_id], timeout_s=wait_s)[0]
-
-    def snapshots(self) -> list[SnapshotFile]:
-        """Snapshots that the service keeps, newest first."""
-        return self._ask(Page[SnapshotFile], "GET", "/v1/snapshots").items
-
-    def download_snapshot(self, snapshot_id: str, path: str | Path) -> SnapshotFile:
-        """Download a snapshot for `sceneprint restore`, and check it against its checksum.
-
-        Parameters
-        ----------
-        snapshot_id : of `snapshots`
-        path : of the new archive; nothing is overwritten
-
-        Raises
-        ------
-        UnknownSnapshot : it does not exist, or no longer.
-        SnapshotError : the path exists.
-        DamagedSnapshot : the checksum does not match.
-        OSError : the file cannot be written.
-        """
-        path = Path(path)
-        # asked first: an unknown one leaves nothing behind
-        known = {one.snapshot_id: one for one in self.snapshots()}
-        if path.exists():
-            raise SnapshotError(f"{path} is there, and nothing is overwritten. Name another.")
-        part = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
-        try:
-            with open(part, "xb", opener=_private) as file:
-                self._fetch_snapshot(snapshot_id, file)
-            if snapshot_id not in known or _digest_of(part) != known[snapshot_id].sha256:
-                raise DamagedSnapshot(
-                    f"Snapshot {snapshot_id} did not come as it was taken. Download it again, or "
-                    "take another."
-                )
-            part.rename(path)
-        finally:
-            part.unlink(missing_ok=True)
-        return known[snapshot_id]
-
-    def delete_snapshot(self, snapshot_id: str) -> None:
-        """Delete a snapshot; UnknownSnapshot if it does not exist."""
-        self._delete(snapshot_path(snapshot_id))
-
-    def _fetch_snapshot(self, snapshot_id: str, file: BinaryIO) -> None:
-        """Write the bytes of one to a file; a download that breaks off goes on."""
-        path, lost = snapshot_path(snapshot_id), 0
-        while True:
-            headers = {"Range": f"bytes={file.tell()}-"} if file.tell() else {}
-            try:
-                with self._http.stream("GET", path, headers=headers) as response:
-                    if not response.is_success:
-                        response.read()
-                        raise error_of(response)
-                    for chunk in response.iter_raw():
-                        file.write(chunk)
-                return
-            except httpx.TransportError as error:
-                lost += 1
-                if lost == _DOWNLOADS:
-                    raise Unreachable(
-                        f"{self._url}: the download of snapshot {snapshot_id} broke off {lost} "
-                        f"times ({error}). Try again when the network is better."
-                    ) from error
-
-
-def _private(path: str, flags: int) -> int:
-    """An archive has all pictures, and the hashes of keys."""
-    return os.open(path, flags, 0o600)
-
-
-def _digest_of(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()

@@ -14,7 +14,7 @@
         - ModelMismatch         signatures or artifacts of two models were compared
       x UnreadableGeometry      a geometry artifact that is missing, damaged or of another schema
       x NotFound                there is no such map, frame or job
-        - UnknownMap, UnknownFrame, UnknownSession, UnknownJob, UnknownQuery, UnknownSnapshot
+        - UnknownMap, UnknownFrame, UnknownSession, UnknownJob, UnknownQuery
         - UnknownKey            there is no key of that name
         - UnknownTenant         there is no tenant of that name
         - UnknownDeletion       there is no deletion that could be undone
@@ -47,8 +47,6 @@
         - NewerSchema           a later version of sceneprint wrote it
         - DamagedBlob           stored bytes are missing or are not those that were stored
         - DamagedSignature      a stored signature's checksum does not fit
-        - SnapshotError         a snapshot cannot be taken, or not be restored there
-          - DamagedSnapshot     its bytes are not those that were written
       x ServiceError            what a client is told by, or of, a service
         - Unreachable           no answer came
         - Refused               the answer is a problem document
@@ -161,10 +159,6 @@ class UnknownQuery(NotFound):
 
 class UnknownDeletion(NotFound):
     """There is no deletion with that id, or it can no longer be undone."""
-
-
-class UnknownSnapshot(NotFound):
-    """There is no snapshot with that id."""
 
 
 class Conflict(SceneprintError):
@@ -297,14 +291,6 @@ class DamagedBlob(StoreError):
 
 class DamagedSignature(StoreError):
     """A stored signature differs from the one that was stored."""
-
-
-class SnapshotError(StoreError):
-    """A snapshot cannot be taken, or cannot be restored there."""
-
-
-class DamagedSnapshot(SnapshotError):
-    """The bytes of a snapshot are not those that were written."""
 
 
 class ServiceError(SceneprintError):

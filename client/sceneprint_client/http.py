@@ -49,7 +49,6 @@ from sceneprint_client.errors import (
     UnknownJob,
     UnknownMap,
     UnknownQuery,
-    UnknownSnapshot,
 )
 
 if TYPE_CHECKING:
@@ -130,11 +129,6 @@ def query_path(query_id: str) -> str:
 def reconstruction_path(job_id: str) -> str:
     """Path of a reconstruction; UnknownJob where none can have that id."""
     return f"/v1/reconstructions/{_part(job_id, 'reconstruction', UnknownJob)}"
-
-
-def snapshot_path(snapshot_id: str) -> str:
-    """Path of a snapshot; UnknownSnapshot where none can have that id."""
-    return f"/v1/snapshots/{_part(snapshot_id, 'snapshot', UnknownSnapshot)}"
 
 
 def match_path(query_id: str, frame_id: str) -> str:

@@ -466,20 +466,6 @@ class JobMethods(ServiceConnection):
         path = f"{coverage_path(map_name, coverage_id)}/changes"
         return self._ask(CoverageChanges, "GET", path, params={"since": since})
 
-    def coverage_plan(
-        self, map_name: str, coverage_id: str, parent_frame: str | None = None
-    ) -> bytes:
-        """A plan of a coverage job as PNG: of the given parent frame, else the most common one.
-
-        Raises
-        ------
-        UnknownMap, UnknownJob : it does not exist.
-        NotIndexed : it has not ended, did not succeed, or no queried frame has a pose.
-        InvalidRequest : it has no plan for that parent frame.
-        """
-        path = f"{coverage_path(map_name, coverage_id)}/plan.png"
-        return self._bytes(path, params=given(parent_frame=parent_frame))
-
     def delete_coverage(self, map_name: str, coverage_id: str) -> None:
         """Delete a coverage job with its result; UnknownMap or UnknownJob if it does not exist."""
         self._delete(coverage_path(map_name, coverage_id))
@@ -600,10 +586,6 @@ class JobMethods(ServiceConnection):
         NotIndexed : it has not ended, or failed.
         """
         return self._bytes(f"{reconstruction_path(job_id)}/mesh.ply")
-
-    def reconstruction_picture(self, job_id: str) -> bytes:
-        """The picture of a reconstruction as a PNG file; see `reconstruction_mesh`."""
-        return self._bytes(f"{reconstruction_path(job_id)}/picture.png")
 
     def delete_reconstruction(self, job_id: str) -> None:
         """Delete a reconstruction with its files; UnknownJob if it does not exist."""

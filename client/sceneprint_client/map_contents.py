@@ -26,7 +26,6 @@ from sceneprint_client.api.listing import (
     SessionChange,
     Trajectory,
 )
-from sceneprint_client.api.maps import By, Growth, GrowthOf
 from sceneprint_client.api.results import (
     CLOUD_FRAMES,
     MOST_DRAWN,
@@ -137,26 +136,6 @@ class MapMethods(ServiceConnection):
         Conflict : the map is not being re-encoded.
         """
         return self._ask(Map, "DELETE", f"{map_path(map_name)}/reencoding")
-
-    def growth(self, map_name: str, by: By = "day", last: int = 30) -> Growth:
-        """Number of frames by the hour or day (UTC) in which they were indexed.
-
-        Parameters
-        ----------
-        map_name : of the map
-        by : "hour" or "day"
-        last : number of hours or days, including the present one; at most 400
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        InvalidRequest : an unknown `by`, or too many.
-        """
-        wanted = checked(GrowthOf, "The growth", by=by, last=last)
-        path = f"{map_path(map_name)}/growth"
-        return self._ask(Growth, "GET", path, params=wanted.model_dump())
-
-    # frames
 
     def frame(self, map_name: str, frame_id: str) -> Frame:
         """A frame; UnknownMap or UnknownFrame if it does not exist."""

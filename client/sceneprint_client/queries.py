@@ -25,14 +25,13 @@ from sceneprint_client.api.results import (
     COLOURS,
     MOST_DRAWN,
     TRANSFORMS,
-    AnswerRetention,
     MatchDetails,
     OverlayColour,
     OverlayTransform,
     QueryRecord,
-    QueryRecordsAdded,
     RecordStatus,
     Similarities,
+    StoredQuery,
 )
 from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.http import (
@@ -196,7 +195,7 @@ class QueryMethods(ServiceConnection):
         since: datetime | str | None = None, until: datetime | str | None = None,
         kept: bool = False,
     ) -> Iterator[QueryRecord]:  # fmt: skip
-        """Past queries, newest first: a small record of each, kept for 30 days by default.
+        """Return past queries, newest first; they are stored for 30 days by default.
 
         Parameters
         ----------
@@ -204,7 +203,7 @@ class QueryMethods(ServiceConnection):
         status : this one, or one of these
         robot : only of this robot
         since, until : from that time on, and before that time; with a zone
-        kept : only those with kept answers, see `keep_answer`
+        kept : only those whose answers somebody keeps, see `keep_answer`
 
         Raises
         ------
@@ -218,7 +217,7 @@ class QueryMethods(ServiceConnection):
         )  # fmt: skip
 
     def delete_queries(self, map_name: str) -> None:
-        """Delete the records of all queries of a map, permanently.
+        """Delete all past queries of a map with their answers, permanently.
 
         Raises
         ------
@@ -227,71 +226,48 @@ class QueryMethods(ServiceConnection):
         """
         self._send("DELETE", "/v1/queries", params={"map": map_name})
 
-    def add_query_records(
-        self, map_name: str, records: Iterable[QueryRecord | dict[str, Any]]
-    ) -> QueryRecordsAdded:
-        """Add records of queries that a robot answered itself, each once; see `Spool.add_queries`.
-
-        Parameters
-        ----------
-        map_name : of the map that was asked
-        records : of `queries` of an embedded client, or NewQueryRecord as JSON; at most 100
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        Forbidden : the key does not have `write` for it.
-        InvalidRequest : a record is invalid, and none was stored.
-        """
-        sent = [one if isinstance(one, dict) else record_json(one) for one in records]
-        path = f"{map_path(map_name)}/queries/records"
-        return self._ask(QueryRecordsAdded, "POST", path, json={"records": sent})
-
     # what can be looked at after a query
 
     def answer(self, query_id: str) -> Answer:
-        """The answer to an earlier query: for about an hour, or while it is kept.
+        """Return the answer to an earlier query while it is stored.
 
         Raises
         ------
-        UnknownQuery : it is not kept, or no longer.
+        UnknownQuery : it is not stored, or no longer.
         """
         return self._ask(Answer, "GET", query_path(query_id))
 
-    def keep_answer(
-        self, query_id: str, title: str | None = None, until: datetime | str | None = None
-    ) -> AnswerRetention:
-        """Keep an answer until it is released, or change title and end of a kept one.
+    def stored_query(self, query_id: str) -> StoredQuery:
+        """Return how an earlier query was sent, and when its answer expires; UnknownQuery."""
+        return self._ask(StoredQuery, "GET", f"{query_path(query_id)}/question")
+
+    def keep_answer(self, query_id: str, title: str | None = None) -> QueryRecord:
+        """Keep an answer until it is released, or change the title of a kept one.
 
         Parameters
         ----------
         query_id : of the answer
         title : a label for people
-        until : time of its automatic release, with a zone; default: never
 
         Raises
         ------
-        UnknownQuery : it is no longer there.
-        QuotaExceeded : a map has too many kept answers.
-        InvalidRequest : the title is too long, or `until` has passed.
+        UnknownQuery : it is no longer stored.
+        QuotaExceeded : too many answers are kept.
+        InvalidRequest : the title is too long.
         """
-        body = given(title=title, until=_as_text(until))
-        return self._ask(AnswerRetention, "POST", f"{query_path(query_id)}/keep", json=body)
+        body = given(title=title)
+        return self._ask(QueryRecord, "PUT", f"{query_path(query_id)}/keep", json=body)
 
     def release_answer(self, query_id: str) -> None:
         """Release a kept answer; UnknownQuery if it is not kept."""
         self._send("DELETE", f"{query_path(query_id)}/keep")
-
-    def answer_retention(self, query_id: str) -> AnswerRetention:
-        """How long an answer is available; UnknownQuery if it is not."""
-        return self._ask(AnswerRetention, "GET", f"{query_path(query_id)}/keep")
 
     def query_cloud(self, query_id: str) -> bytes:
         """The surface that a query saw: points and normals as PLY, in its sensor's frame.
 
         Raises
         ------
-        UnknownQuery : it is not kept, or no longer.
+        UnknownQuery : its answer is not stored, or no longer.
         NotIndexed : it ran without validation.
         """
         return self._bytes(f"{query_path(query_id)}/cloud.ply")
@@ -313,7 +289,7 @@ class QueryMethods(ServiceConnection):
 
         Raises
         ------
-        UnknownQuery : it is not kept, or no longer.
+        UnknownQuery : its answer is not stored, or no longer.
         InvalidRequest : a limit out of range.
         """
         if not 1 <= limit <= _MOST_ALIKE:
@@ -337,7 +313,7 @@ class QueryMethods(ServiceConnection):
 
         Raises
         ------
-        UnknownQuery : it is not kept, or no longer.
+        UnknownQuery : its answer is not stored, or no longer.
         UnknownMap, UnknownFrame : no match has that id, or it was deleted since.
         NotIndexed : the query ran without validation, or the map has another model now.
         """
@@ -372,16 +348,6 @@ class QueryMethods(ServiceConnection):
             f"{match_path(query_id, frame_id)}/overlay.ply",
             params=given(map=map_name, color=color, transform=transform),
         )
-
-
-#: Fields of a record that a service gives, and does not take.
-_OF_THE_SERVICE = {"map", "maps", "key", "kept_until", "keep", "offline"}
-
-
-def record_json(record: QueryRecord) -> dict[str, Any]:
-    """A record of an embedded client as it is sent to a service: NewQueryRecord as JSON."""
-    told = record.model_dump(mode="json", exclude_none=True, exclude=_OF_THE_SERVICE)
-    return told if record.maps == [record.map] else told | {"maps": record.maps}
 
 
 def _as_text(at: datetime | str | None) -> str | None:

@@ -1,9 +1,7 @@
-"""A spool: frames that a robot keeps on its disk while it is offline, and uploads later; and
-records of the queries that it answered itself.
+"""A spool: frames that a robot keeps on its disk while it is offline, and uploads later.
 
 frame, meta  --Spool.add-->  a durable row of one SQLite file
 rows, oldest first  --Spool.sync, Client.upload_batch-->  frames of a map, each once
-records of a copy  --Spool.add_queries-->  rows  --Spool.sync-->  records of the service, each once
 two places  --separation-->  how far apart they are, which decides what a full spool gives up
 """
 
@@ -19,7 +17,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from itertools import islice
 from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -30,10 +27,8 @@ from numpy.typing import NDArray
 from sceneprint_client import errors
 from sceneprint_client.api.base import FrameMeta, GivenPose
 from sceneprint_client.api.frames import MOST_OF_BATCH, BatchItem
-from sceneprint_client.api.results import MOST_OF_RECORDS, QueryRecord
 from sceneprint_client.http import frame_bytes, meta_json
 from sceneprint_client.poses import rotation_of
-from sceneprint_client.queries import record_json
 from sceneprint_client.tracker_core import difference
 from sceneprint_client.uploads import upload_fields
 
@@ -51,11 +46,6 @@ MOST_BYTES = 1 << 30
 METRES, DEGREES, SECONDS = 1.0, 30.0, 60.0
 #: Bytes of frames sent in one request; a larger frame is sent alone.
 BATCH_BYTES = 4 << 20
-#: Bytes of query records sent in one request: of JSON a service takes 256 KiB.
-RECORDS_BYTES = 200_000
-#: Seconds before the newest record that was kept, of which records are read again: one is written
-#: when its query is answered, and told by when that came.
-OVERLAP_S = 60.0
 #: Seconds before a busy service is asked again, if it does not say when.
 _PAUSE_S = 1.0
 #: Seconds that another process may keep the file locked.
@@ -68,10 +58,9 @@ _RESERVE = 512
 #: Marks the file as a spool, and its schema.
 _APPLICATION, _SCHEMA = 0x53705370, 1
 
-# `frames.reason` is null while a frame waits, and '' once it was refused: as long as null, so that
-# a frame is set aside without being written again, for which a full disk has no room. The text is
-# in `reasons`. `data` is last, so that other columns are read without it. `known_queries` has the
-# records of the last minute, which are read again.
+# `frames.reason` is null while a frame waits, and '' once it is refused: as long as null, so that a
+# frame is set aside without being written again, for which a full disk has no room. `data` is last,
+# so that other columns are read without it.
 _TABLES = """
 CREATE TABLE frames (
     id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -113,29 +102,6 @@ CREATE TRIGGER moved AFTER UPDATE OF reason ON frames BEGIN
     UPDATE counters SET waiting = waiting + (NEW.reason IS NULL) - (OLD.reason IS NULL),
         refused = refused + (NEW.reason IS NOT NULL) - (OLD.reason IS NOT NULL);
 END;
-CREATE TABLE queries (
-    id INTEGER PRIMARY KEY AUTOINCREMENT,
-    query_id TEXT NOT NULL UNIQUE,
-    map TEXT NOT NULL,
-    at REAL NOT NULL,
-    bytes INTEGER NOT NULL,
-    reason TEXT,
-    record TEXT NOT NULL
-);
-CREATE INDEX waiting_queries ON queries (at, id) WHERE reason IS NULL;
-CREATE INDEX refused_queries ON queries (id) WHERE reason IS NOT NULL;
-CREATE TABLE known_queries (query_id TEXT PRIMARY KEY, at REAL NOT NULL) WITHOUT ROWID;
-CREATE TRIGGER query_added AFTER INSERT ON queries BEGIN
-    UPDATE counters SET bytes = bytes + NEW.bytes, queries = queries + 1;
-END;
-CREATE TRIGGER query_removed AFTER DELETE ON queries BEGIN
-    UPDATE counters SET bytes = bytes - OLD.bytes, queries = queries - (OLD.reason IS NULL),
-        queries_refused = queries_refused - (OLD.reason IS NOT NULL);
-END;
-CREATE TRIGGER query_moved AFTER UPDATE OF reason ON queries BEGIN
-    UPDATE counters SET queries = queries + (NEW.reason IS NULL) - (OLD.reason IS NULL),
-        queries_refused = queries_refused + (NEW.reason IS NOT NULL) - (OLD.reason IS NOT NULL);
-END;
 CREATE TABLE reasons (frame INTEGER PRIMARY KEY, reason TEXT NOT NULL);
 CREATE TRIGGER reason_removed AFTER DELETE ON frames WHEN OLD.reason IS NOT NULL BEGIN
     DELETE FROM reasons WHERE frame = OLD.id;
@@ -156,14 +122,11 @@ class SpoolStatus:
     ----------
     waiting : frames to upload
     refused : frames that the service refused; `Spool.refusals` has their reasons
-    bytes, most_bytes : that waiting and refused frames and records take on disk, and may take
+    bytes, most_bytes : that waiting and refused frames take on disk, and may take
     uploaded : frames that a map has, since the spool was created
     thinned : waiting frames that a full spool gave up
     discarded : refused frames that a full spool gave up
     oldest : when the first waiting frame was taken, else added; None if none waits
-    queries, queries_refused : records of queries to send, and refused ones
-    queries_sent : records that the service has, since the spool was created
-    queries_discarded : records that a full spool gave up, or that the service keeps no longer
     """
 
     waiting: int
@@ -174,21 +137,16 @@ class SpoolStatus:
     thinned: int
     discarded: int
     oldest: datetime | None
-    queries: int = 0
-    queries_refused: int = 0
-    queries_sent: int = 0
-    queries_discarded: int = 0
 
 
 @dataclass(frozen=True)
 class SpoolRefusal:
-    """A frame that the service refused, and why; or the record of a query, by its id."""
+    """A frame that the service refused, and why."""
 
     name: str | None
     session: str | None
     captured_at: datetime | None
     reason: str
-    query_id: str | None = None
 
 
 @dataclass
@@ -200,18 +158,11 @@ class SyncReport:
     received : frames that are new to the map
     there : frames that the map had already
     refused : frames that were set aside
-    queries, queries_there : records of queries that are new to the history, and that it had
-    queries_expired : records that were removed, as they are older than the service keeps them
-    queries_refused : records that were set aside
     """
 
     received: int = 0
     there: int = 0
     refused: int = 0
-    queries: int = 0
-    queries_there: int = 0
-    queries_expired: int = 0
-    queries_refused: int = 0
 
     @property
     def done(self) -> int:
@@ -240,13 +191,6 @@ class _Waiting:
     meta: FrameMeta
 
 
-@dataclass(frozen=True, eq=False)
-class _WaitingQuery:
-    id: int
-    query_id: str
-    record: str
-
-
 @dataclass(frozen=True)
 class _Target:
     """Where frames go: arguments of `Client.upload_batch`, and how long to wait for a service."""
@@ -264,12 +208,12 @@ class Spool:
     nearest, in pose and time, to the frames before and after it in its run (one session of one
     robot): a metre, 30 degrees and a minute weigh the same; without poses the time alone counts,
     and of equals the oldest goes. The first and the last frame of a run stay while others can go.
-    Refused frames go before any waiting one, and records of queries before any frame.
+    Refused frames go before any waiting one.
 
     Parameters
     ----------
     path : of the SQLite file, created if missing
-    most_bytes : that its frames and records may take; default: as before, 1 GiB for a new spool
+    most_bytes : that its frames may take; default: as before, 1 GiB for a new spool
 
     Raises
     ------
@@ -360,50 +304,10 @@ class Spool:
             _renew_novelty(database, last)
         return True
 
-    def add_queries(self, client: Client) -> int:
-        """Keep records of the queries that an embedded client answered, until they are sent.
-
-        Call it now and then, and before the copy is replaced: each record is kept once. A full
-        spool keeps the newest records, and gives up none of its frames for them. Use one spool
-        for one copy.
-
-        Parameters
-        ----------
-        client : of `Client.embedded`
-
-        Returns
-        -------
-        new : how many records were kept
-
-        Raises
-        ------
-        StoreFull : the disk has no room; the records are read again the next time.
-        UnusableStore : the spool or the copy cannot be used.
-        """
-        with self._transaction(write=False) as database:
-            until = database.execute("SELECT queries_until FROM counters").fetchone()[0]
-        now, new = time.time(), 0
-        # where the clock was set back, what came since may be older than what was read before
-        since = None if until is None or until > now else _moment(until - OVERLAP_S)
-        newest = 0.0 if until is None else until
-        found, first = client.queries(since=since), True
-        while some := list(islice(found, MOST_OF_RECORDS)):  # the newest first
-            if first:
-                newest, first = max(newest, some[0].at.timestamp()), False
-            with self._transaction() as database:
-                for one in some:
-                    new += _keep_query(database, one, min(newest, now) - OVERLAP_S)
-        newest = min(newest, now)
-        with self._transaction() as database:
-            database.execute("UPDATE counters SET queries_until = ?", (newest,))
-            database.execute("DELETE FROM known_queries WHERE at < ?", (newest - OVERLAP_S,))
-        return new
-
     def status(self) -> SpoolStatus:
         """What the spool holds, and what has become of all frames that were added."""
         names = (
             "waiting", "refused", "bytes", "most_bytes", "uploaded", "thinned", "discarded",
-            "queries", "queries_refused", "queries_sent", "queries_discarded",
         )  # fmt: skip
         with self._transaction(write=False) as database:
             row = database.execute(f"SELECT {', '.join(names)} FROM counters").fetchone()
@@ -414,32 +318,24 @@ class Spool:
         return SpoolStatus(**dict(zip(names, row, strict=True)), oldest=oldest)
 
     def refusals(self) -> list[SpoolRefusal]:
-        """Frames that the service refused, oldest first, and then records of queries."""
+        """Frames that the service refused, oldest first."""
         with self._transaction(write=False) as database:
             rows = database.execute(
                 "SELECT meta, coalesce(reasons.reason, ?) FROM frames "
                 "LEFT JOIN reasons ON frame = id WHERE frames.reason IS NOT NULL ORDER BY id",
                 (_NO_REASON,),
             ).fetchall()
-            queries = database.execute(
-                "SELECT query_id, at, reason FROM queries WHERE reason IS NOT NULL ORDER BY id"
-            ).fetchall()
         known = [(FrameMeta.model_validate_json(text), reason) for text, reason in rows]
         return [
             SpoolRefusal(meta.name, meta.session, meta.captured_at, reason)
             for meta, reason in known
-        ] + [
-            SpoolRefusal(None, None, _moment(at), reason, query_id)
-            for query_id, at, reason in queries
         ]
 
     def retry_refused(self) -> int:
         """Let what was refused wait again, as after an upgrade of the service; how many."""
         with self._transaction() as database:
-            query = "UPDATE {} SET reason = NULL WHERE reason IS NOT NULL"
-            return sum(
-                database.execute(query.format(table)).rowcount for table in ("frames", "queries")
-            )
+            query = "UPDATE frames SET reason = NULL WHERE reason IS NOT NULL"
+            return database.execute(query).rowcount
 
     def sync(
         self, client: Client, map_name: str, *, priority: int = 0,
@@ -451,9 +347,6 @@ class Spool:
         Call it again after any error or kill: the service recognises content and metadata that a
         map has, so that no frame is lost and none is there twice. A frame that it refuses (409,
         413, 415, 422) is set aside with its reason, and the next one follows.
-
-        Records of queries are sent first, each to the map that was asked; the service recognises
-        their ids.
 
         Parameters
         ----------
@@ -480,7 +373,6 @@ class Spool:
             query = "SELECT count(*), max(id) FROM frames WHERE reason IS NULL"
             total, last = database.execute(query).fetchone()
         report = SyncReport()
-        self._sync_queries(target, report)
         while total and (batch := self._oldest(last)):
             self._send(target, batch, report)
             if progress is not None:
@@ -566,85 +458,6 @@ class Spool:
                 "WHERE id = ?1 AND reason IS NOT NULL",
                 list(refused.items()),
             )
-
-    # records of queries
-
-    def _sync_queries(self, target: _Target, report: SyncReport) -> None:
-        """Send the records that wait now, oldest first, some of one map at a time."""
-        with self._transaction(write=False) as database:
-            query = "SELECT max(id) FROM queries WHERE reason IS NULL"
-            last = database.execute(query).fetchone()[0]
-        while last is not None and (found := self._oldest_queries(last)) is not None:
-            self._send_queries(target, *found, report)
-
-    def _oldest_queries(self, last: int) -> tuple[str, list[_WaitingQuery]] | None:
-        """A map, and the first records of it that wait, up to an id: as many as fit one request."""
-        waits = "FROM queries WHERE reason IS NULL AND id <= ?"
-        with self._transaction(write=False) as database:
-            first = database.execute(
-                f"SELECT map {waits} ORDER BY at, id LIMIT 1", (last,)
-            ).fetchone()
-            if first is None:
-                return None
-            rows = database.execute(
-                f"SELECT id, query_id, record {waits} AND map = ? ORDER BY at, id LIMIT ?",
-                (last, first[0], MOST_OF_RECORDS),
-            ).fetchall()
-        batch: list[_WaitingQuery] = []
-        size = 0
-        for row in rows:
-            size += len(row[2].encode())
-            if batch and size > RECORDS_BYTES:
-                break
-            batch.append(_WaitingQuery(*row))
-        return first[0], batch
-
-    def _send_queries(
-        self, target: _Target, map_name: str, batch: list[_WaitingQuery], report: SyncReport
-    ) -> None:
-        """Send records, and note what came of each; those refused as a whole are halved."""
-        records = [json.loads(one.record) for one in batch]
-        try:
-            done = _persist(target, lambda: target.client.add_query_records(map_name, records))
-        except errors.SceneprintError as error:
-            elsewhere = map_name != target.map_name
-            if elsewhere and isinstance(error, (errors.UnknownMap, errors.Forbidden)):
-                refused = {one.id: str(error) for one in batch}
-            elif not _is_about_content(error) or isinstance(error, errors.SlowBody):
-                raise
-            elif len(batch) == 1:
-                refused = {batch[0].id: str(error)}
-            else:
-                half = len(batch) // 2
-                self._send_queries(target, map_name, batch[:half], report)
-                self._send_queries(target, map_name, batch[half:], report)
-                return
-            self._settle_queries([], refused, 0)
-            report.queries_refused += len(refused)
-            return
-        reasons = {one.query_id: one.reason for one in done.refused}
-        refused = {one.id: reasons[one.query_id] for one in batch if one.query_id in reasons}
-        taken = [one.id for one in batch if one.id not in refused]
-        self._settle_queries(taken, refused, done.expired)
-        report.queries += done.received
-        report.queries_there += done.there
-        report.queries_expired += done.expired
-        report.queries_refused += len(refused)
-
-    def _settle_queries(self, taken: list[int], refused: dict[int, str], expired: int) -> None:
-        """Remove records that the service has, or keeps no longer, and set others aside."""
-        with self._transaction() as database:
-            removed = 0
-            for number in taken:
-                removed += database.execute("DELETE FROM queries WHERE id = ?", (number,)).rowcount
-            expired = min(expired, removed)
-            database.execute(
-                "UPDATE counters SET queries_sent = queries_sent + ?, "
-                "queries_discarded = queries_discarded + ?",
-                (removed - expired, expired),
-            )
-            for number, reason in refused.items():
-                database.execute("UPDATE queries SET reason = ? WHERE id = ?", (reason, number))
 
     # the file
 
@@ -773,9 +586,7 @@ def pose_matrix(pose: GivenPose | None) -> NDArray[np.float64] | None:
 
 
 def _give_up_one(database: sqlite3.Connection) -> None:
-    """Remove the record or frame that is missed least; see Spool."""
-    if _give_up_query(database, math.inf):
-        return
+    """Remove the frame that is missed least; see Spool."""
     row = database.execute("SELECT id FROM frames WHERE reason IS NOT NULL ORDER BY id").fetchone()
     if row is not None:
         database.execute("DELETE FROM frames WHERE id = ?", row)
@@ -795,65 +606,6 @@ def _give_up_one(database: sqlite3.Connection) -> None:
     database.execute("UPDATE counters SET thinned = thinned + 1")
     _renew_novelty(database, before)
     _renew_novelty(database, after)
-
-
-def _give_up_query(database: sqlite3.Connection, before: float) -> bool:
-    """Remove a refused record, or the oldest that came before a time; whether there was one."""
-    row = database.execute("SELECT id FROM queries WHERE reason IS NOT NULL ORDER BY id").fetchone()
-    if row is None:
-        row = database.execute(
-            "SELECT id FROM queries WHERE reason IS NULL AND at < ? ORDER BY at, id LIMIT 1",
-            (before,),
-        ).fetchone()
-    if row is None:
-        return False
-    database.execute("DELETE FROM queries WHERE id = ?", row)
-    database.execute("UPDATE counters SET queries_discarded = queries_discarded + 1")
-    return True
-
-
-def _keep_query(database: sqlite3.Connection, one: QueryRecord, known_from: float) -> bool:
-    """Keep a record, if it is new and there is room without giving up frames or newer records.
-
-    Parameters
-    ----------
-    database : of the spool
-    one : of an embedded client; those that others sent to the service are passed over
-    known_from : time from which on records are read again, seconds since 1970
-    """
-    at = one.at.timestamp()
-    known = database.execute(
-        "SELECT 1 FROM known_queries WHERE query_id = ?1 "
-        "UNION ALL SELECT 1 FROM queries WHERE query_id = ?1",
-        (one.query_id,),
-    ).fetchone()
-    if one.offline or known is not None:
-        return False
-    if at >= known_from:
-        database.execute("INSERT INTO known_queries VALUES (?, ?)", (one.query_id, at))
-    text = json.dumps(record_json(one))
-    size = _record_bytes(len(text))
-    most = database.execute("SELECT most_bytes FROM counters").fetchone()[0]
-    while database.execute("SELECT bytes FROM counters").fetchone()[0] + size > most:
-        if not _give_up_query(database, at):
-            database.execute("UPDATE counters SET queries_discarded = queries_discarded + 1")
-            return False
-    database.execute(
-        "INSERT INTO queries (query_id, map, at, bytes, record) VALUES (?, ?, ?, ?, ?)",
-        (one.query_id, one.map, at, size, text),
-    )
-    return True
-
-
-def _record_bytes(length: int) -> int:
-    """What a record of so many characters takes of the file: its share of a page that has as many
-    of its size as fit, and of the pages of the indexes.
-    """
-    whole = length + 160  # its other columns
-    share = (
-        _PAGE // max(1, _PAGE // whole) if whole <= _PAGE else (whole + _PAGE - 1) // _PAGE * _PAGE
-    )
-    return share + 256
 
 
 def _neighbour(database: sqlite3.Connection, run: str, number: int | None, side: int) -> int | None:

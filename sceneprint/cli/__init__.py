@@ -55,7 +55,6 @@ COMMANDS = {
     "restore": "storage",
     "pull": "storage",
     "sign": "offline",
-    "picture": "offline",
     "evaluate": "evaluate",
     "evaluate-pairs": "evaluate",
     "synth": "offline",

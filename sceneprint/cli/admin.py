@@ -1,4 +1,4 @@
-"""`sceneprint keys`, `tenants` and `audit`: who may ask a service, who pays, who changed what."""
+"""`sceneprint keys` and `tenants`: who may use a service, and who pays."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from sceneprint.cli import duration
 from sceneprint.cli.options import one_line
 from sceneprint.cli.serve import add_data_option, settings_of
+from sceneprint.process import COMMAND, acting_as
 from sceneprint_client.api.admin import EVERY, SCOPES
 
 if TYPE_CHECKING:
@@ -85,27 +86,24 @@ def run_keys(options: argparse.Namespace) -> int:
         raise InvalidRequest(f"--{given[0]} applies to a new key only. Use it with --create.")
     if options.overlap is not None and options.rotate is None:
         raise InvalidRequest("--overlap applies to a rotation only. Use it with --rotate.")
-    with Engine(settings_of(options)) as engine:
+    with acting_as(COMMAND), Engine(settings_of(options)) as engine:
         if options.list:
             _print_keys(engine)
         elif options.rotate is not None:
             overlap = timedelta(hours=1) if options.overlap is None else options.overlap
             made = engine.rotate_key(options.rotate, overlap.total_seconds())
-            engine.audit.command("keys --rotate", target=made.name)
             _print_secret(made)
             if made.previous_until is not None:
                 ends = f"{made.previous_until:%Y-%m-%dT%H:%M:%SZ}"
                 print(f"the old secret works until {ends}", file=sys.stderr)
         elif options.revoke is not None:
             engine.revoke_key(options.revoke)
-            engine.audit.command("keys --revoke", target=options.revoke)
             print(f"key {one_line(options.revoke)} is revoked")
         else:
             scope: Scope = options.scope or "admin"
             grants = dict.fromkeys(options.map or [EVERY], scope)
             until = None if options.expires is None else datetime.now(UTC) + options.expires
             made = engine.create_key(options.create, grants, until, options.tenant)
-            engine.audit.command("keys --create", target=made.name)
             _print_secret(made)
     return 0
 
@@ -185,10 +183,10 @@ def add_tenants(commands: Any) -> None:
 def run_tenants(options: argparse.Namespace) -> int:
     """Do what was asked for with the tenants of the data folder."""
     from sceneprint.engine import Engine
-    from sceneprint.engine.admin.operations import create_tenant
-    from sceneprint.store.tenants import delete_tenant, list_tenants
+    from sceneprint.engine.admin.operations import create_tenant, delete_tenant
+    from sceneprint.store.tenants import list_tenants
 
-    with Engine(settings_of(options)) as engine:
+    with acting_as(COMMAND), Engine(settings_of(options)) as engine:
         if options.list:
             with engine.store.database.read() as connection:
                 found = list_tenants(connection)
@@ -197,12 +195,9 @@ def run_tenants(options: argparse.Namespace) -> int:
                 count = f"{one.keys} key{'s' * (one.keys != 1)}"
                 print(f"{at:%Y-%m-%dT%H:%M:%SZ}  {one_line(one.name)}  {count}")
         elif options.delete is not None:
-            with engine.store.database.write() as connection:
-                delete_tenant(connection, options.delete)
-            engine.audit.command("tenants --delete", target=options.delete)
+            delete_tenant(engine.store, options.delete)
             print(f"tenant {one_line(options.delete)} is deleted")
         else:
             create_tenant(engine.store, options.create)
-            engine.audit.command("tenants --create", target=options.create)
             print(f"tenant {one_line(options.create)} is created")
     return 0

@@ -46,8 +46,8 @@ def add_coverage(commands: Any) -> None:
         "coverage",
         help="measure where in a map a robot would be found",
         description="Query frames of a map against the rest of it, and count by cell of a plan how "
-        "many are found, found in a wrong place, ambiguous and not found. Can write the plan as a "
-        "picture, and compare with an earlier result.",
+        "many are found, found in a wrong place, ambiguous and not found. Can compare with an "
+        "earlier result.",
     )
     command.add_argument("map", metavar="MAP")
     command.add_argument("--session", metavar="NAME", help="query only frames of this session")
@@ -101,10 +101,6 @@ def add_coverage(commands: Any) -> None:
         metavar="ID",
         help="measure as an earlier result did, and print which cells became better or worse",
     )
-    command.add_argument("--out", type=Path, metavar="FILE", help="write the plan as a PNG")
-    command.add_argument(
-        "--parent-frame", metavar="NAME", help="of the plan to write (default: of most frames)"
-    )
     command.add_argument("--json", action="store_true", help="print JSON")
     add_service_options(command)
     command.set_defaults(run=run_coverage)
@@ -119,25 +115,17 @@ def run_coverage(options: argparse.Namespace) -> int:
             "--since measures with the options of the earlier result. Leave the other options out."
         )
     checked(NewMapCoverage, "The coverage", **given)  # before a service is asked for
-    if options.out is not None:  # it may take an hour
-        check_writable(options.out)
     changes = None
     with open_client(options) as client:
         told = _measured(client, options, given)
-        if told.state is JobState.SUCCEEDED:
-            if options.since is not None:
-                changes = client.coverage_changes(options.map, told.coverage_id, options.since)
-            if options.out is not None:
-                plan = client.coverage_plan(options.map, told.coverage_id, options.parent_frame)
-                write_whole(options.out, plan)
+        if told.state is JobState.SUCCEEDED and options.since is not None:
+            changes = client.coverage_changes(options.map, told.coverage_id, options.since)
     if options.json:
         print((changes or told).model_dump_json())
     else:
         print("\n".join(coverage_lines(told)))
         if changes is not None:
             print("\n".join(change_lines(changes)))
-        if told.state is JobState.SUCCEEDED and options.out is not None:
-            print(f"wrote {one_line(str(options.out))}")
     return 0 if told.state is JobState.SUCCEEDED else 2
 
 

@@ -182,7 +182,7 @@ def _wrong(text: str) -> Check:
 
 
 def object_stores(settings: Settings) -> Iterator[Check]:
-    """Findings about the stores of blobs and of snapshots, where they are in none of the folders.
+    """Yield findings about the stores of blobs and of indexes that are in no folder.
 
     Parameters
     ----------
@@ -191,7 +191,6 @@ def object_stores(settings: Settings) -> Iterator[Check]:
     blobs = None if settings.blob_url is None else settings.blob_url.get_secret_value()
     for subject, setting, url in (
         ("blobs", "SCENEPRINT_BLOB_URL", blobs),
-        ("snapshots", "SCENEPRINT_SNAPSHOT_URL", settings.snapshot_url),
         ("indexes", "SCENEPRINT_INDEX_URL", settings.index_url),
     ):
         if url is not None:
@@ -213,7 +212,7 @@ def _looked_at(subject: str, setting: str, url: str) -> Check:
     return Check("ok", subject, text)
 
 
-# What `sceneprint doctor` says of a database server and its replica; they are only read.
+# What `sceneprint doctor` says of a database server, which is only read.
 
 #: What a commit that was acknowledged needs to survive the loss of power.
 _DURABLE = ("fsync", "full_page_writes")
@@ -228,20 +227,12 @@ SELECT current_setting('server_version') AS version,
   current_setting('max_connections')::int
     - current_setting('superuser_reserved_connections')::int AS connections,
   (SELECT count(*) FROM pg_stat_activity WHERE backend_type = 'client backend') AS taken,
-  pg_is_in_recovery() AS standby,
-  (SELECT extversion FROM pg_extension WHERE extname = 'vector') AS vector,
-  (SELECT default_version FROM pg_available_extensions WHERE name = 'vector') AS installable,
-  has_database_privilege(current_database(), 'CREATE') AS creates
-"""
-_BEHIND = """
-SELECT pg_is_in_recovery(), CASE WHEN pg_last_wal_receive_lsn() = pg_last_wal_replay_lsn() THEN 0
-  ELSE extract(epoch FROM clock_timestamp() - pg_last_xact_replay_timestamp()) END,
-  (SELECT count(*) FROM pg_stat_wal_receiver)
+  pg_is_in_recovery() AS standby
 """
 
 
 def server(settings: Settings) -> Iterator[Check]:
-    """Findings about the database server, and the replica where one is named.
+    """Yield findings about the database server.
 
     Parameters
     ----------
@@ -257,11 +248,8 @@ def server(settings: Settings) -> Iterator[Check]:
         yield from _server_settings(database, settings)
     except SceneprintError as error:
         yield Check("WRONG", "database server", str(error))
-        return
     finally:
         database.close()
-    if settings.replica_url is not None:
-        yield _replica(settings.replica_url.get_secret_value(), settings)
 
 
 def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
@@ -280,7 +268,6 @@ def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
     yield Check("ok", "database server", text)
     yield _durability(told)
     yield _connections(told, settings)
-    yield _vector(told, settings)
     yield _clock(before, there, after, settings)
 
 
@@ -324,23 +311,6 @@ def _connections(told: Mapping[str, object], settings: Settings) -> Check:
     return Check("ok", "connections", text)
 
 
-def _vector(told: Mapping[str, object], settings: Settings) -> Check:
-    wanted = settings.search == "database"
-    if told["vector"] is not None:
-        return Check("ok", "pgvector", f"{told['vector']}")
-    if told["installable"] is not None and told["creates"]:
-        text = f"{told['installable']} is installed; the first use enables it (CREATE EXTENSION)"
-        return Check("ok", "pgvector", text)
-    why = "not installed" if told["installable"] is None else "this user may not enable it"
-    text = (
-        f"{why}: each node loads the index of every map that it searches, and waits for it at "
-        "startup; everything else works. Run CREATE EXTENSION vector in this database"
-    )
-    verdict: Verdict = "WRONG" if wanted else "note"
-    return Check(verdict, "pgvector", f"{text}." if not wanted else f"{text}, or set "
-                   "SCENEPRINT_SEARCH=auto.")  # fmt: skip
-
-
 def _clock(before: float, there: float, after: float, settings: Settings) -> Check:
     """The clocks of this host and of the server, as far as the answer's way can tell."""
     apart = seconds_apart(before, there, after)
@@ -349,40 +319,6 @@ def _clock(before: float, there: float, after: float, settings: Settings) -> Che
         verdict: Verdict = "WRONG" if apart > settings.lease_s else "note"
         return Check(verdict, "clock", f"{text}. Synchronize both with a time server.")
     return Check("ok", "clock", text)
-
-
-def _replica(url: str, settings: Settings) -> Check:
-    from sceneprint.errors import SceneprintError
-    from sceneprint.store.database import known_revisions, reach_database, revision_of
-
-    try:
-        database = reach_database(url)
-    except SceneprintError as error:
-        return Check("WRONG", "replica", f"SCENEPRINT_REPLICA_URL: {error}")
-    try:
-        if database.is_sqlite:
-            text = "SCENEPRINT_REPLICA_URL is not a PostgreSQL URL. Correct it, or unset it."
-            return Check("WRONG", "replica", text)
-        with database.read() as connection:
-            standby, behind, receives = connection.exec_driver_sql(_BEHIND).one()
-            schema = revision_of(connection)
-    except SceneprintError as error:
-        text = f"{error} Until then, queries go to the primary."
-        return Check("WRONG", "replica", text)
-    finally:
-        database.close()
-    if not standby:
-        return Check("note", "replica", f"{database.shown} is a primary, not a standby")
-    if schema != known_revisions()[0]:
-        return Check("note", "replica", f"{database.shown} has schema {schema}: not used yet")
-    text = f"{database.shown} is {'some time' if behind is None else f'{behind:.1f} s'} behind"
-    if not receives:
-        text += ", and does not receive from its primary. See its log."
-        return Check("note", "replica", text)
-    if behind is None or behind > settings.replica_lag_s:
-        text += f"; SCENEPRINT_REPLICA_LAG_S is {settings.replica_lag_s:g} s: it is not used"
-        return Check("note", "replica", text)
-    return Check("ok", "replica", text)
 
 
 # What `sceneprint doctor` looks at on this machine; nothing is changed by looking.

@@ -70,12 +70,6 @@ def add_evaluate(commands: Any) -> None:
     _add_method(command)
     add_recording_options(command)
     command.add_argument("--json", type=Path, metavar="FILE", help="write all figures as JSON")
-    command.add_argument(
-        "--plots",
-        type=Path,
-        metavar="DIR",
-        help="draw curves, bars, a contact sheet and clouds into this folder",
-    )
     command.set_defaults(run=run_evaluate)
 
 
@@ -208,7 +202,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
             f"--levels {options.levels}: model {signer.model.label} has {most} levels. "
             f"Choose from 1 to {most}."
         )
-    _make_room(options)
+    _make_room(options.json)
     settings = EvaluationSettings(
         metric=options.metric,
         levels=options.levels,
@@ -233,27 +227,23 @@ def run_evaluate(options: argparse.Namespace) -> int:
             lambda match: store.frame(database[match]),
             _settings_of(options, signer.model),
         )
-        # figures first: a picture that cannot be drawn must not cost an hour's work
         if options.json is not None:
             write_whole(options.json, to_json(found))
         print(f"model {signer.model.label}: {_counts(found)}")
         print("\n".join(table(found)))
         if options.seven_scenes is not None:
             print("\n".join(["", *seven_scenes_table(found, evaluation.outcomes[0].scene)]))
-        if options.plots is not None:
-            from sceneprint.lab.evaluation.plots import save_pictures
-
-            for path in save_pictures(options.plots, evaluation, found, store, signer.model):
-                print(f"picture: {path}")
     return 0
 
 
-def _make_room(options: argparse.Namespace) -> None:
-    """Folders for what is to be written; what cannot be written must not cost an hour's work."""
-    for file in (options.json, options.plots / "accuracy.png" if options.plots else None):
-        if file is not None:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            check_writable(file)
+def _make_room(file: Path | None) -> None:
+    """Make the folder of a file that is to be written, if any, and check that it can be.
+
+    A file that cannot be written must not cost the work of an hour.
+    """
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(file)
 
 
 def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
@@ -390,8 +380,8 @@ pairs of one PATH, or of several of one scene, may overlap; pairs of two scenes 
 negatives, a quarter of them drawn from pairs with a frame that shows little but
 one plane:
   sceneprint evaluate-pairs redkitchen studyroom2 fr1_rpy --negatives 3000 --json pairs.json
-compare with Open3D (FPFH with RANSAC or FGR, then ICP), and draw curves and failures into a folder:
-  sceneprint evaluate-pairs redkitchen --baselines --out pairs
+compare with Open3D (FPFH with RANSAC or FGR, then ICP):
+  sceneprint evaluate-pairs redkitchen --baselines
 """
 
 
@@ -430,9 +420,6 @@ def add_evaluate_pairs(commands: Any) -> None:
         help="number of processes; only the times depend on it",
     )
     command.add_argument("--json", type=Path, metavar="FILE", help="write all figures as JSON")
-    command.add_argument(
-        "--out", type=Path, metavar="DIR", help="draw curves and failed pairs into this folder"
-    )
     command.set_defaults(run=run_evaluate_pairs)
 
 
@@ -481,7 +468,7 @@ def run_evaluate_pairs(options: argparse.Namespace) -> int:
     from sceneprint.lab.evaluation.report import to_json
 
     own = Settings()
-    _make_pair_room(options)
+    _make_room(options.json)
     signer = open_for(options, own)
     settings = PairSettings(
         drawing=Drawing(options.pairs, options.negatives, options.apart, options.seed),
@@ -498,25 +485,11 @@ def run_evaluate_pairs(options: argparse.Namespace) -> int:
         store = FrameStore(Path(folder))
         evaluation = evaluate_pairs(options.paths, signer, store, settings, _watch)
         found = pair_figures(evaluation, _pair_settings(options, signer.model.id))
-        # figures first: a picture that cannot be drawn must not cost an hour's work
         if options.json is not None:
             write_whole(options.json, to_json(found))
         print(f"model {signer.model.label}: {_pair_counts(found)}")
         print("\n".join(pair_table(found)))
-        if options.out is not None:
-            from sceneprint.lab.evaluation.pair_report import save_pair_pictures
-
-            for path in save_pair_pictures(options.out, evaluation, found, store):
-                print(f"picture: {path}")
     return 0
-
-
-def _make_pair_room(options: argparse.Namespace) -> None:
-    """Folders for what is to be written; what cannot be written must not cost an hour's work."""
-    for file in (options.json, options.out / "roc.png" if options.out else None):
-        if file is not None:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            check_writable(file)
 
 
 def _pair_settings(options: argparse.Namespace, model_id: str) -> dict[str, Any]:

@@ -411,8 +411,7 @@ def _print_queries(queries: Iterable[QueryRecord], *, as_json: bool) -> None:
             any_yet = True
         who = one_line(f"{one.robot or '-'}/{one.session or '-'}")
         came = f"{one.at:%Y-%m-%d %H:%M:%S}  {one.status:11}  {one.milliseconds:5.0f}"
-        late = ", offline" if one.offline else ""
-        print(f"{one.query_id}  {came}  {one.map}  {who}  {_where_or_why(one)}{late}")
+        print(f"{one.query_id}  {came}  {one.map}  {who}  {_where_or_why(one)}")
     if not any_yet and not as_json:
         print("no queries match")
 

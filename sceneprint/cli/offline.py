@@ -33,7 +33,7 @@ from sceneprint.formats.dataset import (
     write_pose,
 )
 from sceneprint.formats.export import write_ply
-from sceneprint.models import PRESETS, ModelParameters, read_model, save_model
+from sceneprint.models import PRESETS, ModelParameters, save_model
 from sceneprint.pipeline import Signature, Signer, sign
 from sceneprint.settings import Settings
 from sceneprint.types import DepthFrame
@@ -371,51 +371,6 @@ class _Bars:
             self.__exit__()
             self.stage, self.bar = stage, tqdm(desc=stage, total=total, disable=None)
         self.bar.update(done - self.bar.n)
-
-
-# `sceneprint picture`: what the geometry sees of a frame.
-
-
-def add_picture(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "picture",
-        help="draw depth, normals and patches of a frame",
-        description="Draw depth, normals as colour, and the boundaries of the surface patches "
-        "at each level.",
-    )
-    command.add_argument("path", type=Path, metavar="PATH", help="a depth image, or a folder")
-    command.add_argument("--out", type=Path, required=True, metavar="FILE.png")
-    command.add_argument(
-        "--frame",
-        type=int,
-        default=0,
-        metavar="N",
-        help="index of the frame in a folder (default: 0)",
-    )
-    add_model_options(command)
-    command.set_defaults(run=run_picture)
-
-
-def run_picture(options: argparse.Namespace) -> int:
-    """Draw one frame."""
-    from sceneprint.pictures import save_picture
-
-    if options.out.suffix.lower() != ".png":
-        raise DatasetError(
-            f"{options.out}: pictures are written as PNG. Use a file name that ends in .png."
-        )
-    frames = [frame for sequence in find_sequences(options.path) for frame in sequence.frames]
-    if not 0 <= options.frame < len(frames):
-        raise DatasetError(
-            f"{options.path}: there is no frame {options.frame}. "
-            f"Choose --frame from 0 to {len(frames) - 1}."
-        )
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    model = read_model(options.model or options.preset or PRESETS[0])
-    save_picture(frames[options.frame].read(), model, options.out)
-    print(f"{frames[options.frame].path} drawn to {options.out}")
-    return 0
 
 
 # `sceneprint synth`: synthetic rooms, or sites scanned by a laser, as a data set.

@@ -429,7 +429,7 @@ def add_reconstruct(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "reconstruct",
-        help="fuse the matches of a frame to a mesh and a picture",
+        help="fuse the matches of a frame to a mesh",
         description="Query a map with a depth frame, and let a worker fuse the accepted matches "
         "to a surface in the camera frame of the query. Exit code 1 if no match is accepted.",
     )
@@ -437,8 +437,10 @@ def add_reconstruct(commands: Any) -> None:
     command.add_argument(
         "frame", metavar="FRAME", help="a depth image, or the id of a frame of the map"
     )
-    command.add_argument("--out", type=Path, metavar="FILE", help="PLY to write (mesh.ply)")
-    command.add_argument("--picture", type=Path, metavar="FILE", help="PNG to write")
+    command.add_argument(
+        "--out", type=Path, default=Path("mesh.ply"), metavar="FILE",
+        help="PLY to write (default: mesh.ply)",
+    )  # fmt: skip
     command.add_argument(
         "--k",
         type=positive,
@@ -473,12 +475,7 @@ def add_reconstruct(commands: Any) -> None:
 
 def run_reconstruct(options: argparse.Namespace) -> int:
     """Query, reconstruct, and write the files; returns 1 where nothing could be fused."""
-    out = options.out
-    if out is None and options.picture is None:
-        out = Path("mesh.ply")
-    for path in (out, options.picture):
-        if path is not None:
-            check_writable(path)
+    check_writable(options.out)
     with open_client(options) as client:
         answer = _query(client, options)
         name = one_line(options.frame)
@@ -499,13 +496,8 @@ def run_reconstruct(options: argparse.Namespace) -> int:
                   file=sys.stderr)  # fmt: skip
             return 2
         print("\n".join([f"{name}:", *coverage_lines(made.coverage)]))
-        for path, fetch in (
-            (out, client.reconstruction_mesh),
-            (options.picture, client.reconstruction_picture),
-        ):
-            if path is not None:
-                write_whole(path, fetch(made.job_id))
-                print(f"wrote {one_line(str(path))}")
+        write_whole(options.out, client.reconstruction_mesh(made.job_id))
+        print(f"wrote {one_line(str(options.out))}")
     return 0
 
 

@@ -1,6 +1,4 @@
-"""`sceneprint spool`: frames, and records of queries, kept on disk while there is no service, and
-uploaded later.
-"""
+"""`sceneprint spool`: frames kept on disk while there is no service, and uploaded later."""
 
 from __future__ import annotations
 
@@ -23,10 +21,8 @@ from sceneprint.cli.options import (
     priority_of,
     share_of,
 )
-from sceneprint.cli.serve import add_data_option, settings_of
 from sceneprint.cli.upload import OF_FRAME, add_frame_options, meta_for, sequences_of
 from sceneprint.errors import DatasetError
-from sceneprint_client import Client
 from sceneprint_client.api.base import NOVEL
 from sceneprint_client.spool import MOST_BYTES, Spool, SpoolRefusal, SyncReport
 
@@ -38,8 +34,7 @@ def add_spool(commands: Any) -> None:
         help="keep frames on disk while there is no service, and upload them later",
         description="Keep frames in a file of bounded size while a robot is offline, and upload "
         "them when it is back. A full spool gives up the frames that are nearest to others. A "
-        "frame leaves the spool once the map has it; whatever is interrupted, run `sync` again. "
-        "Records of queries that the robot answered itself go the same way.",
+        "frame leaves the spool once the map has it; whatever is interrupted, run `sync` again.",
     )
     what = command.add_subparsers(dest="what", required=True, metavar="ACTION")
     add = what.add_parser("add", help="add frames to a spool, which is created if missing")
@@ -53,14 +48,6 @@ def add_spool(commands: Any) -> None:
     add_frame_options(add)
     add.add_argument("--every", type=positive, default=1, metavar="N", help="add every Nth frame")
     add_recording_options(add)
-    queries = what.add_parser(
-        "add-queries",
-        help="add records of the queries that were asked of this robot's copy of the maps",
-        description="Add records of the queries that programs asked of a copy of the maps "
-        "(`sceneprint pull`, `Client.embedded`), each once. Run it before the copy is replaced.",
-    )
-    _add_file(queries)
-    add_data_option(queries)
     status = what.add_parser("status", help="show what waits, and what became of the rest")
     _add_file(status)
     status.add_argument("--json", action="store_true", help="print JSON")
@@ -93,8 +80,6 @@ def run_spool(options: argparse.Namespace) -> int:
     """Do what was asked for with a spool."""
     if options.what == "add":
         return _add(options)
-    if options.what == "add-queries":
-        return _add_queries(options)
     if not options.spool.is_file():
         raise DatasetError(
             f"{options.spool}: There is no spool here. Check the path; `sceneprint spool add` "
@@ -133,29 +118,11 @@ def _add(options: argparse.Namespace) -> int:
     return 2 if errors else 0
 
 
-def _add_queries(options: argparse.Namespace) -> int:
-    """Add records of queries."""
-    folder = settings_of(options).data_dir
-    if not (folder / "sceneprint.db").is_file():
-        raise DatasetError(
-            f"{folder}: There are no maps here. Name a copy with --data; `sceneprint pull` makes "
-            "one."
-        )
-    with Client.embedded(folder) as client, Spool(options.spool) as spool:
-        new = spool.add_queries(client)
-        print(f"{new} query records added; {spool.status().queries} wait")
-    return 0
-
-
 def _status(spool: Spool, options: argparse.Namespace) -> int:
     now, refusals = spool.status(), spool.refusals()
     if options.json:
         oldest = None if now.oldest is None else now.oldest.isoformat()
-        reasons = [
-            {"name": one.name, "reason": one.reason}
-            | ({} if one.query_id is None else {"query_id": one.query_id})
-            for one in refusals
-        ]
+        reasons = [{"name": one.name, "reason": one.reason} for one in refusals]
         print(json.dumps(asdict(now) | {"oldest": oldest, "refusals": reasons}))
         return 0
     age = "" if now.oldest is None else f", the oldest of {_time(now.oldest)}"
@@ -164,19 +131,12 @@ def _status(spool: Spool, options: argparse.Namespace) -> int:
         f"{now.uploaded} uploaded, {now.refused} refused, {now.thinned} thinned, "
         f"{now.discarded} refused and discarded"
     )
-    if now.queries or now.queries_sent or now.queries_refused or now.queries_discarded:
-        print(
-            f"{now.queries} query records wait, {now.queries_sent} sent, "
-            f"{now.queries_refused} refused, {now.queries_discarded} discarded"
-        )
     for one in refusals:
         print(f"  {_name(one)}: {one_line(one.reason)}")
     return 0
 
 
 def _name(refusal: SpoolRefusal) -> str:
-    if refusal.query_id is not None:
-        return f"query {refusal.query_id}"
     return one_line(refusal.name or "a frame")
 
 
@@ -185,7 +145,7 @@ def _time(moment: datetime) -> str:
 
 
 def _sync(spool: Spool, options: argparse.Namespace) -> int:
-    """Upload; returns 2 where a frame or a record is refused."""
+    """Upload; returns 2 where a frame is refused."""
     if options.retry_refused:
         spool.retry_refused()
     before = spool.status()
@@ -210,11 +170,6 @@ def _sync(spool: Spool, options: argparse.Namespace) -> int:
             taken = now.uploaded - before.uploaded
             parts = f", {report.there} of them already there" if report and report.there else ""
             print(f"{taken} frames uploaded{parts}; {now.refused} refused, {now.waiting} wait")
-            if before.queries:
-                print(
-                    f"{now.queries_sent - before.queries_sent} query records sent; "
-                    f"{now.queries_refused} refused, {now.queries} wait"
-                )
     for one in spool.refusals():
         print(f"{_name(one)}: {one_line(one.reason)}", file=sys.stderr)
-    return 2 if now.refused or now.queries_refused else 0
+    return 2 if now.refused else 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import sys
 import time
 from collections import Counter
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from sceneprint.atomic_files import check_writable, make_folder, write_whole
+from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli import positive, whole_number
 from sceneprint.cli.options import (
     add_service_options,
@@ -29,6 +28,7 @@ from sceneprint.cli.options import (
 )
 from sceneprint.cli.serve import add_data_option, settings_of
 from sceneprint.errors import InvalidRequest
+from sceneprint.process import COMMAND, acting_as
 
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from sceneprint.settings import Settings
     from sceneprint.store import Database
     from sceneprint_client.api import Map
-    from sceneprint_client.api.admin import SnapshotFile
 
 #: What was looked at, in the order in which it is told.
 _COUNTED = (
@@ -140,7 +139,7 @@ def run_fsck(options: argparse.Namespace) -> int:
     if options.json is not None:
         check_writable(options.json)
     counts, outcomes = Counter[str](), []
-    with ended_by_signals(), _progress_bar() as progress:
+    with acting_as(COMMAND), ended_by_signals(), _progress_bar() as progress:
         for outcome in fsck(
             settings_of(options), map_name=options.map, repair=options.repair,
             quick=options.quick, progress=progress, counts=counts,
@@ -150,8 +149,8 @@ def run_fsck(options: argparse.Namespace) -> int:
             tqdm.write(_line(outcome))
     repaired = sum(each.done is not None for each in outcomes)
     if repaired:
-        with Engine(settings_of(options)) as engine:
-            engine.audit.command("fsck --repair", map_name=options.map, repaired=repaired)
+        with acting_as(COMMAND), Engine(settings_of(options)) as engine:
+            engine.audit.record("store.repaired", options.map, repaired=repaired)
     if options.json is not None:
         record = {"checked": dict(counts), "findings": [_record(each) for each in outcomes]}
         write_whole(options.json, (json.dumps(record, indent=1) + "\n").encode())
@@ -346,8 +345,6 @@ def _purge(engine: Engine) -> int:
 
 #: Damaged blobs that are named one by one.
 _SHOWN = 10
-#: Longest wait for a service to take one, seconds.
-_PATIENCE_S = 6 * 3600.0
 
 
 def add_snapshot(commands: Any) -> None:
@@ -366,21 +363,7 @@ def add_snapshot(commands: Any) -> None:
         "--out",
         type=Path,
         metavar="FILE",
-        help="archive to write, or its folder (default: SCENEPRINT_SNAPSHOT_URL, else "
-        "sceneprint-TIME.tar here)",
-    )
-    command.add_argument(
-        "--url",
-        metavar="URL",
-        help=(
-            "take the snapshot on the service at this address and download it, instead of "
-            "reading a local folder"
-        ),
-    )
-    command.add_argument(
-        "--key",
-        default=os.environ.get("SCENEPRINT_KEY") or None,
-        help="API key, if that service requires one (default: SCENEPRINT_KEY)",
+        help="archive to write, or its folder (default: sceneprint-TIME.tar here)",
     )
     command.set_defaults(run=run_snapshot)
 
@@ -394,11 +377,7 @@ def run_snapshot(options: argparse.Namespace) -> int:
     if path.is_dir():
         path = path / name
     start = time.perf_counter()
-    if options.url is not None:
-        return _fetched(options, path)
     settings = named_database(options)
-    if options.out is None and settings.snapshot_url is not None:
-        return _shelved(settings)
     with ended_by_signals(), byte_progress("snapshot") as progress:
         taken = take_snapshot(settings, path, progress)
     print(f"{one_line(str(path))}: {contents(taken)} in {time.perf_counter() - start:.1f} s")
@@ -444,52 +423,6 @@ def named_database(options: argparse.Namespace) -> Settings:
             "machine. Set PGPASSWORD, or put the whole URL into SCENEPRINT_DATABASE_URL."
         )
     return settings.model_copy(update={"database_url": SecretStr(options.database)})
-
-
-def _shelved(settings: Settings) -> int:
-    """Take a snapshot to where those of the service are; returns 1 where blobs were lost."""
-    from sceneprint.maintenance.snapshot.creation import SnapshotCatalog, new_snapshot_id
-
-    start = time.perf_counter()
-    with ended_by_signals(), byte_progress("snapshot") as progress:
-        taken = SnapshotCatalog(settings).take(new_snapshot_id(), progress)
-    return _report_snapshot(
-        taken, f"snapshot {taken.snapshot_id} in {settings.snapshot_url}", start
-    )
-
-
-def _fetched(options: argparse.Namespace, path: Path) -> int:
-    """Have a service take a snapshot, and download it; returns 1 where blobs were lost."""
-    from sceneprint.errors import InvalidRequest, SnapshotError
-    from sceneprint_client.api.admin import SnapshotFile
-
-    if options.data is not None:
-        raise InvalidRequest(
-            "--url names a service and --data a local folder. Give only one of them."
-        )
-    start = time.perf_counter()
-    with open_client(options) as client:
-        job = client.take_snapshot(wait_s=_PATIENCE_S)
-        if job.result is None:
-            why = job.error or "no worker has finished it; see `sceneprint jobs`"
-            raise SnapshotError(f"The service did not take the snapshot: job {job.job_id}: {why}")
-        taken = SnapshotFile.model_validate(job.result)
-        client.download_snapshot(taken.snapshot_id, path)
-    return _report_snapshot(taken, str(path), start)
-
-
-def _report_snapshot(taken: SnapshotFile, place: str, start: float) -> int:
-    """Say what has been taken; returns 1 where blobs were lost."""
-    print(
-        f"{one_line(place)}: {taken.maps} maps, {taken.frames} frames, {taken.blobs} blobs, "
-        f"{taken.bytes / 1e6:,.1f} MB in {time.perf_counter() - start:.1f} s"
-    )
-    if taken.damaged:
-        print(
-            f"{taken.damaged} lost blobs are not in the archive; its damaged.jsonl lists them.",
-            file=sys.stderr,
-        )
-    return 1 if taken.damaged else 0
 
 
 @contextmanager
@@ -546,7 +479,7 @@ def add_restore(commands: Any) -> None:
         "archive",
         type=Path,
         metavar="ARCHIVE",
-        help="archive of `sceneprint snapshot`, or the id of a snapshot that a service has taken",
+        help="archive of `sceneprint snapshot`",
     )
     add_data_option(command)
     add_database_option(command)
@@ -563,7 +496,8 @@ def add_restore(commands: Any) -> None:
 def run_restore(options: argparse.Namespace) -> int:
     """Verify or restore; returns 1 where blobs were damaged when the snapshot was taken."""
     settings, start = named_database(options), time.perf_counter()
-    with ended_by_signals(), _archive(options, settings) as archive:
+    archive: Path = options.archive
+    with ended_by_signals():
         if options.verify_only:
             snapshot, done, aside = *_verified(archive), None
         elif settings.database_url is not None:
@@ -581,22 +515,6 @@ def run_restore(options: argparse.Namespace) -> int:
         "them again."
     )
     return 1 if name_damaged(snapshot, advice) else 0
-
-
-@contextmanager
-def _archive(options: argparse.Namespace, settings: Settings) -> Iterator[Path]:
-    """The archive as a file; what is none may be the id of a snapshot that a service has taken."""
-    from sceneprint.maintenance.snapshot.creation import SnapshotCatalog, is_snapshot_id
-
-    named: Path = options.archive
-    if named.exists() or not is_snapshot_id(str(named)):
-        yield named
-        return
-    # of a folder that is to be made nothing may be there
-    fleet = settings.database_url is not None
-    place = settings.data_dir if fleet else settings.data_dir.absolute().parent
-    with SnapshotCatalog(settings).local(str(named), place) as archive:
-        yield archive
 
 
 def _verified(archive: Path) -> tuple[Snapshot, str]:
@@ -648,24 +566,20 @@ def _restore_to_folder(
     return snapshot, f"is restored to {one_line(str(settings.data_dir))}", aside
 
 
-# `sceneprint pull`: a robot's copy of all maps, to localise without network.
+# `sceneprint pull`: a robot's copies of maps, to localise without network.
 
 
 def add_pull(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "pull",
-        help="copy all maps of a service to this machine, to localise without network",
-        description="Download the newest snapshot that a service keeps, verify it, and make it "
-        "the data folder, all or nothing; without a newer one, nothing is downloaded. It replaces "
-        "the copy pulled before, which is moved aside only if frames were added to it, and "
-        "nothing else. Stop every process that uses the folder first. The key must be an "
-        "administrator's. The copy holds all frames and the hashes of keys: protect it. With "
-        "--map, only these maps, without uploads and keys: only what is new is downloaded, a key "
-        "that may read them suffices, and programs may use the folder meanwhile.",
+        help="copy maps of a service to this machine, to localise without network",
+        description="Copy maps of a service to a data folder, without uploads and keys. Only what "
+        "is new is downloaded. A key that may read the maps suffices, and programs may use the "
+        "folder meanwhile.",
     )
     command.add_argument(
-        "--map", action="append", metavar="NAME", help="only this map; may be repeated"
+        "--map", action="append", metavar="NAME", required=True, help="a map; may be repeated"
     )
     add_data_option(command)
     add_service_options(command)
@@ -673,52 +587,17 @@ def add_pull(commands: Any) -> None:
 
 
 def run_pull(options: argparse.Namespace) -> int:
-    """Bring a copy up to date; returns 1 where blobs were damaged when the snapshot was taken."""
-    from sceneprint.errors import SnapshotError
-    from sceneprint.maintenance.snapshot.files import staging
-    from sceneprint.maintenance.snapshot.restoration import renew_copy, snapshot_of_copy
+    """Bring copies of maps to what the service has now."""
+    from sceneprint.engine.maps.map_copy import claim_folder, pull_map
+    from sceneprint.store import open_store
 
-    settings, start = settings_of(options), time.perf_counter()
+    settings = settings_of(options)
     if settings.database_url is not None or settings.blob_url is not None:
         raise InvalidRequest(
             "SCENEPRINT_DATABASE_URL or SCENEPRINT_BLOB_URL is set, but a copy lies in its data "
             "folder. Unset them."
         )
     folder = settings.data_dir.absolute()
-    if options.map:
-        return _pull_maps(options, settings, folder)
-    held = snapshot_of_copy(folder)
-    with ended_by_signals(), open_client(options) as client:
-        newest = next(iter(client.snapshots()), None)
-        if newest is None:
-            raise SnapshotError(
-                "The service keeps no snapshot. Let it take one: `sceneprint snapshot --url`, or "
-                "POST /v1/snapshots."
-            )
-        if newest.snapshot_id == held:
-            print(f"{one_line(str(folder))} is a copy of {held}, the newest snapshot")
-            return 0
-        make_folder(folder.parent)
-        with staging(folder.parent, f".{folder.name}.pulling-") as scratch:
-            client.download_snapshot(newest.snapshot_id, scratch / "copy.tar")
-            with byte_progress("restore") as progress:
-                snapshot, aside = renew_copy(
-                    scratch / "copy.tar", folder, newest.snapshot_id, progress=progress
-                )
-    print(
-        f"{one_line(str(folder))} is a copy of {newest.snapshot_id}: {contents(snapshot)} in "
-        f"{time.perf_counter() - start:.1f} s"
-    )
-    if aside is not None:
-        print(f"frames were added to the copy before: {one_line(str(aside))}", file=sys.stderr)
-    return 1 if name_damaged(snapshot, "They cannot be found by queries of the copy.") else 0
-
-
-def _pull_maps(options: argparse.Namespace, settings: Settings, folder: Path) -> int:
-    """Bring maps of a robot's store to what the service has now."""
-    from sceneprint.engine.maps.map_copy import claim_folder, pull_map
-    from sceneprint.store import open_store
-
     claim_folder(folder)
     with ended_by_signals(), open_client(options) as client:
         store = open_store(settings.database, settings.blobs)
@@ -811,10 +690,8 @@ def run_thin(options: argparse.Namespace) -> int:
             if proposal.losses:
                 print("nothing was deleted; add --yes to delete them")
             return 0
-        with _Bar("delete") as bar:
+        with acting_as(COMMAND), _Bar("delete") as bar:
             deleted = carry_out(engine, proposal, bar.tell)
-        if deleted:
-            engine.audit.command("thin", map_name=options.map, deleted=deleted)
     left = len(proposal.losses) - deleted
     why = (
         f", {left} were not: they, or the frames that stand for them, are already gone"
@@ -938,13 +815,11 @@ def run_reencode(options: argparse.Namespace) -> int:
 
     settings = settings_of(options)
     require_database(settings)
-    with Engine(settings) as engine:
+    with acting_as(COMMAND), Engine(settings) as engine:
         if options.model is not None:
             told = engine.reencode(options.map, options.model)
-            engine.audit.command("reencode --model", map_name=options.map, model=str(options.model))
         elif options.cancel:
             told = map_lifecycle.cancel_reencoding(engine.store, options.map)
-            engine.audit.command("reencode --cancel", map_name=options.map)
         else:
             told = engine.get_map(options.map)
         if options.wait and told.reencoding is not None:

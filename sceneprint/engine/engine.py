@@ -28,10 +28,8 @@ from sceneprint.engine.maps.map_surface import MapSurfaces, SurfaceUpkeep
 from sceneprint.engine.maps.selections import FrameUndo
 from sceneprint.engine.maps.surface_job import SURFACE, SurfaceHandler
 from sceneprint.engine.reconstruction import ReconstructionJobs
-from sceneprint.engine.results.kept_answers import KeptAnswers
-from sceneprint.engine.results.query_history import QueryHistory
-from sceneprint.engine.results.result_views import Inspection, PointClouds, Rerun
-from sceneprint.engine.results.stored_results import ResultValidity, open_results
+from sceneprint.engine.results.query_log import QueryLog, SentQuery
+from sceneprint.engine.results.result_views import Inspection, PointClouds
 from sceneprint.engine.search.local_index import IndexView
 from sceneprint.engine.search.query import Queries
 from sceneprint.engine.search.retrieval import Readers
@@ -46,7 +44,7 @@ from sceneprint.engine.sessions.session_differences import (
 )
 from sceneprint.engine.signers import Signers, warm
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
-from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
+from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.engine.upkeep.purge import Purging, Retention
 from sceneprint.errors import ModelError
 from sceneprint.geometry.kernel import Cores
@@ -57,6 +55,7 @@ from sceneprint.store import frames as stored_frames
 from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import open_store, queue
+from sceneprint.store.answer_files import open_answers
 from sceneprint.store.database_errors import PATIENCE_S, open_patiently
 from sceneprint.store.deletion import remove_map
 from sceneprint.store.events import number_events
@@ -105,28 +104,19 @@ class Engine:
         from threadpoolctl import threadpool_limits
 
         self.settings = settings
-        replica = settings.replica_url
         self.store = open_store(
-            settings.database, settings.blobs,
-            None if replica is None else replica.get_secret_value(), settings.replica_lag_s,
-            settings.geometry_bytes, decoders_of(settings),
-        )  # fmt: skip
+            settings.database, settings.blobs, settings.geometry_bytes, decoders_of(settings)
+        )
         self.signers = Signers(self.store.database, settings.cache_dir)
         self._shared = open_shared(self.store, settings)
         self._upkeep = Upkeep(self.store, self.signers, settings, self._shared)
         self._reencoding = Reencodings(self.store, self._upkeep)
-        self._readers = Readers(self.signers, settings.indexes, settings.search, self._shared)
-        self._vector_tables = VectorTables(self.signers, settings.search)
-        self.kept_answers = KeptAnswers(self.store, settings)
-        self.kept = open_results(
-            settings, self.store.blobs, lambda kept: ResultValidity(self.store).asked(kept),
-            self.kept_answers.find,
-        )  # fmt: skip
-        self.inspection = Inspection(self.store, self.signers, self.kept)
+        self._readers = Readers(self.signers, settings.indexes, self._shared)
+        answers = open_answers(self.store.blobs, settings.query_dir)
+        self.query_log = QueryLog(self.store, answers, settings)
+        self.inspection = Inspection(self.store, self.signers, self.query_log)
         self._cores = Cores(settings.query_cores)
-        self.queries = Queries(self.store, self.signers, self._readers, self.kept, self._cores)
-        self.again = Rerun(self.store, self.kept, self.queries)
-        self.history = QueryHistory(self.store, settings)
+        self.queries = Queries(self.store, self.signers, self._readers, self.query_log, self._cores)
         # threads of the service work side by side, and sums have one order: the same bytes always
         self._limits = threadpool_limits(1)
         server = not self.store.database.is_sqlite
@@ -149,14 +139,14 @@ class Engine:
         self.key_uses = stored_keys.KeyUses()
         self.outputs = FrameFiles(self.store, self.signers)
         self.copies = MapCopies(self.store)
-        self.points = PointClouds(self.store, self.signers, self.inspection.pairs, self.kept)
+        self.points = PointClouds(self.store, self.signers, self.inspection.pairs, self.query_log)
         self.reconstructions = ReconstructionJobs(self.store, self.tasks)
         self.retiring = Retention(self.store, settings.deleted_rows_days)
         self.undo_limits = UndoLimits(settings.undo_s, settings.undo_bytes)
         self.undo = FrameUndo(self.store, self.bell.ring)
         self.purging = Purging(
-            self.store, self._upkeep, self.kept, self.kept_answers, self.undo,
-            self.reconstructions, self.differences, settings.purge_s,
+            self.store, self._upkeep, self.query_log, self.undo, self.reconstructions,
+            self.differences, settings.purge_s,
         )  # fmt: skip
         self._purged = time.monotonic()
         self.operations = OperatorTasks(self.store, settings, self.bell)
@@ -165,7 +155,7 @@ class Engine:
         """Give back what was opened."""
         if self._shared is not None:
             self._shared.close()
-        self.history.close()
+        self.query_log.close()
         self._limits.restore_original_limits()
         self._cores.close()
         self.bell.close()
@@ -200,7 +190,7 @@ class Engine:
 
     def delete_map(self, name: str) -> None:
         """Remove a map with all that is in it; UnknownMap where there is none."""
-        self.history.remove_of_map(name)  # most of them, without keeping other writers waiting
+        self.query_log.remove_of_map(name)  # most of them, while other writers get their turns
         with self.store.database.write() as connection:
             blobs = remove_map(connection, stored_maps.find_map(connection, name))
         self._readers.forget(name)
@@ -216,7 +206,7 @@ class Engine:
 
     def forget_gone(self) -> None:
         """Give up what is held of maps that another process deleted, and now and then of frames."""
-        self.history.tidy()  # this node may have no worker
+        self.query_log.tidy()  # this node may have no worker
         with self.store.database.read() as connection:
             if time.monotonic() - self._purged < self.settings.purge_s / 2:
                 self._readers.tidy(connection)
@@ -228,9 +218,6 @@ class Engine:
             self._shared.purge_local()
             with self.store.database.read() as connection:
                 self._readers.purge(connection)
-        self.kept.forget(
-            ResultValidity(self.store, restorable=True).all_of
-        )  # this node may have no worker
 
     # jobs
 
@@ -269,10 +256,9 @@ class Engine:
         return operations.rotate_key(self.store, name, overlap_s)
 
     def revoke_key(self, name: str) -> None:
-        """Let a key open nothing any more, and remove the records of its queries; UnknownKey."""
+        """Revoke a key; UnknownKey."""
         with self.store.database.write() as connection:
             stored_keys.revoke_key(connection, name)
-        self.history.remove_of_former_keys()  # workers remove those that are on their way
 
     def find_key(self, secret: str) -> stored_keys.KeyRow | None:
         """The key with that secret, or None; also one that has expired."""
@@ -335,11 +321,12 @@ class Engine:
     # queries
 
     def query_frame(
-        self, map_name: str, frame_id: str, query: Query, since: float | None = None
-    ) -> Answer:
+        self, map_name: str, frame_id: str, query: Query, since: float | None = None,
+        sent: SentQuery | None = None,
+    ) -> Answer:  # fmt: skip
         """Look a frame of the map up among the others; see `Queries.stored`."""
         frame = NamedFrame.model_construct(map=map_name, frame_id=frame_id)
-        return self.queries.stored([map_name], frame, query, since)
+        return self.queries.stored([map_name], frame, query, since, sent)
 
     def view(self, map_name: str) -> tuple[MapRow, Model, IndexView]:
         """A map with its model and all its signatures, as they are now; UnknownMap."""
@@ -399,10 +386,9 @@ class Engine:
         self._reencoding.run()
         self.retiring.run()
         published = self._upkeep.run()
-        self._vector_tables.run()
         self.operations.tidy()
         self.audit.tidy()
-        self.history.tidy()
+        self.query_log.tidy()
         self.imports.tidy()
         self._surface_upkeep.run()
         if self.purging.run() is not None:

@@ -1,7 +1,7 @@
 """Reconstructions: the accepted matches of an answer, fused to a surface by a worker.
 
-Kept, NewReconstruction  --begin-->  job
-job  --_fuse, in a worker-->  mesh.ply, picture.png, Coverage
+StoredAnswer, NewReconstruction  --begin-->  job
+job  --_fuse, in a worker-->  mesh.ply, Coverage
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 import numpy as np
-from sqlalchemy import Connection
+from sqlalchemy import Connection, select
 
 from sceneprint.engine.ingest.frame_decoder import read_stored
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept, Tasks
 from sceneprint.engine.maps.map_frames import living
-from sceneprint.engine.results.stored_results import ResultValidity, StoredResult
+from sceneprint.engine.results.query_log import StoredAnswer
 from sceneprint.engine.serializers import when
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import (
@@ -39,15 +39,16 @@ from sceneprint.fusion import (
     FusionParameters,
     fuse,
     open3d,
-    reconstruction_picture,
     within,
 )
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.surface.coverage import added_areas, observed_volume, of_views, share_seen
 from sceneprint.geometry.surface.depth_image import doubled
 from sceneprint.store import Store, queue
+from sceneprint.store.audit_log import record_change
+from sceneprint.store.frames import not_purged
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
-from sceneprint.store.tables import JobRow
+from sceneprint.store.tables import JobRow, frames, maps
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics
 from sceneprint_client.api import JobState, Match
 from sceneprint_client.api.surface import (
@@ -62,7 +63,7 @@ from sceneprint_client.api.surface import (
 
 # Views of an answer fused: their depth out of the store, the surface, its figures, its files.
 #
-# data of a job, geometry of the query  --fused-->  coverage, PLY, PNG
+# data of a job, geometry of the query  --fused-->  coverage, PLY
 
 Source = Literal["upload", "geometry"]
 Strength = Literal["strong", "weak"]
@@ -89,7 +90,7 @@ class JobView:
 def fused(
     store: Store, views: Sequence[JobView], query: Geometry | None, own: JobView | None,
     wanted: NewReconstruction, model_id: str, parent_frame: str, asked_at: float,
-) -> tuple[Coverage, bytes, bytes]:  # fmt: skip
+) -> tuple[Coverage, bytes]:  # fmt: skip
     """Fuse the matches of an answer, and what the query saw.
 
     Parameters
@@ -107,7 +108,6 @@ def fused(
     -------
     coverage : what became of the views
     ply : surface or cloud, in the query's camera frame, coloured by view
-    png : its picture
 
     Raises
     ------
@@ -162,10 +162,7 @@ def fused(
         mesh.points, mesh.normals, colours, mesh.triangles if as_mesh else None,
         comments=(comment,),
     )  # fmt: skip
-    named = f"{len(frames)} views, {coverage.area_m2:.1f} m², {volume:.1f} m³ observed"
-    explained = f"{coverage.query_explained:.0%} of the query explained"
-    title = named if query is None else f"{named}; {explained}"
-    return coverage, ply, reconstruction_picture(mesh, first, frames, added, title)
+    return coverage, ply
 
 
 def _own(
@@ -239,9 +236,9 @@ def _fused_view(view: JobView | None, frame: DepthFrame, source: Source) -> Fuse
 
 
 KIND = "reconstruct"
-#: Files of such a job: what the query saw, until it is fused; and what is made.
-QUERY, MESH, PICTURE = "query.geometry", "mesh.ply", "picture.png"
-MEDIA_TYPES = {MESH: "application/ply", PICTURE: "image/png"}
+#: Files of such a job: what the query saw, until it is fused; and the surface.
+QUERY, MESH = "query.geometry", "mesh.ply"
+MEDIA_TYPE = "application/ply"
 #: The query itself is where it is.
 _STILL = np.eye(4).tolist()
 
@@ -253,12 +250,12 @@ class ReconstructionJobs:
         self._store, self._tasks = store, tasks
         tasks.register(KIND, self._fuse)
 
-    def begin(self, kept: StoredResult, wanted: NewReconstruction) -> Reconstruction:
+    def begin(self, stored: StoredAnswer, wanted: NewReconstruction) -> Reconstruction:
         """Queue a reconstruction. All that it needs of the answer is copied: that may expire.
 
         Parameters
         ----------
-        kept : the answer
+        stored : the answer
         wanted : which of its views, and to what
 
         Raises
@@ -266,15 +263,15 @@ class ReconstructionJobs:
         InvalidRequest : the answer has no accepted match, or not the ones that are named.
         UnknownMap : the map is gone.
         """
-        chosen = _matches_to_fuse(kept.answer.matches, wanted)
-        views, own = [_view(match) for match in chosen], kept.answer.frame
-        maps = sorted({*(view.map for view in views), *([] if own is None else [own.map])})
+        chosen = _matches_to_fuse(stored.answer.matches, wanted)
+        views, own = [_view(match) for match in chosen], stored.answer.frame
+        names = sorted({*(view.map for view in views), *([] if own is None else [own.map])})
         data = {
-            "query_id": kept.answer.query_id,
-            "maps": maps,
+            "query_id": stored.answer.query_id,
+            "maps": names,
             "parent_frame": chosen[0].transform.child_frame if chosen[0].transform else "",
-            "model_id": kept.model_id,
-            "asked_at": kept.at,
+            "model_id": stored.model_id,
+            "asked_at": stored.at,
             "request": wanted.model_dump(mode="json"),
             "views": [asdict(view) for view in views],
             "own": None
@@ -282,13 +279,13 @@ class ReconstructionJobs:
             else asdict(JobView(own.map, own.frame_id, None, None, _STILL)),
         }
         # of several maps: the job's own page would tell who may read one of them of the others
-        of = maps[0] if len(maps) == 1 else None
+        of = names[0] if len(names) == 1 else None
         self._store.database.require_writable()
         while True:
             files = []
-            if kept.geometry is not None:
-                blob = self._store.blobs.put(kept.geometry)
-                files = [queue.JobFile(QUERY, blob, len(kept.geometry), "application/octet-stream")]
+            if (data_of_query := stored.geometry) is not None:
+                blob, size = self._store.blobs.put(data_of_query), len(data_of_query)
+                files = [queue.JobFile(QUERY, blob, size, "application/octet-stream")]
             try:
                 job, _ = self._tasks.begin(KIND, of, data, files=files)
             except Swept:
@@ -304,8 +301,8 @@ class ReconstructionJobs:
             job = _find(connection, job_id)
             return _reconstruction_record(job, queue.files_of(connection, job.number))
 
-    def file(self, job_id: str, name: str) -> queue.JobFile:
-        """A file that a reconstruction made.
+    def mesh(self, job_id: str) -> queue.JobFile:
+        """Return the file of the surface.
 
         Raises
         ------
@@ -314,11 +311,11 @@ class ReconstructionJobs:
         """
         with self._store.database.read() as connection:
             job = _find(connection, job_id)
-            found = queue.files_of(connection, job.number).get(name)
-        if found is None or name not in MEDIA_TYPES:
+            found = queue.files_of(connection, job.number).get(MESH)
+        if found is None:
             why = f": {job.error}" if job.error else "."
             raise NotIndexed(
-                f"Reconstruction {job_id} is {job.state}, and {name} exists once it has "
+                f"Reconstruction {job_id} is {job.state}, and {MESH} exists once it has "
                 f"succeeded{why}"
             )
         return found
@@ -327,13 +324,14 @@ class ReconstructionJobs:
         """Remove a reconstruction, whatever has become of it; UnknownJob where there is none."""
         with self._store.database.write() as connection:
             blobs = queue.remove_job(connection, _find(connection, job_id))
+            record_change(connection, "job.removed", None, job_id, kind=KIND)
         collect_deleted_blobs(self._store, blobs)
 
-    def forget(self, standing: ResultValidity) -> int:
+    def forget(self) -> int:
         """Remove those of which any view was deleted since: they show it; returns how many."""
         with self._store.database.read() as connection:
             found = queue.jobs_with_files(connection, KIND)
-        gone = [job for job in found if not _stands(job, standing)]
+            gone = [job for job in found if not _is_current(connection, job)]
         for job in gone:
             with suppress(UnknownJob):  # somebody else has
                 self.delete(job.id)
@@ -346,14 +344,11 @@ class ReconstructionJobs:
         wanted = NewReconstruction.model_validate(data["request"])
         views = [JobView(**view) for view in data["views"]]
         own = None if data["own"] is None else JobView(**data["own"])
-        coverage, ply, png = fused(
+        coverage, ply = fused(
             self._store, views, self._query_of(task), own, wanted, data["model_id"],
             data["parent_frame"], data["asked_at"],
         )  # fmt: skip
-        files = [
-            queue.JobFile(name, self._store.blobs.put(content), len(content), MEDIA_TYPES[name])
-            for name, content in ((MESH, ply), (PICTURE, png))
-        ]
+        files = [queue.JobFile(MESH, self._store.blobs.put(ply), len(ply), MEDIA_TYPE)]
         return SliceResult(
             over=True,
             progress={"done": len(views), "total": len(views)},
@@ -407,10 +402,22 @@ def _view(match: Match) -> JobView:
     return JobView(match.map, match.frame_id, match.rank, match.validation.strength, T.tolist())
 
 
-def _stands(job: JobRow, standing: ResultValidity) -> bool:
+def _is_current(connection: Connection, job: JobRow) -> bool:
+    """Return whether all views of a job exist, or can be restored."""
     data = job.data or {}
     views = [*data["views"], *([] if data["own"] is None else [data["own"]])]
-    return all(standing.frame(one["map"], one["frame_id"], data["asked_at"]) for one in views)
+    places = {(one["map"], one["frame_id"]) for one in views}
+    there = (
+        select(maps.c.name, frames.c.id)
+        .join(maps, maps.c.number == frames.c.map_number)
+        .where(
+            maps.c.name.in_({name for name, _ in places}),
+            frames.c.id.in_({frame_id for _, frame_id in places}),
+            frames.c.received_at <= data["asked_at"],
+            not_purged(),
+        )
+    )
+    return places <= {(row.name, row.id) for row in connection.execute(there)}
 
 
 def _find(connection: Connection, job_id: str) -> JobRow:
@@ -422,7 +429,7 @@ def _find(connection: Connection, job_id: str) -> JobRow:
 
 def _reconstruction_record(job: JobRow, files: dict[str, queue.JobFile]) -> Reconstruction:
     data, done = job.data or {}, job.state == JobState.SUCCEEDED
-    made = [files[name] for name in MEDIA_TYPES if name in files]
+    made = [files[MESH]] if MESH in files else []
     return Reconstruction(
         job_id=job.id,
         query_id=data["query_id"],

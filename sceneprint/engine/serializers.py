@@ -38,9 +38,10 @@ from sceneprint_client.poses import quaternion_of
 
 # Entity tags: short texts that change when what they stand for does.
 
-#: Columns of a frame that can be edited, beside `up`, `name` and `sequence`.
+#: Columns of a frame that can be edited.
 EDITABLE = (
-    "robot", "session", "captured_at", "tags", "pose_parent", "pose", "base_frame", "base",
+    "robot", "session", "captured_at", "tags", "pose_parent", "pose", "base_frame", "base", "up",
+    "name", "sequence",
 )  # fmt: skip
 
 
@@ -55,20 +56,14 @@ def tag_of(*parts: object) -> str:
 
 
 def frame_tag(frame: FrameRow) -> str:
-    """Stands for all of a frame that can be edited."""
-    # as it was where there is no `up` or name: a tag that somebody holds outlives the upgrade
-    up = [] if frame.up is None else [frame.up]
-    label = (frame.name, frame.sequence)
-    named = [] if label == (None, None) else [["name", *label]]
-    return tag_of("frame", [getattr(frame, name) for name in EDITABLE] + up + named)
+    """Return the entity tag of a frame, which changes with whatever can be edited."""
+    return tag_of("frame", [getattr(frame, name) for name in EDITABLE])
 
 
 def map_tag(row: MapRow) -> str:
-    """Stands for all of a map that can be edited."""
+    """Return the entity tag of a map, which changes with whatever can be edited."""
     limits = row.quota_frames, row.quota_bytes, row.retention_days
-    # as it was where there are none: a tag that somebody holds outlives the upgrade
-    known = () if limits == (None,) * 3 else limits
-    return tag_of("map", row.name, row.title, *known, *([] if row.up is None else [row.up]))
+    return tag_of("map", row.name, row.title, *limits, row.up)
 
 
 def transform(T: Floats, parent_frame: str, child_frame: str) -> Transform:

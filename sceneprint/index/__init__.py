@@ -6,9 +6,8 @@
 A generation is numbered and never changes: the signatures of the map in a few segments, each a
 FAISS file that all processes of a machine share in memory, and that the next generation most often
 shares too. A search compares all of them; a map of more than `segment.FLAT_BYTES` has sketches as
-well, which select the frames that are compared. Where Qdrant is to search, its engine selects
-them instead, over a shard beside each of these files. The database is the truth: deleting the
-folder loses nothing but the time to publish it again.
+well, which select the frames that are compared. The database is the truth: deleting the folder
+loses nothing but the time to publish it again.
 """
 
 from sceneprint.index.generation import (

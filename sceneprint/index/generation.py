@@ -29,7 +29,6 @@ from sceneprint.index.generation_files import (
     is_ours,
     manifests,
     read_manifest,
-    remove,
     write_manifest,
 )
 from sceneprint.index.segment import (
@@ -150,7 +149,6 @@ def newest(
     *,
     known: Generation | None = None,
     sound: Mapping[str, int] | None = None,
-    qdrant: Metric | None = None,
 ) -> Generation | None:
     """Open the newest sound generation of a folder.
 
@@ -164,8 +162,6 @@ def newest(
     known : a generation of this folder that is open: files that it has are not verified again,
         and where it is the newest it is returned itself
     sound : inodes, by name, of files that this process has verified before
-    qdrant : the metric of the signatures, where shards of Qdrant are to be searched, as far as
-        there are any that its engine can open; None where they are left alone
 
     Returns
     -------
@@ -177,7 +173,7 @@ def newest(
             try:
                 manifest = generation_files.read_manifest(path)
                 if (manifest.model_id, manifest.dimension) == (model_id, dimension):
-                    found = open_generation(folder, manifest, known, sound, qdrant)
+                    found = open_generation(folder, manifest, known, sound)
                     break
             except DamagedIndex as error:
                 errors.append(error)
@@ -190,14 +186,14 @@ def newest(
 
 def open_generation(
     folder: Path, manifest: GenerationManifest, known: Generation | None = None,
-    sound: Mapping[str, int] | None = None, qdrant: Metric | None = None,
+    sound: Mapping[str, int] | None = None,
 ) -> Generation:  # fmt: skip
     """Open the files of a generation.
 
     Parameters
     ----------
     folder, manifest : of the generation
-    known, sound, qdrant : see `newest`
+    known, sound : see `newest`
 
     Raises
     ------
@@ -217,7 +213,7 @@ def open_generation(
     segments = tuple(
         open_ones[record]
         if record in open_ones and known is not None and _same(known.inodes, inodes, record)
-        else open_segment(folder, record, manifest.dimension, qdrant)
+        else open_segment(folder, record, manifest.dimension)
         for record in manifest.segments
     )
     return Generation(manifest, segments, inodes)
@@ -429,7 +425,6 @@ def publish(
     flat_bytes: int = FLAT_BYTES,
     after: int = 0,
     share: Callable[[GenerationManifest], bool] = lambda _: True,
-    qdrant: Metric | None = None,
 ) -> Generation | None:
     """Publish the generation that follows `previous`.
 
@@ -455,8 +450,6 @@ def publish(
     after : its number is larger than that
     share : called with the manifest once all files are there and before it is: False where another
         generation was published by that number elsewhere, so that this one is not published
-    qdrant : the metric of the signatures, where shards of Qdrant are to choose what is compared;
-        None where FAISS does, and the metric is "l2"
 
     Returns
     -------
@@ -475,9 +468,7 @@ def publish(
         if not mine or _overtaken(folder, previous):
             return None
         listed = manifests(folder)
-        records, dimension = _write_segments(
-            folder, previous, blocks, drop, clean, flat_bytes, qdrant
-        )
+        records, dimension = _write_segments(folder, previous, blocks, drop, clean, flat_bytes)
         manifest = GenerationManifest(
             number=max(after, listed[0][0] if listed else 0) + 1,
             revision=revision,
@@ -495,12 +486,12 @@ def publish(
         _clean(folder, {own, *(path for _, path in listed[: 0 if clean else 1])})
         before = {} if previous is None else previous.inodes
         written = {name: _inode(folder / name) for name, _ in manifest.files if name not in before}
-        return open_generation(folder, manifest, previous, written, qdrant)
+        return open_generation(folder, manifest, previous, written)
 
 
 def _write_segments(
     folder: Path, previous: Generation | None, blocks: Iterable[Block], drop: frozenset[int],
-    clean: bool, flat_bytes: int, qdrant: Metric | None,
+    clean: bool, flat_bytes: int,
 ) -> tuple[tuple[SegmentFiles, ...], int]:  # fmt: skip
     """Write what is new and what it is merged with; all segments, and bytes of a signature."""
     dimension = None if previous is None else previous.manifest.dimension
@@ -508,12 +499,10 @@ def _write_segments(
     if previous is None and len(new_keys) == 0:
         raise ValueError("a generation of no frames that follows none")
     sources = segment_sources(() if previous is None else previous.segments, new_keys, stored, drop)
-    most = sketch_threshold(sources, flat_bytes) if qdrant is None else np.inf
+    most = sketch_threshold(sources, flat_bytes)
     groups = merge_plan([len(each) for each in sources])
     records = tuple(
-        write_segment(
-            folder, [sources[at] for at in group], clean=clean, flat_bytes=most, qdrant=qdrant
-        )
+        write_segment(folder, [sources[at] for at in group], clean=clean, flat_bytes=most)
         for group in reversed(groups)
     )
     return records, dimension or stored.shape[1]
@@ -561,7 +550,7 @@ def _clean(folder: Path, kept: set[Path]) -> None:
             path.unlink(missing_ok=True)
     for path in folder.iterdir():
         if is_ours(path.name) and path.name not in needed:
-            remove(path)
+            path.unlink(missing_ok=True)
 
 
 def _files(path: Path) -> tuple[tuple[str, int], ...]:

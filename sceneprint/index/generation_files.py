@@ -15,16 +15,14 @@ import mmap
 import os
 import re
 import secrets
-import shutil
 import stat
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from sceneprint.atomic_files import (
@@ -37,13 +35,8 @@ from sceneprint.atomic_files import (
 from sceneprint.errors import DamagedIndex
 from sceneprint.types import Bytes
 
-#: What the keys, the FAISS index, the sketches, the deleted keys and the shard of Qdrant of a
-#: segment are called.
-KINDS = ("keys", "faiss", "sketches", "gone", "qdrant")
-#: Of these the one that is a folder, and what in it names its files.
-FOLDER_KIND, CONTENTS = "qdrant", "contents.json"
-#: Of that list, at most: a larger one is refused unread. It takes 200 bytes a file.
-CONTENTS_BYTES = 1 << 24
+#: What the keys, the FAISS index, the sketches and the deleted keys of a segment are called.
+KINDS = ("keys", "faiss", "sketches", "gone")
 #: Bytes that are read at once where a file is checked.
 BLOCK_BYTES = 8 << 20
 _NAME = re.compile(rf"[0-9a-f]{{64}}\.({'|'.join(KINDS)})")
@@ -112,79 +105,18 @@ def put(
     return name, size
 
 
-def put_folder(folder: Path, kind: str, write: Callable[[Path], object]) -> tuple[str, int]:
-    """Have a folder of files written durably, under the name that their bytes give.
-
-    A list of the files with their lengths and CRC-32, as rows of signatures have it too, is added
-    to them, and its SHA-256 is the name. What is not in that list is no matter: a library may add
-    to its folder what it can do without.
-
-    Parameters
-    ----------
-    folder : must exist
-    kind : FOLDER_KIND
-    write : is called with an empty folder that only its owner may enter, and leaves there what is
-        wanted
-
-    Returns
-    -------
-    the name, and how many bytes the listed files have
-
-    Raises
-    ------
-    Exception : of `write`; or OSError, where it cannot be written. Nothing is left behind.
-    """
-    part = unfinished(folder)
-    try:
-        make_folder(part)
-        write(part)
-        listed, size = {}, 0
-        for path in sorted(part.rglob("*")):
-            if path.is_dir():
-                continue
-            with path.open("rb") as file:
-                length = os.fstat(file.fileno()).st_size
-                checksum = 0
-                for block in _nonzero(file.fileno(), length):
-                    checksum = crc32(block, checksum)
-                os.fsync(file.fileno())
-            listed[path.relative_to(part).as_posix()] = (length, checksum)
-            size += length
-        data = json.dumps(listed, indent=1).encode()
-        write_durable(part / CONTENTS, data)
-        for path in (*part.rglob("*"), part):
-            if path.is_dir():
-                sync_folder(path)
-        name = f"{hashlib.sha256(data).hexdigest()}.{kind}"
-        remove(folder / name)
-        os.replace(part, folder / name)  # noqa: PTH105  (the one call that is atomic by contract)
-        sync_folder(folder)
-    except BaseException:
-        remove(part)
-        raise
-    return name, size
-
-
-def remove(path: Path) -> None:
-    """Remove a file or a folder of a generation, where it is there."""
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
-
-
-def allocated(path: Path | os.DirEntry[str]) -> int:
-    """Bytes that a file of an index takes of the disk: Qdrant's have holes. 0 for a folder."""
-    try:
-        found = path.stat()
-    except OSError:  # removed meanwhile
-        return 0
-    return min(found.st_size, 512 * found.st_blocks) if stat.S_ISREG(found.st_mode) else 0
+def bytes_of(folder: Path) -> int:
+    """Return the bytes of all files below a folder; files that are removed meanwhile count 0."""
+    total = 0
+    for path in folder.rglob("*"):
+        with suppress(OSError):
+            found = path.stat()
+            total += found.st_size if stat.S_ISREG(found.st_mode) else 0
+    return total
 
 
 def check(folder: Path, name: str, size: int) -> Iterator[None]:
-    """Read a file, or a folder of files, and see that its bytes are those that its name was given
-    for.
+    """Read a file, and check that its bytes are those that its name was given for.
 
     Yields
     ------
@@ -194,14 +126,7 @@ def check(folder: Path, name: str, size: int) -> Iterator[None]:
     ------
     DamagedIndex : missing, unreadable, of another size, or with bytes that give another name.
     """
-    if is_name(name, FOLDER_KIND):
-        yield from _check_folder(folder / name, size)
-    else:
-        yield from _check_file(folder / name, size, name.partition(".")[0])
-
-
-def _check_file(path: Path, size: int, digest: str) -> Iterator[None]:
-    made = hashlib.sha256()
+    path, digest, made = folder / name, name.partition(".")[0], hashlib.sha256()
     try:
         with path.open("rb") as file:
             found = os.fstat(file.fileno()).st_size
@@ -214,63 +139,6 @@ def _check_file(path: Path, size: int, digest: str) -> Iterator[None]:
         raise DamagedIndex(f"{path}: cannot be read ({error.strerror or error}).") from error
     if made.hexdigest() != digest:
         raise DamagedIndex(f"{path}: its bytes are not those that were written.")
-
-
-def _check_sparse(path: Path, size: int, checksum: int) -> Iterator[None]:
-    made = 0
-    try:
-        with path.open("rb") as file:
-            found = os.fstat(file.fileno()).st_size
-            if found != size:
-                raise DamagedIndex(f"{path}: {found} bytes, where {size} were written.")
-            for block in _nonzero(file.fileno(), size):
-                made = crc32(block, made)
-                yield
-    except OSError as error:
-        raise DamagedIndex(f"{path}: cannot be read ({error.strerror or error}).") from error
-    if made != checksum:
-        raise DamagedIndex(f"{path}: its bytes are not those that were written.")
-
-
-#: Bytes of a file with holes that are zero together, or not.
-_PIECE = 1 << 20
-
-
-def _nonzero(descriptor: int, size: int) -> Iterator[bytes]:
-    """Where the bytes of a file are that are not zero, and these bytes, piece by piece.
-
-    Qdrant sets much more aside than it fills: what is a hole is not read, and a hole that was
-    filled with zeros is the same.
-    """
-    at, zeros = 0, bytes(_PIECE)
-    while at < size:
-        try:
-            begin = os.lseek(descriptor, at, os.SEEK_DATA)
-        except OSError as error:
-            if error.errno == errno.ENXIO:  # nothing but a hole is left
-                return
-            raise
-        end = os.lseek(descriptor, begin, os.SEEK_HOLE)
-        for at in range(begin - begin % _PIECE, end, _PIECE):
-            piece = os.pread(descriptor, _PIECE, at)
-            if piece != zeros[: len(piece)]:
-                yield b"%d " % at + piece
-        at += _PIECE
-
-
-def _check_folder(path: Path, size: int) -> Iterator[None]:
-    contents = path / CONTENTS
-    try:
-        data = contents.read_bytes() if contents.stat().st_size <= CONTENTS_BYTES else b""
-    except OSError as error:
-        raise DamagedIndex(f"{contents}: cannot be read ({error.strerror or error}).") from error
-    if hashlib.sha256(data).hexdigest() != path.name.partition(".")[0]:
-        raise DamagedIndex(f"{contents}: its bytes are not those that were written.")
-    listed: dict[str, tuple[int, int]] = json.loads(data)
-    if sum(length for length, _ in listed.values()) != size:
-        raise DamagedIndex(f"{path}: its files are not those of its generation.")
-    for name, (length, checksum) in listed.items():
-        yield from _check_sparse(path / name, length, checksum)
 
 
 def mapped(path: Path) -> mmap.mmap | bytes:

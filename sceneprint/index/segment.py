@@ -32,7 +32,6 @@ from sceneprint.index import faiss_index
 from sceneprint.index.faiss_index import codes_of, map_index, nearest
 from sceneprint.index.generation_files import (
     BLOCK_BYTES,
-    FOLDER_KIND,
     Block,
     Keys,
     Recall,
@@ -40,10 +39,8 @@ from sceneprint.index.generation_files import (
     check_block,
     mapped,
     put,
-    put_folder,
     unfinished,
 )
-from sceneprint.index.qdrant_shard import Shard, open_shard, write_shard
 from sceneprint.index.sketches import (
     NEAR,
     Sketches,
@@ -75,10 +72,6 @@ FLAT_SHARE = 1 / 8
 FEW = 8
 #: Longest answer that FAISS gives: of a longer one, ordering costs more than comparing.
 LONGEST = 2048
-
-#: Rows that Qdrant is asked for beyond those that are wanted: of the last ones, distances may be
-#: rounded alike.
-SPARE = 16
 
 #: Rows or keys of frames, and their distances.
 Found = tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -139,7 +132,6 @@ class Segment:
     sketches : of its frames; None where all of them are compared
     gone : (g,) int64, rising, of the frames that do not count: deleted since, or signed anew and
         in another segment
-    shard : of Qdrant, which chooses what is compared; None where it has none, or it is not used
     """
 
     record: SegmentFiles
@@ -147,7 +139,6 @@ class Segment:
     index: IndexScalarQuantizer
     sketches: Sketches | None
     gone: Keys
-    shard: Shard | None = None
 
     def __len__(self) -> int:
         return len(self.keys) - len(self.gone)
@@ -235,49 +226,21 @@ class Segment:
         rows: NDArray[np.int64] | None,
     ) -> Found:  # fmt: skip
         """Rows among which the nearest are, and their distances."""
-        found = None
-        if rows is None and size <= LONGEST:
-            if self.shard is not None:
-                found = self._by_shard(self.shard, query, free, count, size)
-            elif metric == "l2":
-                found = nearest(self.index, query, min(size, count), free)
-        if found is not None:
-            return found
+        if rows is None and size <= LONGEST and metric == "l2":
+            found = nearest(self.index, query, min(size, count), free)
+            if found is not None:
+                return found
         if rows is None:
             rows = np.arange(len(self.keys)) if free is None else np.flatnonzero(free)
         return rows, distances(query, self.vectors, metric, rows)
 
-    def _by_shard(
-        self, shard: Shard, query: Bytes, free: NDArray[np.bool_] | None, count: int, size: int
-    ) -> Found | None:
-        """As `_compared`, of rows that Qdrant chose; None where all have to be compared here.
 
-        More are asked for until none that it left out can be among the nearest, whatever it
-        rounded.
-        """
-        asked = size + SPARE
-        while 0 < size < count and 2 * asked <= count:
-            try:
-                rows, limit = shard.nearest(query, asked, free)
-            except DamagedIndex as error:
-                log.warning("Qdrant failed; all signatures are compared: %s", error)
-                return None
-            found = distances(query, self.vectors, shard.metric, rows)
-            if np.partition(found, size - 1)[size - 1] < limit:
-                return rows, found
-            asked *= 4
-        return None
-
-
-def open_segment(
-    folder: Path, record: SegmentFiles, dimension: int, qdrant: Metric | None = None
-) -> Segment:
+def open_segment(folder: Path, record: SegmentFiles, dimension: int) -> Segment:
     """Map the files of a segment, whose checksums the caller has checked.
 
     Parameters
     ----------
     folder, record, dimension : of the map, the segment, its signatures
-    qdrant : their metric, where Qdrant's shard is to be searched, if there is one
 
     Raises
     ------
@@ -293,13 +256,7 @@ def open_segment(
         gone = _rising_keys(names["gone"])
         if not np.isin(gone, keys).all():
             raise DamagedIndex(f"{names['gone']}: names frames that its segment has not.")
-    shard = None
-    if qdrant is not None and FOLDER_KIND in names:
-        try:
-            shard = open_shard(names[FOLDER_KIND], len(keys), dimension, qdrant)
-        except DamagedIndex as error:  # its files are sound, as they were checked
-            log.warning("Qdrant not used; all signatures are compared: %s", error)
-    return Segment(record, keys, index, sketches, gone, shard)
+    return Segment(record, keys, index, sketches, gone)
 
 
 def _rising_keys(path: Path) -> Keys:
@@ -403,9 +360,8 @@ def spool_blocks(
 
 
 def write_segment(
-    folder: Path, sources: Sequence[SegmentSource], *, clean: bool, flat_bytes: float,
-    qdrant: Metric | None = None,
-) -> SegmentFiles:  # fmt: skip
+    folder: Path, sources: Sequence[SegmentSource], *, clean: bool, flat_bytes: float
+) -> SegmentFiles:
     """Write the frames of some sources as one segment, in the order of their keys.
 
     A segment that is not to change is not read, and its files are named again.
@@ -416,7 +372,6 @@ def write_segment(
     sources : of which at least one has frames
     clean : leave nothing of frames that are gone
     flat_bytes : of signatures, above which there are sketches
-    qdrant : the metric, where it is to have a shard of Qdrant
 
     Raises
     ------
@@ -424,7 +379,7 @@ def write_segment(
     """
     only = sources[0]
     if len(sources) == 1 and only.segment is not None and not only.is_worn(clean):
-        return _renamed(folder, only.segment, only.gone, flat_bytes, qdrant)
+        return _renamed(folder, only.segment, only.gone, flat_bytes)
     keys, order = _merged_keys(sources)
     index, vectors = faiss_index.allocate(len(keys), only.vectors.shape[1])
     step, start = max(BLOCK_BYTES // vectors.shape[1], 1), 0
@@ -442,18 +397,12 @@ def write_segment(
     if vectors.nbytes > flat_bytes:
         made, recall = _put_sketches(folder, vectors)
         files.append(made)
-    if qdrant is not None:
-        files.append(_put_shard(folder, vectors, qdrant))
     return SegmentFiles(tuple(files), recall)
 
 
 def _put_sketches(folder: Path, vectors: Bytes) -> tuple[tuple[str, int], Recall]:
     made, recall = measure_sketches(make_sketches(vectors), vectors)
     return put(folder, "sketches", lambda take: write_sketches(made, take)), recall
-
-
-def _put_shard(folder: Path, vectors: Bytes, metric: Metric) -> tuple[str, int]:
-    return put_folder(folder, FOLDER_KIND, lambda path: write_shard(path, vectors, metric))
 
 
 def _merged_keys(sources: Sequence[SegmentSource]) -> tuple[Keys, NDArray[np.int64]]:
@@ -469,10 +418,8 @@ def _flat_recall(frames: int) -> Recall:
     return Recall(1.0, NEAR, 0, 0, frames)
 
 
-def _renamed(
-    folder: Path, segment: Segment, gone: Keys, flat_bytes: float, qdrant: Metric | None
-) -> SegmentFiles:
-    """The files of a segment that stays, with other frames gone; sketches or a shard if need be.
+def _renamed(folder: Path, segment: Segment, gone: Keys, flat_bytes: float) -> SegmentFiles:
+    """Return the files of a segment that stays, with other frames gone, and sketches if need be.
 
     Of a map that has become large its older segments get sketches, which no search needed before.
     """
@@ -490,11 +437,6 @@ def _renamed(
         files.append(before)
     elif len(gone):
         files.append(put(folder, "gone", lambda take: take(gone.astype("<i8").tobytes())))
-    held = segment.record.file(FOLDER_KIND)
-    if qdrant is not None and (segment.shard is None or held is None):
-        files.append(_put_shard(folder, segment.vectors, qdrant))
-    elif qdrant is not None and held is not None:
-        files.append(held)
     return SegmentFiles(tuple(files), recall)
 
 

@@ -21,7 +21,6 @@ from sqlalchemy import (
     and_,
     bindparam,
     delete,
-    insert,
     literal,
     literal_column,
     not_,
@@ -33,9 +32,8 @@ from sqlalchemy import (
 )
 from sqlalchemy.dialects import postgresql, sqlite
 
-from sceneprint.store.answer_rows import answers_of_map, remove_answers
 from sceneprint.store.database import Database
-from sceneprint.store.events import events_table, record_event, remember
+from sceneprint.store.events import record_event, record_events, remember
 from sceneprint.store.maps import ROOMLESS, count_on, next_revision
 from sceneprint.store.queue import cancel_jobs
 from sceneprint.store.tables import (
@@ -45,16 +43,16 @@ from sceneprint.store.tables import (
     deleted_frames,
     deletions,
     doomed,
+    event_values,
     frame_tags,
     frames,
     job_files,
     job_items,
     jobs,
-    kept_answer_frames,
     map_row,
     maps,
     now,
-    query_records,
+    queries,
     signatures,
     surface_frames,
     surface_tiles,
@@ -119,13 +117,10 @@ def delete_frames(
         ),
         [{"of": n, "at": last - len(living) + i} for i, n in enumerate(living, 1)],
     )  # fmt: skip
-    at, data = time.time(), {} if reason is None else {"reason": reason}
-    connection.execute(
-        insert(events_table(connection)),
-        [
-            {"at": at, "kind": "frame.deleted", "map": row.name, "frame_id": one.id, "data": data}
-            for one in found
-        ],
+    data = {} if reason is None else {"reason": reason}
+    record_events(
+        connection,
+        [event_values("frame.deleted", row.name, one.id, None, data) for one in found],
     )
     return blobs
 
@@ -139,8 +134,6 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     """
     own = select(frames.c.number).where(frames.c.map_number == row.number)
     of_map = select(jobs.c.number).where(jobs.c.map_number == row.number)
-    answers = remove_answers(connection, answers_of_map(connection, row.number))
-    doom(connection, answers)
     asked = (
         select(frames.c.blob).where(frames.c.map_number == row.number),
         select(signatures.c.geometry).where(signatures.c.frame_number.in_(own)),
@@ -151,7 +144,7 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
         ),
     )
     found = (blob for one in asked for blob in connection.execute(one).scalars())
-    referred = sorted({*answers, *found})
+    referred = sorted(set(found))
     doom_found(connection, *asked)
     connection.execute(delete(signatures).where(signatures.c.frame_number.in_(own)))
     tiles = select(surface_tiles.c.number).where(surface_tiles.c.map_number == row.number)
@@ -167,7 +160,7 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     connection.execute(delete(deletions).where(deletions.c.map_number == row.number))
     connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(own)))
     connection.execute(delete(frames).where(frames.c.map_number == row.number))
-    connection.execute(delete(query_records).where(query_records.c.map_number == row.number))
+    connection.execute(delete(queries).where(queries.c.map_number == row.number))
     connection.execute(delete(maps).where(maps.c.number == row.number))
     record_event(connection, "map.deleted", row.name)
     remember(connection, row)
@@ -183,6 +176,7 @@ BLOCK = 500
 def remove_in_blocks(
     database: Database, find: Callable[[Connection, int], Sequence[int]],
     remove: Callable[[Connection, Sequence[int]], None], most: float = math.inf,
+    block: int = BLOCK,
 ) -> int:  # fmt: skip
     """Remove rows, a block of them in each commit, so that other writers get their turns.
 
@@ -193,6 +187,7 @@ def remove_in_blocks(
         are none
     remove : removes them
     most : end when so many are removed
+    block : rows in each commit
 
     Returns
     -------
@@ -201,12 +196,12 @@ def remove_in_blocks(
     removed = 0
     while removed < most:
         with database.read() as connection:
-            numbers = find(connection, BLOCK)
+            numbers = find(connection, block)
         if numbers:
             with database.write() as connection:
                 remove(connection, numbers)
         removed += len(numbers)
-        if len(numbers) < BLOCK:
+        if len(numbers) < block:
             break
     return removed
 
@@ -322,7 +317,7 @@ def maps_with_ended(connection: Connection, before: float) -> list[MapRow]:
 def remove_ended(connection: Connection, map_number: int, before: float, limit: int) -> int:
     """Remove rows of frames of a map that ended before a time, with their jobs.
 
-    Those stay that can be restored, that an answer or a surface shows, and whose job has not ended.
+    Those stay that can be restored, that a surface shows, and whose job has not ended.
 
     Parameters
     ----------
@@ -381,7 +376,7 @@ def _unreferred() -> list[ColumnElement[bool]]:
     )
     shown = (
         select(table.c.frame_number).where(table.c.frame_number == frames.c.number)
-        for table in (deleted_frames, kept_answer_frames, surface_frames, surface_touches)
+        for table in (deleted_frames, surface_frames, surface_touches)
     )
     return [not_(one.exists()) for one in (unfinished, *shown)]
 

@@ -29,10 +29,12 @@ from sqlalchemy import (
 )
 
 from sceneprint.errors import UnusableStore
+from sceneprint.store.audit_log import append_lines
 from sceneprint.store.database import MAPS_OPTION, Database
 from sceneprint.store.tables import (
     MapRow,
     among,
+    audit_values,
     blocks,
     event_values,
     events,
@@ -48,11 +50,52 @@ def record_event(
     map_name: str | None = None,
     frame_id: str | None = None,
     job_id: str | None = None,
+    *,
+    details: Mapping[str, Any] | None = None,
     **data: Any,
 ) -> None:
-    """Note an event; `kind` is one of `KINDS` of the API."""
-    values = event_values(kind, map_name, frame_id, job_id, data)
-    connection.execute(insert(events_table(connection)).values(values))
+    """Write an event, and its line of the audit log where an actor made the change.
+
+    Parameters
+    ----------
+    connection : of the transaction of the change
+    kind : one of `KINDS` of the API
+    map_name, frame_id, job_id : that it is about
+    details : for the audit log alone
+    data : more, by kind
+    """
+    record_events(connection, [event_values(kind, map_name, frame_id, job_id, data)], details)
+
+
+def record_events(
+    connection: Connection, found: Sequence[dict[str, Any]],
+    details: Mapping[str, Any] | None = None,
+) -> None:  # fmt: skip
+    """Write events and their lines of the audit log, as `record_event`.
+
+    Parameters
+    ----------
+    connection : of the transaction of the changes
+    found : columns of each, see `event_values`
+    details : for the audit log alone, of each
+    """
+    connection.execute(insert(events_table(connection)), found)
+    append_lines(
+        connection,
+        [
+            audit_values(
+                one["kind"], one["map"],
+                one["frame_id"] or one["data"].get("name") or one["job_id"],
+                {**one["data"], **(details or {})},
+            )
+            for one in found
+            if one["kind"] not in _DISCOVERIES
+        ],
+    )  # fmt: skip
+
+
+#: Kinds of events that are no change by whoever happens to read the frame.
+_DISCOVERIES = frozenset(("frame.damaged",))
 
 
 def events_table(connection: Connection) -> Table:

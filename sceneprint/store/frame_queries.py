@@ -711,39 +711,6 @@ _OTHERS = tuple(state for state in FrameState if state != FrameState.INDEXED)
 _KEPT = tuple(state for state in FrameState if state not in ROOMLESS)
 
 
-def indexed_by_time(
-    connection: Connection, map_number: int, start: float, width_s: float
-) -> Counter[int]:
-    """How many frames that are indexed now became so in each interval since a time.
-
-    The index of times lacks the state, and reading every row for it would be slow: all are
-    counted, and those that are no longer indexed, which another index names, are taken off.
-
-    Parameters
-    ----------
-    connection : of the database
-    map_number : of the map
-    start : when the first interval begins, seconds since 1970
-    width_s : of an interval, seconds
-
-    Returns
-    -------
-    counts : by the number of the interval
-    """
-    at = frames.c.indexed_at
-    interval = (at - start) // width_s
-    asked = select(interval, func.count()).where(frames.c.map_number == map_number)
-    every = connection.execute(asked.where(at >= start).group_by(interval))
-    counts = Counter({int(place): n for place, n in every})
-    # adding 0 is how SQLite is told to go by the state
-    gone = connection.execute(
-        asked.where(frames.c.state.in_(_OTHERS), at + 0 >= start).group_by(interval)
-    )
-    for place, n in gone:
-        counts[int(place)] -= n
-    return counts
-
-
 def frames_with_uploads(
     connection: Connection, map_number: int, most: int
 ) -> tuple[list[int], int]:

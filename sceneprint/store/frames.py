@@ -10,6 +10,7 @@ from sqlalchemy import (
     Connection,
     delete,
     func,
+    or_,
     select,
     union,
     update,
@@ -27,7 +28,6 @@ from sceneprint.store.tables import (
     frame_tags,
     frames,
     job_files,
-    kept_answers,
     maps,
     now,
     signatures,
@@ -100,6 +100,12 @@ def delete_frame(
     return delete_frames(connection, row, [frame.number], deletion=deletion)
 
 
+def not_purged() -> ColumnElement[bool]:
+    """Return the condition that a frame exists, or was deleted and can be restored."""
+    restorable = frames.c.number.in_(select(deleted_frames.c.frame_number))
+    return or_(frames.c.state != FrameState.DELETED, restorable)
+
+
 def refers_to(connection: Connection, blob: str) -> bool:
     """Whether anything refers to a blob; see `referred_blobs`."""
     return bool(referred_blobs(connection, [blob]))
@@ -107,7 +113,7 @@ def refers_to(connection: Connection, blob: str) -> bool:
 
 def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
     """Those of some blobs, a thousand at most, that a frame which is there or can be restored, a
-    signature, a job, a tile or a kept answer refers to.
+    signature, a job or a tile refers to.
     """
     referring = (
         (frames.c.blob, frames.c.state.not_in(ROOMLESS)),
@@ -116,7 +122,6 @@ def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
         (surface_tiles.c.blob,),
         (surface_tiles.c.draft,),
         (deleted_frames.c.blob,),
-        (kept_answers.c.blob,),
     )
     asked = (select(column).where(column.in_(blobs), *more) for column, *more in referring)
     return set(connection.execute(union(*asked)).scalars())
@@ -203,6 +208,10 @@ def write_frame(
     return frame_of(connection, frame.number)
 
 
+#: Columns of a map whose new values are in the audit log.
+_LIMITS = ("quota_frames", "quota_bytes", "retention_days")
+
+
 def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) -> MapRow:
     """Change columns of a map: title, quotas, retention, up."""
     changed = {name: new for name, new in values.items() if getattr(row, name) != new}
@@ -210,5 +219,6 @@ def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) ->
         return row
     connection.execute(update(maps).where(maps.c.number == row.number).values(**changed))
     # not what they are: who may read the map sees it there
-    record_event(connection, "map.edited", row.name, fields=sorted(changed))
+    limits = {name: changed[name] for name in _LIMITS if name in changed}
+    record_event(connection, "map.edited", row.name, details=limits, fields=sorted(changed))
     return find_map(connection, row.name)

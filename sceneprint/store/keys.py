@@ -9,6 +9,7 @@ import time
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import (
@@ -85,7 +86,10 @@ def create_key(
             tenant=join_tenant(connection, name, tenant),
         )
     )  # fmt: skip
-    record_event(connection, "key.created", name=name)
+    record_event(
+        connection, "key.created", name=name,
+        details={"grants": dict(grants), "tenant": tenant or name, "expires_at": _iso(expires_at)},
+    )  # fmt: skip
     return secret
 
 
@@ -141,7 +145,7 @@ def rotate_key(connection: Connection, name: str, overlap_s: float) -> str:
         .where(keys.c.name == name)
         .values(digest=_digest(secret), previous_digest=previous, previous_until=until)
     )
-    record_event(connection, "key.rotated", name=name)
+    record_event(connection, "key.rotated", name=name, details={"previous_until": _iso(until)})
     return secret
 
 
@@ -176,6 +180,10 @@ def revoke_key(connection: Connection, name: str) -> None:
         raise _unknown_key(name)
     leave_tenant(connection, name, tenant)
     record_event(connection, "key.revoked", name=name)
+
+
+def _iso(seconds: float | None) -> str | None:
+    return None if seconds is None else datetime.fromtimestamp(seconds, UTC).isoformat()
 
 
 def _unknown_key(name: str) -> UnknownKey:

@@ -46,6 +46,7 @@ from sqlalchemy import (
 from sqlalchemy.sql.dml import ReturningUpdate
 from sqlalchemy.types import TypeEngine
 
+from sceneprint.store.audit_log import append_lines
 from sceneprint.store.events import events_table
 from sceneprint.store.maps import received_values, write_tags
 from sceneprint.store.tables import (
@@ -53,6 +54,8 @@ from sceneprint.store.tables import (
     TEXT,
     WHOLE,
     MapRow,
+    audit,
+    audit_values,
     event_values,
     frame_tags,
     frames,
@@ -102,16 +105,20 @@ class NewFrame:
                 "size": self.values["bytes"], "content": self.values["content_id"]}  # fmt: skip
 
     def rows(self, connection: Connection) -> dict[str, dict[str, Any]]:
-        """What is inserted of it: columns of a frame, a job and an event, and of what is kept."""
+        """Return the columns of its frame, job and event; of its line of the audit log and of its
+        idempotency key, where it has them.
+        """
         number = self.row.number
         job = self.context.run(job_values, connection, "sign", self.priority)
         told = event_values("frame.received", self.row.name, self.frame_id, self.job_id, {})
+        line = self.context.run(audit_values, told["kind"], self.row.name, self.frame_id, {})
         rows = {
             "frame": received_values(connection, number, self.frame_id, self.values),
             "job": {**job, "id": self.job_id, "map_number": number},
             "event": told,
         }
-        return rows if self.kept is None else {**rows, "kept": self.kept}
+        optional = {"line": line, "kept": self.kept}
+        return {**rows, **{of: row for of, row in optional.items() if row is not None}}
 
 
 def receive_frames(connection: Connection, given: Sequence[NewFrame]) -> set[str]:
@@ -146,8 +153,10 @@ def receive_frames(connection: Connection, given: Sequence[NewFrame]) -> set[str
         for of, values in row.items():
             names.setdefault(of, {}).update(dict.fromkeys(values))
     fixed = {key: rows[0][of][name] for of, name, key in _keys(names) if key in _FIXED}
+    columns = tuple((of, tuple(names[of])) for of in ("frame", "job", "event", *_OPTIONAL)
+                    if of in names)  # fmt: skip
     asked = _reception(
-        events_table(connection), *map(tuple, names.values()), fixed=tuple(fixed.items()),
+        events_table(connection), columns, fixed=tuple(fixed.items()),
         tagged=any(one.tags for one in first),
     )  # fmt: skip
     records = [_record(i, *one) for i, one in enumerate(zip(first, rows, strict=True))]
@@ -165,6 +174,7 @@ def _received(connection: Connection, one: NewFrame) -> bool:
     write_tags(connection, number, one.tags)
     connection.execute(insert(jobs).values(frame_number=number, **rows["job"]))
     connection.execute(insert(events_table(connection)).values(rows["event"]))
+    append_lines(connection, [rows.get("line")])
     return True
 
 
@@ -216,7 +226,11 @@ _FIXED = frozenset(
 #: Those whose values are another's.
 _SAME = {
     "job_map_number": "frame_map_number", "event_frame_id": "frame_id", "event_job_id": "job_id",
+    "line_at": "event_at", "line_tenant": "job_tenant", "line_action": "event_kind",
+    "line_map": "event_map", "line_target": "frame_id", "line_data": "event_data",
 }  # fmt: skip
+#: What not every new frame has, each with a column that is null where it is missing.
+_OPTIONAL = {"line": "actor", "kept": "key"}
 
 
 def _keys(names: Mapping[str, Iterable[str]]) -> Iterator[tuple[str, str, str]]:
@@ -236,24 +250,24 @@ def _record(place: int, one: NewFrame, rows: dict[str, dict[str, Any]]) -> dict[
 
 @cache
 def _reception(
-    told: Table, of_frame: tuple[str, ...], of_job: tuple[str, ...], of_event: tuple[str, ...],
-    of_kept: tuple[str, ...] = (), *, fixed: tuple[tuple[str, Any], ...], tagged: bool,
+    told: Table, columns: tuple[tuple[str, tuple[str, ...]], ...], *,
+    fixed: tuple[tuple[str, Any], ...], tagged: bool,
 ) -> Select[Any]:  # fmt: skip
-    """Frames taken with their jobs, events and tags, and with what is remembered of requests.
+    """Return the statement that takes frames with their jobs, events, tags, lines of the audit log
+    and idempotency keys.
 
     Parameters
     ----------
-    told : where events are inserted
-    of_frame, of_job, of_event, of_kept : columns of each row
+    told : table that events are inserted into
+    columns : names of the columns of each row
     fixed : values of columns by their keys, the same for all
     tagged : whether a frame has a tag
     """
-    tables = {"frame": (frames, of_frame), "job": (jobs, of_job), "event": (told, of_event)}
-    if of_kept:
-        tables["kept"] = (idempotency, of_kept)
+    of = {"frame": frames, "job": jobs, "event": told, "line": audit, "kept": idempotency}
+    tables = {name: (of[name], names) for name, names in columns}
     known = dict(fixed)
     given = _given(tables)
-    lacking = _lacking(given, kept=bool(of_kept))
+    lacking = _lacking(given, kept="kept" in tables)
     room = _rooms_taken(lacking)
     has_room = and_(room.c.number == lacking.c.frame_map_number,
                     room.c.name == lacking.c.event_map)  # fmt: skip
@@ -271,9 +285,9 @@ def _reception(
         tag = func.json_array_elements_text(lacking.c.tags)
         rows = select(new.c.number, tag).select_from(taken)
         others.append(insert(frame_tags).from_select(["frame_number", "tag"], rows))
-    if of_kept:
-        is_kept = lacking.c.kept_key.is_not(None)
-        others.append(_inserted("kept", tables, known, lacking, taken, is_kept))
+    for name in (one for one in _OPTIONAL if one in tables):
+        is_there = lacking.c[f"{name}_{_OPTIONAL[name]}"].is_not(None)
+        others.append(_inserted(name, tables, known, lacking, taken, is_there))
     return select(new.c.id).add_cte(*(one.cte(f"other_{i}") for i, one in enumerate(others)))
 
 
@@ -346,9 +360,10 @@ def _inserted(
         key = f"{of}_{name}"
         if key in _STAMPED:
             return STATEMENT_TIME
+        key = _SAME.get(key, key)
         if key in fixed:
             return literal(fixed[key], _kind(table.c[name].type))
-        sent, kind = lacking.c[_SAME.get(key, key)], table.c[name].type
+        sent, kind = lacking.c[key], table.c[name].type
         if isinstance(kind, JSON) and not kind.none_as_null:  # a record's null is that of SQL
             return func.coalesce(sent, literal_column("CAST('null' AS json)"))
         return sent

@@ -25,7 +25,6 @@ from sceneprint.errors import DamagedSignature
 from sceneprint.store import reencoding_rows
 from sceneprint.store.events import events_table
 from sceneprint.store.maps import next_revision
-from sceneprint.store.postgres import vectors
 from sceneprint.store.queue import PENDING
 from sceneprint.store.surface_rows import mark_edited, note_edit
 from sceneprint.store.tables import (
@@ -91,9 +90,8 @@ def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) 
 
 
 def index_claimed_frame(
-    connection: Connection, job: JobRow, frame: FrameRow, map_name: str, made: StoredSignature,
-    *, single: bool = False,
-) -> bool:  # fmt: skip
+    connection: Connection, job: JobRow, frame: FrameRow, map_name: str, made: StoredSignature
+) -> bool:
     """End a job and index its frame in one statement, as most signatures are on PostgreSQL: the
     map's other writers wait for each round trip.
 
@@ -103,13 +101,11 @@ def index_claimed_frame(
     job : as it was claimed, of that frame
     frame, made : see `index_frame`
     map_name : of the frame's map
-    single : whether the transaction has no room for another statement
 
     Returns
     -------
     done : False, and nothing was written, on SQLite; where the job is not held any more; where
-        the map has another model, or is to have one: then what else has to be done must be found;
-        and where another statement would be needed, as pgvector searches the map
+        the map has another model, or is to have one: then what else has to be done must be found
     """
     if connection.dialect.name == "sqlite":
         return False
@@ -119,15 +115,11 @@ def index_claimed_frame(
         "frame": frame.number, "model": made.model_id, "vector": made.vector,
         "checksum": crc32(made.vector), "geometry": made.geometry,
         "n_patches": json.dumps(list(made.n_patches)), "n_pairs": json.dumps(list(made.n_pairs)),
-        "vectors": vectors.table_of(len(made.vector)), "indexed_at": time.time(), **told,
-        "data": json.dumps(told["data"]), "single": single,
+        "indexed_at": time.time(), **told,
+        "data": json.dumps(told["data"]),
     }  # fmt: skip
-    found = connection.execute(_index_claimed(events_table(connection).name), values).first()
-    if found is None:
-        return False
-    if found.has_vectors:
-        vectors.put(connection, frame.number, made.model_id, len(made.vector))
-    return True
+    statement = _index_claimed(events_table(connection).name)
+    return connection.execute(statement, values).first() is not None
 
 
 @cache
@@ -139,7 +131,7 @@ def _index_claimed(events_name: str) -> TextClause:
                 leased_until = NULL, finished_at = extract(epoch FROM statement_timestamp())
             WHERE number = :job AND token = :token AND worker = :worker
                 AND state = '{JobState.RUNNING}'
-                AND NOT (:single AND to_regclass(:vectors) IS NOT NULL) AND EXISTS (
+                AND EXISTS (
                     SELECT FROM maps WHERE number = :map_number AND model_id = :model
                         AND next_model_id IS NULL)
             RETURNING number
@@ -164,7 +156,7 @@ def _index_claimed(events_name: str) -> TextClause:
             INSERT INTO {events_name} (at, kind, map, frame_id, job_id, data)
             SELECT :at, :kind, :map, :frame_id, :job_id, cast(:data AS json) FROM revised
         )
-        SELECT to_regclass(:vectors) IS NOT NULL AS has_vectors FROM revised
+        SELECT revision FROM revised
         """
     )
 
@@ -199,7 +191,7 @@ def replace_signature(connection: Connection, frame: FrameRow, made: StoredSigna
 
 
 def _write_signature(connection: Connection, frame: FrameRow, made: StoredSignature) -> None:
-    """Store a signature and its vector in place of those that the model made before."""
+    """Store a signature in place of the one that the model made before."""
     own = (signatures.c.frame_number == frame.number) & (signatures.c.model_id == made.model_id)
     connection.execute(delete(signatures).where(own))
     put_signatures(connection, [(frame.number, made)])
@@ -216,8 +208,6 @@ def put_signatures(connection: Connection, made: Sequence[tuple[int, StoredSigna
         for number, one in made
     ]  # fmt: skip
     connection.execute(insert(signatures), rows)
-    for number, one in made:
-        vectors.put(connection, number, one.model_id, len(one.vector))
 
 
 def changes_since(

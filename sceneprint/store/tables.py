@@ -39,7 +39,6 @@ from sqlalchemy import (
     bindparam,
     cast,
     extract,
-    false,
     func,
     literal,
     literal_column,
@@ -47,7 +46,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from sceneprint.process import current_tenant, request_id, traceparent
+from sceneprint.process import current_actor, current_tenant, request_id
 from sceneprint_client.api import FrameState, JobState
 from sceneprint_client.api.frames import Kind
 
@@ -140,7 +139,6 @@ frames = Table(
     Index(None, "map_number", "content_id"),
     Index(None, "map_number", "revision"),
     Index(None, "map_number", "number"),
-    Index(None, "map_number", "indexed_at"),
     Index(  # all that a filter asks about: rows need not be read for it
         "ix_frames_searched",
         "map_number",
@@ -333,39 +331,22 @@ idempotency = Table(
     Index(None, "created_at"),
 )
 
-#: Who changed what.
+#: Who changed what, a line for each change; append-only.
 audit = Table(
     "audit",
     metadata,
     Column("number", WHOLE, primary_key=True),
     Column("at", Float, nullable=False),
-    Column("actor", _string(128), nullable=False),
+    Column("actor", _string(128), nullable=False),  # name of the key; "" where none is required
     Column("address", _string(64)),
-    Column("action", _string(64), nullable=False),
+    Column("tenant", _string(128), nullable=False),
+    Column("action", _string(32), nullable=False),
     Column("map", _string(63)),
     Column("target", _string(128)),
     Column("request_id", _string(64)),
     Column("data", JSON, nullable=False),
-    # the chain that the line is part of, its place there, and its hash; null: of before version 0.3
-    Column("tenant", _string(128)),
-    Column("refused", Boolean),
-    Column("sequence", WHOLE),
-    Column("hash", _string(64)),
-    Index("uq_audit_tenant_refused_sequence", "tenant", "refused", "sequence", unique=True),
-    Index(None, "at"),
+    Index(None, "tenant", "number"),
     sqlite_autoincrement=True,
-)
-
-#: Chains of the audit log: changes and refusals of each tenant. What was pruned ends in `anchor`.
-audit_chains = Table(
-    "audit_chains",
-    metadata,
-    Column("tenant", _string(128), primary_key=True),
-    Column("refused", Boolean, primary_key=True),
-    Column("pruned", WHOLE, nullable=False),  # place of the last line that is gone; 0: none is
-    Column("anchor", _string(64), nullable=False),  # hash of that line
-    Column("last", WHOLE, nullable=False),  # place of the newest line
-    Column("head", _string(64), nullable=False),  # its hash
 )
 
 #: One row: the oldest revision whose processes may write to this schema.
@@ -413,18 +394,18 @@ former_maps = Table(
     Index(None, "number"),
 )
 
-#: What came of each query, in short, for some time.
-query_records = Table(
-    "query_records",
+#: Queries and their outcomes, for some time, and their answers while there is room.
+queries = Table(
+    "queries",
     metadata,
     Column("number", WHOLE, primary_key=True),
-    Column("id", _string(32), nullable=False),  # of the answer
+    Column("id", _string(32), nullable=False, unique=True),  # of the answer
     Column("at", Float, nullable=False),  # when the query came
     Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
-    Column("maps", JSON(none_as_null=True)),  # names of all that were asked; null: this one alone
+    Column("maps", JSON(none_as_null=True)),  # names of all maps searched; null: this one alone
     Column("robot", _string(128)),
     Column("session", _string(128)),
-    Column("key_id", _string(32)),  # of the key that was shown
+    Column("key_id", _string(32)),  # of the key that the request came with
     Column("status", _string(16), nullable=False),
     Column("cause", _string(64)),
     Column("reason", TEXT, nullable=False),
@@ -435,22 +416,29 @@ query_records = Table(
     Column("alternatives", WHOLE, nullable=False),
     Column("milliseconds", Float, nullable=False),
     Column("kind", _string(8)),
-    Column("frame_map", _string(63)),  # the stored frame that was asked for
+    Column("frame_map", _string(63)),  # the stored frame that was the query
     Column("frame_id", _string(64)),
-    Column("kept", Boolean, nullable=False),  # whether its answer was to be kept
-    # a robot answered it itself, and sent the record later
-    Column("offline", Boolean, nullable=False, server_default=false()),
+    Column("listed", Boolean, nullable=False),  # false: stored only to look at its answer
+    Column("kept_at", Float),  # since when the answer is kept; null: it expires
+    Column("title", _string(200)),  # of a kept answer
+    Column("shown", JSON(none_as_null=True)),  # numbers of the frames that the answer shows
+    Column("bytes", BigInteger, nullable=False),  # of the answer; 0: it is not stored
+    Column("answer", LargeBinary),  # of a kept one; others are files, see `answer_files`
     Index(None, "at", "number"),
     Index(None, "map_number", "at", "number"),
     Index(None, "map_number", "status", "at", "number"),
     Index(None, "robot", "at", "number"),
-    Index(None, "key_id"),
     sqlite_autoincrement=True,
 )
-#: Records that robots send, each once.
+#: Stored answers by age, and kept ones: few among many rows.
 Index(
-    "ix_query_records_offline", query_records.c.map_number, query_records.c.id, unique=True,
-    sqlite_where=literal_column("offline = 1"), postgresql_where=literal_column("offline"),
+    "ix_queries_stored", queries.c.at, queries.c.number, queries.c.bytes,
+    sqlite_where=literal_column("bytes > 0"), postgresql_where=literal_column("bytes > 0"),
+)  # fmt: skip
+Index(
+    "ix_queries_kept", queries.c.map_number, queries.c.at, queries.c.number,
+    sqlite_where=literal_column("kept_at IS NOT NULL"),
+    postgresql_where=literal_column("kept_at IS NOT NULL"),
 )  # fmt: skip
 
 #: The fused surface of a map: where its making stands.
@@ -527,44 +515,6 @@ surface_touches = Table(
     "surface_touches",
     metadata,
     Column("tile_number", WHOLE, ForeignKey("surface_tiles.number"), primary_key=True),
-    Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
-    Index(None, "frame_number"),
-)
-
-#: Answers of queries that are kept until they are released; the blob is as `stored_results` has it.
-kept_answers = Table(
-    "kept_answers",
-    metadata,
-    Column("number", WHOLE, primary_key=True),
-    Column("id", _string(32), nullable=False, unique=True),  # of the answer
-    Column("blob", _string(64), nullable=False),
-    Column("bytes", BigInteger, nullable=False),
-    Column("title", _string(200)),
-    Column("kept_at", Float, nullable=False),
-    Column("until", Float),  # null: until it is released
-    Column("at", Float, nullable=False),  # when the query came; this and the next: as `record`
-    Column("status", _string(16), nullable=False),
-    Column("robot", _string(128)),
-    Column("record", JSON, nullable=False),  # what lists tell of the query
-    Index(None, "blob"),
-    Index(None, "at", "number"),
-    sqlite_autoincrement=True,
-)
-
-#: The maps that a kept answer was asked of: it goes with any of them, and counts in each.
-kept_answer_maps = Table(
-    "kept_answer_maps",
-    metadata,
-    Column("kept_number", WHOLE, ForeignKey("kept_answers.number"), primary_key=True),
-    Column("map_number", WHOLE, ForeignKey("maps.number"), primary_key=True),
-    Index(None, "map_number", "kept_number"),
-)
-
-#: The frames that a kept answer shows: it goes with any of them.
-kept_answer_frames = Table(
-    "kept_answer_frames",
-    metadata,
-    Column("kept_number", WHOLE, ForeignKey("kept_answers.number"), primary_key=True),
     Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
     Index(None, "frame_number"),
 )
@@ -852,13 +802,27 @@ def job_values(
 
 
 def request_data() -> dict[str, Any] | None:
-    """What a job keeps of the request that queues it; None outside of one."""
+    """Return what a job keeps of the request that queues it; None outside of one."""
     if request_id() is None:
         return None
-    data: dict[str, Any] = {"request_id": request_id()}  # whose log its worker's lines belong to
-    if (parent := traceparent()) is not None:
-        data["traceparent"] = parent
-    return data
+    return {"request_id": request_id()}  # the worker's log lines name it
+
+
+def audit_values(
+    action: str, map_name: str | None, target: str | None, data: dict[str, Any]
+) -> dict[str, Any] | None:
+    """Return the columns of a line of the audit log for a change by the current actor.
+
+    None of a worker: what it carries out has a line from when it was requested.
+    """
+    actor = current_actor()
+    if actor is None:
+        return None
+    return {
+        "at": time.time(), "actor": actor.name, "address": actor.address,
+        "tenant": current_tenant(), "action": action, "map": map_name, "target": target,
+        "request_id": request_id(), "data": data,
+    }  # fmt: skip
 
 
 def event_values(

@@ -14,28 +14,24 @@ from pydantic import BaseModel, Field, ValidationError
 from sceneprint import __version__
 from sceneprint.engine import Engine
 from sceneprint.engine.admin import operations
-from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.maps import map_lifecycle
 from sceneprint.errors import InvalidRequest, UnsupportedType
-from sceneprint.maintenance.snapshot.creation import SNAPSHOT, SnapshotCatalog
+from sceneprint.store.audit_log import AuditFilter
 from sceneprint.store.events import newest_number
-from sceneprint_client.api import Job, JobState, Map, Page
+from sceneprint_client.api import Map, Page
 from sceneprint_client.api.admin import (
-    Audited,
+    AuditLine,
     Key,
     MadeKey,
     Me,
     ModelInfo,
     NewKey,
     NewModel,
-    ReplicaSeen,
-    SnapshotFile,
     Stats,
 )
 from service.auth import Asking, Guest, Here, administers, may_admin, reads_every, v1_router
 from service.bodies import media_type, read_json
 from service.problems import declared, invalid
-from service.responses import files, send_file
 
 router = APIRouter(tags=["operations"])
 
@@ -58,9 +54,6 @@ class Readiness(Health):
         description="How many are in each state; null for who may not read all maps."
     )
     jobs: dict[str, int] | None = Field(description="As `frames`.")
-    replica: str | None = Field(
-        default=None, description="What queries are answered from, where there is a read replica."
-    )
 
 
 @router.head("/healthz", include_in_schema=False)  # as balancers ask
@@ -101,16 +94,7 @@ def _look(engine: Engine) -> Readiness:
         read_only=engine.store.read_only,
         frames=None,
         jobs=None,
-        replica=_replica(engine.operations.statistics.replica()),
     )
-
-
-def _replica(seen: ReplicaSeen | None) -> str | None:
-    if seen is None:
-        return None
-    if not seen.used:
-        return "the replica is not in use: queries read the primary"
-    return f"queries read a replica, which is at most {seen.behind_s:.1f} s behind"
 
 
 @router.get(
@@ -123,7 +107,7 @@ def metrics(here: Here) -> Response:
     """Figures for Prometheus; a key, where one is asked for, must have `read` for `*`."""
     figures = here.engine.operations.statistics.figures()
     held, spool = here.requests.by_tenant(), here.spool.by_tenant()
-    text = here.metrics.text(figures, here.feed.streams, here.engine.history.lost, held, spool)
+    text = here.metrics.text(figures, here.feed.streams, here.engine.query_log.lost, held, spool)
     return Response(text, media_type=CONTENT_TYPE_LATEST)
 
 
@@ -157,7 +141,6 @@ async def create_key(request: Request, here: Here, response: Response) -> MadeKe
     make = partial(here.engine.create_key, new.name, new.grants, new.expires_at, new.tenant)
     made = await here.run(make)
     response.headers["Location"] = f"/v1/keys/{quote(made.name, safe='')}"
-    request.state.audited = made.model_dump(mode="json", include={"grants", "expires_at", "tenant"})
     return made
 
 
@@ -186,7 +169,6 @@ def me(asking: Asking) -> Me:
 def rotate_key(
     key_name: Annotated[str, Path(description="Of the key.")],
     here: Here,
-    request: Request,
     overlap_s: Annotated[
         float,
         Query(
@@ -200,9 +182,7 @@ def rotate_key(
 
     Rotated again within the overlap, the secret in use keeps its end, and the new one is replaced.
     """
-    made = here.engine.rotate_key(key_name, overlap_s)
-    request.state.audited = made.model_dump(mode="json", include={"previous_until"})
-    return made
+    return here.engine.rotate_key(key_name, overlap_s)
 
 
 @keys_router.delete(
@@ -225,16 +205,18 @@ def list_changes(
     map_name: Annotated[
         str | None, Query(alias="map", max_length=63, description="That was changed.")
     ] = None,
+    action: Annotated[
+        str | None,
+        Query(max_length=32, description="Beginning of the action, such as `key.` or `refused`."),
+    ] = None,
     cursor: Cursor = None,
     limit: Limit = 100,
-) -> Page[Audited]:
-    """Who changed what, and who was refused (401, 403), the newest first: all but uploads of
-    frames, which the events tell of.
+) -> Page[AuditLine]:
+    """List who changed what, and which requests were refused (401, 403), the newest first.
 
-    Lines are kept for `SCENEPRINT_AUDIT_KEPT_DAYS`; of each tenant at most 200,000 changes and as
-    many refusals. `sceneprint audit verify` checks their hashes.
+    Lines are kept for `SCENEPRINT_AUDIT_KEPT_DAYS`, and at most a million of each tenant.
     """
-    return here.engine.audit.page(cursor, limit, actor, map_name)
+    return here.engine.audit.page(AuditFilter(actor, map_name, action), cursor, limit)
 
 
 def _new(given: object) -> NewKey:
@@ -330,51 +312,3 @@ def _wanted(given: object) -> NewModel:
         return NewModel.model_validate(given)
     except ValidationError as error:
         raise invalid(error, "The model") from error
-
-
-# Snapshots of the data folder, taken by a worker while all goes on.
-
-snapshots_router = v1_router("/snapshots", "operations", administers)
-
-
-@snapshots_router.post("", status_code=202, responses=declared())
-def take_snapshot(here: Here, response: Response) -> Job:
-    """Have a snapshot taken of all maps: database and blobs, one state of both, in one archive.
-
-    Ask for the job until it has succeeded: `result` is the snapshot then. One that waits its turn
-    already is not queued twice. Restoring is for the operator: `sceneprint restore`.
-    """
-    waiting = lifecycle.list_jobs(here.engine.store, JobState.QUEUED, limit=1, kind=SNAPSHOT).items
-    job = waiting[0] if waiting else here.engine.tasks.begin(SNAPSHOT, None, {})[0]
-    response.headers["Location"] = f"/v1/jobs/{job.job_id}"
-    return job
-
-
-@snapshots_router.get("", responses=declared())
-def list_snapshots(here: Here) -> Page[SnapshotFile]:
-    """Snapshots that were taken over the service, the newest first: all in one page."""
-    return Page[SnapshotFile](items=list(SnapshotCatalog(here.engine.settings).list()))
-
-
-@snapshots_router.get(
-    "/{snapshot_id}",
-    response_class=Response,
-    responses=files(["application/x-tar"], "The archive, for `sceneprint restore`."),
-)
-def get_snapshot(snapshot_id: str, request: Request, here: Here) -> Response:
-    """The archive. It holds all frames and the hashes of keys: keep it as you keep the folder.
-
-    With `Range` a download goes on where it broke off.
-    """
-    shelf = SnapshotCatalog(here.engine.settings)
-    found = shelf.find(snapshot_id)
-    name = f"sceneprint-{snapshot_id}.tar"
-    return send_file(
-        request, lambda: shelf.open(snapshot_id), "application/x-tar", found.sha256, name
-    )
-
-
-@snapshots_router.delete("/{snapshot_id}", status_code=204, responses=declared(404))
-def delete_snapshot(snapshot_id: str, here: Here) -> None:
-    """Remove a snapshot. A download that is under way goes on."""
-    SnapshotCatalog(here.engine.settings).delete(snapshot_id)

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 from fastapi import Depends, Query, Request, Response
 
 from sceneprint_client.api import Page
-from sceneprint_client.api.base import Label
 from sceneprint_client.api.coverage import (
     CoverageChanges,
     CoverageFrame,
@@ -18,11 +17,9 @@ from sceneprint_client.api.coverage import (
 from service.auth import Here, may_read, may_write, v1_router
 from service.bodies import read_record
 from service.problems import declared
-from service.responses import file_responses, look, sent
 
 router = v1_router("/maps/{map_name}/coverage", "coverage", may_read)
 
-_PNG = "image/png"
 _BODY: dict[str, Any] = {
     "required": False,
     "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewMapCoverage"}}},
@@ -107,28 +104,3 @@ def get_coverage_changes(
 ) -> CoverageChanges:
     """Which cells became better or worse since an earlier result; 409 until both succeeded."""
     return here.engine.coverage.changes(map_name, job_id, since)
-
-
-@router.get(
-    "/{job_id}/plan.png",
-    response_class=Response,
-    responses=file_responses(
-        _PNG,
-        description="A plan seen from above: cells coloured by outcome, queried frames as dots, "
-        "lines to their look-alikes, a scale bar.",
-        statuses=(404, 409, 422),
-    ),
-)
-async def get_coverage_plan(
-    map_name: str,
-    job_id: str,
-    request: Request,
-    here: Here,
-    parent_frame: Annotated[
-        Label | None,
-        Query(description="Of the plan; default: the one of most queried frames."),
-    ] = None,
-) -> Response:
-    """A plan as a picture; 409 until the job has succeeded."""
-    output = await look(here, lambda: here.engine.coverage.picture(map_name, job_id, parent_frame))
-    return await sent(request, here, output, _PNG, f"coverage-{job_id[:12]}.png")

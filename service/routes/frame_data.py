@@ -42,7 +42,8 @@ from service.responses import (
     sent,
     tagged,
 )
-from service.routes.results import MapName, readable_answer
+from service.routes.queries import require_readable
+from service.routes.results import MapName
 
 router = v1_router("/maps/{map_name}/frames/{frame_id}", "frames", may_read)
 
@@ -221,7 +222,7 @@ async def get_query_points(
     query_id: str, request: Request, here: Here, asking: Asking, limit: Limit = LIMIT
 ) -> Response:
     """The surface that a query saw, for a page to draw, in the query's sensor's frame."""
-    await here.run(readable_answer, query_id, here, asking)
+    await here.run(require_readable, query_id, here, asking)
     found = await look(here, lambda: here.engine.points.query(query_id, limit))
     return await sent(request, here, found, MEDIA_TYPE)
 
@@ -257,7 +258,7 @@ async def get_match_points(
     """The query or a match of it, for a page to draw, each in its own sensor's frame; every point
     says how far it is from the surface that the other saw.
     """
-    await here.run(readable_answer, query_id, here, asking)
+    await here.run(require_readable, query_id, here, asking)
     clouds = here.engine.points
     found = await look(
         here, lambda: clouds.match(query_id, frame_id, map_name, side, transform, limit)

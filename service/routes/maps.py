@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from fastapi import Depends, Query, Request, Response
 from pydantic import ValidationError
 
-from sceneprint.engine.maps.map_lifecycle import LIMITS, edit_frame, edit_map
+from sceneprint.engine.maps.map_lifecycle import edit_frame, edit_map
 from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint_client.api import Frame, Map, NewMap, Page
 from sceneprint_client.api.listing import OPERATORS
@@ -155,8 +155,6 @@ async def patch_map(
         asking.require_every("admin")
     edit = partial(edit_map, here.engine.store, map_name, patch, tags, dry_run=dry_run)
     edited = await here.run(edit)
-    told = {name: getattr(edited, name) for name in sorted(LIMITS & patch.keys())}
-    request.state.audited = {"dry_run": True} if dry_run else told
     response.headers["ETag"] = f'"{edited.etag}"'
     return edited
 

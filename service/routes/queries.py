@@ -2,7 +2,7 @@
 
 A query names a stored frame in JSON, or comes as a frame with its options.
 
-    AskedQuery, what answers it  --run_query-->  Answer
+    SentQuery, what answers it  --run_query-->  Answer
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from fastapi import Depends, Request
 from pydantic import BaseModel, ValidationError
 from starlette.datastructures import FormData, UploadFile
 
-from sceneprint.engine.results.query_history import AskedQuery, record_of
+from sceneprint.engine.results.query_log import SentQuery, query_row, unknown_query
 from sceneprint.engine.search.query import check_localizes, localization_of
 from sceneprint.errors import InvalidRequest, MalformedBody, NotFound
+from sceneprint.store.query_rows import QueryRow
 from sceneprint_client.api import (
     Answer,
     Comparison,
@@ -310,16 +311,16 @@ def _wrong(name: str, how: str) -> InvalidRequest:
 
 
 async def run_query(
-    here: Context, asked: AskedQuery, since: float, do: Callable[[], Answer]
+    here: Context, sent: SentQuery, since: float, do: Callable[[], Answer]
 ) -> Answer:
-    """Answer a query when it is its turn, and leave a record of it, unless it wants none.
+    """Answer a query when it is its turn, count it, and log it if it fails.
 
     Parameters
     ----------
     here : of the service; the query has a place at its gate
-    asked : the query, and who asks
+    sent : the query, and who sends it
     since : when the request came, by `time.perf_counter`
-    do : answers it, in a thread
+    do : answers and logs it, in a thread
 
     Raises
     ------
@@ -330,17 +331,11 @@ async def run_query(
     except NotFound:  # what was asked for is not there: no query was begun
         raise
     except Exception as error:
-        _note(here, asked, error, since)
+        here.engine.query_log.note(query_row(sent, error, time.perf_counter() - since))
         raise
-    if asked.query.record:
+    if sent.query.record:
         here.metrics.answer(answer)
-    _note(here, asked, answer, since)
     return answer
-
-
-def _note(here: Context, asked: AskedQuery, came_of_it: Answer | Exception, since: float) -> None:
-    if asked.query.record:
-        here.engine.history.note(record_of(asked, came_of_it, time.perf_counter() - since))
 
 
 # The routes.
@@ -350,14 +345,14 @@ router = v1_router(tag="queries")
 _ROBOT: dict[str, Any] = {
     "robot": {
         "type": "string", "maxLength": 128,
-        "description": "Who asks, for the record; of an upload `meta` says so.",
+        "description": "Who sends it, for the log; of an upload `meta` says so.",
     }
 }  # fmt: skip
 _FRAME_ID: dict[str, Any] = {
     "frame_id": {"type": "string", "description": "A frame of the map, in place of an upload."}
 }
 _BODY = described(Query, _FRAME_ID | _ROBOT, ["frame_id"])
-_SEVERAL = described(SeveralQuery, _ROBOT, ["maps", "frame"])
+_SEVERAL = described(SeveralQuery, _ROBOT, ["maps"])
 _STATUSES = declared(400, 404, 413, 415, 422)
 
 
@@ -380,7 +375,7 @@ async def ask(map_name: str, request: Request, here: Here, asking: Asking) -> An
 async def localize(map_name: str, request: Request, here: Here, asking: Asking) -> Localization:
     """Where am I in this map? One status and one pose; ask as for a query.
 
-    The whole answer, with all candidates, is kept under `query_id` unless `keep` is false.
+    The whole answer, with all candidates, is stored under `query_id` unless `keep` is false.
     """
     return localization_of(await _asked(map_name, request, here, asking, localizes=True))
 
@@ -411,17 +406,17 @@ async def localize_sequence(
         if wrong is not None:
             raise wrong
         *_, last = (one for one in sent.metas if isinstance(one, FrameMeta))
-        asked = AskedQuery([map_name], query, last.robot, last.session, asking.key_id, at=at)
+        log = SentQuery([map_name], query, last.robot, last.session, asking.key_id, at=at)
         answer = await run_query(
-            here, asked, since,
+            here, log, since,
             lambda: engine.queries.sequence(
-                map_name, [(one.data, one.meta) for one in sent.read()], query, since
+                map_name, [(one.data, one.meta) for one in sent.read()], query, since, log
             ),
         )  # fmt: skip
     return localization_of(answer)
 
 
-@router.post("/queries", responses=_STATUSES, openapi_extra=_SEVERAL)
+@router.post("/queries", responses=_STATUSES | declared(409), openapi_extra=_SEVERAL)
 async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
     """In which of these maps was this frame taken? One ranking over all of them.
 
@@ -431,20 +426,55 @@ async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
     since, at, queries = time.perf_counter(), time.time(), here.engine.queries
     async with here.gate.place(), question(request, SeveralQuery, "frame") as body:
         query, upload, frame = body.query, body.upload, body.query.frame
+        if query.query_id is not None and (upload is not None or frame is not None):
+            raise InvalidRequest(
+                "The query has two frames. Give a frame or `query_id`.",
+                (("query_id", "given together with a frame"),),
+            )
         maps = await here.run(queries.maps_of, query, partial(asking.may, "read"))
         named = None if frame is None else FrameName(map=frame.map, frame_id=frame.frame_id)
-        asked = AskedQuery(maps, query, body.robot, body.session, asking.key_id, named, at)
+        sent = SentQuery(maps, query, body.robot, body.session, asking.key_id, named, at)
         if upload is not None:
             return await run_query(
-                here, asked, since,
-                lambda: queries.upload(maps, upload.file.read(), upload.meta, query, since),
+                here, sent, since,
+                lambda: queries.upload(maps, upload.file.read(), upload.meta, query, since, sent),
             )  # fmt: skip
+        if query.query_id is not None:
+            return await _repeated(query.query_id, here, asking, sent, since)
         if frame is None:
             raise unnamed("frame")
         asking.require(frame.map, "read")
         return await run_query(
-            here, asked, since, lambda: queries.stored(maps, frame, query, since)
+            here, sent, since, lambda: queries.stored(maps, frame, query, since, sent)
         )
+
+
+def require_readable(query_id: str, here: Context, asking: Caller) -> QueryRow:
+    """Return the row of a query, if the caller may read all maps that it names.
+
+    Raises
+    ------
+    UnknownQuery : its answer is not stored, or the caller may not see it: the text is the same.
+    """
+    row = here.engine.query_log.find_row(query_id)
+    maps = [*row.searched, *([] if row.frame_map is None else [row.frame_map])]
+    if len(asking.readable(maps)) < len(maps):
+        raise unknown_query(query_id)
+    return row
+
+
+async def _repeated(
+    query_id: str, here: Context, asking: Caller, sent: SentQuery, since: float
+) -> Answer:
+    """Repeat an earlier query with other options."""
+    log = here.engine.query_log
+    await here.run(require_readable, query_id, here, asking)
+    stored = await here.run(log.find, query_id)
+    sent = replace(sent, frame=stored.answer.frame)
+    return await run_query(
+        here, sent, since,
+        lambda: here.engine.queries.again(list(sent.maps), stored, sent.query, since, sent),
+    )  # fmt: skip
 
 
 async def _asked(
@@ -453,22 +483,22 @@ async def _asked(
     since, at, engine = time.perf_counter(), time.time(), here.engine
     async with here.gate.place(), question(request, Query, "frame_id") as body:
         query, upload = body.query, body.upload
-        asked = AskedQuery([map_name], query, body.robot, body.session, asking.key_id, at=at)
+        sent = SentQuery([map_name], query, body.robot, body.session, asking.key_id, at=at)
         if localizes:
             check_localizes(query)
         if upload is not None:
             return await run_query(
-                here, asked, since,
+                here, sent, since,
                 lambda: engine.queries.upload(
-                    [map_name], upload.file.read(), upload.meta, query, since
+                    [map_name], upload.file.read(), upload.meta, query, since, sent
                 ),
             )  # fmt: skip
         frame_id = body.named["frame_id"]
         if not isinstance(frame_id, str):
             raise unnamed("frame_id")
-        asked = replace(asked, frame=FrameName(map=map_name, frame_id=frame_id))
+        sent = replace(sent, frame=FrameName(map=map_name, frame_id=frame_id))
         return await run_query(
-            here, asked, since, lambda: engine.query_frame(map_name, frame_id, query, since)
+            here, sent, since, lambda: engine.query_frame(map_name, frame_id, query, since, sent)
         )
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from fastapi import Request, Response
 
-from sceneprint.engine.reconstruction import MEDIA_TYPES, MESH, PICTURE
-from sceneprint.engine.results.stored_results import StoredResult, unknown_query
+from sceneprint.engine.reconstruction import MEDIA_TYPE, MESH
+from sceneprint.engine.results.query_log import StoredAnswer, unknown_query
 from sceneprint.errors import DamagedBlob
 from sceneprint.store.queue import unknown_job
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
@@ -41,11 +41,11 @@ async def reconstruct(
     """Fuse the accepted matches of an answer, moved into the query's camera frame, to a surface.
 
     A worker does it, with Open3D. The answer may expire meanwhile. Ask under `Location` until
-    `state` is `succeeded`; then mesh.ply and picture.png are there. It takes the scope `write`.
+    `state` is `succeeded`; then mesh.ply is there. It takes the scope `write`.
     """
-    kept = await here.run(lambda: _stored_answer(here, asking, query_id))
+    stored = await here.run(lambda: _stored_answer(here, asking, query_id))
     wanted = await read_record(request, NewReconstruction, "The reconstruction", optional=True)
-    made = await here.run(lambda: here.engine.reconstructions.begin(kept, wanted))
+    made = await here.run(lambda: here.engine.reconstructions.begin(stored, wanted))
     response.headers["Location"] = f"/v1/reconstructions/{made.job_id}"
     return made
 
@@ -60,7 +60,7 @@ def get_reconstruction(job_id: str, here: Here, asking: Asking) -> Reconstructio
     "/reconstructions/{job_id}/mesh.ply",
     response_class=Response,
     responses=files(
-        [MEDIA_TYPES[MESH]],
+        [MEDIA_TYPE],
         "Points with normals, coloured by the first view that saw them, and triangles unless a "
         "cloud was asked for; binary little-endian. A comment names the frame of coordinates.",
         409,
@@ -68,19 +68,9 @@ def get_reconstruction(job_id: str, here: Here, asking: Asking) -> Reconstructio
 )
 async def get_mesh(job_id: str, request: Request, here: Here, asking: Asking) -> Response:
     """The surface, in the query's camera frame; 409 until the job has succeeded."""
-    return await _sent(request, here, asking, job_id, MESH)
-
-
-@router.get(
-    "/reconstructions/{job_id}/picture.png",
-    response_class=Response,
-    responses=files(
-        [MEDIA_TYPES[PICTURE]], "The surface from above, coloured by view, with the cameras.", 409
-    ),
-)
-async def get_picture(job_id: str, request: Request, here: Here, asking: Asking) -> Response:
-    """A picture of the surface, and what each view adds to it; 409 until it is made."""
-    return await _sent(request, here, asking, job_id, PICTURE)
+    await here.run(_find_reconstruction, here, asking, job_id)
+    async with here.gate.place():  # it is read whole: when it is its turn
+        return await here.gate.run(lambda: _mesh(request, here, job_id))
 
 
 @router.delete("/reconstructions/{job_id}", status_code=204, responses=declared(404))
@@ -91,17 +81,17 @@ def delete_reconstruction(job_id: str, here: Here, asking: Asking) -> None:
     here.engine.reconstructions.delete(job_id)
 
 
-def _stored_answer(here: Context, asking: Caller, query_id: str) -> StoredResult:
+def _stored_answer(here: Context, asking: Caller, query_id: str) -> StoredAnswer:
     """The answer, for who may read the maps that it was asked of, and write to those it names."""
-    kept = here.engine.kept.find(query_id)
-    answer = kept.answer
+    stored = here.engine.query_log.find(query_id)
+    answer = stored.answer
     matched = {match.map for match in answer.matches}
     asked = {*answer.maps, *([] if answer.frame is None else [answer.frame.map])}
     if not all(asking.may("read", name) for name in asked | matched):
         raise unknown_query(query_id)
     for name in sorted(matched):
         asking.require(name, "write")
-    return kept
+    return stored
 
 
 def _find_reconstruction(here: Context, asking: Caller, job_id: str) -> Reconstruction:
@@ -111,24 +101,15 @@ def _find_reconstruction(here: Context, asking: Caller, job_id: str) -> Reconstr
     return found
 
 
-async def _sent(
-    request: Request, here: Context, asking: Caller, job_id: str, name: str
-) -> Response:
-    """A file of a reconstruction, which is read whole before: when it is its turn."""
-    await here.run(_find_reconstruction, here, asking, job_id)
-    async with here.gate.place():
-        return await here.gate.run(lambda: _file(request, here, job_id, name))
-
-
-def _file(request: Request, here: Context, job_id: str, name: str) -> Response:
-    file, blobs = here.engine.reconstructions.file(job_id, name), here.engine.store.blobs
+def _mesh(request: Request, here: Context, job_id: str) -> Response:
+    file, blobs = here.engine.reconstructions.mesh(job_id), here.engine.store.blobs
     if is_known(request, file.blob) or blobs.condition(file.blob) == "sound":
         with suppress(FileNotFoundError):
             return send_file(
                 request, lambda: blobs.open(file.blob), file.media_type, file.blob,
-                f"{job_id[:12]}-{name}",
+                f"{job_id[:12]}-{MESH}",
             )  # fmt: skip
-    here.engine.reconstructions.file(job_id, name)  # UnknownJob where it was deleted meanwhile
+    here.engine.reconstructions.mesh(job_id)  # UnknownJob where it was deleted meanwhile
     raise DamagedBlob(
-        f"{name} of reconstruction {job_id} is damaged. Start the reconstruction again."
+        f"{MESH} of reconstruction {job_id} is damaged. Start the reconstruction again."
     )

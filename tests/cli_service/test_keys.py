@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
@@ -13,7 +12,6 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
-from sceneprint.store.audit_chain import KeyChange
 
 Run = Callable[..., Any]
 
@@ -66,21 +64,14 @@ def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint: Run, tmp_pa
         listed.stderr
         == "expiring within 7 days: robot. Create keys in their place with --create.\n"
     )
-    newer = keys("--rotate", "robot", "--overlap", "7d").stdout.strip()
-    assert [named(one) for one in (old, new, newer)] == ["robot", None, "robot"]
     last = keys("--rotate", "robot", "--overlap", "0").stdout.strip()
-    assert [named(one) for one in (old, newer, last)] == [None, None, "robot"]
-    assert "old secret" not in keys("--list").stdout
+    assert [named(one) for one in (old, last)] == [None, "robot"]
     assert "no key named 'nobody'" in keys("--rotate", "nobody", expect=2).stderr
     assert (
         "not within 0 s and 30 days"
         in keys("--rotate", "robot", "--overlap", "31d", expect=2).stderr
     )
     assert "Use it with --rotate" in keys("--list", "--overlap", "1h", expect=2).stderr
-    actions = [
-        line.split("  ")[2] for line in sceneprint("audit", "--data", tmp_path).stdout.splitlines()
-    ]
-    assert actions == ["keys --rotate robot"] * 3 + ["keys --create robot"]
 
 
 @pytest.mark.parametrize(
@@ -147,23 +138,3 @@ def test_what_a_key_may_is_said_when_it_is_made(sceneprint: Run, tmp_path: Path)
     assert "'No Map' is not a valid map name" in done.stderr
     done = sceneprint("keys", "--create", "command", "--data", tmp_path, expect=2)
     assert "is not a valid key name" in done.stderr
-
-
-def test_who_changed_what_is_printed(sceneprint: Run, tmp_path: Path) -> None:
-    for arguments in (("--create", "robot"), ("--create", "screen"), ("--revoke", "robot")):
-        sceneprint("keys", *arguments, "--data", tmp_path)
-    with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
-        engine.audit.note(KeyChange("delete_map", "screen", "192.0.2.7", "hall", request_id="r1"))
-    lines = sceneprint("audit", "--data", tmp_path).stdout.splitlines()
-    assert [line[22:] for line in lines] == [
-        "screen from 192.0.2.7  delete_map hall",
-        "command  keys --revoke robot",
-        "command  keys --create screen",
-        "command  keys --create robot",
-    ]
-    lines = sceneprint("audit", "--limit", "1", "--data", tmp_path).stdout.splitlines()
-    assert [line[22:] for line in lines] == ["screen from 192.0.2.7  delete_map hall"]
-    done = sceneprint("audit", "--actor", "screen", "--json", "--data", tmp_path)
-    (one,) = [json.loads(line) for line in done.stdout.splitlines()]
-    assert (one["map"], one["address"], one["request_id"]) == ("hall", "192.0.2.7", "r1")
-    assert sceneprint("audit", "--map", "yard", "--data", tmp_path).stdout == ""

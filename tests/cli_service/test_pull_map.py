@@ -1,4 +1,4 @@
-"""`sceneprint pull --map`: maps of a running service in a robot's folder."""
+"""`sceneprint pull`: maps of a running service in a robot's folder."""
 
 from __future__ import annotations
 

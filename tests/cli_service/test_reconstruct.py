@@ -1,4 +1,4 @@
-"""`sceneprint reconstruct` and `sceneprint snapshot --url` against a real service."""
+"""`sceneprint reconstruct` against a real service."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_mesh_and_a_picture(
+def test_a_mesh_and_its_figures(
     sceneprint: Run, service_url: str, walk: Path, tmp_path: Path, with_open3d: None
 ) -> None:
     with Client(service_url) as client:
@@ -35,10 +35,8 @@ def test_a_mesh_and_a_picture(
     first, *rest = sorted(walk.glob("*.png"))
     for path in rest:
         sceneprint("upload", "walk", path)
-    mesh, picture = tmp_path / "mesh.ply", tmp_path / "mesh.png"
-    said = sceneprint(
-        "reconstruct", "walk", first, "--out", mesh, "--picture", picture, "--voxel", "0.05"
-    )
+    mesh = tmp_path / "mesh.ply"
+    said = sceneprint("reconstruct", "walk", first, "--out", mesh, "--voxel", "0.05")
     lines = said.stdout.splitlines()
     total = re.search(r"(\d+) views show ([\d.]+) m2 of surface", lines[1])
     assert total is not None
@@ -46,9 +44,8 @@ def test_a_mesh_and_a_picture(
     assert len(views) == int(total[1])
     assert "the frame itself" in views[0]
     assert float(views[-1].split()[-1]) == pytest.approx(float(total[2]), abs=0.01)
-    assert lines[-2:] == [f"wrote {mesh}", f"wrote {picture}"]
+    assert lines[-1] == f"wrote {mesh}"
     assert mesh.read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\n")
-    assert picture.read_bytes().startswith(b"\x89PNG")
     # a stored frame finds the others, and is fused as it was sent
     sceneprint("upload", "walk", first)
     with Client(service_url) as client:
@@ -68,15 +65,3 @@ def test_what_cannot_be_reconstructed(sceneprint: Run, service_url: str, walk: P
     assert "6 frames found. Name a single frame file." in said.stderr
     said = sceneprint("reconstruct", "nothing", "nobody", expect=2)
     assert "There is no frame 'nobody'" in said.stderr
-
-
-def test_a_snapshot_of_a_service(
-    sceneprint: Run, service_url: str, tmp_path: Path, data_folder: Path
-) -> None:
-    archive = tmp_path / "all.tar"
-    said = sceneprint("snapshot", "--url", service_url, "--out", archive)
-    assert re.match(rf"{archive}: \d+ maps, \d+ frames, \d+ blobs, [\d.]+ MB in", said.stdout)
-    assert "is complete" in sceneprint("restore", archive, "--verify-only").stdout
-    assert list((data_folder / "snapshots").glob("*.tar"))
-    said = sceneprint("snapshot", "--url", service_url, "--data", tmp_path, expect=2)
-    assert "Give only one of them" in said.stderr

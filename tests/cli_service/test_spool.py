@@ -6,7 +6,6 @@ import json
 import runpy
 import sqlite3
 import sys
-import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -14,10 +13,8 @@ from typing import Any
 
 import pytest
 
-from benchmarks.waiting import PATIENCE_S
 from sceneprint_client import Client
-from sceneprint_client.api import CameraIntrinsics, FrameMeta
-from sceneprint_client.errors import FrameError
+from sceneprint_client.api import CameraIntrinsics
 
 ROOT = Path(__file__).resolve().parents[2]
 CAMERA = CameraIntrinsics(width=16, height=12, fx=14, fy=14, cx=7.5, cy=5.5)
@@ -109,7 +106,7 @@ def test_the_example_goes_on_while_it_is_offline(
 
 
 @pytest.mark.sqlite_only("a copy of the maps is a folder with SQLite")
-def test_the_example_localises_by_its_copy_and_sends_the_records(
+def test_the_example_localises_by_its_copy(
     service_url: str, run_example: Callable[..., list[str]], tmp_path: Path
 ) -> None:
     with Client(service_url) as client, Client.embedded(tmp_path / "copy") as robot:
@@ -117,42 +114,5 @@ def test_the_example_localises_by_its_copy_and_sends_the_records(
         for one in (client, robot):
             one.create_map("offline-example", model="depth")
     copy = ("--copy", tmp_path / "copy")
-    told = run_example("http://127.0.0.1:9", *copy)
-    assert told[0].endswith(": not_found")
-    assert run_example(service_url, *copy)[1:3] == [
-        "uploaded 6, already there 0, refused 0", "the history has 2 records of queries more",
-    ]  # fmt: skip
-    with Client(service_url) as client:
-        assert [one.status for one in client.queries("offline-example") if one.offline] \
-            == ["not_found"] * 2  # fmt: skip
-
-
-@pytest.mark.sqlite_only("a copy of the maps is a folder with SQLite")
-def test_records_of_a_copys_queries_are_spooled_and_sent(
-    sceneprint: Callable[..., Any], service_url: str, tmp_path: Path
-) -> None:
-    spool, copy = tmp_path / "robot.spool", tmp_path / "copy"
-    said = sceneprint("spool", "add-queries", spool, "--data", copy, expect=2)
-    assert "There are no maps here" in said.stderr
-    assert not spool.exists()
-    with Client(service_url) as client, Client.embedded(copy) as robot:
-        for one in (client, robot):
-            one.create_map("offline-records", model="depth")
-        for frame in (b"no depth image", b"nor this"):
-            with pytest.raises(FrameError):
-                robot.query("offline-records", frame, FrameMeta(robot="cart", intrinsics=CAMERA))
-        end = time.monotonic() + PATIENCE_S
-        while len(list(robot.queries("offline-records"))) < 2:  # they are written in a moment
-            assert time.monotonic() < end
-        added = sceneprint("spool", "add-queries", spool, "--data", copy)
-        assert added.stdout == "2 query records added; 2 wait\n"
-        added = sceneprint("spool", "add-queries", spool, "--data", copy)
-        assert added.stdout == "0 query records added; 2 wait\n"
-        said = sceneprint("spool", "sync", spool, "offline-records")
-        assert said.stdout == (
-            "0 frames uploaded; 0 refused, 0 wait\n2 query records sent; 0 refused, 0 wait\n"
-        )
-        lines = sceneprint("spool", "status", spool).stdout.splitlines()
-        assert lines[2:] == ["0 query records wait, 2 sent, 0 refused, 0 discarded"]
-        told = sceneprint("queries", "offline-records").stdout.splitlines()
-    assert [line.endswith(", offline") for line in told] == [False, True, True]
+    assert run_example("http://127.0.0.1:9", *copy)[0].endswith(": not_found")
+    assert run_example(service_url, *copy)[1] == "uploaded 6, already there 0, refused 0"

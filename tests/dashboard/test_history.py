@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from datetime import UTC, datetime
 
 import pytest
 
@@ -103,19 +102,3 @@ def test_new_queries_are_announced_and_looking_leaves_none(station, asked, page,
     rows = page.evaluate(ROWS)
     assert [one["id"] for one in rows] == [one["query_id"] for one in records(station)]
     assert len(rows) == len(before) + 2
-
-
-def test_a_query_that_a_robot_answered_itself_is_told_as_such(station, page, settle):
-    path = station.make_map("offline")
-    record = {
-        "query_id": "5" * 32, "at": datetime.now(UTC).isoformat(), "robot": "cart",
-        "status": "not_found", "reason": "nothing in the map is alike", "milliseconds": 31,
-    }  # fmt: skip
-    sent = station.client.post(f"{path}/queries/records", json={"records": [record]})
-    assert sent.json()["received"] == 1
-    page.goto(f"{station.home}#/maps/offline/queries")
-    settle(page)
-    [row] = page.evaluate(ROWS)
-    assert (row["id"], row["answer"]) == ("5" * 32, None)
-    cells = row["cells"]
-    assert (cells[1], cells[2], cells[7]) == ("cart\noffline", "Not found", "on the robot")

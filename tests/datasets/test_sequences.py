@@ -130,7 +130,7 @@ def test_a_single_file(kitchen: Path) -> None:
     assert (sequence.layout, sequence.frames[0].name) == (Layout.PLAIN, "kitchen/rgbd")
     np.testing.assert_array_equal(sequence.frames[0].read().depth, DEPTH)
     (sequence,) = find_sequences(kitchen / "TrainSplit.txt")
-    with pytest.raises(UnreadableFrame, match=r"TrainSplit\.txt: .*neither PNG nor NPY"):
+    with pytest.raises(UnreadableFrame, match=r"^.*TrainSplit\.txt: "):
         sequence.frames[0].read()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import shutil
 from collections import Counter
 from collections.abc import Callable
@@ -13,14 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from sqlalchemy import select
 
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import Work, cancel
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.maps.map_coverage import CoverageHandler, frames_to_query
-from sceneprint.engine.maps.map_plans import COLOURS, FOOTER, WIDTH
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.lab.synth import SynthRoom
 from sceneprint.settings import Settings
@@ -310,24 +307,6 @@ def test_cells_that_became_better_are_told(engine: Engine, work_off: WorkOff, ro
             engine.coverage.changes("hall", other, before.coverage_id)
 
 
-def test_the_plan_is_drawn_in_the_colours_of_its_cells(engine: Engine, rooms: Rooms) -> None:
-    output = engine.coverage.picture("hall", rooms.whole)
-    pixels = np.asarray(Image.open(io.BytesIO(output.make())).convert("RGB"))
-    assert pixels.shape[1] == WIDTH
-    plan, legend = pixels[:-FOOTER], pixels[-FOOTER:]
-    shown = {name for name, colour in COLOURS.items() if (plan == colour).all(axis=2).sum() > 20}
-    assert shown == {"ambiguous"}
-    assert all((legend == colour).all(axis=2).any() for colour in COLOURS.values())
-    other = engine.coverage.picture("hall", rooms.whole, rooms.parents[1])
-    assert other.tag != output.tag
-    first = engine.coverage.frames("hall", rooms.whole, limit=1).items[0]
-    engine.delete_frame("hall", first.frame_id)
-    assert engine.coverage.picture("hall", rooms.whole).tag != output.tag
-    assert engine.coverage.picture("hall", rooms.whole, rooms.parents[1]).tag == other.tag
-    with pytest.raises(InvalidRequest, match="no plan of parent frame 'x'"):
-        engine.coverage.picture("hall", rooms.whole, "x")
-
-
 def test_what_cannot_be_measured_is_refused(
     engine: Engine, work_off: WorkOff, rooms: Rooms
 ) -> None:
@@ -338,9 +317,8 @@ def test_what_cannot_be_measured_is_refused(
     with pytest.raises(ValueError, match="leaves out the whole session already"):
         NewMapCoverage(other_sessions=True, not_within_s=3.0)
     queued = engine.coverage.begin("hall", NewMapCoverage(every=6))
-    for ask in (engine.coverage.picture, lambda *of: engine.coverage.changes(*of, of[1])):
-        with pytest.raises(NotIndexed, match="is queued"):
-            ask("hall", queued.coverage_id)
+    with pytest.raises(NotIndexed, match="is queued"):
+        engine.coverage.changes("hall", queued.coverage_id, queued.coverage_id)
     with pytest.raises(UnknownJob, match="no coverage"):
         engine.coverage.get("pair", queued.coverage_id)
     cancel(engine.store, queued.coverage_id)

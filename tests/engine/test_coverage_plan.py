@@ -10,9 +10,7 @@ import pytest
 from sceneprint.engine.maps.map_plans import (
     MOST_CELLS,
     QueriedPosition,
-    cell_outcome,
     cell_width,
-    coverage_picture,
     coverage_plans,
     localisability,
     plan_changes,
@@ -22,7 +20,6 @@ from sceneprint_client.api.coverage import (
     CoverageCell,
     CoverageOutcome,
     CoveragePlan,
-    CoverageResult,
 )
 
 LEVEL = PlanAxes(np.eye(3)[:2], "map")
@@ -107,12 +104,6 @@ def test_a_pose_far_beyond_all_sense_has_a_cell() -> None:
     (one,), cell_m = coverage_plans(asked, taken, {"map": LEVEL}, None)
     assert cell_m == 500_000
     assert [cell.column for cell in one.cells] == [-(2**52), 0, 2**52]
-    result = CoverageResult(
-        found=1, wrong=0, ambiguous=0, not_found=0, frames=1, skipped=0, unchecked=0, model="m",
-        revision=1, last_revision=1, map_frames=3, cell_m=cell_m,
-    )  # fmt: skip
-    drawn = coverage_picture(one, result, [], np.empty((0, 2)), "hall")
-    assert drawn.startswith(b"\x89PNG")
 
 
 def test_cells_widen_where_there_would_be_too_many() -> None:
@@ -156,11 +147,3 @@ def test_two_results_are_compared_cell_by_cell() -> None:
     assert told.cells[4].after is None
     assert (gone.parent_frame, [one.trend for one in gone.cells]) == ("gone", ["gone"])
     assert localisability(before[0].cells[3]) == pytest.approx(1 / 3)
-
-
-def test_a_wrong_pose_colours_its_cell_whatever_else_is_in_it() -> None:
-    assert cell_outcome(cell(0, 0, 9)) is None
-    assert cell_outcome(cell(0, 0, 9, found=8, wrong=1)) == "wrong"
-    assert cell_outcome(cell(0, 0, 9, found=2, not_found=1)) == "found"
-    assert cell_outcome(cell(0, 0, 9, found=1, ambiguous=1)) == "ambiguous"
-    assert cell_outcome(cell(0, 0, 9, ambiguous=1, not_found=1)) == "not_found"

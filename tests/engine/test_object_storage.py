@@ -48,7 +48,8 @@ def test_what_one_node_takes_another_works_on(
     told = one.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query(k=1))
     assert told.status == "found"
     assert told.matches[0].frame_id == added[0].frame_id
-    assert other.kept.find(told.query_id).answer == told
+    assert one.query_log.flush(60)
+    assert other.query_log.find(told.query_id).answer == told
     assert keys(objects, "queries/") == [f"queries/{told.query_id}"]
     assert not (one.settings.data_dir / "blobs").exists()
     assert not (one.settings.data_dir / "queries").exists()

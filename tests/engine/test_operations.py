@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from sqlalchemy import func, select, update
 
@@ -20,7 +21,7 @@ from sceneprint.engine.admin.statistics import anchors
 from sceneprint.engine.search import retrieval
 from sceneprint.errors import Conflict, IdempotencyConflict, InvalidRequest, UnknownMap
 from sceneprint.models import PRESETS, read_model
-from sceneprint.process import Latencies, bin_of
+from sceneprint.process import BINS, FIRST_S, STEP, Latencies, bin_of, merged, quantile
 from sceneprint.store.events import Wanted, record_event
 from sceneprint.store.keys import IdempotentRequest, remove_old_requests
 from sceneprint.store.store_counts import add_sample, samples_since
@@ -328,3 +329,38 @@ def test_models_are_listed_with_the_maps_that_may_be_named(make_engine, small_mo
     assert engine.operations.catalogue.find(depth.label, lambda _: False).id == depth.id
     with pytest.raises(Conflict, match="is already switching to"):
         engine.reencode("shop", engine.operations.catalogue.find("paper"))
+
+
+@pytest.mark.parametrize("spread", [0.3, 1.0, 2.0])
+def test_quantiles_of_several_processes_are_those_of_all_times(spread):
+    rng = np.random.default_rng(3)
+    times = np.exp(rng.normal(np.log(0.08), spread, 5000)).clip(FIRST_S, 600)
+    processes = [Latencies() for _ in range(3)]
+    for i, one in enumerate(times):
+        processes[i % 3].add(float(one))
+    together = merged([one.as_json() for one in processes])
+    assert sum(together.values()) == 5000
+    for share in (0.5, 0.95, 0.99, 1.0):
+        exact = float(np.quantile(times, share, method="inverted_cdf"))
+        found = quantile(together, share)
+        assert found is not None
+        # the middle of a bin is at most half a bin from whatever is in it
+        assert abs(np.log(found / exact)) <= np.log(STEP) / 2 + 1e-9
+
+
+def test_bins_meet_without_a_gap():
+    for place in range(1, BINS - 1):
+        lower = FIRST_S * STEP**place
+        assert (bin_of(lower * 1.0001), bin_of(lower * 0.9999)) == (place, place - 1)
+    assert (bin_of(0.0), bin_of(-1.0), bin_of(1e9)) == (0, 0, BINS - 1)
+
+
+def test_of_nothing_there_is_no_quantile():
+    assert quantile({}, 0.5) is None
+    assert merged([]) == {}
+    one = Latencies()
+    one.add(0.25)
+    for share in (0.0, 0.5, 1.0):  # of one answer it is that answer
+        found = quantile(merged([one.as_json()]), share)
+        assert found is not None
+        assert 0.9 < found / 0.25 < 1.1

@@ -100,7 +100,7 @@ def test_what_cannot_be_drawn(full: Engine, asked: Answer, ids: Ids) -> None:
     with pytest.raises(UnknownFrame, match="no match"):
         full.points.match(asked.query_id, "nobody")
     bare = full.query_frame("hall", ids(full)[3], Query(k=1, stages=("retrieve",)))
-    with pytest.raises(NotIndexed, match="without validation"):
+    with pytest.raises(NotIndexed):
         full.points.query(bare.query_id)
     found = full.points.match(asked.query_id, best)
     full.delete_frame("hall", best)

@@ -23,18 +23,13 @@ from sceneprint.engine.upkeep.purge import Purging
 from sceneprint.errors import BusyIndex, UnknownJob, UnknownQuery
 from sceneprint.index import newest, newest_number
 from sceneprint.index.generation_files import building
-from sceneprint.models import read_model
 from sceneprint.store.frames import delete_frame, write_frame
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.postgres.vectors import table_of
 from sceneprint.store.signatures import stored_vector
 from sceneprint_client.api import NewMap, Query
-from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.surface import NewReconstruction
 
-#: Where PostgreSQL keeps the vectors of signatures.
-VECTORS = table_of(read_model("depth").signature_bytes)
 #: Bytes of a piece that is looked for, and pieces of each thing.
 PIECE, MANY = 24, 40
 
@@ -57,7 +52,7 @@ def files(folder: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def rows(engine: Engine) -> Iterator[tuple[str, bytes]]:
-    """All tables of a server's database, those of vectors with them, as bytes and as text."""
+    """All tables of a server's database, as bytes and as text."""
     if engine.store.database.is_sqlite:
         return  # it is one of the files
     with engine.store.database.read() as connection:
@@ -82,7 +77,7 @@ def places(engine: Engine, folder: Path, wanted: list[bytes]) -> set[str]:
 def lived_in(make_engine, store_url, uploads, work_off, tmp_path):
     """A map whose index was published twice."""
     (tmp_path / "data" / "blobs").mkdir(parents=True)  # of a database that is there nobody makes it
-    given = {"database_url": store_url, "tail_frames": 2, "search": "database"}
+    given = {"database_url": store_url, "tail_frames": 2}
     engine = make_engine(tmp_path / "data", **given)
     engine.create_map(NewMap(name="hall", model="depth"))
     for one in uploads[:6]:
@@ -108,12 +103,10 @@ def secret(lived_in, ids, uploads):
     generation = newest(folder, row.model_id, len(vectors[0]))
     assert generation is not None
     assert len(generation) == len(numbers)
-    numbers_of = (np.frombuffer(vectors[0], np.uint8).astype(int) - 128).tolist()
     return {
         "upload": pieces(uploads[0].data, [one.data for one in uploads[1:]]),
         "signature": pieces(vectors[0], vectors[1:]),
         "artifact": pieces(artifacts[0], artifacts[1:]),
-        "vector": [",".join(map(str, numbers_of[:PIECE])).encode()],
         "tag": [b"by-the-door"],
     }
 
@@ -124,26 +117,28 @@ def asked(engine: Engine, frame_id: str, uploads) -> tuple[str, str, str]:
     own = engine.query_frame("hall", frame_id, options)
     other = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, options)
     assert frame_id in {match.frame_id for match in other.matches}
-    fused = engine.reconstructions.begin(engine.kept.find(own.query_id), NewReconstruction())
+    fused = engine.reconstructions.begin(engine.query_log.find(own.query_id), NewReconstruction())
     return own.query_id, other.query_id, fused.job_id
 
 
 def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
     engine, frame_id = lived_in, ids(lived_in)[0]
     own, shows, fused = asked(engine, frame_id, uploads)
+    third = engine.query_frame("hall", frame_id, Query(seed=1)).query_id
+    for one in (shows, third):
+        assert engine.query_log.keep(one, None).kept_at is not None
     truth = "sceneprint.db" if engine.store.database.is_sqlite else "table signatures"
     found = {what: places(engine, tmp_path, wanted) for what, wanted in secret.items()}
     assert found["upload"] == {"blobs"}
-    assert found["signature"] == {truth, "queries", "index .faiss"}
-    assert found["artifact"] == {"blobs", "queries"}
     is_sqlite = engine.store.database.is_sqlite
-    assert found["vector"] == (set() if is_sqlite else {f"table {VECTORS}"})
+    answers = {"queries", "sceneprint.db" if is_sqlite else "table queries"}  # one is kept
+    assert found["signature"] == {truth, *answers, "index .faiss"}
+    assert found["artifact"] == {"blobs", *answers}
 
     with engine.store.database.write() as connection:  # of the others, which stay
         row = find_map(connection, "hall")
         for name in ids(engine)[1:]:
             write_frame(connection, row, find_frame(connection, row, name), {"tags": []})
-    assert engine.kept_answers.keep(engine.kept, shows, KeepOptions()).kept
     engine.delete_frame("hall", frame_id)
     assert places(engine, tmp_path, secret["upload"]) == {"blobs"}  # it can be restored
     with pytest.raises(UnknownQuery):
@@ -166,7 +161,7 @@ def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
 def test_no_byte_of_a_map_is_left(lived_in, secret, ids, uploads, tmp_path):
     engine, frame_id = lived_in, ids(lived_in)[0]
     _, shows, _ = asked(engine, frame_id, uploads)
-    engine.kept_answers.keep(engine.kept, shows, KeepOptions())
+    engine.query_log.keep(shows, None)
     engine.delete_frame("hall", ids(engine)[1])
     engine.delete_map("hall")
     engine.publish_due()
@@ -230,7 +225,7 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
     second = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2, purge_s=1)
     workers = [
         Purging(
-            one.store, one._upkeep, one.kept, one.kept_answers, one.undo, one.reconstructions,
+            one.store, one._upkeep, one.query_log, one.undo, one.reconstructions,
             one.differences, 0.0,
         )
         for one in (second, second)

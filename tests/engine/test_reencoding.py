@@ -89,10 +89,9 @@ def queued(engine: Engine) -> list[tuple[str, int, str]]:
         return [tuple(row) for row in connection.execute(asked)]
 
 
-def test_a_map_of_version_0_1_is_compared_whole_by_l1_until_it_is_moved(
+def test_a_map_of_psi_is_compared_whole_by_l1_until_it_is_moved(
     make_engine: Make, paper_folder: Path, uploads: Any, work_off: WorkOff, tmp_path: Path
 ) -> None:
-    """`paper` has the id that it had in version 0.1: the same psi, which has no index."""
     shutil.copytree(paper_folder, tmp_path / "old")
     engine = make_engine(tmp_path / "old", tail_frames=1)
 

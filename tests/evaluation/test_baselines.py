@@ -299,11 +299,8 @@ def test_clouds_are_evaluated_as_depth_images_are(
     found = evaluated(
         tmp_path, folder, "--db", "0:6:2", "--queries", "1:6:4", "--within", 1, "--candidates", 2,
         "--model", model_file, "--baselines", "rings", "thumbnail_l1",
-        "--plots", tmp_path / "plots",
     )  # fmt: skip
     assert found["counts"] == {"queries": 2, "database": 3, "left_out": 0}
     assert found["VDR"]["within_10cm_10deg"] == 1.0
     assert found["baselines"]["rings"]["recall"]["queries"] == 2
     assert "made for" in found["baselines"]["thumbnail_l1"]["reason"]
-    assert (tmp_path / "plots" / "contact.png").exists()
-    assert not (tmp_path / "plots" / "cloud.png").exists()

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from sceneprint.cli import main
 from sceneprint.formats.export import write_ply
@@ -44,7 +43,7 @@ def alone(
     asked: list[str], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[dict[str, Any], Path]:
     folder = tmp_path_factory.mktemp("alone")
-    return figures(folder, *asked, "--jobs", "1", "--out", str(folder)), folder
+    return figures(folder, *asked, "--jobs", "1"), folder
 
 
 def test_pairs_of_rooms_are_registered_and_others_refused(
@@ -62,15 +61,6 @@ def test_pairs_of_rooms_are_registered_and_others_refused(
     assert {"precision", "recall", "accepted"} <= set(found["bins"]["10-30"]["validation"])
     assert found["roc"]["overlap"]["area"] > 0.9
     assert found["settings"]["right"] == [0.1, 10.0]
-
-
-def test_pictures_show_something(alone: tuple[dict[str, Any], Path]) -> None:
-    found, folder = alone
-    drawn = ["roc.png", "success.png"] + ["failures.png"] * bool(found["failures"])
-    for name in drawn:
-        with Image.open(folder / name) as image:
-            pixels = np.asarray(image.convert("RGB"))[::3, ::3]
-        assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 20
 
 
 @pytest.mark.thorough
@@ -95,14 +85,12 @@ def test_clouds_are_registered_as_well(building: Path, asked: list[str], tmp_pat
         np.savetxt(room / f"{i}.pose.txt", frame.pose)
     few = ["--pairs", "2", "--apart", "1", "--jobs", "1", "--right", "1e-5", "1"]
     model = ["--model", asked[asked.index("--model") + 1]]
-    found = figures(tmp_path, "evaluate-pairs", str(room), *model, *few, "--out", str(tmp_path))
+    found = figures(tmp_path, "evaluate-pairs", str(room), *model, *few)
     tried = [one for one in found["bins"].values() if one["pairs"]]
     assert tried
     for one in tried:
         assert one["success"]["within_5cm_5deg"] == one["bound"]["within_5cm_5deg"] == 1.0
-        assert one["success"]["right"] == 0.0  # a hundredth of a millimetre: all are failures, ...
-    with Image.open(tmp_path / "failures.png") as image:  # ... and drawn
-        assert len(np.unique(np.asarray(image.convert("RGB"))[::3, ::3].reshape(-1, 3))) > 20
+        assert one["success"]["right"] == 0.0  # a hundredth of a millimetre
 
 
 @pytest.mark.usefixtures("with_open3d")

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Table, insert, select, update
 
 from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
-from sceneprint.store.maps import add_frame, add_map, frame_of, keep_model, map_of
+from sceneprint.store.maps import add_frame, add_map, keep_model, map_of
 from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame, index_frame
 from sceneprint.store.tables import (
@@ -213,23 +213,6 @@ def test_a_job_that_is_lost_or_of_another_model_indexes_nothing(
         happened(connection, job)
     before = rows(server_store, row)
     assert not indexed(server_store, row, job, at_once=True)
-    assert rows(server_store, row) == before
-
-
-def test_where_vectors_are_kept_a_single_statement_indexes_nothing(
-    server_store: Store, pair: list[MapRow]
-) -> None:
-    """As their table has to be written in the same transaction."""
-    row = pair[0]
-    received(server_store, row, at_once=True)
-    job = claimed(server_store, row)
-    with server_store.database.write() as connection:
-        connection.exec_driver_sql(f"CREATE TABLE vectors_{len(MADE.vector)} ()")
-    before = rows(server_store, row)
-    with server_store.database.read() as connection:
-        frame = frame_of(connection, job.frame)
-    with server_store.database.write(map_number=row.number, single=True) as connection:
-        assert not index_claimed_frame(connection, job, frame, row.name, MADE, single=True)
     assert rows(server_store, row) == before
 
 

@@ -123,7 +123,7 @@ def claimed(database: Database) -> tuple[JobRow, FrameRow]:
 def sign(database: Database, job: JobRow, frame: FrameRow) -> None:
     made = StoredSignature(MODEL, bytes(400), "00" * 32, [1], [1])
     with database.write(map_number=frame.map_number, single=True) as connection:
-        assert index_claimed_frame(connection, job, frame, "hall", made, single=True)
+        assert index_claimed_frame(connection, job, frame, "hall", made)
 
 
 def edit(database: Database, row: MapRow, note: str, *, single: bool = True) -> None:

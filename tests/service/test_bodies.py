@@ -74,9 +74,8 @@ FORMS = {
     "no form": (X, b"hello", 400, "malformed-body", "cannot be parsed"),
     "nameless": (X, b'--x\r\nContent-Disposition: form-data\r\n\r\na\r\n' + END, 400,
                  "malformed-body", "name"),
-    "two files": (X, FRAME + FRAME + KNOWN + END, 422, "invalid-request", "more than one part"),
-    "three files": (X, 3 * FRAME + KNOWN + END, 400, "malformed-body", "Too many files"),
-    "other file": (X, FRAME + part("more", b"a", "b") + END, 422, "invalid-request",
+    "two files": (X, FRAME + FRAME + KNOWN + END, 400, "malformed-body", "Too many files"),
+    "other file": (X, KNOWN + part("more", b"a", "b") + END, 422, "invalid-request",
                    "unknown part 'more'"),
     "long field": (X, FRAME + part("meta", b" " * 262_145) + END, 413, "too-large", "100000"),
     "many fields": (X, FRAME + part("meta", b"{}") * 17 + END, 400, "malformed-body", "fields"),
@@ -157,9 +156,9 @@ def test_what_is_as_large_as_may_be_is_read(narrow, refused):
     body += b" " * (LIMIT - len(body))  # behind the end, and so without effect
     headers = {"content-type": X}
     full = narrow.client.post("/v1/maps/hall/frames", content=body, headers=headers)
-    refused(full, 422, "unreadable-frame", "neither PNG nor NPY")
+    refused(full, 422, "unreadable-frame")
     streamed = narrow.client.post("/v1/maps/hall/frames", content=iter([body]), headers=headers)
-    refused(streamed, 422, "unreadable-frame", "neither PNG nor NPY")
+    refused(streamed, 422, "unreadable-frame")
     over = narrow.client.post("/v1/maps/hall/frames", content=iter([body, b" "]), headers=headers)
     refused(over, 413, "too-large")
 

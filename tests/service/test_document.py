@@ -44,7 +44,7 @@ def test_the_document_is_whole(document):
             place = place[step]
         assert isinstance(place, dict)
     names = [operation["operationId"] for operation in operations(document).values()]
-    assert len(names) == len(set(names)) == 110
+    assert len(names) == len(set(names)) == 106
     used = {reference.rpartition("/")[2] for reference in found}
     assert set(document["components"]["schemas"]) == used  # nothing that nothing refers to
 
@@ -95,7 +95,7 @@ def test_bodies_that_are_read_by_hand_are_described(document):
     assert list(upload["content"]) == ["multipart/form-data", *raw]
     form = upload["content"]["multipart/form-data"]["schema"]
     assert form["required"] == ["frame", "meta"]
-    assert sorted(form["properties"]) == ["frame", "if_novel", "meta", "priority", "signed"]
+    assert sorted(form["properties"]) == ["frame", "if_novel", "meta", "priority"]
     query = operations(document)["post", "/v1/maps/{map_name}/queries"]["requestBody"]
     options = {"k", "stages", "exact", "filter", "seed", "candidates", "diversity", "validation",
                "prior", "deadline_ms", "explain", "explain_frame", "keep",
@@ -118,7 +118,7 @@ def test_bodies_that_are_read_by_hand_are_described(document):
     assert by_form["diversity"]["contentSchema"] == {"$ref": "#/components/schemas/Diversity"}
     several = operations(document)["post", "/v1/queries"]["requestBody"]["content"]
     assert several["multipart/form-data"]["schema"]["required"] == ["frame", "maps", "meta"]
-    assert several["application/json"]["schema"]["required"] == ["maps", "frame"]
+    assert several["application/json"]["schema"]["required"] == ["maps"]
     pair = operations(document)["post", "/v1/similarity"]["requestBody"]["content"]
     parts = set(pair["multipart/form-data"]["schema"]["properties"])
     assert parts >= {"a", "b", "meta_a", "meta_b", "frame_a", "frame_b", "validate", "model"}

@@ -67,7 +67,7 @@ def test_lists_refuse_what_they_cannot_have(
     path = make_map(served, "unordered")
     for more in ({}, {"session": ["a", "b"]}):
         answer = served.client.get(f"{path}/frames", params={"order": "taken", **more})
-        assert "order of one session" in refused(answer, 422, "invalid-request")["detail"]
+        refused(answer, 422, "invalid-request", "order")
     for name in ("", "a\0", "a" * 256):
         refused(served.client.get(f"{path}/frames", params={"name": name}), 422, "invalid-request")
 

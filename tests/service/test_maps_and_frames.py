@@ -21,7 +21,7 @@ def test_a_map_is_made_once_and_stays_as_it_was_made(served, refused):
     assert datetime.fromisoformat(made["created_at"]).utcoffset() is not None
     for other in ({"title": "Another"}, {}, {"title": "The hall", "model": "paper"}):
         answer = served.client.post("/v1/maps", json={"name": "hall", **other})
-        refused(answer, 409, "map-exists", "'hall' already exists with a different title, model")
+        refused(answer, 409, "map-exists", "'hall'")
     assert served.client.get("/v1/maps/hall").json()["title"] == "The hall"
     names = [one["name"] for one in served.client.get("/v1/maps").json()["items"]]
     assert "hall" in names

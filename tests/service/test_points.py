@@ -53,7 +53,7 @@ def test_refusals_of_points(served, drawn, refused):
     for url in (frame, f"{query}/points", match):
         for limit in (0, 100_001, "all"):
             refused(served.client.get(f"{url}?limit={limit}"), 422, "invalid-request", "limit")
-    refused(served.client.get(f"{frame}?frame=parent"), 422, "invalid-request", "has no pose")
+    refused(served.client.get(f"{frame}?frame=parent"), 422, "invalid-request", "frame")
     refused(served.client.get(f"{frame}?frame=moon"), 422, "invalid-request", "frame")
     refused(served.client.get(f"{match}?side=left"), 422, "invalid-request", "side")
     refused(served.client.get(f"{match}?transform=best"), 422, "invalid-request", "transform")
@@ -64,4 +64,4 @@ def test_refusals_of_points(served, drawn, refused):
     quick = served.client.post(f"{drawn['path']}/queries", json=bare).json()["query_id"]
     for tail in ("points", f"matches/{drawn['ids'][1]}/points"):
         reply = served.client.get(f"/v1/queries/{quick}/{tail}")
-        refused(reply, 409, "not-indexed", "without validation")
+        refused(reply, 409, "not-indexed")

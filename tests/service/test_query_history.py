@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from typing import Any
 
 import pytest
@@ -26,14 +25,6 @@ def house(tmp_path, store_url, open_house) -> Iterator[Any]:
     with open_house(tmp_path, store_url, KEYS) as opened:
         for name in ("alpha", "bravo"):
             opened.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def shared_house(tmp_path_factory, open_house) -> Iterator[Any]:
-    """One on SQLite for tests that leave nothing in it."""
-    with open_house(tmp_path_factory.mktemp("shared"), None, KEYS) as opened:
-        opened.ask("boss", "POST", "/v1/maps", json={"name": "alpha", "model": "depth"})
         yield opened
 
 
@@ -83,12 +74,12 @@ def test_each_query_leaves_a_record_of_what_came_of_it(house, shots, refused):
             name: answer["location"]["pose"][name]
             for name in ("parent_frame", "translation", "rotation")
         },
-        "milliseconds": first["milliseconds"], "frame": None, "kept_until": first["kept_until"],
-        "keep": None, "offline": False,
+        "milliseconds": first["milliseconds"], "frame": None, "stored": True,
+        "expires_at": first["expires_at"], "kept_at": None, "title": None,
     }  # fmt: skip
     assert first["milliseconds"] >= answer["milliseconds"]["total"]
     kept = house.ask("robot", "GET", f"/v1/queries/{first['query_id']}")
-    assert (kept.status_code, first["kept_until"] > first["at"]) == (200, True)
+    assert (kept.status_code, first["expires_at"] > first["at"]) == (200, True)
     told = lost.json()
     assert (nowhere["query_id"], nowhere["status"], nowhere["robot"], nowhere["pose"]) == (
         told["query_id"], "not_found", "cart", None
@@ -100,11 +91,11 @@ def test_each_query_leaves_a_record_of_what_came_of_it(house, shots, refused):
     assert (rank["status"], rank["robot"], rank["frame"]) == (
         "unvalidated", "arm", {"map": "alpha", "frame_id": ids[0]}
     )  # fmt: skip
-    assert (failed["status"], failed["cause"], failed["kept_until"], failed["robot"]) == (
-        "failed", "unreadable-frame", None, "cart"
+    assert (failed["status"], failed["cause"], failed["stored"], failed["robot"]) == (
+        "failed", "unreadable-frame", False, "cart"
     )  # fmt: skip
-    assert (last["query_id"], last["map"], last["kept_until"]) == (
-        spread["query_id"], "alpha", None
+    assert (last["query_id"], last["map"], last["stored"]) == (
+        spread["query_id"], "alpha", False
     )  # fmt: skip
     # who may not read a map is not told that it was asked
     assert (last["maps"], listed(house, "both")[0]["maps"]) == (["alpha"], ["alpha", "bravo"])
@@ -144,8 +135,8 @@ def test_who_may_read_a_map_may_list_its_queries(house, small_shots, refused):
     before = listed(house, "boss")
     counted = house.ask("boss", "GET", "/metrics").text
     assert house.ask("robot", "POST", f"{ALPHA}/queries", **quiet).status_code == 200
-    again = house.ask("boss", "POST", f"/v1/queries/{before[0]['query_id']}/again",
-                      json={"record": False})  # fmt: skip
+    repeated = {"maps": ["alpha"], "query_id": before[0]["query_id"], "record": False}
+    again = house.ask("boss", "POST", "/v1/queries", json=repeated)
     assert again.status_code == 200
     refused(house.ask("robot", "POST", f"{ALPHA}/queries", json={"frame_id": "x", "k": 0}), 422,
             "invalid-request")  # fmt: skip
@@ -157,7 +148,7 @@ def test_who_may_read_a_map_may_list_its_queries(house, small_shots, refused):
         for text in (counted, house.ask("boss", "GET", "/metrics").text)
     ]
     assert answers[0] == answers[1]
-    assert "sceneprint_query_records_lost_total 0.0" in counted
+    assert "sceneprint_queries_lost_total 0.0" in counted
 
     delete = {"params": {"map": "alpha"}}
     refused(house.ask("robot", "DELETE", "/v1/queries", **delete), 403, "forbidden")
@@ -165,89 +156,3 @@ def test_who_may_read_a_map_may_list_its_queries(house, small_shots, refused):
     assert [one["map"] for one in listed(house, "boss")] == ["bravo"]
     assert house.ask("boss", "DELETE", "/v1/maps/bravo").status_code == 204
     assert listed(house, "boss") == []
-
-
-def offline(number: int, **more: Any) -> dict[str, Any]:
-    """A record of a query that a robot answered itself."""
-    at = datetime.now(UTC).isoformat()
-    one = {"query_id": f"{number:032x}", "at": at, "status": "failed", "reason": "dark",
-           "milliseconds": 7.5}  # fmt: skip
-    return one | more
-
-
-POSE = {"parent_frame": "room", "translation": {"x": 1, "y": 2, "z": 3},
-        "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}  # fmt: skip
-
-
-def test_who_may_write_to_a_map_may_send_records_of_it(house, refused):
-    def send(key: str, *records: Any, **more: Any) -> Any:
-        body = {"json": {"records": list(records)}} | more
-        return house.ask(key, "POST", f"{ALPHA}/queries/records", **body)
-
-    sent = [offline(i) for i in range(100)]
-    answer = send("robot", *sent)
-    assert answer.status_code == 200, answer.text
-    assert answer.json() == {"received": 100, "there": 0, "expired": 0, "refused": []}
-    assert send("boss", *sent[:2]).json()["there"] == 2
-    assert {(one["key"], one["offline"]) for one in listed(house, "robot")} == {("robot", True)}
-    refused(send("both", offline(200)), 403, "forbidden")
-    refused(send("other", offline(200)), 404, "unknown-map")
-    refused(
-        house.ask("boss", "POST", "/v1/maps/cellar/queries/records",
-                  json={"records": [offline(200)]}),
-        404, "unknown-map",
-    )  # fmt: skip
-    refused(send("robot", json=[]), 422, "invalid-request")
-    refused(send("robot", json=None, content=b"{", headers={"Content-Type": "application/json"}),
-            400, "malformed-body")  # fmt: skip
-    refused(send("robot", json=None, content=b"x", headers={"Content-Type": "text/plain"}),
-            415, "unsupported-type")  # fmt: skip
-    large = [offline(i, reason="\u00e9" * 1000) for i in range(300)]
-    refused(send("robot", *large), 413, "too-large")
-    audit = house.ask("boss", "GET", "/v1/audit", params={"limit": 9}).json()["items"]
-    noted = [one["data"] for one in audit if one["action"] == "add_query_records"]
-    assert [one["records"] for one in noted if one["status"] == 200] == [2, 100]
-
-
-@pytest.mark.parametrize(
-    ("wrong", "place"),
-    [
-        ({"query_id": "A" * 32}, "query_id"), ({"query_id": "a" * 31}, "query_id"),
-        ({"query_id": f"{'a' * 32}\n"}, "query_id"), ({"at": "2026-11-23T10:00:00"}, "at"),
-        ({"at": None}, "at"), ({"status": "fine"}, "status"), ({"reason": "x" * 1001}, "reason"),
-        ({"reason": "a\0"}, "reason"), ({"reason": None}, "reason"),
-        ({"cause": "not so"}, "cause"), ({"cause": "x" * 65}, "cause"),
-        ({"robot": ""}, "robot"), ({"robot": "x" * 129}, "robot"), ({"session": "a\n"}, "session"),
-        ({"support": -1}, "support"), ({"support": 1_000_001}, "support"),
-        ({"rival_ratio": -0.1}, "rival_ratio"), ({"rival_ratio": 1e7}, "rival_ratio"),
-        ({"alternatives": 1_000_001}, "alternatives"), ({"alternatives": None}, "alternatives"),
-        ({"milliseconds": -1}, "milliseconds"), ({"milliseconds": 86_400_001}, "milliseconds"),
-        ({"milliseconds": None}, "milliseconds"), ({"kind": "video"}, "kind"),
-        ({"maps": []}, "maps"), ({"maps": ["alpha"] * 65}, "maps"), ({"maps": ["A"]}, "maps"),
-        ({"frame": {"map": "alpha"}}, "frame_id"),
-        ({"frame": {"map": "alpha", "frame_id": "x" * 65}}, "frame_id"),
-        ({"pose": POSE}, "records.1"), ({"key": "boss"}, "key"), ({"offline": False}, "offline"),
-        ({"status": "found", "pose": POSE | {"parent_frame": "x" * 129}}, "parent_frame"),
-        ({"status": "found", "pose": POSE | {"translation": {"x": 2e9, "y": 0, "z": 0}}}, "pose"),
-        ({"status": "found", "pose": POSE | {"translation": {"x": None, "y": 0, "z": 0}}}, "x"),
-        ({"status": "found", "pose": POSE | {"rotation": dict.fromkeys("xyzw", 0.0)}}, "pose"),
-        ({"status": "found", "pose": POSE | {"rotation": dict.fromkeys("xyzw", 0.6)}}, "pose"),
-    ],
-)  # fmt: skip
-def test_one_invalid_record_refuses_them_all(shared_house, refused, wrong, place):
-    records = [offline(1), offline(2, **wrong)]
-    answer = shared_house.ask("robot", "POST", f"{ALPHA}/queries/records",
-                              json={"records": records})  # fmt: skip
-    refused(answer, 422, "invalid-request")
-    fields = [one["field"] for one in answer.json()["errors"]]
-    assert all(one.startswith("records.1") for one in fields), fields
-    assert any(place in one for one in fields), fields
-    assert listed(shared_house, "boss") == []
-
-
-def test_how_many_records_a_request_may_have(shared_house, refused):
-    for records in ([], [offline(i) for i in range(101)], [offline(1), offline(1)]):
-        answer = shared_house.ask("robot", "POST", f"{ALPHA}/queries/records",
-                                  json={"records": records})  # fmt: skip
-        refused(answer, 422, "invalid-request")
-    assert listed(shared_house, "boss") == []

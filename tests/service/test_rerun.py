@@ -1,4 +1,4 @@
-"""Rerun of a stored query: with the same options or others, without uploading the file again."""
+"""Stored queries repeated with the same options or others, without uploading the file again."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ def asked(served, make_map, shots) -> dict[str, Any]:
 
 
 def again(served, query_id: str, **options: Any) -> dict[str, Any]:
-    reply = served.client.post(f"/v1/queries/{query_id}/again", json=options)
+    question = served.client.get(f"/v1/queries/{query_id}/question").json()
+    body = {"maps": question["maps"], **question["options"], **options, "query_id": query_id}
+    body = {name: value for name, value in body.items() if value is not None}
+    reply = served.client.post("/v1/queries", json=body)
     assert reply.status_code == 200, reply.text
     told: dict[str, Any] = reply.json()
     return told
@@ -50,7 +53,6 @@ def test_an_upload_is_asked_again_without_its_file(served, asked):
     assert told["query_id"] != asked["query_id"]
     assert same(told) == same(asked)
     assert same(served.client.get(f"/v1/queries/{told['query_id']}").json()) == same(asked)
-    # what is given changes, what is not stays, and null is the default again
     fewer = again(served, told["query_id"], k=1, candidates=2)
     assert (fewer["counts"]["selected"], fewer["seed"]) == (2, 3)
     assert again(served, fewer["query_id"], k=None, candidates=None)["counts"] == asked["counts"]
@@ -66,12 +68,17 @@ def test_an_upload_is_asked_again_without_its_file(served, asked):
 
 def test_the_question_is_told(served, asked):
     question = served.client.get(f"/v1/queries/{asked['query_id']}/question").json()
-    assert question.pop("asked_at").endswith("+00:00")
-    assert question == {
-        "query_id": asked["query_id"], "maps": ["again"], "frame": None, "kind": "depth",
-        "robot": "r", "session": "s", "validates": True, "model": asked["model"],
+    (record,) = [
+        one
+        for one in served.client.get("/v1/queries", params={"map": "again"}).json()["items"]
+        if one["query_id"] == asked["query_id"]
+    ]
+    assert question == record | {
+        "validates": True, "model": asked["model"],
         "options": {"seed": 3, "validation": {"residual_m": 0.05}},
     }  # fmt: skip
+    assert (record["robot"], record["session"], record["stored"]) == ("r", "s", True)
+    assert record["expires_at"] > record["at"]
 
 
 def test_a_stored_frame_is_asked_again_of_other_maps(served, asked, make_map, shots):
@@ -99,12 +106,10 @@ def test_another_frame_of_the_same_id_is_not_asked_in_its_place(served, make_map
     put(0)
     asked = {"frame_id": "door", "stages": "retrieve"}
     query_id = served.client.post(f"{path}/queries", json=asked).json()["query_id"]
-    for i, status in ((0, 200), (2, 404)):  # the same frame once more, and another
-        assert served.client.delete(f"{path}/frames/door").status_code == 204
-        put(i)
-        reply = served.client.post(f"/v1/queries/{query_id}/again", json={})
-        assert reply.status_code == status, reply.text
-    refused(reply, 404, "unknown-frame", "a new frame has its id")
+    assert served.client.delete(f"{path}/frames/door").status_code == 204
+    put(2)
+    body = {"maps": ["again-other"], "query_id": query_id}
+    refused(served.client.post("/v1/queries", json=body), 404, "unknown-query")
 
 
 def test_the_query_is_drawn_as_the_frame_is(served, asked):
@@ -126,26 +131,28 @@ def test_what_cannot_be_asked_again(served, asked, shots, refused):
     path = f"/v1/queries/{asked['query_id']}"
     reply = served.client.get(f"{path}/preview.png?view=patches")
     refused(reply, 422, "invalid-request", "not stored")
-    for wrong in ({"kk": 2}, {"k": 0}, {"frame": {"map": "again", "frame_id": "x"}}, {"maps": []}):
-        refused(served.client.post(f"{path}/again", json=wrong), 422, "invalid-request", "")
-    refused(served.client.post(f"{path}/again", json=[1]), 400, "malformed-body", "object")
-    reply = served.client.post(
-        f"{path}/again", content=b"{}", headers={"Content-Type": "text/plain"}
-    )
-    refused(reply, 415, "unsupported-type", "application/json")
-    reply = served.client.post(f"{path}/again", json={"maps": ["nowhere"]})
-    refused(reply, 404, "unknown-map", "nowhere")
-    reply = served.client.post(f"/v1/queries/{'0' * 32}/again", json={})
-    refused(reply, 404, "unknown-query", "expired")
+    frame = {"map": "again", "frame_id": "x"}
+    for wrong in ({"kk": 2}, {"k": 0}, {"frame": frame}, {"maps": []}):
+        body = {"maps": ["again"], "query_id": asked["query_id"]} | wrong
+        refused(served.client.post("/v1/queries", json=body), 422, "invalid-request", "")
+    form = shots[0].form()
+    form["data"] |= {"maps": "again", "query_id": asked["query_id"]}
+    refused(served.client.post("/v1/queries", **form), 422, "invalid-request", "two frames")
+    for body, kind in (
+        ({"maps": ["nowhere"], "query_id": asked["query_id"]}, "unknown-map"),
+        ({"maps": ["again"], "query_id": "0" * 32}, "unknown-query"),
+    ):
+        refused(served.client.post("/v1/queries", json=body), 404, kind)
     # without validation no points were made: they cannot be validated, or drawn
     form = shots[0].form()
     form["data"]["stages"] = "retrieve"
     bare = served.client.post("/v1/maps/again/queries", **form).json()["query_id"]
     refused(served.client.get(f"/v1/queries/{bare}/preview.png"), 409, "not-indexed", "validate")
     assert not served.client.get(f"/v1/queries/{bare}/question").json()["validates"]
-    reply = served.client.post(f"/v1/queries/{bare}/again", json={"stages": None})
-    refused(reply, 409, "not-indexed", "with the frame")
+    reply = served.client.post("/v1/queries", json={"maps": ["again"], "query_id": bare})
+    refused(reply, 409, "not-indexed", "Send the frame")
     # and a map of another model cannot be asked with this signature
     served.client.post("/v1/maps", json={"name": "again-paper", "model": "paper"})
-    reply = served.client.post(f"{path}/again", json={"maps": ["again-paper"]})
+    body = {"maps": ["again-paper"], "query_id": asked["query_id"]}
+    reply = served.client.post("/v1/queries", json=body)
     refused(reply, 409, "not-indexed", "a different model")

@@ -268,10 +268,10 @@ def test_a_key_is_made_shown_once_used_and_revoked(walled, refused):
     assert [key["name"] for key in rest["items"]] == ["reader", "robot/7 é", "watcher", "writer"]
     assert made["secret"] not in str(listed) + str(rest)
     again = walled.ask("boss", "POST", "/v1/keys", json=new)
-    refused(again, 409, "conflict", "There is a key named")
+    refused(again, 409, "conflict")
     gone = walled.ask("boss", "DELETE", answer.headers["location"])
     assert gone.status_code == 204
-    refused(walled.ask("new", "GET", "/v1/keys/me"), 401, "key-required", "unknown, revoked or")
+    refused(walled.ask("new", "GET", "/v1/keys/me"), 401, "key-required")
     refused(walled.ask("boss", "DELETE", answer.headers["location"]), 404, "unknown-key")
 
 
@@ -354,9 +354,9 @@ def test_changes_are_noted_and_found(walled):
     assert walled.ask("boss", "DELETE", "/v1/maps/m1").status_code == 404
     assert walled.ask("watcher", "DELETE", "/v1/maps/m2").status_code == 403
     lines = walled.ask("boss", "GET", "/v1/audit?map=m1").json()["items"]
-    assert [line["action"] for line in lines] == ["delete_map", "create_map"]
+    assert [line["action"] for line in lines] == ["map.deleted", "map.created"]
     assert [line["actor"] for line in lines] == ["boss", "boss"]
-    assert (lines[0]["request_id"], lines[0]["data"]["status"]) == ("delete-1", 204)
+    assert (lines[0]["request_id"], lines[0]["tenant"]) == ("delete-1", "boss")
     assert lines[0]["at"] >= lines[1]["at"]
     page = walled.ask("boss", "GET", "/v1/audit?limit=1&map=m1").json()
     rest = walled.ask("boss", "GET", f"/v1/audit?map=m1&cursor={page['next_cursor']}").json()
@@ -387,10 +387,11 @@ def test_what_a_key_was_refused_is_noted_a_few_times(walled):
         answer = walled.server.client.get("/v1/audit", headers=given)
         assert answer.status_code == 403
     lines = walled.ask("boss", "GET", "/v1/audit?actor=peeper&limit=1000").json()["items"]
-    assert [one["sequence"] for one in lines] == list(range(AT_ONCE, 0, -1))
-    told = ("action", "tenant", "address", "refused", "request_id", "data")
+    assert len(lines) == AT_ONCE
+    told = ("action", "tenant", "address", "request_id", "data")
     assert [lines[0][name] for name in told] == [
-        "list_changes", "peeper", "127.0.0.1", True, "peep", {"status": 403},
+        "refused", "peeper", "127.0.0.1", "peep",
+        {"operation": "list_changes", "status": 403},
     ]  # fmt: skip
 
 

@@ -57,7 +57,7 @@ def test_the_last_of_several_frames_is_placed(served, path, shots):
         (2, False, {}, "frame 0 has no pose"),
         (2, True, {"k": "0"}, "greater than or equal to 1"),
         (2, True, {"colour": "red"}, "colour"),
-        (2, True, {"stages": "retrieve"}, "A pose needs validated matches"),
+        (2, True, {"stages": "retrieve"}, "stages"),
     ],
 )
 def test_what_is_no_sequence_is_refused(served, path, shots, count, poses, more, told):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import sqlite3
 import subprocess
 import sys
@@ -26,11 +27,10 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.tables import MapRow, metadata
 
 TABLES = [
-    "audit", "audit_chains", "deleted_frames", "deletions", "doomed", "events", "former_maps",
-    "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs", "kept_answer_frames",
-    "kept_answer_maps", "kept_answers", "keys", "maps", "models", "pending_events",
-    "query_records", "samples",
-    "schema_range", "scrubs", "secrets", "signatures", "surface_frames",
+    "audit", "deleted_frames", "deletions", "doomed", "events", "former_maps",
+    "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs", "keys", "maps",
+    "models", "pending_events", "queries", "samples", "schema_range",
+    "scrubs", "secrets", "signatures", "surface_frames",
     "surface_tiles", "surface_touches", "surfaces", "tenants",
 ]  # fmt: skip
 
@@ -231,3 +231,42 @@ def test_a_connection_that_is_in_use_is_closed_when_it_comes_back(tmp_path: Path
     with database.read() as connection:  # and it can be used again
         assert connection.exec_driver_sql("SELECT 1").scalar() == 1
     database.close()
+
+
+#: Largest file of the child, in pages of the database: less than the schema takes.
+PAGES = 4
+OPENS = """
+import sys
+from sceneprint.errors import UnusableStore
+from sceneprint.store import open_database
+try:
+    open_database(sys.argv[1]).close()
+    print("opened")
+except UnusableStore as error:
+    print(error)
+"""
+
+
+def narrow() -> None:
+    """For a child about to begin: its files stay small, as on a disk that is full."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096 * PAGES, 4096 * PAGES))
+
+
+def schema(path: Path) -> set[tuple[str, ...]]:
+    with closing(sqlite3.connect(path)) as connection:
+        assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        return set(connection.execute("SELECT name, sql FROM sqlite_master").fetchall())
+
+
+def test_a_schema_that_finds_no_room_changes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "truth.db"
+    url = f"sqlite:///{path}"
+    found = schema(path)
+    done = subprocess.run(
+        [sys.executable, "-c", OPENS, url], capture_output=True, text=True, check=True,
+        preexec_fn=narrow,
+    )  # fmt: skip
+    assert "that the disk has room" in done.stdout
+    assert schema(path) == found
+    open_database(url).close()  # and with room it goes on
+    assert len(schema(path)) > len(found)

@@ -75,36 +75,28 @@ class Me(ApiRecord):
     expires_at: datetime | None = Field(default=None, description="Null: it does not expire.")
 
 
-class Audited(ApiRecord):
-    """A change and who made it, or what somebody was refused."""
+class AuditLine(ApiRecord):
+    """A change and who made it, or a request that was refused."""
 
+    number: int = Field(description="Grows with each line, and may leave gaps.")
     at: datetime
     actor: str | None = Field(
-        description="Name of the key that was shown; null where none was asked for; `command` for "
-        "a command on the data folder."
+        description="Name of the key; null where the service requires none; `command` for a "
+        "command on the data folder."
     )
     address: str | None = Field(
         description="Where the request came from; behind a proxy, the proxy's."
     )
-    action: str = Field(description="The operation, such as `delete_map`.")
-    map: str | None = Field(description="That was changed.")
-    target: str | None = Field(description="What was changed in it, or of no map: an id or name.")
+    tenant: str = Field(description="Of the key; empty where there is none.")
+    action: str = Field(
+        description="The kind of the change's event, such as `map.deleted`, or an action without "
+        "an event, such as `job.cancelled`; `refused` for a request that was refused (401 or 403) "
+        "and changed nothing."
+    )
+    map: str | None = Field(description="Name of the map that was changed.")
+    target: str | None = Field(description="What was changed: the id or name.")
     request_id: str | None = Field(description="As in the log.")
-    data: dict[str, Any] = Field(description="More of what was changed, by the operation.")
-    refused: bool = Field(
-        default=False, description="Whether it was refused (401 or 403) and nothing was changed."
-    )
-    tenant: str | None = Field(
-        default=None,
-        description="In whose chain the line is; null: a line of before version 0.3, in none.",
-    )
-    sequence: int | None = Field(
-        default=None, description="Place in the chain of the tenant's changes, or of refusals."
-    )
-    hash: str | None = Field(
-        default=None,
-        description="SHA-256 of the hash before it in its chain and of the line, as hexadecimal.",
-    )
+    data: dict[str, Any] = Field(description="More, by action.")
 
 
 # How a service does, and what it signs with, as JSON.
@@ -175,16 +167,6 @@ class WorkerSeen(ApiRecord):
 
     name: str = Field(description="Its host and process id.")
     job_id: str | None = Field(description="What it is at.")
-
-
-class ReplicaSeen(ApiRecord):
-    """The read replica, as the process that answers sees it."""
-
-    used: bool = Field(description="Whether queries are answered from it; its log says why not.")
-    behind_s: float | None = Field(
-        description="What was stored or deleted so many seconds ago, or earlier, is in it; null: "
-        "not known."
-    )
 
 
 class Latency(ApiRecord):
@@ -276,10 +258,6 @@ class Stats(ApiRecord):
     use: MapUse | None = Field(
         default=None, description="Against quota and retention; null where no map was asked for."
     )
-    replica: ReplicaSeen | None = Field(
-        default=None,
-        description="Null where there is none, or a map was asked for.",
-    )
     scrub: ScrubSeen | None = Field(
         default=None, description="Null where none has begun, or a map was asked for."
     )
@@ -339,17 +317,28 @@ class Progress(ApiRecord):
     total: int | None = Field(default=None, description="Of so many, where that is known.")
 
 
+class MapJob(ApiRecord):
+    """A job that computes something of a map."""
+
+    map: str
+    state: JobState
+    progress: Progress | None = Field(description="Null until it has begun.")
+    error: str | None
+    created_at: datetime
+    finished_at: datetime | None
+
+
 class Job(ApiRecord):
     """A piece of work in the queue."""
 
     job_id: str
     kind: str = Field(
         description="`sign`, `import`, `associate`, `coverage`, `difference`, `surface`, "
-        "`reconstruct`, `snapshot`, or `reencode`: that one signs an indexed frame once more, with "
+        "`reconstruct`, or `reencode`: that one signs an indexed frame once more, with "
         "the model to come or as what was made of it is damaged."
     )
     state: JobState
-    map: str | None = Field(description="That it is about; null for `snapshot`.")
+    map: str | None = Field(description="The map that it works on.")
     frame_id: str | None = Field(description="That it signs; null where it is of no single one.")
     priority: int = Field(description="Jobs of a greater one are done first.")
     attempts: int
@@ -413,8 +402,7 @@ KINDS = {
     "frame.restored": "Its deletion was undone; what was indexed is signed again.",
     "query.answered": (
         "A query was answered, or failed; `data` has `query_id`, `status`, `robot`, `pose` where "
-        "it was found, and more of its record; `offline` where a robot answered it itself, and "
-        "sent the record later."
+        "it was found, and more about it."
     ),
     "import.done": "An archive was imported, as far as it could be; `data` is its result.",
     "association.found": "A job that looked for associations is over; `data` is its result.",
@@ -456,19 +444,3 @@ class EventPage(Page[Event]):
         description="Id of the newest event of your maps, of whatever kind, when this was asked; "
         "0 where there was none yet: what follows it is told by a stream with this as `after`."
     )
-
-
-# Snapshots that a service has taken, as JSON.
-
-
-class SnapshotFile(ApiRecord):
-    """One state of the data folder in an archive, which `sceneprint restore` puts back."""
-
-    snapshot_id: str
-    created_at: datetime = Field(description="Its state is not older.")
-    bytes: int
-    sha256: str = Field(description="Of the archive.")
-    maps: int
-    frames: int
-    blobs: int
-    damaged: int = Field(description="Blobs that were missing or damaged, and are not in it.")

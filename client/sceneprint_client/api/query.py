@@ -414,7 +414,7 @@ class Query(Given):
     exact: bool = Field(
         default=False,
         description="Compare every frame of the map that passes the filter. Most queries do so "
-        "anyway: only in a large map, or where PostgreSQL searches, are some left out.",
+        "anyway: only in a large map are some left out.",
     )
     filter: Filter | None = Field(
         default=None,
@@ -459,11 +459,11 @@ class Query(Given):
     )
     keep: bool = Field(
         default=True,
-        description="Keep the answer for a while, so that GET /v1/queries/{query_id} has it.",
+        description="Store the answer, so that GET /v1/queries/{query_id} returns it.",
     )
     record: bool = Field(
         default=True,
-        description="Leave a record in GET /v1/queries, an event, and a count in the figures.",
+        description="List the query in GET /v1/queries, report it as an event, and count it.",
     )
 
     @field_validator("stages", mode="before", json_schema_input_type=str | tuple[Stage, ...])
@@ -501,6 +501,11 @@ class SeveralQuery(Query):
     )
     frame: NamedFrame | None = Field(
         default=None, description="A stored frame, in place of an upload; it does not find itself."
+    )
+    query_id: str | None = Field(
+        default=None,
+        description="An earlier query whose answer is stored, in place of an upload: its frame "
+        "with these options. The answer has an id of its own.",
     )
 
     @field_validator("maps", mode="before")
@@ -592,12 +597,6 @@ class Answer(ApiRecord):
     deadline_reached: bool | None = Field(
         default=None,
         description="Whether candidates were left out for want of time; null without a deadline.",
-    )
-    replica_behind_s: float | None = Field(
-        default=None,
-        description="Answered from a read replica: what was stored or deleted so many seconds "
-        "before the query came, or earlier, is taken into account. Null: answered from the "
-        "database itself, as of now.",
     )
     explanations: list[Explanation] | None = Field(
         default=None, description="With `explain`: every frame of the ranking, the nearest first."

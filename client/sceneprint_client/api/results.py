@@ -1,28 +1,23 @@
-"""What can be looked at after a query, as JSON."""
+"""Past queries, and what can be looked at after one, as JSON."""
 
 from __future__ import annotations
 
-import math
-from datetime import datetime, timezone
+from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import AwareDatetime, Field, StringConstraints, model_validator
+from pydantic import Field
 
 from sceneprint_client.api.base import (
     ApiRecord,
     Given,
-    GivenQuaternion,
-    GivenVector,
-    Label,
     Note,
     Quaternion,
     Transform,
     Vector,
 )
-from sceneprint_client.api.frames import FRAME_ID, Kind
-from sceneprint_client.api.maps import Preset, Slug
+from sceneprint_client.api.frames import Kind
+from sceneprint_client.api.maps import Preset
 from sceneprint_client.api.query import (
-    MOST_MAPS,
     FrameName,
     JsonText,
     NamedFrame,
@@ -31,33 +26,9 @@ from sceneprint_client.api.query import (
     ValidationOptions,
 )
 
-# How a query was asked, as JSON: so that it can be understood, and asked again.
+# Past queries.
 
-
-class Question(ApiRecord):
-    """What was asked, and how."""
-
-    query_id: str
-    maps: list[str] = Field(description="The maps that were asked.")
-    frame: FrameName | None = Field(
-        description="The stored frame that was asked for; null for an upload."
-    )
-    kind: Kind = Field(description="Of the frame that was asked for.")
-    robot: str | None = Field(description="Who took an uploaded frame, as it was told.")
-    session: str | None
-    asked_at: str = Field(description="When, in UTC.")
-    validates: bool = Field(
-        description="Its points are kept, so that it can be asked again with the stage `validate`."
-    )
-    model: str
-    options: dict[str, Any] = Field(
-        description="As they were given; what was left out had its default."
-    )
-
-
-# What is left of a query for longer than its answer, as JSON.
-
-#: What came of a query: the status of its answer, or that there was none.
+#: The outcome of a query: the status of its answer, or that there was none.
 RecordStatus = Literal["found", "ambiguous", "not_found", "unvalidated", "failed"]
 RECORD_STATUSES: tuple[RecordStatus, ...] = (
     "found", "ambiguous", "not_found", "unvalidated", "failed"
@@ -75,50 +46,24 @@ class RecordedPose(ApiRecord):
 class KeepOptions(Given):
     """How to keep an answer."""
 
-    title: Note | None = Field(default=None, description="For people.")
-    until: AwareDatetime | None = Field(
-        default=None,
-        description="It is released then; with a time zone. Default: it is kept until it is "
-        "released.",
-    )
-
-
-class AnswerRetention(ApiRecord):
-    """For how long an answer can be looked at."""
-
-    query_id: str
-    kept: bool = Field(description="Whether somebody keeps it.")
-    title: str | None = None
-    kept_at: datetime | None = Field(default=None, description="Since when it is kept.")
-    until: datetime | None = Field(
-        default=None,
-        description="When it goes, or earlier where room is needed; of a kept one when it is "
-        "released: null, not by itself.",
-    )
-
-
-class KeptAnswer(ApiRecord):
-    """How an answer is kept beyond its hour."""
-
-    title: str | None
-    kept_at: datetime
-    until: datetime | None = Field(description="When it is released; null: not by itself.")
-    bytes: int
+    title: Note | None = Field(default=None, description="A label for people.")
 
 
 class QueryRecord(ApiRecord):
-    """What came of a query, in short; nothing of what its frame shows."""
+    """A past query and its outcome; nothing of what its frame shows."""
 
-    query_id: str = Field(description="GET /v1/queries/{query_id} has the answer while it is kept.")
+    query_id: str = Field(
+        description="While `stored` is true, GET /v1/queries/{query_id} returns the answer."
+    )
     at: datetime = Field(description="When the query came.")
     map: str = Field(
-        description="Of several maps that were asked: the one it was found in, that of the first "
-        "alternative or match, or the first that was named."
+        description="Of several maps that were searched: the one it was found in, that of the "
+        "first alternative or match, or the first that was named."
     )
-    maps: list[str] = Field(description="Those that were asked and that you may read.")
-    robot: str | None = Field(description="Who asked, as far as the query said.")
+    maps: list[str] = Field(description="All maps that were searched and that you may read.")
+    robot: str | None = Field(description="Who sent it, if the query said so.")
     session: str | None
-    key: str | None = Field(description="Name of the key that was shown; null without one.")
+    key: str | None = Field(description="Name of the API key; null without one, or once revoked.")
     status: RecordStatus = Field(
         description="Of the answer. `failed`: there was none, and `reason` says why."
     )
@@ -128,131 +73,35 @@ class QueryRecord(ApiRecord):
     )
     reason: str
     pose: RecordedPose | None = Field(description="Of `found`, where the matches have poses.")
-    support: int | None = Field(description="Matches that agree on `pose`.")
+    support: int | None = Field(description="Number of matches that agree on `pose`.")
     rival_ratio: float | None = Field(description="How near another place comes, 0 to 1.")
-    alternatives: int = Field(description="Of `ambiguous`: poses that the evidence supports.")
+    alternatives: int = Field(
+        description="Of `ambiguous`: number of poses that the evidence supports."
+    )
     milliseconds: float
     kind: Kind | None = Field(description="Of the frame; null where it was not read.")
     frame: FrameName | None = Field(
-        description="The stored frame that was asked for; null for an upload, and where you may "
+        description="The stored frame that was the query; null for an upload, and where you may "
         "not read its map."
     )
-    kept_until: datetime | None = Field(
-        description="The answer is kept until then, while there is room; null: not any more, or "
-        "it never was. See also `keep`."
+    stored: bool = Field(description="Whether the answer can still be looked at.")
+    expires_at: datetime | None = Field(
+        description="When the record and the answer are removed; the answer earlier where room is "
+        "needed. Null: the answer is kept."
     )
-    keep: KeptAnswer | None = Field(
-        default=None, description="Where somebody keeps the answer for longer."
+    kept_at: datetime | None = Field(description="Since when somebody keeps the answer.")
+    title: str | None = Field(description="Of a kept answer.")
+
+
+class StoredQuery(QueryRecord):
+    """A past query whose answer is stored, and how it was sent."""
+
+    validates: bool = Field(
+        description="Its points are stored, so that it can be repeated with the stage `validate`."
     )
-    offline: bool = Field(
-        default=False,
-        description="The robot answered the query itself, from a copy of the map, and sent this "
-        "record later. The service never had the answer.",
-    )
-
-
-# Records of queries that a robot answered itself, as JSON.
-
-#: Most records in one request.
-MOST_OF_RECORDS = 100
-#: Characters of a record's reason; that of an answer has some 200.
-MOST_REASON = 1000
-#: Longest that a query may have taken, milliseconds: a day.
-MOST_MS = 86_400_000.0
-#: Farthest place of a pose along each axis, metres, and what a quaternion's norm may miss 1 by.
-FARTHEST_POSE, NORM_TOLERANCE = 1e9, 1e-3
-#: Most matches or alternatives that a record may count.
-MOST_COUNTED = 1_000_000
-
-
-class NewRecordedPose(Given):
-    """T_parent_query, metres and a unit quaternion."""
-
-    parent_frame: Label
-    translation: GivenVector
-    rotation: GivenQuaternion
-
-    @model_validator(mode="after")
-    def _is_pose(self) -> NewRecordedPose:
-        t, r = self.translation, self.rotation
-        if max(abs(t.x), abs(t.y), abs(t.z)) > FARTHEST_POSE:
-            raise ValueError(f"farther than {FARTHEST_POSE:g} m from the origin")
-        if abs(math.hypot(r.x, r.y, r.z, r.w) - 1.0) > NORM_TOLERANCE:
-            raise ValueError("its rotation is not a unit quaternion")
-        return self
-
-
-class NewRecordedFrame(Given):
-    """The stored frame that was asked for."""
-
-    map: Slug
-    frame_id: Annotated[str, StringConstraints(pattern=f"^{FRAME_ID}$")]
-
-
-class NewQueryRecord(Given):
-    """What came of a query that a robot answered itself; fields as in QueryRecord."""
-
-    query_id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
-    at: AwareDatetime = Field(
-        description="When the query came, on the robot's clock. The service stores a time in the "
-        "future as that of the request."
-    )
-    maps: Annotated[list[Slug], Field(min_length=1, max_length=MOST_MAPS)] | None = Field(
-        default=None, description="All that were asked, if more than this map."
-    )
-    robot: Label | None = None
-    session: Label | None = None
-    status: RecordStatus
-    cause: Annotated[str, StringConstraints(pattern=r"^[a-z0-9_-]{1,64}$")] | None = None
-    reason: Annotated[str, StringConstraints(max_length=MOST_REASON, pattern=r"^[^\x00]*$")]
-    pose: NewRecordedPose | None = None
-    support: int | None = Field(default=None, ge=0, le=MOST_COUNTED)
-    rival_ratio: float | None = Field(default=None, ge=0, le=MOST_COUNTED)
-    alternatives: int = Field(default=0, ge=0, le=MOST_COUNTED)
-    milliseconds: float = Field(ge=0, le=MOST_MS)
-    kind: Kind | None = None
-    frame: NewRecordedFrame | None = None
-
-    @model_validator(mode="after")
-    def _is_consistent(self) -> NewQueryRecord:
-        if self.pose is not None and self.status != "found":
-            raise ValueError(f"pose: of a query that was {self.status}; only `found` has one")
-        try:  # as it will be told
-            datetime.fromtimestamp(self.at.timestamp(), timezone.utc)
-        except (ValueError, OverflowError) as error:
-            raise ValueError("at: not within the years 1 to 9999 of UTC") from error
-        return self
-
-
-class NewQueryRecords(Given):
-    """Records of queries of one map."""
-
-    records: list[NewQueryRecord] = Field(min_length=1, max_length=MOST_OF_RECORDS)
-
-    @model_validator(mode="after")
-    def _once_each(self) -> NewQueryRecords:
-        ids = {one.query_id for one in self.records}
-        if len(ids) < len(self.records):
-            raise ValueError("records: a `query_id` is there twice")
-        return self
-
-
-class RefusedRecord(ApiRecord):
-    """A record that the service did not store, and why."""
-
-    query_id: str
-    reason: str
-
-
-class QueryRecordsAdded(ApiRecord):
-    """What came of some records; each is counted or named once."""
-
-    received: int = Field(description="Stored.")
-    there: int = Field(description="Stored before, with the same content.")
-    expired: int = Field(description="Older than the service keeps records, and so not stored.")
-    refused: list[RefusedRecord] = Field(
-        description="Not stored: the id belongs to another record, or the query is older than the "
-        "map."
+    model: str
+    options: dict[str, Any] = Field(
+        description="As they were sent; what was left out had its default."
     )
 
 

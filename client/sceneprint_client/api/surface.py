@@ -200,7 +200,7 @@ class Coverage(ApiRecord):
 class ReconstructionFile(ApiRecord):
     """What a reconstruction made."""
 
-    name: Literal["mesh.ply", "picture.png"]
+    name: Literal["mesh.ply"]
     media_type: str
     bytes: int
 

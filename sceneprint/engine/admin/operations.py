@@ -7,7 +7,7 @@ import binascii
 import logging
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,10 +18,11 @@ from sceneprint.engine.admin.statistics import Statistics, anchors
 from sceneprint.engine.maps.map_lifecycle import Catalogue
 from sceneprint.engine.serializers import when
 from sceneprint.errors import InvalidRequest, SceneprintError
+from sceneprint.process import COMMAND, Actor
 from sceneprint.settings import Settings
-from sceneprint.store import Database, Store, audit_chain, tenants
+from sceneprint.store import Database, Store, audit_log, tenants
 from sceneprint.store import keys as stored
-from sceneprint.store.audit_chain import ChainsVerified, KeyChange
+from sceneprint.store.audit_log import AuditFilter, AuditRow
 from sceneprint.store.deletion import DAY_S, remove_in_blocks
 from sceneprint.store.events import (
     EventRow,
@@ -43,7 +44,7 @@ from sceneprint_client.api.admin import (
     EVERY,
     GRANTED,
     MISSED,
-    Audited,
+    AuditLine,
     Event,
     EventPage,
     Key,
@@ -230,16 +231,12 @@ def event_record(seals: OpaqueIds, row: EventRow) -> Event:
     )
 
 
-# Keys: made, told of, and forgotten.
-
 # Who changed what.
-
-#: The actor of what a command does to the data folder; no key may be named so.
-COMMAND = "command"
-
 
 #: Seconds between two looks for lines that are no longer kept.
 PRUNE_S = 3600.0
+#: Lines that are read at once.
+_BLOCK = 1000
 
 
 class Audit:
@@ -255,13 +252,25 @@ class Audit:
         self._store, self._kept_s = store, DAY_S * kept_days
         self._pruned = time.monotonic() - PRUNE_S
 
-    def note(self, change: KeyChange) -> None:
-        """Add a line."""
-        with self._store.database.write() as connection:
-            audit_chain.note(connection, change)
+    def record_refusal(
+        self, actor: Actor, tenant: str, map_name: str | None, target: str | None, request_id: str,
+        **data: Any,
+    ) -> None:  # fmt: skip
+        """Write a line for a request that was refused; see `audit_log.record_refusal`."""
+        with self._store.database.write(turn=False) as connection:
+            audit_log.record_refusal(
+                connection, actor, tenant, map_name, target, request_id, **data
+            )
+
+    def record(
+        self, action: str, map_name: str | None = None, target: str | None = None, **data: Any
+    ) -> None:
+        """Write a line for a change outside of the database, or in many transactions."""
+        with self._store.database.write(turn=False) as connection:
+            audit_log.record_change(connection, action, map_name, target, **data)
 
     def tidy(self, now: float | None = None) -> int:
-        """Remove some lines that are no longer kept, if it is time; returns how many.
+        """Remove lines that are no longer kept, if it is time; returns how many.
 
         What goes wrong is logged and tried again.
 
@@ -272,65 +281,32 @@ class Audit:
         if time.monotonic() - self._pruned < PRUNE_S or self._store.database.read_only:
             return 0
         self._pruned = time.monotonic()
+
+        def spent(connection: Connection, limit: int) -> list[int]:
+            before = (read_clock(connection) if now is None else now) - self._kept_s
+            return audit_log.spent_lines(connection, before, limit)
+
         try:
-            with self._store.database.read() as connection:
-                before = (read_clock(connection) if now is None else now) - self._kept_s
-                if not audit_chain.has_old_lines(connection, before):
-                    return 0
-            with self._store.database.write() as connection:
-                removed = audit_chain.prune_old_lines(connection, before)
+            return remove_in_blocks(self._store.database, spent, audit_log.remove_lines, AT_MOST)
         except SceneprintError as error:
             log.warning("audit entries not removed", extra={"error": str(error)})
             return 0
-        if removed:
-            self._pruned -= PRUNE_S  # there may be more
-        return removed
 
-    def verify(self) -> ChainsVerified:
-        """See whether a line was changed or removed; see `audit_chain.verify_chains`."""
-        with self._store.database.read() as connection:
-            return audit_chain.verify_chains(connection)
-
-    def lines(self, since: float | None = None) -> Iterator[Audited]:
-        """All lines, the oldest first; of a time, seconds since 1970, and later."""
+    def lines(self, wanted: AuditFilter) -> Iterator[AuditLine]:
+        """Yield all lines, the oldest first."""
         after = 0
         while True:  # whoever takes them may be slow, and no transaction waits for that
             with self._store.database.read() as connection:
-                block = audit_chain.lines_in_order(connection, after, since)
+                block = audit_log.list_lines(connection, wanted, _BLOCK, after=after)
             if not block:
                 return
-            yield from map(_audit_record, block)
+            yield from map(_audit_line, block)
             after = block[-1].number
 
-    def differences(self, copy: Iterable[Audited]) -> Iterator[tuple[Audited, str]]:
-        """Lines of a copy that are no longer what is stored, with the difference in words."""
-        with self._store.database.read() as connection:
-            for one in copy:
-                line = KeyChange(
-                    one.action, one.actor or "", tenant=one.tenant, refused=one.refused,
-                    sequence=one.sequence, hash=one.hash,
-                )  # fmt: skip
-                why = audit_chain.differs_from_copy(connection, line)
-                if why is not None:
-                    yield one, why
-
-    def command(
-        self, action: str, *, map_name: str | None = None, target: str | None = None, **data: Any
-    ) -> None:
-        """Add a line for a command on the data folder."""
-        self.note(KeyChange(action, COMMAND, map=map_name, target=target, data=data))
-
     def page(
-        self, cursor: str | None = None, limit: int = 100, actor: str | None = None,
-        map_name: str | None = None,
-    ) -> Page[Audited]:  # fmt: skip
-        """Changes, the newest first.
-
-        Parameters
-        ----------
-        cursor, limit : of the page
-        actor : name of the key that made them; default: of all, and of none
-        map_name : that was changed; default: any, and none
+        self, wanted: AuditFilter, cursor: str | None = None, limit: int = 100
+    ) -> Page[AuditLine]:
+        """Return a page of lines, the newest first.
 
         Raises
         ------
@@ -339,27 +315,14 @@ class Audit:
         seals = self._store.seals
         before = seals.row("audit", cursor)
         with self._store.database.read() as connection:
-            found = audit_chain.list_changes(connection, before, limit + 1, actor, map_name)
+            found = audit_log.list_lines(connection, wanted, limit + 1, before=before)
         more = seals.next_cursor("audit", [one.number for one in found], limit)
-        return Page[Audited](items=[_audit_record(one) for one in found[:limit]], next_cursor=more)
+        return Page[AuditLine](items=[_audit_line(one) for one in found[:limit]], next_cursor=more)
 
 
-def _audit_record(change: KeyChange) -> Audited:
-    assert change.at is not None
-    return Audited(
-        at=datetime.fromtimestamp(change.at, UTC),
-        actor=change.actor or None,
-        address=change.address,
-        action=change.action,
-        map=change.map,
-        target=change.target,
-        request_id=change.request_id,
-        data=change.data or {},
-        refused=bool(change.refused),
-        tenant=change.tenant,
-        sequence=change.sequence,
-        hash=change.hash,
-    )
+def _audit_line(row: AuditRow) -> AuditLine:
+    values = vars(row) | {"at": when(row.at), "actor": row.actor or None}
+    return AuditLine.model_validate(values)
 
 
 def create_key(
@@ -410,6 +373,14 @@ def create_tenant(store: Store, name: str) -> None:
     _check_name(name, "tenant")
     with store.database.write() as connection:
         tenants.create_tenant(connection, name)
+        audit_log.record_change(connection, "tenant.created", target=name)
+
+
+def delete_tenant(store: Store, name: str) -> None:
+    """Delete a tenant that has no key; UnknownTenant, Conflict."""
+    with store.database.write() as connection:
+        tenants.delete_tenant(connection, name)
+        audit_log.record_change(connection, "tenant.deleted", target=name)
 
 
 def _check_name(name: str, of: str) -> None:

@@ -25,7 +25,7 @@ from sceneprint.engine.serializers import when
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
 from sceneprint.index.generation_files import (
     GenerationManifest,
-    allocated,
+    bytes_of,
     manifests,
     read_manifest,
 )
@@ -49,7 +49,6 @@ from sceneprint_client.api.admin import (
     Latency,
     MapUse,
     Minute,
-    ReplicaSeen,
     ScrubSeen,
     Sizes,
     Stats,
@@ -118,7 +117,7 @@ def sizes(settings: Settings, store: Store) -> Sizes:
     return Sizes(
         database=_of_database(store.database),
         blobs=_of_blobs(blobs) if isinstance(blobs, Path) else _of_objects(store),
-        index=sum(_files_of(settings.indexes, deep=True)),
+        index=bytes_of(settings.indexes),
         free=free,
         disk=disk,
     )
@@ -135,7 +134,7 @@ def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRo
     return Sizes(
         database=signed * total // share,
         blobs=(uploads + artifacts) * total // share,
-        index=sum(_files_of(index_folder(indexes, row), deep=True)),
+        index=bytes_of(index_folder(indexes, row)),
         free=None,
         disk=None,
     )
@@ -189,14 +188,12 @@ def _of_blobs(folder: Path) -> int:
     return total
 
 
-def _files_of(folder: Path, *, deep: bool = False) -> Iterator[int]:
-    """Bytes of the files of a folder; with `deep`, what those of an index take of the disk."""
+def _files_of(folder: Path) -> Iterator[int]:
+    """Yield the bytes of each file of a folder."""
     try:
         for one in os.scandir(folder):
             if one.is_file(follow_symlinks=False):
-                yield allocated(one) if deep else _size(one)
-            elif deep and one.is_dir(follow_symlinks=False):
-                yield from _files_of(Path(one.path), deep=True)
+                yield _size(one)
     except OSError:
         return  # removed meanwhile, or not there yet
 
@@ -332,7 +329,6 @@ class Statistics:
             workers=workers,
             bytes=taken,
             use=None if row is None else _use(row),
-            replica=self.replica() if row is None else None,
             scrub=scrub,
             total=Counted(**_recent_counts(happened, range(minutes), samples)),
             minutes=_minutes(happened, samples, start, minutes),
@@ -388,14 +384,6 @@ class Statistics:
         )
         self._counts = found
         return found
-
-    def replica(self) -> ReplicaSeen | None:
-        """How the read replica does, if there is one."""
-        if self._store.replica is None:
-            return None
-        found = self._store.replica.standing()
-        behind_s = None if found.behind_s is None else round(found.behind_s, 3)
-        return ReplicaSeen(used=found.used, behind_s=behind_s)
 
     def began(self, worker: str) -> None:
         """Note that a worker has begun; where that cannot be written, nobody will know."""

@@ -16,6 +16,7 @@ from sceneprint.engine.serializers import job_record
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError, UnknownJob
 from sceneprint.store import Store, queue
+from sceneprint.store.audit_log import record_change
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import frame_of, map_of
@@ -220,6 +221,7 @@ def cancel(store: Store, job_id: str) -> Job:
         gone: list[str] = []
         if job.state != JobState.CANCELLED:
             queue.cancel(connection, job)
+            record_change(connection, "job.cancelled", _map_name(connection, job), job.id)
             fail_frame(connection, job, CANCELLED)
             gone = queue.remove_parts(connection, job.number, items=False, files=[ARCHIVE])
         cancelled = _job_record(connection, queue.find_job(connection, job_id))
@@ -269,6 +271,7 @@ def retry(store: Store, job_id: str) -> tuple[Job, bool]:
                 "be signed. Restore the folder from a backup, or upload the frame again."
             )
         again = queue.enqueue(connection, job.kind, frame.number, job.priority, job.model_id)
+        record_change(connection, "job.retried", row.name, job.id)
         if job.kind != REENCODE:
             set_state(connection, frame.number, FrameState.RECEIVED)
             record_event(connection, "frame.received", row.name, frame.id, again.id)
@@ -342,6 +345,7 @@ def _retry_task(connection: Connection, job: JobRow) -> tuple[Job, bool]:
     if job.state == JobState.SUCCEEDED:
         raise CannotRetry(f"Job {job.id} is {job.state}, so there is nothing to retry.")
     queue.revive(connection, job)
+    record_change(connection, "job.retried", _map_name(connection, job), job.id)
     return _job_record(connection, queue.find_job(connection, job.id)), True
 
 
@@ -351,5 +355,8 @@ def _job_record(connection: Connection, job: JobRow) -> Job:
         frame_id = frame_of(connection, job.frame).id
         last = queue.last_of(connection, job.kind, job.frame_number, job.model_id)
         followed_by = None if last is None or last.number == job.number else last.id
-    name = None if job.map_number is None else map_of(connection, job.map_number).name
-    return job_record(job, frame_id, name, followed_by)
+    return job_record(job, frame_id, _map_name(connection, job), followed_by)
+
+
+def _map_name(connection: Connection, job: JobRow) -> str | None:
+    return None if job.map_number is None else map_of(connection, job.map_number).name

@@ -22,7 +22,6 @@ from sceneprint.formats.artifact import write_geometry
 from sceneprint.geometry.retrieval.ranking import Metric, distance_share, distances
 from sceneprint.models import Model
 from sceneprint.pipeline import prepare
-from sceneprint.process import span
 from sceneprint.store import Database, Store, queue
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import find_map, frame_of, geometry_blobs, map_of
@@ -144,13 +143,10 @@ def _make(store: Store, signers: Signers, work: lifecycle.Work) -> Made:
     if work.model_id not in models_of(work.map):
         raise lifecycle.Outdated
     signer = signers(work.model_id)
-    with span("decode"):
-        frame = read_stored(store.blobs.get(work.frame.blob), work.frame, store.decoders)
-    with span("sign"):
-        signature, geometry = prepare(frame, signer)
+    frame = read_stored(store.blobs.get(work.frame.blob), work.frame, store.decoders)
+    signature, geometry = prepare(frame, signer)
     artifact = write_geometry(geometry)
-    with span("artifact"):
-        blob = store.blobs.put(artifact)
+    blob = store.blobs.put(artifact)
     stored = StoredSignature(
         model_id=signature.model_id,
         vector=signature.vector.tobytes(),
@@ -171,8 +167,7 @@ def _store_patiently(
     until = time.monotonic() + AWAY_S
     while True:
         try:
-            with span("commit"):
-                return _store(store, signers, readers, work, made)
+            return _store(store, signers, readers, work, made)
         except errors.StoreAway:
             if time.monotonic() > until:
                 raise
@@ -240,9 +235,7 @@ def _index_alone(store: Store, work: lifecycle.Work, result: Made) -> bool:
     if store.database.is_sqlite or work.frame.novelty is not None:
         return False
     with store.database.write(map_number=work.frame.map_number, single=True) as connection:
-        is_indexed = index_claimed_frame(
-            connection, work.job, work.frame, work.map.name, made, single=True
-        )
+        is_indexed = index_claimed_frame(connection, work.job, work.frame, work.map.name, made)
     if is_indexed:  # a deletion may have removed it before the commit: from now on none does
         store.blobs.ensure(made.geometry, result.artifact)
     return is_indexed
@@ -319,7 +312,7 @@ def look(database: Database, readers: Readers, row: MapRow, made: StoredSignatur
             raise errors.LostLease(str(error)) from error
         if now.number != row.number or now.model_id != made.model_id:
             return None
-        (view,) = readers.views(connection, database, [now])
+        view = readers.view(connection, now)
     hits = view.search(_vector(made), 1, dead=view.dead)
     if len(hits) == 0:
         return Look(view.revision, None)

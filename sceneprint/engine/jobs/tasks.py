@@ -1,7 +1,6 @@
-"""Jobs that are of no single frame: long ones, done in slices, and those of maps found and removed.
+"""Long jobs, that are of no single frame: done in slices.
 
-    begin  -->  queued  --claim-->  Task  --Tasks.run-->  a SliceResult for each slice
-    MapJobs  --find | page | remove-->  rows of jobs of a map, by the ids that the outside knows
+    begin  -->  queued  --claim-->  LongJob  --Tasks.run-->  a SliceResult for each slice
 
 What a slice found, how far it came, and that the job goes on or is over, is one commit, fenced by
 the job's token. A slice whose worker died is done again from where the last one ended.
@@ -29,16 +28,15 @@ from sceneprint.errors import (
     MissingDependency,
     NotFound,
     SceneprintError,
-    SnapshotError,
     StoreError,
     UnknownJob,
     UnusableStore,
 )
 from sceneprint.store import Store, queue
+from sceneprint.store.audit_log import record_change
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map, map_of, require_bytes
-from sceneprint.store.queue import find_job, list_jobs, remove_job
 from sceneprint.store.tables import ARCHIVE, JobRow, MapRow
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Job, JobState
@@ -119,7 +117,7 @@ log = logging.getLogger(__name__)
 #: Seconds of a slice at most, and between two looks whether another job waits that goes before.
 SLICE_S, LOOK_S = 15.0, 0.1
 #: Errors that trying again cannot help: what was asked for cannot be done.
-HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, SnapshotError)
+HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency)
 
 
 def ends_within(is_over: IsOver, seconds: float) -> IsOver:
@@ -134,23 +132,15 @@ class Tasks:
     def __init__(self, store: Store, bell: Wakeup) -> None:
         self._store, self._bell = store, bell
         self._handlers: dict[str, Handler] = {}
-        self._longest: dict[str, float] = {}
 
-    def register(self, kind: str, handler: Handler, longest_s: float | None = None) -> None:
+    def register(self, kind: str, handler: Handler) -> None:
         """Let jobs of a kind be done by this process.
 
         Parameters
         ----------
         kind, handler : see there
-        longest_s : that a slice may take, where that may be more than of other kinds
         """
         self._handlers[kind] = handler
-        if longest_s is not None:
-            self._longest[kind] = longest_s
-
-    def longest_s(self, kind: str, usual_s: float) -> float:
-        """Seconds after which a slice of that kind of job does not end any more."""
-        return max(self._longest.get(kind, 0.0), usual_s)
 
     def begin(
         self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
@@ -193,6 +183,7 @@ class Tasks:
             number = None if row is None else row.number
             job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
             queue.add_files(connection, job.number, files)
+            record_change(connection, "job.queued", map_name, job.id, kind=kind)
             if once is not None:
                 once.keep(connection, {"job_id": job.id})
         self._bell.ring()
@@ -209,7 +200,6 @@ class Tasks:
         start, job = time.perf_counter(), task.job
         state: JobState | None
         try:
-            longest_s = self.longest_s(job.kind, longest_s)
             with renewed(self._store, task.job, lease_s, longest_s):
                 handler = self._handlers.get(job.kind)
                 if handler is None:
@@ -332,71 +322,3 @@ def _about(task: LongJob, **more: object) -> dict[str, object]:
     job = task.job
     name = None if task.map is None else task.map.name
     return {"job_id": job.id, "kind": job.kind, "map": name, "attempt": job.attempts, **more}
-
-
-@dataclass(frozen=True, eq=False)
-class MapJobs:
-    """The jobs of a kind in all maps.
-
-    Parameters
-    ----------
-    store : with the jobs
-    kind : of the jobs, such as associate
-    noun : what one is called in errors, such as association
-    path : of the list below a map's path, such as associations
-    """
-
-    store: Store
-    kind: str
-    noun: str
-    path: str
-
-    def find(self, connection: Connection, map_name: str, job_id: str) -> JobRow:
-        """A job of a map.
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        UnknownJob : the map has no job of this kind and id.
-        """
-        row = find_map(connection, map_name)
-        message = (
-            f"There is no {self.noun} {job_id!r:.80} in map {row.name!r}. List them with "
-            f"GET /v1/maps/{row.name}/{self.path}."
-        )
-        try:
-            job = find_job(connection, job_id)
-        except UnknownJob:
-            raise UnknownJob(message) from None
-        if job.kind != self.kind or job.map_number != row.number:
-            raise UnknownJob(message)
-        return job
-
-    def page(
-        self, map_name: str, cursor: str | None, limit: int
-    ) -> tuple[list[JobRow], str | None]:
-        """Jobs of a map, the newest first, and the cursor of the next page.
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        InvalidRequest : a cursor that was not given out.
-        """
-        seals = self.store.seals
-        before = seals.row("job", cursor)
-        with self.store.database.read() as connection:
-            find_map(connection, map_name)
-            found = list_jobs(connection, before, limit + 1, None, self.kind, [map_name])
-        more = seals.next_cursor("job", [one.job.number for one in found], limit)
-        return [one.job for one in found[:limit]], more
-
-    def remove(self, map_name: str, job_id: str) -> None:
-        """Delete a job with its results; one that is not over is given up.
-
-        Raises
-        ------
-        UnknownMap, UnknownJob : there is none.
-        """
-        with self.store.database.write() as connection:
-            blobs = remove_job(connection, self.find(connection, map_name, job_id))
-        collect_deleted_blobs(self.store, blobs)

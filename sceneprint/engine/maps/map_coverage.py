@@ -1,4 +1,4 @@
-"""Coverage of maps: jobs begun, done in slices, listed, read, drawn, compared and removed.
+"""Coverage of maps: jobs begun, done in slices, listed, read, compared and removed.
 
     frames, in the order of runs  -->  an item each  --coverage_plans-->  plans, counts
 
@@ -11,36 +11,32 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.tasks import IsOver, LongJob, MapJobs, SliceResult, Tasks, ends_within
-from sceneprint.engine.maps.map_frames import Output
+from sceneprint.engine.jobs.map_jobs import BLOCK, MapJobs, page_of_items
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Tasks, ends_within
 from sceneprint.engine.maps.map_plans import (
-    DrawnFrame,
     QueriedPosition,
-    coverage_picture,
     coverage_plans,
     plan_changes,
 )
 from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.search.up_vectors import parent_axes
-from sceneprint.engine.serializers import job_progress, model_label, tag_of, when
+from sceneprint.engine.serializers import model_label
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import (
     DamagedBlob,
     DamagedSignature,
     InvalidRequest,
-    NotIndexed,
     UnknownFrame,
     UnreadableGeometry,
 )
-from sceneprint.geometry.rigid import difference, moved
+from sceneprint.geometry.rigid import difference
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import (
     PathFrame,
@@ -50,13 +46,12 @@ from sceneprint.store.frame_queries import (
     stops_of,
 )
 from sceneprint.store.frames import count_states
-from sceneprint.store.maps import find_map, geometry_blobs, living_frame, living_map, model_names
-from sceneprint.store.opaque_ids import row_of
+from sceneprint.store.maps import find_map, living_frame, living_map, model_names
 from sceneprint.store.queue import items_of
 from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats
-from sceneprint_client.api import Answer, Filter, JobState, Page, Progress, Query, Transform, Vector
+from sceneprint_client.api import Answer, Filter, Page, Query, Transform, Vector
 from sceneprint_client.api.coverage import (
     CELL_TRENDS,
     COVERAGE_OUTCOMES,
@@ -69,11 +64,6 @@ from sceneprint_client.api.coverage import (
     NewMapCoverage,
 )
 
-#: Items that are read at once.
-_BLOCK = 500
-#: Frames whose surfaces a plan shows, at most.
-_SEEN_FRAMES = 48
-
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
@@ -85,12 +75,14 @@ class _Measured:
     plans: list[CoveragePlan]
 
 
-class CoverageJobs:
+class CoverageJobs(MapJobs[MapCoverage]):
     """Coverage of maps."""
 
     def __init__(self, store: Store, tasks: Tasks) -> None:
-        self._store, self._tasks = store, tasks
-        self._jobs = MapJobs(store, COVERAGE, "coverage", "coverage")
+        super().__init__(
+            store, tasks, MapCoverage, kind=COVERAGE, noun="coverage", path="coverage",
+            priority=PRIORITY,
+        )  # fmt: skip
 
     def begin(self, map_name: str, asked: NewMapCoverage) -> MapCoverage:
         """Queue a coverage job.
@@ -102,32 +94,14 @@ class CoverageJobs:
         """
         with self._store.database.read() as connection:
             total = len(frames_to_query(connection, find_map(connection, map_name), asked))
-        data = asked.model_dump(mode="json", exclude_unset=True)
-        job, _ = self._tasks.begin(COVERAGE, map_name, data, PRIORITY)
-        return MapCoverage(
-            coverage_id=job.job_id, map=map_name, asked=asked, state=job.state,
-            progress=Progress(done=0, total=total), result=None, error=None,
-            created_at=job.created_at, finished_at=None,
-        )  # fmt: skip
-
-    def list_all(
-        self, map_name: str, cursor: str | None = None, limit: int = 100
-    ) -> Page[MapCoverage]:
-        """Coverage jobs of a map without their plans, the newest first; see `MapJobs.page`."""
-        found, more = self._jobs.page(map_name, cursor, limit)
-        items = [_coverage_record(job, map_name) for job in found]
-        return Page[MapCoverage](items=items, next_cursor=more)
+        return self.queue(map_name, asked, total)
 
     def get(self, map_name: str, job_id: str) -> MapCoverage:
-        """A coverage job; UnknownMap or UnknownJob where there is none."""
+        """Return a coverage job with its plans, which lists leave out."""
         with self._store.database.read() as connection:
-            job = self._jobs.find(connection, map_name, job_id)
+            job = self.find(connection, map_name, job_id)
             plans = None if job.result is None else _plans(connection, job)
-        return _coverage_record(job, map_name, plans)
-
-    def remove(self, map_name: str, job_id: str) -> None:
-        """Delete a coverage job with its result; see `MapJobs.remove`."""
-        self._jobs.remove(map_name, job_id)
+        return self.record(job, map_name, plans=plans)
 
     def frames(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
@@ -146,57 +120,22 @@ class CoverageJobs:
         UnknownMap, UnknownJob : there is none.
         InvalidRequest : a cursor that was not given out.
         """
-        after = row_of(cursor)
-        at = 0 if after is None else after + 1
-        found: list[CoverageFrame] = []
         with self._store.database.read() as connection:
-            job = self._jobs.find(connection, map_name, job_id)
-            while len(found) <= limit:
-                block = _frame_items(connection, job, at, _BLOCK)
+            job = self.find(connection, map_name, job_id)
+
+            def made(at: int, block: Sequence[dict[str, Any]]) -> list[CoverageFrame]:
                 stops = stops_of(connection, _numbers(block))
-                found += [
+                return [
                     _frame_record(at + i, item, stops)
                     for i, item in enumerate(block)
                     if item["frame"] in stops and outcome in (None, item["outcome"])
                 ]
-                at += len(block)
-                if len(block) < _BLOCK:
-                    break
-        more = str(found[limit - 1].number) if len(found) > limit else None
-        return Page[CoverageFrame](items=found[:limit], next_cursor=more)
 
-    def picture(self, map_name: str, job_id: str, parent: str | None = None) -> Output[bytes]:
-        """A plan as a PNG, with the queried frames that are still there.
-
-        Parameters
-        ----------
-        map_name, job_id : of the coverage job
-        parent : frame of the plan; default: that of most queried frames
-
-        Raises
-        ------
-        UnknownMap, UnknownJob : there is none.
-        NotIndexed : it did not succeed, or no queried frame has a pose.
-        InvalidRequest : it has no plan of that parent frame.
-        """
-        with self._store.database.read() as connection:
-            measured = self._measured(connection, map_name, job_id)
-            items = _frame_items(connection, measured.job, 0, measured.result.frames)
-            plan = _chosen_plan(measured.plans, parent)
-            items = [item for item in items if item["parent"] == plan.parent_frame]
-            stops = stops_of(connection, _numbers(items))
-            own = [item["frame"] for item in items if item["frame"] in stops]
-            row = find_map(connection, map_name)
-            blobs = geometry_blobs(connection, _spread(own, _SEEN_FRAMES), row.model_id)
-        drawn = [_drawn_frame(item, stops, plan) for item in items if item["frame"] in stops]
-        tag = tag_of("coverage", job_id, plan.parent_frame, [repr(one) for one in drawn])
-        title = f"Coverage of {map_name}, parent frame {plan.parent_frame}"
-
-        def make() -> bytes:
-            points = self._points([(stops[number], blob) for number, blob in blobs.items()], plan)
-            return coverage_picture(plan, measured.result, drawn, points, title)
-
-        return Output(tag, make)
+            items, more = page_of_items(
+                cursor, limit, lambda at: _frame_items(connection, job, at, BLOCK), made,
+                lambda frame: frame.number,
+            )  # fmt: skip
+        return Page[CoverageFrame](items=items, next_cursor=more)
 
     def changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
         """A result compared with an earlier one of the same map and the same options.
@@ -223,27 +162,11 @@ class CoverageJobs:
             result_after=after.result, plans=plans,
         )  # fmt: skip
 
-    def _points(self, seen: Sequence[tuple[PathFrame, str]], plan: CoveragePlan) -> Floats:
-        """(n, 2) what frames see, along the axes of a plan; without those that are damaged."""
-        axes, found = np.array([plan.x_axis, plan.y_axis]), [np.empty((0, 2))]
-        for stop, blob in seen:
-            if stop.pose is None or stop.parent != plan.parent_frame:
-                continue  # edited since
-            with suppress(DamagedBlob, UnreadableGeometry):
-                surface = self._store.geometries.read(blob).surface
-                points = surface.points[surface.valid].astype(np.float64)
-                found.append(moved(np.array(stop.pose), points) @ axes.T)
-        return np.concatenate(found)
-
     def _measured(self, connection: Connection, map_name: str, job_id: str) -> _Measured:
-        job = self._jobs.find(connection, map_name, job_id)
-        if job.state != JobState.SUCCEEDED or job.result is None:
-            raise NotIndexed(
-                f"Coverage {job.id} is {job.state}; its plans exist once it has succeeded. See "
-                f"GET /v1/maps/{map_name}/coverage/{job.id}."
-            )
+        job = self.find(connection, map_name, job_id)
+        found = self.require_success(job, map_name, "its plans exist")
         asked = NewMapCoverage.model_validate(job.data or {})
-        result = CoverageResult.model_validate(job.result)
+        result = CoverageResult.model_validate(found)
         return _Measured(job, asked, result, _plans(connection, job))
 
 
@@ -279,33 +202,6 @@ def _require_comparable(before: _Measured, after: _Measured) -> None:
             )
 
 
-def _chosen_plan(plans: Sequence[CoveragePlan], parent: str | None) -> CoveragePlan:
-    for plan in plans:
-        if parent in (None, plan.parent_frame):
-            return plan
-    if not plans:
-        raise NotIndexed(
-            "There is no plan, as no queried frame has a pose. Upload frames with poses."
-        )
-    names = ", ".join(plan.parent_frame for plan in plans)
-    raise InvalidRequest(
-        f"There is no plan of parent frame {parent!r:.80}. Choose from {names!r:.400}.",
-        (("parent_frame", "no such plan"),),
-    )
-
-
-def _coverage_record(
-    job: JobRow, map_name: str, plans: list[CoveragePlan] | None = None
-) -> MapCoverage:
-    return MapCoverage(
-        coverage_id=job.id, map=map_name, asked=NewMapCoverage.model_validate(job.data or {}),
-        state=job.state, progress=job_progress(job),
-        result=None if job.result is None else CoverageResult.model_validate(job.result),
-        plans=plans, error=job.error, created_at=when(job.created_at),
-        finished_at=when(job.finished_at),
-    )  # fmt: skip
-
-
 def _plans(connection: Connection, job: JobRow) -> list[CoveragePlan]:
     """Plans of a job that has succeeded: the items behind those of its frames."""
     found = items_of(connection, job.number, (job.result or {})["frames"])
@@ -319,11 +215,6 @@ def _frame_items(
     if job.result is not None:
         limit = max(min(limit, job.result["frames"] - first), 0)
     return items_of(connection, job.number, first, limit)
-
-
-def _spread(numbers: Sequence[int], most: int) -> list[int]:
-    """At most so many of some numbers, evenly spaced."""
-    return list(numbers[:: -(-len(numbers) // most) or 1])
 
 
 def _numbers(items: Sequence[dict[str, Any]]) -> set[int]:
@@ -341,22 +232,6 @@ def _frame_record(number: int, item: dict[str, Any], stops: dict[int, PathFrame]
         position=None if at is None else Vector(x=at[0], y=at[1], z=at[2]),
         look_alikes=[stops[one].id for one in item["look_alikes"] if one in stops],
         **{name: item[name] for name in same},
-    )  # fmt: skip
-
-
-def _drawn_frame(
-    item: dict[str, Any], stops: dict[int, PathFrame], plan: CoveragePlan
-) -> DrawnFrame:
-    """A queried frame on its plan, with where its look-alikes of the same plan were taken."""
-    axes = np.array([plan.x_axis, plan.y_axis])
-    others = [stops[one] for one in item["look_alikes"] if one in stops]
-    return DrawnFrame(
-        tuple((axes @ item["at"]).tolist()), item["outcome"],
-        tuple(
-            tuple((axes @ np.array(other.pose)[:3, 3]).tolist())
-            for other in others
-            if other.pose is not None and other.parent == plan.parent_frame
-        ),
     )  # fmt: skip
 
 

@@ -34,6 +34,7 @@ from sceneprint.index import Generation
 from sceneprint.models import PRESETS, Model, parse_model, read_model, write_model
 from sceneprint.store import Database, Store, signatures
 from sceneprint.store import reencoding_rows as stored
+from sceneprint.store.audit_log import record_change
 from sceneprint.store.frames import write_frame, write_map
 from sceneprint.store.maps import (
     add_map,
@@ -300,6 +301,8 @@ def begin_reencoding(store: Store, map_name: str, model: str | Path | Model) -> 
             keep_model(connection, wanted.id, wanted.name, write_model(wanted))
             stored.begin(connection, row, wanted.id)
             row = find_map(connection, row.name)
+        else:
+            record_change(connection, "map.reencoding_retried", row.name, model=wanted.id)
     _enqueue(store, row, again=True)
     with store.database.read() as connection:
         return map_record(connection, find_map(connection, map_name))

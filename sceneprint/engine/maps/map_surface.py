@@ -35,6 +35,7 @@ from sceneprint.geometry.cells import FACTOR, TilePlace
 from sceneprint.geometry.rigid import moved
 from sceneprint.store import Store, queue
 from sceneprint.store import surface_rows as stored
+from sceneprint.store.audit_log import record_change
 from sceneprint.store.maps import find_map, map_of
 from sceneprint.store.opaque_ids import invalid_cursor
 from sceneprint.store.surface_rows import LevelTotals, SightingFrame, SurfaceRow, TileRow
@@ -102,6 +103,8 @@ class MapSurfaces:
                 stored.write_surface(connection, row.number, wanted=True, model_id="")
                 surface = stored.find_surface(connection, row.number) or surface
             begun, blobs = begin_job(connection, row, surface)
+            if begun:
+                record_change(connection, "surface.requested", map_name)
             told = _surface_record(connection, row, stored.find_surface(connection, row.number))
             if not begun and not told.frames:
                 raise InvalidRequest(
@@ -128,6 +131,7 @@ class MapSurfaces:
             job = _job_of(connection, surface)
             blobs = [] if job is None else queue.remove_job(connection, job)
             stored.write_surface(connection, row.number, wanted=False, job_number=None)
+            record_change(connection, "surface.removed", map_name)
         collect_deleted_blobs(self._store, blobs)
         until = time.monotonic() + _CALL_S
         while not remove_block(self._store, row) and time.monotonic() < until:

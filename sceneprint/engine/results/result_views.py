@@ -1,36 +1,32 @@
-"""What one can look at after a query: its points, its ranking, any match with its evidence, and how
-it was asked; and the query asked once more.
+"""What one can look at after a query: its points and its ranking, the evidence of a match, and how
+it was sent.
 
-query id  --Inspection-->  Answer | PLY | Similarities | MatchDetails
-query id  --Rerun-->  Question | PNG | Answer
+query id  --Inspection-->  Answer | StoredQuery | PLY | PNG | Similarities | MatchDetails
+query id, frame id  --Pairs-->  StoredPair  --opened-->  both geometries  --validated-->  Validation
+frame | query | match  --PointClouds-->  Output
 
-A match is validated once more, with the seed and the options of the query: see `Pairs`.
+A match is validated once more, with the seed and the options of the query: the same answer.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 
 from sceneprint import errors
 from sceneprint.engine.maps.map_frames import FORM, Output, find_indexed, geometry_of, placed
-from sceneprint.engine.results.stored_results import StoredResult, StoredResults
-from sceneprint.engine.search.query import Queries, steadily
+from sceneprint.engine.results.query_log import QueryLog, StoredAnswer
 from sceneprint.engine.search.response import uncertainty_record, validation_record
-from sceneprint.engine.search.retrieval import Deadline, PreparedQuery, check_taken
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import query_sensor, sensor_of, tag_of, transform
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
-from sceneprint.errors import DamagedSignature, InvalidRequest, NotIndexed, UnknownFrame
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.export import LIMIT, encode_points, points_of, thinned, write_ply
 from sceneprint.geometry.registration.icp import PAIR_METHOD
@@ -50,7 +46,7 @@ from sceneprint.geometry.validation.inspection import (
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.pictures import depth_view, normals_view, picture
 from sceneprint.pipeline import validate, validate_guided, validate_without_up
-from sceneprint.store import Store, read_through
+from sceneprint.store import Store
 from sceneprint.store.frames import refers_to
 from sceneprint.store.maps import (
     find_frame,
@@ -60,10 +56,10 @@ from sceneprint.store.maps import (
     geometry_blobs,
     list_maps,
 )
-from sceneprint.store.signatures import stored_signatures, stored_vector
+from sceneprint.store.signatures import stored_signatures
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Bytes, Floats, Floats32, Geometry
-from sceneprint_client.api import Answer, FrameState, NamedFrame, Query
+from sceneprint_client.api import Answer, FrameState
 from sceneprint_client.api import Match as ToldMatch
 from sceneprint_client.api.query import FrameName
 from sceneprint_client.api.results import (
@@ -75,37 +71,30 @@ from sceneprint_client.api.results import (
     OverlayTransform,
     Points,
     PointsSide,
-    Question,
     Similarities,
+    StoredQuery,
     Triple,
     View,
 )
 
-# A query that is kept and one of its matches, looked at again.
-#
-# query id, frame id  --Pairs-->  Pair  --opened-->  both geometries  --validated-->  Validation
-#
-# A match is validated once more, with the seed and the options of the query: the same answer. A
-# page asks for several views of one match at once, so the last few validations are remembered.
-
-#: Validations that are remembered: some 1 kB each.
+#: Validations that are remembered, some 1 kB each: a page requests several views of one match.
 _REMEMBERED = 64
 
 
 @dataclass(frozen=True, eq=False)
 class StoredPair:
-    """A kept query and one of its matches.
+    """A stored answer and one of its matches.
 
     Parameters
     ----------
-    kept, match : the answer, and the match of it
-    sensor : what the coordinates of the match are called
+    stored, match : the answer, and the match of it
+    sensor : name of the match's sensor frame
     blob : of the match's geometry artifact
     row, number : the match's map and number
     ups : up in the query's and in the match's sensors, as far as it is known
     """
 
-    kept: StoredResult
+    stored: StoredAnswer
     match: ToldMatch
     sensor: str
     blob: str
@@ -115,10 +104,10 @@ class StoredPair:
 
 
 class Pairs:
-    """Matches of answers that are kept."""
+    """Matches of stored answers."""
 
-    def __init__(self, store: Store, signers: Signers, kept: StoredResults) -> None:
-        self._store, self._signers, self._kept = store, signers, kept
+    def __init__(self, store: Store, signers: Signers, query_log: QueryLog) -> None:
+        self._store, self._signers, self._log = store, signers, query_log
         self._remembered = _ValidationCache()
 
     def find(self, query_id: str, frame_id: str, map_name: str | None = None) -> StoredPair:
@@ -126,19 +115,19 @@ class Pairs:
 
         Raises
         ------
-        UnknownQuery : it is not kept, or no longer.
+        UnknownQuery : its answer is not stored, or no longer.
         UnknownMap, UnknownFrame : no match has that id, or it was deleted since.
         NotIndexed : the query was asked without validation, or the map has changed its model.
         """
-        kept = self._kept.find(query_id)
-        match = _match_of(kept, frame_id, map_name)
-        check_geometry(kept)
+        stored = self._log.find(query_id)
+        match = _match_of(stored, frame_id, map_name)
+        check_geometry(stored)
         with self._store.database.read() as connection:
             row = find_map(connection, match.map)
             frame = find_frame(connection, row, match.frame_id)
-            blobs = geometry_blobs(connection, [frame.number], kept.model_id)
-            ups = {} if kept.up is None else known_ups(connection, kept.ranked)
-        if frame.state == FrameState.DELETED or frame.number not in kept.ranked:
+            blobs = geometry_blobs(connection, [frame.number], stored.model_id)
+            ups = {} if stored.up is None else known_ups(connection, stored.ranked)
+        if frame.state == FrameState.DELETED or frame.number not in stored.ranked:
             raise _deleted(match)
         if frame.number not in blobs:
             raise errors.NotIndexed(
@@ -146,8 +135,8 @@ class Pairs:
                 "different models cannot be compared. Send the query again."
             )
         return StoredPair(
-            kept, match, sensor_of(frame), blobs[frame.number], row, frame.number,
-            (kept.up, ups.get(frame.number)),
+            stored, match, sensor_of(frame), blobs[frame.number], row, frame.number,
+            (stored.up, ups.get(frame.number)),
         )  # fmt: skip
 
     def opened(self, pair: StoredPair) -> tuple[Geometry, Geometry]:
@@ -158,7 +147,7 @@ class Pairs:
         DamagedBlob : the match's is damaged, and so is its upload. Else it is made again.
         UnknownFrame : the match was deleted meanwhile.
         """
-        query = geometry_of_query(pair.kept)
+        query = geometry_of_query(pair.stored)
         try:
             return query, read_geometry(self._store.blobs.get(pair.blob))
         except (errors.DamagedBlob, errors.UnreadableGeometry):
@@ -166,20 +155,20 @@ class Pairs:
                 if not refers_to(connection, pair.blob):
                     raise _deleted(pair.match) from None
                 frame = frame_of(connection, pair.number)
-            if pair.row.model_id == pair.kept.model_id:
+            if pair.row.model_id == pair.stored.model_id:
                 resign_frames(self._store, pair.row, [pair.number], pair.row.model_id)
-        _, artifact = rebuild_frame(self._store, self._signers(pair.kept.model_id), frame)
+        _, artifact = rebuild_frame(self._store, self._signers(pair.stored.model_id), frame)
         return query, read_geometry(artifact)
 
     def parameters(self, pair: StoredPair) -> ValidationParameters:
         """Those of the model, by which evidence is counted."""
-        return self._signers(pair.kept.model_id).model.parameters.validation
+        return self._signers(pair.stored.model_id).model.parameters.validation
 
     def validated(self, pair: StoredPair, query: Geometry, match: Geometry) -> PairValidation:
         """What comes of aligning them, as the query had it."""
         p = self.parameters(pair)
-        seed, options = pair.kept.query.seed, thresholds(pair.kept.query.validation, p)
-        key = pair.kept.answer.query_id, pair.blob
+        seed, options = pair.stored.query.seed, thresholds(pair.stored.query.validation, p)
+        key = pair.stored.answer.query_id, pair.blob
 
         def make() -> PairValidation:
             if pair.match.predicted is not None:
@@ -188,7 +177,7 @@ class Pairs:
                 if guided is not None:
                     return guided
             found = validate(query, match, seed, *options, ups=pair.ups)
-            if found.reason != pair.match.validation.reason and pair.kept.up is not None:
+            if found.reason != pair.match.validation.reason and pair.stored.up is not None:
                 # nothing was accepted with `up`, and the surfaces were asked without it
                 return validate_without_up(query, match, seed, options[0], pair.ups) or found
             return found
@@ -222,19 +211,19 @@ class _ValidationCache:
         return found.result()
 
 
-def check_geometry(kept: StoredResult, needs: str = "the stage") -> bytes:
-    """The bytes of a query's artifact; NotIndexed where it was asked without validation."""
-    if kept.geometry is None:
+def check_geometry(stored: StoredAnswer, needs: str = "the stage") -> bytes:
+    """Return the bytes of a query's artifact; NotIndexed where it was sent without validation."""
+    if stored.geometry is None:
         raise errors.NotIndexed(
-            f"Query {kept.answer.query_id} ran without validation, so its points were not "
+            f"Query {stored.answer.query_id} ran without validation, so its points were not "
             f"stored. Send the query again with {needs} `validate`."
         )
-    return kept.geometry
+    return stored.geometry
 
 
-def geometry_of_query(kept: StoredResult) -> Geometry:
-    """A query's artifact; NotIndexed where it was asked without validation."""
-    return read_geometry(check_geometry(kept))
+def geometry_of_query(stored: StoredAnswer) -> Geometry:
+    """Return a query's artifact; NotIndexed where it was sent without validation."""
+    return read_geometry(check_geometry(stored))
 
 
 def _deleted(match: ToldMatch) -> errors.UnknownFrame:
@@ -243,64 +232,101 @@ def _deleted(match: ToldMatch) -> errors.UnknownFrame:
     )
 
 
-def _match_of(kept: StoredResult, frame_id: str, map_name: str | None) -> ToldMatch:
-    for one in kept.answer.matches:
+def _match_of(stored: StoredAnswer, frame_id: str, map_name: str | None) -> ToldMatch:
+    for one in stored.answer.matches:
         if one.frame_id == frame_id and map_name in (None, one.map):
             return one
     raise errors.UnknownFrame(
-        f"Query {kept.answer.query_id} has no match "
+        f"Query {stored.answer.query_id} has no match "
         f"{frame_id!r:.80}{'' if map_name is None else f' in map {map_name!r:.80}'}. Its answer "
         "lists the matches."
     )
 
 
 class Inspection:
-    """Answers that are kept, and what is behind them."""
+    """Stored answers, and what they rest on."""
 
-    def __init__(self, store: Store, signers: Signers, kept: StoredResults) -> None:
-        self._store, self._signers, self._kept = store, signers, kept
-        self.pairs = Pairs(store, signers, kept)
+    def __init__(self, store: Store, signers: Signers, query_log: QueryLog) -> None:
+        self._store, self._signers, self._log = store, signers, query_log
+        self.pairs = Pairs(store, signers, query_log)
 
     def answer(self, query_id: str) -> Answer:
-        """The answer again; UnknownQuery where it is not kept, or no longer."""
-        return self._kept.find(query_id).answer
+        """The answer again; UnknownQuery where it is not stored, or no longer."""
+        return self._log.find(query_id).answer
+
+    def question(
+        self, query_id: str, may_read: Callable[[str], bool] = lambda _: True
+    ) -> StoredQuery:
+        """Return how a query was sent; UnknownQuery where its answer is not stored, or no longer.
+
+        Parameters
+        ----------
+        query_id : of the answer
+        may_read : whether the caller may read a map: the names of others are left out
+        """
+        stored, record = self._log.find(query_id), self._log.record(query_id, may_read)
+        return StoredQuery(
+            **record.model_dump(),
+            validates=stored.geometry is not None or stored.answer.frame is not None,
+            model=stored.answer.model,
+            options=stored.query.model_dump(mode="json", exclude_unset=True),
+        )
+
+    def preview(self, query_id: str, view: View = "depth", width: int = 320) -> bytes:
+        """Return a picture of what the query saw as PNG; see `sceneprint.pictures`.
+
+        Raises
+        ------
+        UnknownQuery : its answer is not stored, or no longer.
+        NotIndexed : it was sent without validation, for which alone its points are computed.
+        InvalidRequest : its patches, which are not stored.
+        """
+        stored = self._log.find(query_id)
+        if view == "patches":
+            raise errors.InvalidRequest(
+                "The patches of a query are not stored. Use view=depth or view=normals.",
+                (("view", "not stored for a query"),),
+            )
+        surface = read_geometry(check_geometry(stored, "the frame and the stage")).surface
+        colours, text = (depth_view if view == "depth" else normals_view)(surface)
+        return picture(colours, width, {"view": view, "model": stored.answer.model, **text})
 
     def cloud(self, query_id: str) -> bytes:
         """The query's points and normals as PLY, in the coordinates of its sensor.
 
         Raises
         ------
-        UnknownQuery : it is not kept, or no longer.
+        UnknownQuery : its answer is not stored, or no longer.
         NotIndexed : it was asked without validation, for which alone its points are made.
         """
-        kept = self._kept.find(query_id)
-        points, normals = points_of(geometry_of_query(kept).surface)
+        stored = self._log.find(query_id)
+        points, normals = points_of(geometry_of_query(stored).surface)
         comments = [
-            f"frame {_sensor(kept)}", f"points of query {query_id}, metres",
-            f"model {kept.answer.model}",
+            f"frame {_sensor(stored)}", f"points of query {query_id}, metres",
+            f"model {stored.answer.model}",
         ]  # fmt: skip
         return write_ply(points, normals, comments=comments)
 
     def similarities(self, query_id: str, limit: int = 50) -> Similarities:
         """How alike the query and the first of its ranking are, each to each; UnknownQuery."""
-        kept = self._kept.find(query_id)
-        wanted = kept.ranked[:limit]
+        stored = self._log.find(query_id)
+        wanted = stored.ranked[:limit]
         with self._store.database.read() as connection:
             rows = frames_of(connection, wanted)
-            vectors = stored_signatures(connection, rows, kept.model_id)
+            vectors = stored_signatures(connection, rows, stored.model_id)
             names = {row.number: row.name for row in list_maps(connection)}
         # a frame's number is used once, but its map may be one that the caller cannot know
         there = [
-            n for n in wanted if n in vectors and names[rows[n].map_number] in kept.answer.maps
+            n for n in wanted if n in vectors and names[rows[n].map_number] in stored.answer.maps
         ]
         stacked: Bytes = np.stack(
-            [kept.vector, *(np.frombuffer(vectors[n], np.uint8) for n in there)]
+            [stored.vector, *(np.frombuffer(vectors[n], np.uint8) for n in there)]
         )
-        model = self._signers(kept.model_id).model
+        model = self._signers(stored.model_id).model
         shares = similarity(pairwise_distances(stacked, model.metric), model.unrelated_distance)
         return Similarities(
             query_id=query_id,
-            model=kept.answer.model,
+            model=stored.answer.model,
             frames=[FrameName(map=names[rows[n].map_number], frame_id=rows[n].id) for n in there],
             names=[rows[n].name for n in there],
             similarity=shares.round(4).tolist(),
@@ -316,17 +342,17 @@ class Inspection:
 
         Raises
         ------
-        UnknownQuery : it is not kept, or no longer.
+        UnknownQuery : its answer is not stored, or no longer.
         UnknownMap, UnknownFrame : no match has that id, or it was deleted since.
         NotIndexed : there are no points to validate it with: the query was asked without
             validation, or the map has changed its model since.
         DamagedBlob, UnreadableGeometry : the match's artifact is damaged; it is made again.
         """
         pair = self.pairs.find(query_id, frame_id, map_name)
-        kept, match, p = pair.kept, pair.match, self.pairs.parameters(pair)
+        stored, match, p = pair.stored, pair.match, self.pairs.parameters(pair)
         query, other = self.pairs.opened(pair)
         v = self.pairs.validated(pair, query, other)
-        names = pair.sensor, _sensor(kept)
+        names = pair.sensor, _sensor(stored)
         T, rival = v.T_match_query, v.T_rival
         traces = None if T is None else trace(query, other, T, p.agreement, p.alignment.consensus)
         return MatchDetails(
@@ -342,7 +368,7 @@ class Inspection:
             patches=None if traces is None else _coincidences(traces, query, other),
             query=None if traces is None else _points(traces.query, traces.of_query),
             match=None if traces is None else _points(traces.match, traces.of_match),
-            seed=kept.query.seed,
+            seed=stored.query.seed,
         )
 
     def overlay(
@@ -383,15 +409,15 @@ class Inspection:
         comments = [
             f"frame {pair.sensor}",
             f"query {query_id} and frame {pair.match.frame_id} of map {pair.match.map}, metres",
-            f"transform {by}, colours by {colour}", f"model {pair.kept.answer.model}",
+            f"transform {by}, colours by {colour}", f"model {pair.stored.answer.model}",
         ]  # fmt: skip
         if pair.match.name is not None:
             comments.append(f"name of the frame: {pair.match.name}")
         return write_ply(points, normals, colours, comments=comments)
 
 
-def _sensor(kept: StoredResult) -> str:
-    return query_sensor(kept.answer.frame, kept.answer.kind, kept.answer.maps)
+def _sensor(stored: StoredAnswer) -> str:
+    return query_sensor(stored.answer.frame, stored.answer.kind, stored.answer.maps)
 
 
 def _coincidences(traces: Traces, query: Geometry, match: Geometry) -> Coincidences:
@@ -420,17 +446,13 @@ def _triples(rows: Floats) -> list[Triple]:
     return [(x, y, z) for x, y, z in rows.round(4).tolist()]
 
 
-# Points of frames, queries and matches as bytes that a page draws; see
-# `sceneprint.formats.export`.
-#
-# frame | query | match  --PointClouds-->  Output
-
-
 class PointClouds:
-    """Points to be drawn."""
+    """Points of frames, queries and matches as bytes that a page draws; see
+    `sceneprint.formats.export`.
+    """
 
-    def __init__(self, store: Store, signers: Signers, pairs: Pairs, kept: StoredResults) -> None:
-        self._store, self._signers, self._pairs, self._kept = store, signers, pairs, kept
+    def __init__(self, store: Store, signers: Signers, pairs: Pairs, query_log: QueryLog) -> None:
+        self._store, self._signers, self._pairs, self._log = store, signers, pairs, query_log
 
     def frame(
         self, map_name: str, frame_id: str, within: CloudFrame = "optical", limit: int = LIMIT
@@ -450,18 +472,18 @@ class PointClouds:
         return Output(tag, make)
 
     def query(self, query_id: str, limit: int = LIMIT) -> Output[bytes]:
-        """Points of a kept query in its sensor's frame, with normals and patches.
+        """Points of a query in its sensor's frame, with normals and patches.
 
         Raises
         ------
-        UnknownQuery : it is not kept, or no longer.
+        UnknownQuery : its answer is not stored, or no longer.
         NotIndexed : it was asked without validation.
         """
-        kept = self._kept.find(query_id)
-        check_geometry(kept)
+        stored = self._log.find(query_id)
+        check_geometry(stored)
 
         def make() -> bytes:
-            geometry = geometry_of_query(kept)
+            geometry = geometry_of_query(stored)
             points, total = _some(geometry, limit)
             return _encoded(geometry, points, total)
 
@@ -530,137 +552,3 @@ def _encoded(
         at, normals = moved(T, at), normals @ T[:3, :3].T
     patches = patches_at(points, geometry.patches)
     return encode_points(at, normals, patches, residuals, total=total, scale=scale)
-
-
-# A kept query once more: how it was asked, what it saw, and what other options would answer.
-#
-# An operator is told the id of a robot's query, and has neither the frame nor the robot. The
-# signature and the points that are kept with the answer are all that asking again needs.
-
-
-class Rerun:
-    """Kept queries, asked once more."""
-
-    def __init__(self, store: Store, kept: StoredResults, queries: Queries) -> None:
-        self._store, self._kept, self._queries = store, kept, queries
-
-    def question(self, query_id: str) -> Question:
-        """How it was asked; UnknownQuery where it is not kept, or no longer."""
-        kept = self._kept.find(query_id)
-        return Question(
-            query_id=query_id,
-            maps=kept.answer.maps,
-            frame=kept.answer.frame,
-            kind=kept.answer.kind,
-            robot=kept.taken.robot,
-            session=kept.taken.session,
-            asked_at=datetime.fromtimestamp(kept.at, UTC).isoformat(timespec="seconds"),
-            validates=kept.geometry is not None or kept.answer.frame is not None,
-            model=kept.answer.model,
-            options=_given_options(kept),
-        )
-
-    def preview(self, query_id: str, view: View = "depth", width: int = 320) -> bytes:
-        """A picture of what the query saw as PNG; see `sceneprint.pictures`.
-
-        Raises
-        ------
-        UnknownQuery : it is not kept, or no longer.
-        NotIndexed : it was asked without validation, for which alone its points are made.
-        InvalidRequest : its patches, which are not kept.
-        """
-        kept = self._kept.find(query_id)
-        if view == "patches":
-            raise InvalidRequest(
-                "The patches of a query are not stored. Use view=depth or view=normals.",
-                (("view", "not stored for a query"),),
-            )
-        surface = read_geometry(check_geometry(kept, "the frame and the stage")).surface
-        colours, text = (depth_view if view == "depth" else normals_view)(surface)
-        return picture(colours, width, {"view": view, "model": kept.answer.model, **text})
-
-    def options(self, query_id: str, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """How to ask again: as it was asked, with what is given put in its place.
-
-        Parameters
-        ----------
-        query_id : of a kept answer
-        changes : options by name; None puts back the default
-        """
-        merged = {**_given_options(self._kept.find(query_id)), **changes}
-        return {name: value for name, value in merged.items() if value is not None}
-
-    def ask(
-        self, query_id: str, maps: list[str], query: Query, since: float | None = None
-    ) -> Answer:
-        """Ask a kept query once more.
-
-        Parameters
-        ----------
-        query_id : of a kept answer
-        maps, query, since : see `Queries.upload`
-
-        Raises
-        ------
-        UnknownQuery : it is not kept, or no longer.
-        UnknownMap, UnknownFrame : a map, or the stored frame that was asked for, is gone, or
-            another frame has its id.
-        NotIndexed : it was an upload asked without validation, and this asks for it; or a map has
-            another model than its signature.
-        InvalidRequest : see `prepare_upload` and `prepare_stored`.
-        """
-        kept = self._kept.find(query_id)
-        frame = kept.answer.frame
-        if frame is not None:
-            named = NamedFrame(map=frame.map, frame_id=frame.frame_id)
-            self._check_same(kept, named)
-            return self._queries.stored(maps, named, query, since)
-        deadline = Deadline(query.deadline_ms, since)
-
-        def ask(rows: list[MapRow]) -> Answer:
-            for row in rows:
-                if row.model_id != kept.model_id:
-                    raise NotIndexed(
-                        f"Map {row.name!r} has a different model than the query was signed with, "
-                        "and the upload of the query is not stored. Send the frame again."
-                    )
-            return self._queries.answer(rows, _ready(kept, query), query, deadline)
-
-        return read_through(self._store.replica, lambda: steadily(self._store, maps, ask))
-
-    def _check_same(self, kept: StoredResult, named: NamedFrame) -> None:
-        """Frames that are deleted give up their ids; one of the same content signs the same."""
-        with self._store.database.read() as connection:
-            frame = find_frame(connection, find_map(connection, named.map), named.frame_id)
-            try:
-                vector = stored_vector(connection, frame.number, kept.model_id)
-            except DamagedSignature:  # whoever asks for it has it made again
-                return
-        if vector is not None and vector != kept.vector.tobytes():
-            raise UnknownFrame(
-                f"Frame {named.frame_id} of map {named.map!r} was deleted after the query, and a "
-                "new frame has its id. Send a new query."
-            )
-
-
-def _given_options(kept: StoredResult) -> dict[str, Any]:
-    told: dict[str, Any] = kept.query.model_dump(mode="json", exclude_unset=True)
-    return {name: value for name, value in told.items() if name in Query.model_fields}
-
-
-def _ready(kept: StoredResult, query: Query) -> PreparedQuery:
-    """The query as `Queries.upload` prepared it."""
-    artifact = kept.geometry
-    validates = "validate" in query.stages
-    return PreparedQuery(
-        kept.model_id,
-        kept.vector,
-        read_geometry(check_geometry(kept, "the frame and the stage")) if validates else None,
-        check_taken(kept.taken, query),
-        None,
-        0.0,
-        base=kept.base,
-        artifact=artifact,
-        kind=kept.answer.kind,
-        up=kept.up,
-    )

@@ -1,10 +1,9 @@
 """What queries search: each map's signatures, caught up with the database before every query.
 
 A `Reader` holds one map: the newest generation of its index, and the tail of frames indexed after
-it. What it hands out is a `View`, which never changes; catching up makes a new one beside it.
-A map of which a node would have to read much first is left to PostgreSQL, where that has vectors.
-Signatures compared by L1 have neither index nor vectors, but where Qdrant searches: they are all
-tail.
+it. What it hands out is an `IndexView`, which never changes; catching up makes a new one beside it.
+A map without an index on this node is all tail: its signatures are read from the database once, and
+compared exactly until a worker has published its index. Signatures compared by L1 never have one.
 """
 
 from __future__ import annotations
@@ -16,11 +15,10 @@ import re
 import tempfile
 import threading
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Collection, Set
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +37,7 @@ from sceneprint.index import (
     signatures_of,
 )
 from sceneprint.index.generation_files import SCHEMA_VERSION, GenerationManifest, Keys
-from sceneprint.index.qdrant_shard import can_hold
 from sceneprint.models import Model
-from sceneprint.store import require_primary
 from sceneprint.store.events import holds_anchor
 from sceneprint.store.signatures import SignatureChange, changes_since, count_indexed
 from sceneprint.store.tables import MapRow
@@ -50,13 +46,9 @@ from sceneprint.types import Bytes
 log = logging.getLogger(__name__)
 
 
-#: Where a map is searched: by this node, or by the database.
-Kind = Literal["local", "database"]
-
-
 @dataclass(frozen=True, eq=False)
-class MapView(ABC):
-    """A map that can be searched, as of one revision or later.
+class IndexView:
+    """A map as of one revision: an index, and the frames that are newer.
 
     Parameters
     ----------
@@ -66,71 +58,29 @@ class MapView(ABC):
     size : frames that can be found
     dead : frames that it holds and that are deleted
     damaged : frames that were passed over, as their signature is damaged
+    generation : of its index, or None
+    tail : frames newer than it
     """
-
-    #: Who searches it.
-    kind: ClassVar[Kind]
 
     model_id: str
     metric: Metric
     revision: int
     size: int
     dead: frozenset[int]
-    damaged: Set[int]
-
-    @property
-    def number(self) -> int:
-        """Of the generation of the index; 0 where none is used."""
-        return 0
-
-    @abstractmethod
-    def search(
-        self, query: Bytes, size: int, *, dead: frozenset[int], among: Keys | None = None,
-        exact: bool = False,
-    ) -> SearchHits:  # fmt: skip
-        """The nearest frames by exact distance; see `index.search`."""
-
-    @abstractmethod
-    def nearer(
-        self, query: Bytes, key: int, distance: int, *, dead: frozenset[int],
-        among: Keys | None = None,
-    ) -> int:  # fmt: skip
-        """How many frames come before one in the order of exact distance, equal ones by key."""
-
-    @abstractmethod
-    def signatures(self, keys: Keys) -> Bytes:
-        """Signatures (r, D) of frames that it has."""
-
-    @abstractmethod
-    def has(self, keys: Keys) -> NDArray[np.bool_]:
-        """Which frames (n,) can be found."""
-
-
-@dataclass(frozen=True, eq=False)
-class IndexView(MapView):
-    """A map as of one revision, held by this node: an index, and the frames that are newer.
-
-    Parameters
-    ----------
-    generation : of its index, or None
-    tail : frames newer than it
-    """
-
-    kind: ClassVar[Kind] = "local"
-
+    damaged: frozenset[int]
     generation: Generation | None
     tail: Tail
 
     @property
     def number(self) -> int:
-        """See MapView."""
+        """Number of the generation of the index; 0 where none is used."""
         return 0 if self.generation is None else self.generation.number
 
     def search(
         self, query: Bytes, size: int, *, dead: frozenset[int], among: Keys | None = None,
         exact: bool = False,
     ) -> SearchHits:  # fmt: skip
-        """See `index.search`."""
+        """Return the nearest frames by exact distance; see `index.search`."""
         return search(
             query, self.generation, self.tail, size, metric=self.metric, dead=dead, among=among,
             exact=exact,
@@ -140,17 +90,17 @@ class IndexView(MapView):
         self, query: Bytes, key: int, distance: int, *, dead: frozenset[int],
         among: Keys | None = None,
     ) -> int:  # fmt: skip
-        """See MapView."""
+        """Count the frames that come before one in the order of exact distance, then of keys."""
         hits = self.search(query, max(self.size, 1), dead=dead, among=among, exact=True)
         same = (hits.distances == distance) & (hits.keys < key)
         return int(((hits.distances < distance) | same).sum())
 
     def signatures(self, keys: Keys) -> Bytes:
-        """See `index.signatures_of`."""
+        """Return the signatures (r, D) of frames that it has; see `index.signatures_of`."""
         return signatures_of(keys, self.generation, self.tail)
 
     def has(self, keys: Keys) -> NDArray[np.bool_]:
-        """See MapView."""
+        """Return which frames (n,) can be found."""
         known = self.tail.places.of(keys) >= 0
         if self.generation is not None:
             known |= self.generation.has(keys)
@@ -275,7 +225,7 @@ def _nameless(folder: Path, size: int) -> mmap.mmap:
     ) from failed
 
 
-#: Frames that a node reads of maps before it would ask the database instead, if it can.
+#: Frames that a reader may be behind before it begins again with a newer index, if there is one.
 READ_MOST = 20_000
 #: Seconds between two looks for a newer generation, and until one that is damaged, or out of reach
 #: for a moment, is read again.
@@ -298,18 +248,6 @@ _FOLDER_NAME = re.compile(
 )
 
 
-def qdrant_metric(model: Model, wanted: bool) -> Metric | None:
-    """By what Qdrant compares the signatures of a model; None where it does not.
-
-    Parameters
-    ----------
-    model : of a map
-    wanted : whether Qdrant is to search at all
-    """
-    holds = wanted and can_hold(model.signature_bytes, model.metric)
-    return model.metric if holds else None
-
-
 def is_index_folder(name: str) -> bool:
     """Return whether a name is one of `index_folder`."""
     return _FOLDER_NAME.fullmatch(name) is not None
@@ -327,7 +265,6 @@ def trusted(connection: Connection, row: MapRow, found: Published | None) -> Pub
         return None
     if found.revision <= row.revision and holds_anchor(connection, found.anchor):
         return found
-    require_primary("the state of an index")
     return None
 
 
@@ -339,14 +276,10 @@ class Reader:
     connection, row : see `view`
     folder : of its index
     model : of its signatures
-    qdrant : whether Qdrant is to search its index
     """
 
-    def __init__(
-        self, connection: Connection, row: MapRow, folder: Path, model: Model, qdrant: bool = False
-    ) -> None:
+    def __init__(self, connection: Connection, row: MapRow, folder: Path, model: Model) -> None:
         self._folder, self._model = folder, model
-        self._qdrant = qdrant_metric(model, qdrant)
         self._looked = self._asked = time.monotonic()
         self._lock = threading.Lock()
         self._unsound = 0, 0.0  # number of a generation that cannot be used, until the next try
@@ -370,14 +303,6 @@ class Reader:
         """Memory of the tail."""
         return self._tail.bytes_held
 
-    def lacks(self, connection: Connection, row: MapRow) -> int | None:
-        """How many frames it has yet to read; None: with these it would hold too many."""
-        view = self._view
-        newer = max(row.revision - view.revision, 0)
-        if len(view.tail) + newer > READ_MOST:
-            newer = count_indexed(connection, row.number, view.revision, READ_MOST + 1)
-        return newer if len(view.tail) + newer <= READ_MOST else None
-
     def is_outdated(self) -> bool:
         """Whether there is an index that this reader does not use."""
         number = self._newest_number()
@@ -395,8 +320,6 @@ class Reader:
         """The map as of the row's revision, or later."""
         self._asked = time.monotonic()
         behind = self._view.revision < row.revision
-        if self._view.revision > row.revision:
-            require_primary("what is held of a map")
         # who only looks for a newer generation waits for nobody
         if (behind or self._is_time()) and self._lock.acquire(blocking=behind):
             try:
@@ -423,7 +346,8 @@ class Reader:
         return time.monotonic() - self._looked >= _LOOK_S
 
     def _catch_up(self, connection: Connection, row: MapRow) -> None:
-        if 0 < self._view.revision < row.pruned_revision:
+        is_far_behind = row.revision - self._view.revision > READ_MOST and self.is_outdated()
+        if 0 < self._view.revision < row.pruned_revision or is_far_behind:
             self._begin(connection, row)
         view = self._view
         self._tail.reserve(count_indexed(connection, row.number, view.revision))
@@ -468,8 +392,7 @@ class Reader:
         self._publish(found, view.revision)
 
     def _newest_number(self) -> int | None:
-        has_index = self._model.metric == "l2" or self._qdrant is not None
-        return newest_number(self._folder) if has_index else None
+        return newest_number(self._folder) if self._model.metric == "l2" else None
 
     def _newest(
         self, connection: Connection, row: MapRow, known: Generation | None
@@ -478,7 +401,7 @@ class Reader:
         if number is None:
             return None
         length = self._model.signature_bytes
-        found = newest(self._folder, row.model_id, length, known=known, qdrant=self._qdrant)
+        found = newest(self._folder, row.model_id, length, known=known)
         if found is None or found.number < number:
             self._unsound = number, time.monotonic() + _AGAIN_S
         return trusted(connection, row, found)

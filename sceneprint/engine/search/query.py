@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
-from sceneprint.engine.results.stored_results import StoredResult, StoredResults
+from sceneprint.engine.results.query_log import QueryLog, SentQuery, StoredAnswer, query_row
 from sceneprint.engine.search.answer import SequenceFrame, answer
 from sceneprint.engine.search.response import uncertainty_record, validation_record
 from sceneprint.engine.search.retrieval import (
@@ -17,20 +18,29 @@ from sceneprint.engine.search.retrieval import (
     PreparedQuery,
     Readers,
     SearchedMap,
+    check_taken,
     prepare_stored,
     prepare_upload,
 )
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import model_label, sensor_frame, transform
 from sceneprint.engine.signers import Signers
-from sceneprint.errors import Busy, InvalidRequest, ModelMismatch, SceneprintError, UnknownMap
+from sceneprint.errors import (
+    Busy,
+    InvalidRequest,
+    ModelMismatch,
+    NotIndexed,
+    SceneprintError,
+    UnknownMap,
+)
+from sceneprint.formats.artifact import read_geometry
 from sceneprint.geometry.kernel import Cores
 from sceneprint.geometry.registration.icp import PAIR_METHOD
 from sceneprint.geometry.retrieval.ranking import distances, similarity
 from sceneprint.geometry.rigid import inverse
 from sceneprint.models import PRESETS, read_model
 from sceneprint.pipeline import Signer, validate
-from sceneprint.store import Store, read_through
+from sceneprint.store import Store
 from sceneprint.store.maps import find_maps, list_maps, model_names, unknown_map
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats
@@ -69,7 +79,7 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
     UnknownMap : one of them is none.
     Busy : a map switched again and again.
     """
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         rows = find_maps(connection, maps)
     for _ in range(TRIES):
         try:
@@ -107,7 +117,7 @@ def check_model(one: str, other: str) -> None:
 def _other_models(store: Store, rows: Sequence[MapRow]) -> list[MapRow] | None:
     """The maps where one of them has another model by now, or None."""
     try:
-        with store.queried.read() as connection:
+        with store.database.read() as connection:
             now = find_maps(connection, [row.name for row in rows])
     except UnknownMap:
         return None
@@ -157,7 +167,7 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
 
     names = [side.map for side in sides if isinstance(side, NamedFrame)]
     maps = list(dict.fromkeys(names))
-    return read_through(store.replica, lambda: steadily(store, maps, ask))
+    return steadily(store, maps, ask)
 
 
 def _compared(a: PreparedQuery, b: PreparedQuery, signer: Signer, how: Comparison) -> Similarity:
@@ -192,7 +202,7 @@ def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Compari
     """What signs the uploads: with the model of the stored frames, if there are any."""
     if not rows:
         return signers.of(read_model(how.model or PRESETS[0]))
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         names = model_names(connection)
     told = [f"{row.name} has {model_label(names[row.model_id], row.model_id)}" for row in rows]
     if len({row.model_id for row in rows}) > 1:
@@ -224,30 +234,25 @@ def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
     return sensor_frame(ids[0], a.kind), sensor_frame(ids[1], b.kind)
 
 
-#: Maps that `*` asks at once where the database searches: by one statement, whatever their number.
-#: Otherwise this node holds what is asked, and there are MOST_MAPS.
-FLEET_MAPS = 1000
-
-
 class Queries:
     """Asks one or more maps of one model.
 
     Parameters
     ----------
     store, signers, readers : of the engine
-    kept : where answers are kept for a while
+    query_log : where answers are stored
     cores : that queries share
     """
 
     def __init__(
-        self, store: Store, signers: Signers, readers: Readers, kept: StoredResults, cores: Cores
+        self, store: Store, signers: Signers, readers: Readers, query_log: QueryLog, cores: Cores
     ) -> None:
         self._store, self._signers, self._readers = store, signers, readers
-        self._kept, self._cores = kept, cores
+        self._log, self._cores = query_log, cores
 
     def upload(
         self, maps: Sequence[str], data: bytes, meta: FrameMeta, query: Query,
-        since: float | None = None,
+        since: float | None = None, sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
         """Look a frame up that is not kept; see `prepare_upload`.
 
@@ -257,6 +262,7 @@ class Queries:
         data, meta : the frame
         query : how to ask
         since : when the request came, by `time.perf_counter`; default: now
+        sent : the query as the log lists it; None: the log does not list it
 
         Raises
         ------
@@ -269,13 +275,13 @@ class Queries:
             self._check_models(rows)
             signer = self._signers(rows[0].model_id)
             ready = prepare_upload(data, meta, signer, query, self._store.decoders)
-            return self.answer(rows, ready, query, deadline)
+            return self.answer(rows, ready, query, deadline, sent=sent)
 
         return self._steadily(maps, ask)
 
     def sequence(
         self, map_name: str, frames: Sequence[tuple[bytes, FrameMeta]], query: Query,
-        since: float | None = None,
+        since: float | None = None, sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
         """Look up the last of some frames of one run; the earlier ones vote for its pose too.
 
@@ -285,7 +291,7 @@ class Queries:
         frames : samples and meta of each in the order they were taken: their poses, in one parent
             frame of any name, are the odometry
         query : how to ask, for each of them
-        since : see `upload`
+        since, sent : see `upload`
 
         Raises
         ------
@@ -302,13 +308,14 @@ class Queries:
             earlier = [
                 SequenceFrame(one, inverse(_odometry(last)) @ _odometry(one)) for one in before
             ]
-            return self.answer(rows, last, query, deadline, earlier)
+            return self.answer(rows, last, query, deadline, earlier, sent)
 
         return self._steadily([map_name], ask)
 
     def stored(
-        self, maps: Sequence[str], frame: NamedFrame, query: Query, since: float | None = None
-    ) -> Answer:
+        self, maps: Sequence[str], frame: NamedFrame, query: Query, since: float | None = None,
+        sent: SentQuery | None = None,
+    ) -> Answer:  # fmt: skip
         """Look a stored frame up, which does not find itself; see `prepare_stored` and `upload`."""
         deadline = Deadline(query.deadline_ms, since)
 
@@ -316,18 +323,64 @@ class Queries:
             self._check_models(rows)
             self._signers(rows[0].model_id)  # while no connection is held: a crowd would hold all
             ready = prepare_stored(self._store, self._signers, frame.map, frame.frame_id, query)
-            return self.answer(rows[: len(maps)], ready, query, deadline)
+            return self.answer(rows[: len(maps)], ready, query, deadline, sent=sent)
 
         home = [] if frame.map in maps else [frame.map]
         names = [*maps, *home]
         return self._steadily(names, ask)
 
+    def again(
+        self, maps: Sequence[str], stored: StoredAnswer, query: Query,
+        since: float | None = None, sent: SentQuery | None = None,
+    ) -> Answer:  # fmt: skip
+        """Repeat a query whose answer is stored, an upload without its file.
+
+        Parameters
+        ----------
+        maps, query, since, sent : see `upload`
+        stored : the earlier answer
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : a map, or the stored frame that was the query, is gone.
+        NotIndexed : it was an upload sent without validation, and this requests it; or a map has
+            another model than its signature.
+        InvalidRequest : see `prepare_upload` and `prepare_stored`.
+        """
+        frame = stored.answer.frame
+        if frame is not None:
+            named = NamedFrame(map=frame.map, frame_id=frame.frame_id)
+            return self.stored(maps, named, query, since, sent)
+        deadline, geometry = Deadline(query.deadline_ms, since), None
+        if "validate" in query.stages:
+            if stored.geometry is None:
+                raise NotIndexed(
+                    f"Query {stored.answer.query_id} ran without validation, so its points were "
+                    "not stored. Send the frame again."
+                )
+            geometry = read_geometry(stored.geometry)
+        asked = PreparedQuery(
+            stored.model_id, stored.vector, geometry, check_taken(stored.taken, query), None, 0.0,
+            base=stored.base, artifact=stored.geometry, kind=stored.answer.kind, up=stored.up,
+        )  # fmt: skip
+
+        def ask(rows: list[MapRow]) -> Answer:
+            for row in rows:
+                if row.model_id != stored.model_id:
+                    raise NotIndexed(
+                        f"Map {row.name!r} has a different model than the query was signed with, "
+                        "and the upload of the query is not stored. Send the frame again."
+                    )
+            return self.answer(rows, asked, query, deadline, sent=sent)
+
+        return self._steadily(maps, ask)
+
     def answer(
         self, asked_of: Sequence[MapRow], asked: PreparedQuery, query: Query, deadline: Deadline,
-        earlier: Sequence[SequenceFrame] = (),
+        earlier: Sequence[SequenceFrame] = (), sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
         """Answer from the maps as they are now; ModelMismatch where one has switched meanwhile."""
-        database = self._store.queried
+        database = self._store.database
         with database.read() as connection:
             rows = find_maps(connection, [one.name for one in asked_of])
             for row, one in zip(rows, asked_of, strict=True):
@@ -337,23 +390,40 @@ class Queries:
                         "the query again."
                     )
                 check_model(asked.model_id, row.model_id)
-            views = self._readers.views(connection, database, rows)
+            views = [self._readers.view(connection, row) for row in rows]
         places = [SearchedMap(row, view) for row, view in zip(rows, views, strict=True)]
         for place in places:
             check_model(place.view.model_id, asked.model_id)
         model = self._signers(asked.model_id).model
-        told, ranked = answer(self._store, places, model, asked, query, deadline, earlier)
+        found, ranked = answer(self._store, places, model, asked, query, deadline, earlier)
+        self._note(found, ranked, asked, query, deadline, sent)
+        return found
+
+    def _note(
+        self, found: Answer, ranked: Sequence[int], asked: PreparedQuery, query: Query,
+        deadline: Deadline, sent: SentQuery | None,
+    ) -> None:  # fmt: skip
+        """Have the log store an answer."""
+        listed = sent is not None and query.record
+        if not (listed or query.keep):
+            return
+        if sent is None:
+            sent = SentQuery(found.maps, query, frame=found.frame)
+        row = query_row(sent, found, time.perf_counter() - deadline.since)
+        stored, shown = None, set[int]()
         if query.keep:
-            kept = StoredResult(
-                told, query, asked.model_id, asked.vector, asked.artifact, ranked,
+            stored = StoredAnswer(
+                found, query, asked.model_id, asked.vector, asked.artifact, tuple(ranked),
                 taken=asked.taken, base=asked.base, up=asked.up,
             )  # fmt: skip
-            self._kept.keep(kept)
-        return told
+            # explanations show the whole ranking
+            shown = {ranked[one.rank - 1] for one in found.explanations or found.matches}
+            shown |= set() if asked.frame is None else {asked.frame[0]}
+        self._log.note(replace(row, listed=listed), stored, sorted(shown))
 
     def _steadily(self, maps: Sequence[str], ask: Callable[[list[MapRow]], Answer]) -> Answer:
         with self._cores.lent():
-            return read_through(self._store.replica, lambda: steadily(self._store, maps, ask))
+            return steadily(self._store, maps, ask)
 
     def compare(self, a: Side, b: Side, how: Comparison) -> Similarity:
         """Compare two frames; see `compare`."""
@@ -382,23 +452,20 @@ class Queries:
             return list(dict.fromkeys(query.maps))
         with self._store.database.read() as connection:
             names = [row.name for row in list_maps(connection) if may_read(row.name)]
-            most = MOST_MAPS
-            if len(names) > most and self._readers.asks_database(connection):
-                most = FLEET_MAPS
         if not names:
             raise UnknownMap("There is no map to search yet. Create one, or name an existing one.")
-        if len(names) > most:
+        if len(names) > MOST_MAPS:
             raise InvalidRequest(
-                f"There are {len(names)} maps, but a query can search at most {most}. Name the "
-                "maps to search.",
-                (("maps", f"more than {most}"),),
+                f"There are {len(names)} maps, but a query can search at most {MOST_MAPS}. Name "
+                "the maps to search.",
+                (("maps", f"more than {MOST_MAPS}"),),
             )
         return names
 
     def _check_models(self, rows: Sequence[MapRow]) -> None:
         if len({row.model_id for row in rows}) == 1:
             return
-        with self._store.queried.read() as connection:
+        with self._store.database.read() as connection:
             names = model_names(connection)
         told = {row.name: model_label(names[row.model_id], row.model_id) for row in rows}
         which = ", ".join(f"{name} has {model}" for name, model in told.items())

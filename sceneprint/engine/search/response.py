@@ -391,9 +391,8 @@ def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
     selected = bool(at) and at[0] in asking.tried.chosen
     validation, T = _aligned(asking, part, row)
     if missed:
-        index = "the index" if view.kind == "local" else "pgvector in the database"
         lost: Lost | None = "shortlist"
-        reason = f"{index} missed it, although its rank is {rank}; query with `exact`"
+        reason = f"the index missed it, although its rank is {rank}; query with `exact`"
     else:
         lost, reason = _lost(asking, row, rank, passes, bool(at), selected)
     early = lost not in (None, "validation")
@@ -426,7 +425,7 @@ def _locate_frame(asking: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapS
     """The frame, and what is searched of its map: the first that has one which can be found."""
     parts, own = asking.searched.parts, asking.asked.frame
     held, missing = [], None
-    with asking.store.queried.read() as connection:
+    with asking.store.database.read() as connection:
         for part in parts:
             try:
                 held.append((part, find_frame(connection, part.place.row, frame_id)))
@@ -502,7 +501,7 @@ def _aligned(
                 status="skipped", reason="the deadline passed before it was validated"
             ), None
         model_id = part.place.row.model_id
-        with asking.store.queried.read() as connection:
+        with asking.store.database.read() as connection:
             blob = geometry_blobs(connection, [row.number], model_id).get(row.number)
             ranked = asking.searched.ranking.indices.tolist()
             up = known_ups(connection, [*ranked, row.number]).get(row.number)

@@ -1,6 +1,6 @@
 """A query to R, one ranking over all maps that are asked: Sec. III-C.
 
-maps as of now  --Readers.views-->  MapViews  --search_maps-->  Searched
+maps as of now  --Readers.view-->  IndexViews  --search_maps-->  Searched
 """
 
 from __future__ import annotations
@@ -9,10 +9,9 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +20,8 @@ from sqlalchemy import Connection, select
 from sceneprint import errors
 from sceneprint.decoders import Decoders
 from sceneprint.engine.ingest.frame_decoder import read_upload
-from sceneprint.engine.search.local_index import READ_MOST, IndexView, MapView, Reader, index_folder
+from sceneprint.engine.search.local_index import IndexView, Reader, index_folder
 from sceneprint.engine.search.shared_index import IN_USE_S, SharedIndexes
-from sceneprint.engine.search.stored_maps import Stored, StoredMaps, search_stored
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
@@ -33,20 +31,18 @@ from sceneprint.index import SearchHits
 from sceneprint.index.generation_files import Keys
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, prepare, sign
-from sceneprint.store import Database, Store
+from sceneprint.store import Store
 from sceneprint.store.frame_queries import QueryOrigin, passing
 from sceneprint.store.frames import refers_to
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs, list_maps
-from sceneprint.store.postgres import vectors
 from sceneprint.store.signatures import stored_vector
 from sceneprint.store.tables import MapRow, maps
 from sceneprint.types import Bytes, Floats, Geometry
 from sceneprint_client.api import Filter, FrameMeta, Query
 from sceneprint_client.api.frames import Kind
 
-# The readers of all maps, and where each is searched.
+# The readers of all maps.
 
-Setting = Literal["auto", "local", "database", "qdrant"]
 #: Memory of all tails above which maps that were not asked for long are forgotten.
 HELD_BYTES = 1 << 30
 #: Seconds between two looks for maps that are held and no longer there.
@@ -60,65 +56,18 @@ class Readers:
     ----------
     signers : see Signers
     indexes : folder of all indexes
-    setting : `local` and `qdrant` never ask the database; `database` wherever it can; `auto` where
-        much is missing here. `qdrant` has Qdrant search the indexes of this node
     shared : indexes of the fleet, of which maps that are asked are fetched
     """
 
     def __init__(
-        self, signers: Signers, indexes: Path, setting: Setting = "local",
-        shared: SharedIndexes | None = None,
-    ) -> None:  # fmt: skip
+        self, signers: Signers, indexes: Path, shared: SharedIndexes | None = None
+    ) -> None:
         self._shared = shared
-        self._signers, self._indexes, self._setting = signers, indexes, setting
-        self._stored = StoredMaps()
+        self._signers, self._indexes = signers, indexes
         self._database, self._history = signers.database, signers.database.history
         self._lock = threading.Lock()
         self._open: OrderedDict[str, tuple[tuple[int, str], Reader]] = OrderedDict()
         self._tidied = time.monotonic()
-
-    def views(
-        self, connection: Connection, database: Database, rows: Sequence[MapRow]
-    ) -> list[MapView]:
-        """Maps of one model as of their rows' revisions, or later, each where it is searched best.
-
-        Parameters
-        ----------
-        connection : a reading transaction of `database`
-        rows : of the maps, one or more
-        """
-        model = self._signers(rows[0].model_id).model
-        found: dict[int, MapView] = {}
-        if model.metric == "l2" and model.signature_bytes in self._searched_there(connection):
-            others = self._others(connection, rows)
-            found.update(self._stored.views(connection, database, others, model))
-        return [found.get(row.number) or self.view(connection, row) for row in rows]
-
-    def asks_database(self, connection: Connection) -> bool:
-        """Whether the database searches, so that a query may name very many maps."""
-        return bool(self._searched_there(connection))
-
-    def _searched_there(self, connection: Connection) -> frozenset[int]:
-        if self._setting in ("local", "qdrant") or self._database.is_sqlite:
-            return frozenset()
-        return vectors.complete_dimensions(connection)
-
-    def _others(self, connection: Connection, rows: Sequence[MapRow]) -> list[MapRow]:
-        """Maps of which this node would have to read much before it could search them."""
-        if self._setting == "database":
-            return list(rows)
-        others, left = [], READ_MOST
-        for row in rows:
-            reader = self._reader(connection, row)
-            lacking = reader.lacks(connection, row)
-            if lacking is None and reader.is_outdated():
-                self.forget(row.name)  # it was asked long ago: another begins with the newest index
-                lacking = self._reader(connection, row).lacks(connection, row)
-            if lacking is None or lacking > left:
-                others.append(row)
-            else:
-                left -= lacking
-        return others
 
     def view(self, connection: Connection, row: MapRow) -> IndexView:
         """A map as of the row's revision, or later, on this node."""
@@ -136,8 +85,7 @@ class Readers:
             wanted = (row.number, row.model_id)
             if reader is None or held != wanted:  # made anew, or signed with another model
                 model = self._signers(row.model_id).model
-                folder, qdrant = index_folder(self._indexes, row), self._setting == "qdrant"
-                reader = Reader(connection, row, folder, model, qdrant)
+                reader = Reader(connection, row, index_folder(self._indexes, row), model)
                 self._open[row.name] = (wanted, reader)
             self._open.move_to_end(row.name)
             # the one that was asked longest ago first, and never the one that is asked now
@@ -265,7 +213,7 @@ def prepare_stored(
     DamagedBlob : what was made of it is damaged, and its upload too.
     """
     start = time.perf_counter()
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         row = find_map(connection, map_name)
         frame = find_frame(connection, row, frame_id)
         try:
@@ -291,7 +239,7 @@ def prepare_stored(
             artifact = store.blobs.get(blobs[frame.number])
             geometry = read_geometry(artifact)
         except (errors.DamagedBlob, errors.UnreadableGeometry):
-            with store.queried.read() as connection:
+            with store.database.read() as connection:
                 if not refers_to(connection, blobs[frame.number]):
                     raise errors.UnknownFrame(
                         f"Frame {frame_id} of map {map_name!r} was deleted during the query."
@@ -343,8 +291,8 @@ class Deadline:
     """
 
     def __init__(self, milliseconds: int | None, since: float | None = None) -> None:
-        since = time.perf_counter() if since is None else since
-        self._ends = None if milliseconds is None else since + milliseconds / 1e3
+        self.since = time.perf_counter() if since is None else since
+        self._ends = None if milliseconds is None else self.since + milliseconds / 1e3
         self._longest, self._began = FIRST_S, 0.0
         self.reached: bool | None = None if milliseconds is None else False
 
@@ -365,7 +313,7 @@ class SearchedMap:
     """A map that is asked: its row, and its frames as of one revision."""
 
     row: MapRow
-    view: MapView
+    view: IndexView
 
 
 @dataclass(frozen=True, eq=False)
@@ -447,7 +395,12 @@ def search_maps(
     """
     parts = tuple(_part(store, place, asked, query) for place in places)
     size = ranking_size(sum(part.passed for part in parts))
-    hits = _searched(asked.vector, parts, size, query.exact)
+    hits = tuple(
+        part.place.view.search(
+            asked.vector, size, dead=part.dead, among=part.among, exact=query.exact
+        )
+        for part in parts
+    )
     keys = np.concatenate([one.keys for one in hits])
     found = np.concatenate([one.distances for one in hits])
     owners = np.repeat(np.arange(len(parts)), [len(one) for one in hits])
@@ -463,29 +416,6 @@ def rank_among_all(searched: Searched, asked: PreparedQuery, number: int, distan
     return 1 + sum(
         part.place.view.nearer(asked.vector, number, distance, dead=part.dead, among=part.among)
         for part in searched.parts
-    )
-
-
-def _searched(
-    vector: Bytes, parts: Sequence[MapSearch], size: int, exact: bool
-) -> tuple[SearchHits, ...]:
-    """Hits of each part: of those in the database by one statement for all."""
-    stored = [(part.place.view, part) for part in parts if isinstance(part.place.view, Stored)]
-    among = [part.among for _, part in stored if part.among is not None]
-    found = iter(
-        search_stored(
-            [view for view, _ in stored], vector, size,
-            dead=frozenset().union(*(part.dead for _, part in stored)),
-            among=among if among else None, exact=exact,
-        )
-        if stored else ()
-    )  # fmt: skip
-    # the database counts the query itself, where it is of the map
-    return tuple(
-        replace(hits := next(found), compared=min(hits.compared, part.passed))
-        if isinstance(part.place.view, Stored)
-        else part.place.view.search(vector, size, dead=part.dead, among=part.among, exact=exact)
-        for part in parts
     )
 
 
@@ -505,8 +435,6 @@ def _among(
 ) -> Keys:
     """Frames of a view that pass a filter; the database may be newer or older than the view."""
     view = place.view
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         numbers = passing(connection, place.row.number, wanted, asked.taken)
-    if isinstance(view, Stored):  # what passes is found, or was deleted since
-        return numbers[~np.isin(numbers, list(dead))]
     return numbers[view.has(numbers) & ~np.isin(numbers, list(dead))]

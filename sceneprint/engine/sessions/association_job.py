@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult
-from sceneprint.engine.search.local_index import MapView
+from sceneprint.engine.search.local_index import IndexView
 from sceneprint.engine.search.retrieval import Readers
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import thresholds
@@ -244,7 +244,7 @@ class Associating:
             resign_frames(self._store, row, [number], row.model_id)
             return None
 
-    def _view(self, of: MapRow) -> tuple[MapRow, Model, MapView]:
+    def _view(self, of: MapRow) -> tuple[MapRow, Model, IndexView]:
         """The map as it is now: frames of it may be deleted, and its model may change.
 
         Raises
@@ -259,8 +259,7 @@ class Associating:
                 if row.number != of.number:
                     raise unknown_map(of.name)
                 if row.model_id == model.id:
-                    views = self._readers.views(connection, self._store.database, [row])
-                    return row, model, views[0]
+                    return row, model, self._readers.view(connection, row)
 
 
 def _item(number: int, match: PairMatch) -> dict[str, Any]:

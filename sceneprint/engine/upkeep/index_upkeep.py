@@ -6,7 +6,6 @@ import logging
 import os
 import shutil
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -17,17 +16,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection
-from sqlalchemy.exc import SQLAlchemyError
 
 from sceneprint.atomic_files import PRIVATE_FILE, make_folder
 from sceneprint.engine.search.local_index import (
-    READ_MOST,
     index_folder,
     is_index_folder,
-    qdrant_metric,
     trusted,
 )
-from sceneprint.engine.search.retrieval import Setting
 from sceneprint.engine.search.shared_index import SharedIndexes
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
@@ -35,24 +30,21 @@ from sceneprint.errors import (
     BusyIndex,
     DamagedIndex,
     InvalidRequest,
-    ModelError,
     SceneprintError,
     UnknownMap,
     UnusableStore,
 )
-from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.index import Generation, clear, manifests, newest, newest_number, publish, scrub
-from sceneprint.index.generation_files import GenerationManifest, remove
+from sceneprint.index.generation_files import GenerationManifest
 from sceneprint.models import Model
 from sceneprint.settings import Settings
 from sceneprint.store import Store
 from sceneprint.store.deletion import DAY_S, newest_deletion
 from sceneprint.store.events import anchor_of_now
 from sceneprint.store.maps import find_map, list_maps
-from sceneprint.store.postgres import vectors
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.queue import read_clock
-from sceneprint.store.reencoding_rows import is_complete, models_of
+from sceneprint.store.reencoding_rows import is_complete
 from sceneprint.store.signatures import changes_since, count_gone, count_indexed, deleted_since
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Bytes
@@ -103,7 +95,7 @@ class Scrubber:
                 return None
             if damaged is not None:
                 log.error("damaged index file removed", extra={"path": str(damaged)})
-                remove(damaged)  # what names it is passed over from now on
+                damaged.unlink(missing_ok=True)  # what names it is passed over from now on
                 return damaged.parent
         return None
 
@@ -144,7 +136,7 @@ class Upkeep:
     settings : `indexes` is the folder of all indexes; a generation may lack `tail_frames` frames,
         and as many deletions; after `scrub_s` seconds all files are read again, to see that they
         are sound; an index that lacks a deletion of `deleted_rows_days` ago cannot be brought up
-        to date; `search` says whether indexes have shards of Qdrant
+        to date
     shared : indexes of the fleet; None where each host builds its own
     """
 
@@ -160,7 +152,6 @@ class Upkeep:
         # read all of them for each thousand frames would take longer than to write
         self._verified: dict[tuple[int, str], Mapping[str, int]] = {}
         self._models: dict[str, Model | None] = {}
-        self._qdrant = settings.search == "qdrant"
         self._scrubber = Scrubber(settings.indexes, settings.scrub_s)
         self._rows_s = DAY_S * settings.deleted_rows_days
         # map and model: when it is looked next for deletions that the index should know of by now
@@ -274,8 +265,8 @@ class Upkeep:
         return model is not None and self._is_indexed(model)
 
     def _is_indexed(self, model: Model) -> bool:
-        """Whether maps of a model have an index: those of L1 where Qdrant searches it alone."""
-        return model.metric == "l2" or qdrant_metric(model, self._qdrant) is not None
+        """Return whether maps of a model have an index: signatures compared by L1 have none."""
+        return model.metric == "l2"
 
     def _due(self, connection: Connection, row: MapRow) -> bool:
         number, since = self._published.get((row.number, row.model_id), (None, 0))
@@ -323,11 +314,8 @@ class Upkeep:
         model = self._model(row.model_id)
         if model is None:  # of another version's model, which says so where there is an index
             return self._purge_own(row)
-        if not self._is_indexed(model):  # Qdrant may have searched it before
-            folder = index_folder(self._indexes, row)
-            left = any(folder.glob("*.json"))
-            shutil.rmtree(folder, ignore_errors=True)
-            return left
+        if not self._is_indexed(model):
+            return False
         own = self._purge_own if self._shared is None else self._purge_shared
         return own(row)
 
@@ -490,14 +478,13 @@ class Upkeep:
                 return None  # made anew, or signed anew, in the meantime; next time
             folder = index_folder(self._indexes, now)
             length = signer.model.signature_bytes
-            metric, previous = qdrant_metric(signer.model, self._qdrant), None
+            previous = None
             if not anew:
                 previous = trusted(connection, now, self._newest(now, folder, length))
             since = 0 if previous is None else previous.revision
             if previous is not None:
                 self._note(now, previous)
-            wanted = anyway or _lacks_shard(previous, metric)
-            if not wanted and not self._is_long(connection, now, since):
+            if not anyway and not self._is_long(connection, now, since):
                 return None  # another worker was first
             if previous is None and count_indexed(connection, now.number, 0) == 0:
                 if anew:
@@ -516,7 +503,6 @@ class Upkeep:
                 clean=clean,
                 after=after,
                 share=share,
-                qdrant=metric,
             )
         resign_frames(self._store, now, damaged, now.model_id)
         if generation is None:
@@ -535,8 +521,7 @@ class Upkeep:
     def _newest(self, row: MapRow, folder: Path, length: int) -> Generation | None:
         """The newest sound generation here; what this process has verified is not read again."""
         sound = self._verified.get((row.number, row.model_id))
-        metric = qdrant_metric(self._signers(row.model_id).model, self._qdrant)
-        return newest(folder, row.model_id, length, sound=sound, qdrant=metric)
+        return newest(folder, row.model_id, length, sound=sound)
 
     def _clean(self, rows: Sequence[MapRow]) -> None:
         """Remove the indexes of maps that are no more, of models that they had, and of psi."""
@@ -558,15 +543,6 @@ class Upkeep:
         return {index_folder(self._indexes, row).name for row in known}
 
 
-def _lacks_shard(previous: Generation | None, metric: Metric | None) -> bool:
-    """Whether a generation was published before Qdrant was to search, or by another engine."""
-    return (
-        metric is not None
-        and previous is not None
-        and any(one.shard is None for one in previous.segments)
-    )
-
-
 def _coming(row: MapRow) -> MapRow:
     """A map as it will be with the model that it is being signed with."""
     if row.next_model_id is None:
@@ -584,82 +560,3 @@ def _blocks(
         if made:
             rows = np.stack([np.frombuffer(vector, np.uint8) for _, vector in made])
             yield np.array([number for number, _ in made], np.int64), rows
-
-
-# Vectors of signatures in PostgreSQL, made and filled by workers beside everything else.
-#
-# models of the maps  --VectorTables.run-->  a table for each dimension, filled block by block
-
-#: Seconds for which a worker adds vectors before it looks for frames to sign again.
-FILL_S = 2.0
-#: Seconds between two looks for what is missing.
-LOOK_S = 10.0
-#: Seconds until another try where the database has no pgvector, and after any other error.
-AGAIN_S, PAUSE_S = 600.0, 30.0
-
-
-class VectorTables:
-    """Keeps a table of vectors for each dimension that the maps of this database need.
-
-    Parameters
-    ----------
-    signers : that know the models, and the database
-    setting : with `local` and `qdrant` there are none; with `auto` none that no node would ask
-    """
-
-    def __init__(self, signers: Signers, setting: Setting) -> None:
-        self._signers, self._database, self._setting = signers, signers.database, setting
-        self._not_before = 0.0
-
-    def run(self) -> bool:
-        """Do a little of what is due; returns whether there is more to do at once."""
-        database = self._database
-        if database.is_sqlite or database.read_only or self._setting in ("local", "qdrant"):
-            return False
-        if time.monotonic() < self._not_before:
-            return False
-        try:
-            until = time.monotonic() + FILL_S
-            more = [self._bring_on(dimension, until) for dimension in self._wanted()]
-        except (SceneprintError, SQLAlchemyError) as error:  # it costs nobody anything but time
-            self._not_before = time.monotonic() + PAUSE_S
-            log.error("vector table update failed", extra={"error": f"{error!s:.500}"})
-            return False
-        if not any(more) and time.monotonic() > self._not_before:
-            self._not_before = time.monotonic() + LOOK_S
-        return any(more)
-
-    def _wanted(self) -> list[int]:
-        """Dimensions of the models in use whose signatures are compared by L2."""
-        frames: Counter[int] = Counter()
-        with self._database.read() as connection:
-            rows = list_maps(connection)
-        for row in rows:
-            for model_id in models_of(row):
-                try:
-                    model = self._signers(model_id).model
-                except ModelError:  # its maps can be neither signed nor searched; `warm` says so
-                    continue
-                if model.metric == "l2":
-                    frames[model.signature_bytes] += row.used_frames
-        least = READ_MOST if self._setting == "auto" else -1
-        return sorted(dimension for dimension, n in frames.items() if n > least)
-
-    def _bring_on(self, dimension: int, until: float) -> bool:
-        with self._database.read() as connection:
-            complete = dimension in vectors.complete_dimensions(connection)
-        if not complete:
-            with self._database.write() as connection:
-                reason = vectors.make_table(connection, dimension)
-            if reason is not None:
-                self._not_before = time.monotonic() + AGAIN_S
-                log.warning("database search disabled: %s", reason)
-                return False
-        while not complete:
-            with self._database.write() as connection:
-                complete = vectors.fill(connection, dimension)
-            if time.monotonic() >= until:
-                break
-        if complete and vectors.add_graph(self._database, dimension):
-            log.info("vector index built", extra={"dimension": dimension})
-        return not complete

@@ -22,8 +22,7 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.maps.selections import FrameUndo
 from sceneprint.engine.reconstruction import ReconstructionJobs
-from sceneprint.engine.results.kept_answers import KeptAnswers
-from sceneprint.engine.results.stored_results import ResultValidity, StoredResults
+from sceneprint.engine.results.query_log import QueryLog
 from sceneprint.engine.sessions.session_differences import DifferenceJobs
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs, collect_doomed_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
@@ -168,18 +167,16 @@ class Purging:
 
     Parameters
     ----------
-    store, upkeep, kept, kept_answers, undo, reconstructions, differences : of the engine
+    store, upkeep, query_log, undo, reconstructions, differences : of the engine
     purge_s : seconds after which nothing may be left
     """
 
     def __init__(
-        self, store: Store, upkeep: Upkeep, kept: StoredResults, kept_answers: KeptAnswers,
-        undo: FrameUndo, reconstructions: ReconstructionJobs, differences: DifferenceJobs,
-        purge_s: float,
+        self, store: Store, upkeep: Upkeep, query_log: QueryLog, undo: FrameUndo,
+        reconstructions: ReconstructionJobs, differences: DifferenceJobs, purge_s: float,
     ) -> None:  # fmt: skip
-        self._store, self._upkeep, self._kept = store, upkeep, kept
-        self._kept_answers, self._undo, self._reconstructions = kept_answers, undo, reconstructions
-        self._differences = differences
+        self._store, self._upkeep, self._log, self._undo = store, upkeep, query_log, undo
+        self._reconstructions, self._differences = reconstructions, differences
         self._every_s = purge_s / 2  # what is deleted just after a look is gone in time too
         self._next = time.monotonic() + self._every_s
 
@@ -223,15 +220,13 @@ class Purging:
                 return 0
 
         tried(lambda: self._undo.purge(everything=before is None))
-        standing = ResultValidity(self._store, restorable=True)
         with self._store.database.read() as connection:
             rows = [row for row in list_maps(connection) if wanted(row)]
         found = Purged(
             blobs=tried(lambda: collect_doomed_blobs(self._store, before, seconds)),
-            reconstructions=tried(lambda: self._reconstructions.forget(standing)),
+            reconstructions=tried(self._reconstructions.forget),
             differences=tried(self._differences.forget),
-            answers=tried(lambda: self._kept.forget(standing.all_of))
-            + tried(self._kept_answers.remove_spent),
+            answers=tried(self._log.purge),
             indexes=tried(lambda: self._swept(now=before is None))
             + sum(tried(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]
         )

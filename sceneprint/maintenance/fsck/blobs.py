@@ -30,7 +30,6 @@ from sceneprint.maintenance.fsck.findings import (
 )
 from sceneprint.models import Model
 from sceneprint.models.model_file import is_sound_table
-from sceneprint.store.answer_rows import remove_answers
 from sceneprint.store.blobs.folder import PART, BlobEntry, Condition
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import refers_to
@@ -42,7 +41,6 @@ from sceneprint.store.tables import (
     frames,
     job_files,
     jobs,
-    kept_answers,
     maps,
     signatures,
     surface_tiles,
@@ -407,48 +405,6 @@ def _repair_tile(folder: Folder, number: int, blob: str) -> str:
         moved = quarantine_blob(folder, blob) if condition == "damaged" else ""
         spoil_tile(connection, tile)
     return f"{moved}a worker makes it again"
-
-
-# Kept answers: lost or damaged.
-
-
-def check_answers(folder: Folder) -> Iterator[Finding]:
-    """Answers that are kept until they are released, each against its hash."""
-    if folder.map_name is not None:  # one may be of several maps
-        return
-    asked = select(kept_answers.c.number, kept_answers.c.id, kept_answers.c.blob)
-    with folder.store.database.read() as connection:
-        found = connection.execute(asked.order_by(kept_answers.c.number)).all()
-    for done, one in enumerate(found):
-        folder.progress("kept answers", done, len(found))
-        folder.counts["blobs"] += 1
-        condition = folder.store.blobs.condition(one.blob, quick=folder.quick)
-        if condition == "sound" or not _is_kept(folder, one.number):
-            continue
-        move = "move it to the quarantine, and " if condition == "damaged" else ""
-        yield Finding(
-            f"{condition}-answer", f"the kept answer {one.id}", "damage",
-            "it cannot be looked at", f"{move}keep it no longer: send the query again",
-            path=folder.store.blobs.place(one.blob),
-            repair=partial(_repair_answer, folder, one.number, one.blob),
-        )  # fmt: skip
-
-
-def _is_kept(folder: Folder, number: int) -> bool:
-    with folder.store.database.read() as connection:
-        own = select(kept_answers.c.number).where(kept_answers.c.number == number)
-        return connection.execute(own).first() is not None
-
-
-def _repair_answer(folder: Folder, number: int, blob: str) -> str:
-    with folder.store.database.write() as connection:
-        condition = folder.store.blobs.condition(blob)
-        if condition == "sound":
-            return GONE
-        moved = quarantine_blob(folder, blob) if condition == "damaged" else ""
-        if not remove_answers(connection, [number]):
-            return GONE
-    return f"{moved}it is kept no longer"
 
 
 # Signatures whose bytes are not those that were stored.

@@ -18,7 +18,6 @@ from sqlalchemy import select
 
 from sceneprint.errors import SceneprintError, UnusableStore
 from sceneprint.maintenance.fsck.blobs import (
-    check_answers,
     check_artifacts,
     check_files,
     check_products,
@@ -56,7 +55,7 @@ GRACE_S = 3600.0
 
 _CHECKS: tuple[Callable[[Folder], Iterator[Finding]], ...] = (
     check_database, check_models, check_rows, check_counts, check_signatures, check_uploads,
-    check_artifacts, check_products, check_surfaces, check_answers, check_files, check_indexes,
+    check_artifacts, check_products, check_surfaces, check_files, check_indexes,
     check_tables,
 )  # fmt: skip
 

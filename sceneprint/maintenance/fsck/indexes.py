@@ -26,14 +26,13 @@ from sceneprint.errors import DamagedIndex, StoreError
 from sceneprint.index import Generation, newest, signatures_of
 from sceneprint.index.generation_files import (
     GenerationManifest,
-    allocated,
     building,
+    bytes_of,
     check,
     draw,
     is_ours,
     manifests,
     read_manifest,
-    remove,
 )
 from sceneprint.maintenance.fsck.blobs import WRITING_S, changed_at
 from sceneprint.maintenance.fsck.findings import Finding, Folder
@@ -119,7 +118,7 @@ def describe_index(
     with engine.store.database.read() as connection:
         sizes = _sizes(connection, engine, row, seed)
         lag_s = _lag_s(connection, row, view)
-    on_disk = sum(allocated(path) for path in folder.rglob("*"))
+    on_disk = bytes_of(folder)
     generation = view.generation
     recall, spread, looked_up = _recall(view, sample, seed, progress)
     return IndexStats(
@@ -293,7 +292,7 @@ def _remove_file(file: Path) -> str:
             raise StoreError("a worker is building this index; run it again when that is done")
         needing = [path for _, path in manifests(file.parent) if _needs(path, file.name)]
         for path in (*needing, file):  # manifests first: none should promise what is gone
-            remove(path)
+            path.unlink(missing_ok=True)
     return f"removed, and {len(needing)} generations that need it" if needing else "removed"
 
 
@@ -389,7 +388,7 @@ def _remove_generations(place: Path) -> str:
             path.unlink(missing_ok=True)
         for path in place.iterdir():
             if is_ours(path.name):
-                remove(path)
+                path.unlink(missing_ok=True)
     return f"{len(listed)} generations removed"
 
 

@@ -11,7 +11,7 @@ import hashlib
 import json
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -344,9 +344,7 @@ _USES_OF_SURFACES = " UNION ALL ".join(
     f" WHERE {column} IS NOT NULL"
     for column in ("blob", "draft")
 )
-#: The answers that are kept.
-_USES_OF_ANSWERS = "SELECT blob AS digest, number, 'answer' AS role FROM kept_answers"
-_USES = " UNION ALL ".join([_USES_OF_FRAMES, _USES_OF_JOBS, _USES_OF_SURFACES, _USES_OF_ANSWERS])
+_USES = " UNION ALL ".join([_USES_OF_FRAMES, _USES_OF_JOBS, _USES_OF_SURFACES])
 
 
 @dataclass(frozen=True)
@@ -435,6 +433,18 @@ def copy_database(source: Path, to: Path) -> None:
         ) from error
     if sealed is not None:
         sealed.check(before)
+
+
+def forget_answers(path: Path) -> None:
+    """Let no query of a copy have an answer in a file, as the archive has none of these.
+
+    Where the copy is damaged, whoever reads it says so.
+    """
+    with suppress(sqlite3.Error), closing(_connect(path, "mode=rw")) as file:
+        file.execute("DELETE FROM queries WHERE NOT listed AND kept_at IS NULL")
+        file.execute(
+            "UPDATE queries SET bytes = 0, shown = NULL WHERE bytes > 0 AND kept_at IS NULL"
+        )
 
 
 @contextmanager
@@ -568,14 +578,6 @@ def uses(connection: sqlite3.Connection, digest: str) -> tuple[BlobUse, ...]:
         (digest,),
     )
     found += [BlobUse(map=name, role="surface") for (name,) in rows]
-    rows = connection.execute(
-        "SELECT maps.name, kept_answers.id FROM kept_answers JOIN kept_answer_maps AS of"
-        " ON of.kept_number = kept_answers.number"
-        " JOIN maps ON maps.number = of.map_number WHERE CAST(blob AS TEXT) = ?"
-        " ORDER BY kept_answers.number, maps.number",
-        (digest,),
-    )
-    found += [BlobUse(map=name, query=query, role="answer") for name, query in rows]
     return tuple(found)
 
 

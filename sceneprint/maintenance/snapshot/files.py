@@ -216,8 +216,7 @@ class BlobUse(_Record):
     map: str
     frame: str | None = None
     job: str | None = None
-    query: str | None = None
-    role: Literal["upload", "geometry", "job", "surface", "deleted", "answer"]
+    role: Literal["upload", "geometry", "job", "surface", "deleted"]
 
 
 class LostBlob(_Record):

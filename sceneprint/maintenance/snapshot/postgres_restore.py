@@ -54,7 +54,6 @@ from sceneprint.store.blobs.object_store import BucketOwner
 from sceneprint.store.database import Database, open_database, reach_database
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint.store.postgres.connection import allow
-from sceneprint.store.postgres.vectors import drop_tables
 from sceneprint.store.tables import metadata, secrets
 
 # A SQLite file written into the empty database of a fleet, in one transaction.
@@ -80,7 +79,6 @@ def copy_into(connection: Connection, file: sqlite3.Connection) -> None:
     """
     allow(connection, 0)
     check_empty(connection)
-    drop_tables(connection)  # of vectors, which a copy of signatures does not make
     for name in _OF_ITSELF:
         connection.exec_driver_sql(f"DELETE FROM {name}")
     # foreign keys ask for the order

@@ -2,27 +2,24 @@
 
 archive  --verify_snapshot-->  Snapshot
 archive  --restore_snapshot-->  data folder
-archive  --renew_copy-->  data folder of a robot, in place of an earlier copy
 """
 
 from __future__ import annotations
 
 import fcntl
 import hashlib
-import json
 import os
-import shutil
 import sqlite3
 import stat
 from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from pydantic import ValidationError
 
-from sceneprint.atomic_files import create_private, make_folder, sync_folder, write_durable
+from sceneprint.atomic_files import create_private, make_folder, sync_folder
 from sceneprint.errors import DamagedSnapshot, SnapshotError
 from sceneprint.maintenance.snapshot import database_copy
 from sceneprint.maintenance.snapshot.creation import Progress, Snapshot
@@ -398,113 +395,3 @@ def restore_snapshot(
     with full_disk_explained(folder), target.staging() as made:
         snapshot = unpack(archive, made, progress, with_blobs=True)
         return snapshot, target.put(made, blobs=BLOBS.rstrip("/"), database=DATABASE)
-
-
-# Copies for robots: the same, put in place of the copy of before.
-
-#: Says in a data folder that it is a copy, and of which snapshot.
-_COPY = "copy.json"
-
-
-def snapshot_of_copy(folder: Path) -> str | None:
-    """Id of the snapshot that a data folder is a copy of; None where it is no copy."""
-    record = _read_copy(folder)
-    return None if record is None else str(record["snapshot_id"])
-
-
-def renew_copy(
-    archive: Path, folder: Path, snapshot_id: str, *, progress: Progress | None = None
-) -> tuple[Snapshot, Path | None]:
-    """Make a data folder a copy of a snapshot, all of it or nothing.
-
-    The copy that is there goes, unless frames were added to it since: then it is moved aside. The
-    new copy has the records of queries that were asked of the one before, and none of the service.
-
-    Parameters
-    ----------
-    archive : of the snapshot
-    folder : missing, empty, or an earlier copy
-    snapshot_id : to remember
-    progress : told of bytes done and bytes in all
-
-    Returns
-    -------
-    snapshot : what was copied
-    aside : where the earlier copy is now, if frames were added to it
-
-    Raises
-    ------
-    SnapshotError : as for `restore_snapshot`; or the folder holds something else than a copy.
-    """
-    before = _read_copy(folder)
-    if before is None and folder.is_dir():
-        try:
-            folder.rmdir()
-        except OSError as error:
-            raise SnapshotError(
-                f"{folder} is not empty and no copy that was pulled, or cannot be replaced "
-                f"({error.strerror}). Nothing was changed. Name another folder with --data."
-            ) from error
-    target = RestoreTarget(folder, replace=True)
-    with full_disk_explained(folder), target.staging() as made:
-        snapshot = unpack(archive, made, progress, with_blobs=True)
-        _replace_queries(made / DATABASE, None if before is None else folder / DATABASE)
-        record = {"snapshot_id": snapshot_id, "frames": _frames_of(made)}
-        write_durable(made / _COPY, json.dumps(record).encode(), folder_is_new=False)
-        aside = target.put(made, blobs=BLOBS.rstrip("/"), database=DATABASE)
-    if aside is not None and before is not None and before["frames"] == _frames_of(aside):
-        shutil.rmtree(aside, ignore_errors=True)
-        aside = None
-    return snapshot, aside
-
-
-def _read_copy(folder: Path) -> dict[str, object] | None:
-    try:
-        record = json.loads((folder / _COPY).read_bytes())
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except ValueError:
-        record = None
-    if not isinstance(record, dict) or not {"snapshot_id", "frames"} <= record.keys():
-        raise SnapshotError(
-            f"{folder / _COPY} is damaged. Move the folder away, or name another with --data."
-        )
-    return record
-
-
-def _replace_queries(made: Path, before: Path | None) -> None:
-    """Let a copy's records of queries be those of an earlier copy.
-
-    Parameters
-    ----------
-    made : database of the copy, as the service had it
-    before : that of the earlier copy; None where there is none
-    """
-    with closing(sqlite3.connect(made)) as database:
-        with database:
-            database.execute("DELETE FROM query_records")
-        if before is None or not before.is_file():
-            return
-        database.execute("ATTACH ? AS before", (str(before),))
-        columns = [  # the two may have been written by different versions
-            [row[1] for row in database.execute(f"PRAGMA {one}.table_info(query_records)")]
-            for one in ("main", "before")
-        ]
-        names = [one for one in columns[0] if one in columns[1] and one != "number"]
-        names.remove("map_number")
-        with database:  # of a map that was made anew since, none
-            database.execute(
-                f"INSERT INTO query_records (map_number, {', '.join(names)}) "
-                f"SELECT own.number, {', '.join(f'query.{one}' for one in names)} "
-                "FROM before.query_records AS query "
-                "JOIN before.maps AS held ON held.number = query.map_number "
-                "JOIN maps AS own ON own.name = held.name AND own.created_at = held.created_at "
-                "ORDER BY query.number"
-            )
-
-
-def _frames_of(folder: Path) -> list[int]:
-    """Count and highest number of all frames that a data folder ever had."""
-    with closing(sqlite3.connect(folder / DATABASE)) as database:
-        query = "SELECT count(*), coalesce(max(number), 0) FROM frames"
-        return list(database.execute(query).fetchone())

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 LOCKS = 0x5CE7E
 #: Whose turn it is to write.
 TURN = 1
-#: Who links vectors (see `vectors`); who numbers events (see `events`).
-VECTORS, EVENTS = 7, 8
+#: Who numbers events (see `events`).
+EVENTS = 8
 #: The first number of locks of single maps; the second is that of the map.
 MAP_LOCKS = 0x5CE7F
 #: Of maps whose numbers have the same last bits, writers take turns.

@@ -100,17 +100,17 @@ def test_a_row_that_refers_to_none_keeps_all_hands_off(house: Any) -> None:
     assert house.sql("SELECT COUNT(*) FROM signatures") == [(13,)]
 
 
-def test_a_record_of_a_query_is_of_a_map_that_is_there(house: Any) -> None:
+def test_a_query_refers_to_an_existing_map(house: Any) -> None:
     ((number,),) = house.sql("SELECT number FROM maps WHERE name = 'hall'")
     house.sql(
-        "INSERT INTO query_records (id, at, map_number, status, reason, alternatives, "
-        "milliseconds, kept) VALUES ('q', 1.0, ?, 'found', '', 0, 1.0, true)", number
+        "INSERT INTO queries (id, at, map_number, status, reason, alternatives, milliseconds, "
+        "listed, bytes) VALUES ('q', 1.0, ?, 'found', '', 0, 1.0, true, 0)", number
     )  # fmt: skip
     assert house.look() == []
-    house.sql("UPDATE query_records SET map_number = 99")
+    house.sql("UPDATE queries SET map_number = 99")
     (found,) = house.look(repair=True)
     assert (found.finding.kind, found.done) == ("dangling-row", None)
-    assert found.finding.what == "row 1 of table query_records"
+    assert found.finding.what == "row 1 of table queries"
 
 
 def test_a_damaged_model_that_ships_is_put_back(house: Any) -> None:
@@ -146,7 +146,7 @@ def test_a_later_schema_is_refused(house: Any) -> None:
     house.sql("UPDATE alembic_version SET version_num = '9999'")
     house.sql("UPDATE schema_range SET least_revision = '9999'")
     before = house.files()
-    with pytest.raises(NewerSchema, match="has schema 9999"):
+    with pytest.raises(NewerSchema):
         house.look()
     assert house.files() == before
 

@@ -1,7 +1,8 @@
-"""Blobs of no living frame: files of jobs, kept answers, uploads that can be restored."""
+"""Blobs of no living frame: files of jobs, tiles, uploads that can be restored."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,15 @@ from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 from sceneprint.settings import Settings
 from sceneprint.store import Store
-from sceneprint.store.answer_rows import NewKeptAnswer, keep_answer
 from sceneprint.store.maps import find_map
+from sceneprint.store.query_rows import (
+    NewQuery,
+    WantedQueries,
+    add_queries,
+    keep_answer,
+    list_queries,
+    read_kept,
+)
 from sceneprint.store.queue import JobFile, add_files, files_of, find_job
 from sceneprint.store.surface_rows import add_surface, find_surface, tiles_to_rebuild, write_tile
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, NewMap
@@ -128,46 +136,45 @@ def test_a_lost_tile_is_named_and_made_again(settings, tiled, condition):
 
 
 @pytest.fixture
-def kept(settings: Settings) -> tuple[str, str, str]:
-    """A kept answer and its blob, and a deletion that can be undone."""
+def deletion(settings: Settings) -> str:
+    """Id of a deletion that can be undone, in a store that has a kept answer and another one."""
     with Engine(settings) as engine:
         engine.create_map(NewMap(name="hall", model="depth"))
-        blob = engine.store.blobs.put(b"an answer")
         png = encode_png(np.full((48, 64), 2000, np.uint16))
         lens = CameraIntrinsics(width=64, height=48, fx=60, fy=60, cx=32, cy=24)
         frame, _ = engine.add_frame("hall", png, FrameMeta(intrinsics=lens, robot="r1"))
         with engine.store.database.write() as connection:
-            row = find_map(connection, "hall")
-            new = NewKeptAnswer(
-                "ab" * 16, blob, 9, 1.0, "found", None, {"map": "hall"}, [row.number], []
-            )
-            keep_answer(connection, new, None, None)
+            add_queries(connection, [query_of("a"), query_of("b"), query_of("c", listed=False)])
+            keep_answer(connection, 1, b"an answer", 1.0)
         engine.delete_frame("hall", frame.frame_id)
-        (deletion,) = engine.undo.list_all("hall", None, 9).items
-    return new.id, blob, deletion.deletion_id
+        (found,) = engine.undo.list_all("hall", None, 9).items
+    return found.deletion_id
+
+
+def query_of(letter: str, *, listed: bool = True) -> NewQuery:
+    return NewQuery(
+        id=letter * 32, at=time.time(), map="hall", maps=None, robot=None, session=None,
+        status="found", cause=None, reason="", pose_parent=None, pose=None, support=None,
+        rival_ratio=None, alternatives=0, milliseconds=1.0, kind=None, frame_map=None,
+        frame_id=None, key_id=None, listed=listed, bytes=9,
+    )  # fmt: skip
 
 
 @pytest.mark.sqlite_only("restores to a database of its own in the folder")
-def test_a_snapshot_has_kept_answers_and_what_can_be_restored(settings, kept, tmp_path):
+def test_a_snapshot_has_kept_answers_and_what_can_be_restored(settings, deletion, tmp_path):
     assert list(fsck(settings, grace_s=0)) == []
     take_snapshot(settings, tmp_path / "all.tar")
     restore_snapshot(tmp_path / "all.tar", tmp_path / "again")
     again = Settings(data_dir=tmp_path / "again", database_url=None)
     assert list(fsck(again, grace_s=0)) == []
     with Engine(again) as engine:
-        assert engine.store.blobs.get(kept[1]) == b"an answer"
-        done = engine.undo.restore("hall", RestoreOptions(deletion_id=kept[2]))
+        with engine.store.database.read() as connection:
+            rows = list_queries(connection, WantedQueries(), None, 9)
+            assert [(one.id[0], one.kept_at, one.bytes) for one in rows] == [
+                ("b", None, 0), ("a", 1.0, 9)
+            ]  # fmt: skip
+            assert read_kept(connection, rows[1].number) == b"an answer"
+        done = engine.undo.restore("hall", RestoreOptions(deletion_id=deletion))
         assert done.frames == 1
         assert [one.robot for one in engine.list_frames("hall").items] == ["r1"]
     assert list(fsck(again, grace_s=0)) == []
-
-
-def test_a_lost_answer_is_named_and_kept_no_longer(settings, kept):
-    (settings.blob_dir / kept[1][:2] / kept[1]).unlink()
-    (found,) = fsck(settings, grace_s=0)
-    assert (found.finding.kind, found.finding.what) == (
-        "missing-answer", f"the kept answer {kept[0]}"
-    )  # fmt: skip
-    (done,) = fsck(settings, grace_s=0, repair=True)
-    assert done.done == "it is kept no longer"
-    assert list(fsck(settings, grace_s=0)) == []

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import time
 from contextlib import closing
-from datetime import UTC, datetime
 from pathlib import Path
 
 import psycopg
@@ -20,11 +19,10 @@ from pydantic import SecretStr
 from sqlalchemy import insert
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
-from sceneprint.errors import DamagedSnapshot, SnapshotError, UnknownSnapshot, UnusableStore
+from sceneprint.errors import DamagedSnapshot, SnapshotError, UnusableStore
 from sceneprint.maintenance.fsck.check import fsck
-from sceneprint.maintenance.snapshot.creation import SnapshotCatalog, take_snapshot
+from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.maintenance.snapshot.database_copy import copy_server
 from sceneprint.maintenance.snapshot.postgres_restore import restore_to_fleet
 from sceneprint.maintenance.snapshot.restoration import restore_snapshot
@@ -262,59 +260,20 @@ def test_commands(archive, postgres, tmp_path, sceneprint, monkeypatch):
     assert "is complete" in sceneprint("restore", "--verify-only", out).stdout
 
 
-def test_blobs_and_snapshots_in_an_object_store(
-    archive, postgres_url, bucket, tmp_path, uploads, sceneprint, monkeypatch
-):
-    kept = {"blob_url": SecretStr(f"{bucket}/one"), "snapshot_url": bucket, "snapshots_kept": 2}
-    fleet = fleet_of(tmp_path / "node", postgres_url, **kept)
+def test_blobs_in_an_object_store(archive, postgres_url, bucket, tmp_path):
+    fleet = fleet_of(tmp_path / "node", postgres_url, blob_url=SecretStr(f"{bucket}/one"))
     with Engine(fleet):  # it marks the prefix with a name that the database then loses
         pass
-    told = restore_to_fleet(archive, fleet)
+    restored = restore_to_fleet(archive, fleet)
     assert not (tmp_path / "node" / "blobs").exists()
     with Engine(fleet) as engine:
         blobs = {*engine.store.blobs.digests()}
         engine.store.blobs.remove(first := min(blobs))
-    assert len(blobs) == told.manifest.blobs.count
-    shelf = SnapshotCatalog(fleet)
-    ids = [f"{datetime.now(UTC):%Y%m%d}T00000{n}Z-0123abcd" for n in range(3)]
-    for one in ids:
-        assert shelf.take(one).damaged == 1  # the one that was removed
-    other = SnapshotCatalog(fleet_of(tmp_path / "other", postgres_url, **kept))  # another host
-    assert [one.snapshot_id for one in other.list()] == ids[:0:-1]
-    with other.open(ids[2]) as file:
-        assert file.read(13) == b"manifest.json"
-    with pytest.raises(UnknownSnapshot):
-        other.find(ids[0])
-    other.delete(ids[1])
-    assert [one.snapshot_id for one in shelf.list()] == [ids[2]]
-    monkeypatch.setenv("SCENEPRINT_SNAPSHOT_URL", bucket)
-    monkeypatch.setenv("SCENEPRINT_BLOB_URL", f"{bucket}/one")
-    refused = sceneprint("restore", ids[2], "--data", tmp_path / "home", expect=2)
-    assert "SCENEPRINT_BLOB_URL is set" in refused.stderr
-    monkeypatch.delenv("SCENEPRINT_BLOB_URL")
-    said = sceneprint("restore", ids[2], "--data", tmp_path / "home", expect=1)
-    assert f"{first[:12]}, missing" in said.stderr
-    assert len([*(tmp_path / "home" / "blobs").glob("*/*")]) == len(blobs) - 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["home", "node"]
-
-
-@pytest.mark.thorough
-def test_taken_over_the_service(
-    archive, postgres, postgres_url, tmp_path, sceneprint, monkeypatch, rows
-):
-    fleet = fleet_of(tmp_path / "node", postgres_url)
-    restore_to_fleet(archive, fleet)
-    # nothing is to be signed, which takes its time
-    postgres.execute("DELETE FROM jobs WHERE state = 'queued'", postgres_url.rpartition("/")[2])
-    monkeypatch.setenv("SCENEPRINT_DATABASE_URL", postgres_url)
-    with serving(fleet.data_dir, 1) as url:
-        said = sceneprint("snapshot", "--url", url, "--out", tmp_path / "a.tar").stdout
-        assert "a.tar: 1 maps, 5 frames" in said
+    assert len(blobs) == restored.manifest.blobs.count
+    taken = take_snapshot(fleet, tmp_path / "a.tar")
+    assert [(one.digest, one.why) for one in taken.damaged] == [(first, "missing")]
     restore_snapshot(tmp_path / "a.tar", tmp_path / "home")
-    asked = "SELECT id, blob, revision FROM frames ORDER BY number"
-    assert rows(tmp_path / "home", asked) == ask(postgres_url, asked)
-    [job] = rows(tmp_path / "home", "SELECT state FROM jobs WHERE kind = 'snapshot'")
-    assert job == ("running",)  # the one that took it
+    assert len([*(tmp_path / "home" / "blobs").glob("*/*")]) == len(blobs) - 1
 
 
 def test_a_prefix_is_not_shared_with_the_store_that_was_copied(archive, postgres, bucket, tmp_path):

@@ -185,7 +185,6 @@ class Page {
     const { coverage_id: id, created_at: when } = this.shown, same = JSON.stringify(this.shown.asked);
     const name = (one) => `${one.created_at.slice(0, 16).replace("T", " ")} · ${percent(one.result.found / Math.max(one.result.frames, 1))} of ${count(one.result.frames)} found`;
     const earlier = this.results.filter((one) => one.created_at < when && JSON.stringify(one.asked) === same);
-    const file = (text, path, params, as) => h("button", { class: "button", type: "button", onClick: () => save(path, { params, name: as }) }, text);
     return h("div", { class: "toolbar cover-bar" },
       h("label", { class: "cover-field" }, h("span", { class: "muted" }, "Result"),
         h("select", { id: "cover-result", onChange: (event) => this.#look({ result: event.target.value, since: null, cell: null, frame: null }) },
@@ -196,8 +195,7 @@ class Page {
           earlier.map((one) => h("option", { value: one.coverage_id, selected: one.coverage_id === this.seen.since }, name(one))))),
       h("span", { class: "muted cover-when" }, "measured ", time(this.shown.finished_at)),
       h("div", { class: "toolbar", role: "group", "aria-label": "Download" },
-        this.planned && file("PNG", `${this.path}/${id}/plan.png`, { parent_frame: this.planned.parent_frame }, `coverage-${this.map}.png`),
-        file("JSON", `${this.path}/${id}`, {}, `coverage-${this.map}.json`),
+        h("button", { class: "button", type: "button", onClick: () => save(`${this.path}/${id}`, { name: `coverage-${this.map}.json` }) }, "JSON"),
         may("write", this.map) && h("button", { class: "button danger", type: "button", onClick: once(() => this.#remove(id)) }, "Delete")));
   }
 

@@ -1,5 +1,5 @@
-// The queries of a map: who asked, what came of it, where, and why it failed. It reads records that
-// are kept; nothing is asked again.
+// The queries of a map: who sent them, their outcome, where, and why they failed. Nothing is queried
+// again.
 import { get, watch } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, ms, percent, shortId, time } from "../lib/format.js";
@@ -21,7 +21,6 @@ const PERIODS = [["", "Any time"], ["1", "Last hour"], ["24", "Last 24 hours"], 
 const KEPT = [["", "All queries"], ["true", "Kept answers"]];
 const HOUR_MS = 3_600_000;
 const AT_ONCE = 50;
-const OFFLINE = "The robot answered this query itself, and sent the record later.";
 const TOGETHER_MS = 500; // events of a burst are one look
 
 /** @param {HTMLElement} root @param {Object<string, any>} context see main.js */
@@ -115,8 +114,7 @@ function row(one) {
   return h("tr", { role: "row", dataset: { query: one.query_id, status: one.status } },
     cell("when", time(one.at)),
     h("th", { class: "queries-who", scope: "row", role: "rowheader" }, one.robot ?? h("span", { class: "muted", title: "The query did not say who asked." }, one.key ? `key ${one.key}` : "not named"),
-      one.session && h("span", { class: "queries-more muted" }, one.session),
-      one.offline && h("span", { class: "queries-more muted", title: OFFLINE }, "offline")),
+      one.session && h("span", { class: "queries-more muted" }, one.session)),
     cell("outcome", h("span", { class: "badge", dataset: { kind } }, text)),
     cell("pose", pose(one)),
     cell("views number", one.pose ? count(one.support) : "–"),
@@ -139,10 +137,12 @@ function why({ reason, frame }) {
 }
 
 /** The answer while it is there, and afterwards that it is not. */
-function answer({ query_id: id, kept_until: until, keep, status, offline }) {
-  if (keep) return [h("a", { class: "mono", href: link("queries", id), "aria-label": `Answer ${shortId(id)}` }, shortId(id)), h("span", { class: "queries-more muted" }, keep.title ? `kept: ${keep.title}` : "kept")];
-  if (until && Date.parse(until) > Date.now()) return h("a", { class: "mono", href: link("queries", id), "aria-label": `Answer ${shortId(id)}` }, shortId(id));
-  const text = offline ? ["on the robot", OFFLINE] : status === "failed" ? ["no answer", "The query failed."] : ["expired", "Answers expire after about an hour; this record stays longer."];
+function answer({ query_id: id, stored, kept_at: kept, title, status }) {
+  if (stored) {
+    return [h("a", { class: "mono", href: link("queries", id), "aria-label": `Answer ${shortId(id)}` }, shortId(id)),
+      kept && h("span", { class: "queries-more muted" }, title ? `kept: ${title}` : "kept")];
+  }
+  const text = status === "failed" ? ["no answer", "The query failed."] : ["expired", "The oldest answers go first where space runs out; their records stay longer."];
   return h("span", { class: "muted", title: `${text[1]} Query ${id}.` }, text[0]);
 }
 

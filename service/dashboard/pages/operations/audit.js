@@ -1,4 +1,4 @@
-// Who changed what: all but uploads, which the events tell of.
+// Who changed what.
 import { get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { time } from "../lib/format.js";
@@ -29,7 +29,7 @@ export async function renderTab(root, { search, signal }) {
 
   await older();
   put(root, h("form", { class: "toolbar spread", onSubmit: (event) => { event.preventDefault(); go(to({ actor: actor.value.trim() })); } },
-    h("p", { class: "muted" }, "Changes and refusals; each has a hash over the one before it."),
+    h("p", { class: "muted" }, "Changes, uploads and refused requests."),
     h("div", { class: "toolbar" }, h("span", { class: "inline-field" }, actor), h("button", { class: "button", type: "submit" }, "Find"),
       await mapField(asked.map, signal, (map) => go(to({ map }))))),
   card, none, more);
@@ -39,7 +39,7 @@ function changeRow(one) {
   const data = Object.keys(one.data).length > 0 && JSON.stringify(one.data);
   return h("tr", {}, h("td", {}, time(one.at)),
     h("th", { scope: "row" }, one.actor ?? h("span", { class: "muted" }, "no key required")),
-    h("td", {}, `${one.action.replaceAll("_", " ")}${one.refused ? " (refused)" : ""}`), h("td", {}, one.map ?? "–"),
+    h("td", {}, one.action), h("td", {}, one.map ?? "–"),
     h("td", { class: "mono cut", title: one.target }, one.target ?? "–"), h("td", { class: "mono" }, one.address ?? "–"),
     h("td", { class: "mono cut", title: data || null }, data || "–"));
 }

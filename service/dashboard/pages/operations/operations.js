@@ -11,7 +11,6 @@ const TABS = [
   { tab: "events", text: "Events", load: () => import("./events.js") },
   { tab: "keys", text: "Keys", load: () => import("./keys.js"), admin: true },
   { tab: "audit", text: "Audit", load: () => import("./audit.js"), admin: true },
-  { tab: "snapshots", text: "Snapshots", load: () => import("./snapshots.js"), admin: true },
 ];
 
 /** See lib/router.js. */
@@ -25,6 +24,6 @@ export async function render(root, context) {
   const { renderTab } = await shown.load();
   await renderTab(body, context);
   put(root, tabs, me() !== null && !may("admin") && h("p", { class: "muted" },
-    "Keys, audit log and snapshots need a key with admin access to all maps."), body);
+    "Keys and the audit log need a key with admin access to all maps."), body);
   if (shown.tab !== "") context.title(shown.text);
 }

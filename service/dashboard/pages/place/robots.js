@@ -281,9 +281,9 @@ export class Robots {
   }
 }
 
-/** Its answer while that is kept, and else its record among the queries of the map. */
-function linkOf({ query_id: id, kept_until: until, at, robot }, map) {
-  if (until && Date.parse(until) > Date.now()) return link("queries", id);
+/** Its answer while that is stored, and else its record among the queries of the map. */
+function linkOf({ query_id: id, stored, at, robot }, map) {
+  if (stored) return link("queries", id);
   const since = new Date(Date.parse(at)).toISOString(), end = new Date(Date.parse(at) + 1000).toISOString();
   return link("maps", map, "queries", { robot, since, until: end });
 }

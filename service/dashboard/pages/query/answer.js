@@ -1,12 +1,11 @@
-// An answer by its id, as a robot or a colleague tells it: there for about an hour, or while somebody
-// keeps it.
+// An answer by its id, as a robot or a colleague tells it: while it is stored.
 import { at, get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { shortId, time } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { empty, soon } from "../lib/states.js";
 import { backdrops } from "../plan/backdrop.js";
-import { askAgain } from "./asking.js";
+import { repeat } from "./asking.js";
 import { pickFrame } from "./picker.js";
 import { recall } from "./recent.js";
 import { again, showAnswer } from "./result.js";
@@ -39,7 +38,7 @@ export async function render(root, { params, search, signal, go, title, actions 
   await showAnswer(body, answer, {
     signal, pictures, backdrops: backdrops(signal), isOwnPage: true, seen,
     onseen: ({ why, match }) => go(link("queries", params.query, { why: why ? "open" : null, match }), { replace: true, quiet: true }),
-    ask: async (frame) => (await askAgain(answer.query_id, { explain_frame: frame, explain: null, keep: false, record: false }, signal)).explained_frame,
+    ask: async (frame) => (await repeat(answer.query_id, answer.maps, { ...question.options, explain_frame: frame, explain: null, keep: false, record: false }, signal)).explained_frame,
     pick: answer.maps.length === 1 ? () => pickFrame(answer.maps[0], { pictures, signal, title: "Why not this frame?" }) : undefined,
   });
 }
@@ -49,7 +48,7 @@ function asked(question) {
   const said = Object.entries(options).filter(([name]) => !["explain", "explain_frame", "keep", "record"].includes(name));
   const who = [question.robot && `robot ${question.robot}`, question.session && `session ${question.session}`].filter(Boolean);
   return h("p", { class: "muted query-note" },
-    "Asked ", time(question.asked_at), " of ", question.maps.map((name, i) => [i > 0 && ", ", h("a", { href: link("maps", name) }, name)]),
+    "Asked ", time(question.at), " of ", question.maps.map((name, i) => [i > 0 && ", ", h("a", { href: link("maps", name) }, name)]),
     question.frame ? [" with frame ", h("a", { class: "mono", href: link("maps", question.frame.map, "frames", question.frame.frame_id) }, shortId(question.frame.frame_id))]
       : ` with an uploaded ${question.kind === "cloud" ? "cloud" : "depth image"}`,
     who.length > 0 && ` of ${who.join(", ")}`, ". ",
@@ -61,7 +60,7 @@ function notKept(id) {
   const address = recall(id);
   return empty({
     title: "This answer has expired",
-    text: ["Answers expire after about an hour, or earlier if space runs out. The id may also be wrong, or your key may not see it.",
+    text: ["Answers expire after some weeks, or earlier if space runs out. The id may also be wrong, or your key may not see it.",
       !address && " Send the frame again from the page of its map."],
     actions: [address && h("a", { class: "button primary", href: address }, "Repeat the query"), h("a", { class: "button", href: "#/" }, "All maps")],
   });

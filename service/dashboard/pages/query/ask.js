@@ -62,7 +62,7 @@ class Page {
     this.asked = question?.maps ?? this.home;
     /** @type {import("./asking.js").Source | null} */
     this.source = null;
-    if (question) this.source = { query: question.query_id, frame: question.frame ?? undefined };
+    if (question) this.source = { query: question.query_id, base: question.options, frame: question.frame ?? undefined };
     else if (search.get("frame")) this.source = { frame: { map: params.map, frame_id: search.get("frame") } };
     this.lost = question === undefined ? search.get("query") : null;
     this.pictures = thumbs(signal);

@@ -1,12 +1,12 @@
-// One source of queries - a stored frame, a file, or a kept query - asked again and again.
+// One source of queries - a stored frame, a file, or an earlier query - asked again and again.
 import { at, send } from "../lib/api.js";
 import { formOf } from "../frames/source.js";
 import { fill, plain } from "./options.js";
 
 /**
- * @typedef {{frame?: {map: string, frame_id: string}, file?: File, given?: Object<string, any>, query?: string}} Source
- *   a frame of a map; a file, with what is told of it; the id of a kept answer. A file that was
- *   asked once has both `file` and `query`
+ * @typedef {{frame?: {map: string, frame_id: string}, file?: File, given?: Object<string, any>, query?: string, base?: Object<string, any>}} Source
+ *   a frame of a map; a file, with its metadata; the id of an earlier query, with its options. A
+ *   file that was sent once has both `file` and `query`
  */
 
 /**
@@ -20,9 +20,9 @@ import { fill, plain } from "./options.js";
 export async function ask(source, maps, options, signal) {
   if (source.query) {
     try {
-      return await askAgain(source.query, { ...options, maps }, signal);
+      return await repeat(source.query, maps, { ...source.base, ...options }, signal);
     } catch (error) {
-      // no longer kept, or of another model by now: with the file at hand it is simply sent again
+      // no longer stored, or of another model by now: with the file at hand it is simply sent again
       if (!source.file || ![404, 409].includes(error.status)) throw error;
       source.query = undefined;
     }
@@ -43,11 +43,12 @@ export async function ask(source, maps, options, signal) {
 }
 
 /**
- * Ask a kept query again.
+ * Repeat an earlier query.
  * @param {string} id
- * @param {Object<string, any>} changes options; null puts back the default
+ * @param {string[] | "*"} maps
+ * @param {Object<string, any>} options all of them; null for a default
  * @param {AbortSignal} signal
  */
-export async function askAgain(id, changes, signal) {
-  return (await send("POST", `${at("queries", id)}/again`, { json: changes, signal })).data;
+export async function repeat(id, maps, options, signal) {
+  return (await send("POST", "queries", { json: { maps, query_id: id, ...plain(options) }, signal })).data;
 }

@@ -2,14 +2,12 @@
 import { at, get, save, send } from "../lib/api.js";
 import { h, once, put } from "../lib/dom.js";
 import { count, percent } from "../lib/format.js";
-import { picture } from "../lib/picture.js";
 import { go, link, parse } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { failed } from "../lib/states.js";
 import { poll } from "../operations/poll.js";
 
 const POLL_S = 1;
-const WIDTH = 640;
 const WAITING = { queued: "Waiting for a worker…", running: "Fusing the views…" };
 
 /**
@@ -50,14 +48,11 @@ export function reconstructionPanel(answer, signal) {
   function show(told) {
     const { coverage } = told;
     const path = at("reconstructions", told.job_id);
-    const alt = "The fused surface from above, coloured by view, with the cameras";
     put(said, "The reconstruction is there.");
-    put(body, picture(`${path}/picture.png`, {}, { alt, width: WIDTH, height: 0.75 * WIDTH, signal }),
-      h("p", { class: "muted" }, `${count(coverage.views.length)} views show ${coverage.area_m2.toFixed(1)} m² together; `,
+    put(body, h("p", { class: "muted" }, `${count(coverage.views.length)} views show ${coverage.area_m2.toFixed(1)} m² together; `,
         `the matches explain ${percent(coverage.query_explained)} of the query. Voxels of ${(100 * coverage.voxel_m).toFixed(1)} cm, ${count(coverage.triangles)} triangles.`),
       h("div", { class: "toolbar" },
         h("button", { class: "button", type: "button", onClick: () => save(`${path}/mesh.ply`) }, "Mesh (PLY)"),
-        h("button", { class: "button", type: "button", onClick: () => save(`${path}/picture.png`) }, "Picture (PNG)"),
         h("a", { class: "button quiet", href: link("operations", "jobs", told.job_id) }, "The job")));
   }
 

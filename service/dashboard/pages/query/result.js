@@ -111,7 +111,7 @@ function lead(answer, before, isOwnPage) {
     h("div", { class: "query-verdict-links" },
       (answer.status === "ambiguous" || answer.status === "not_found") && h("a", { class: "button", href: link("maps", mapOf(answer), "coverage") }, "Coverage of the map"),
       (pose || several.length > 0) && h("a", { class: "button", href: link("maps", mapOf(answer), "place", { query: answer.query_id }) }, "On the map"),
-      !isOwnPage && h("a", { class: "button", href: link("queries", answer.query_id), title: "Can be shared while it is kept, or for an hour" }, `Answer ${shortId(answer.query_id)}`)));
+      !isOwnPage && h("a", { class: "button", href: link("queries", answer.query_id), title: "Can be shared while it is stored" }, `Answer ${shortId(answer.query_id)}`)));
 }
 
 function poseOf(location, kind) {

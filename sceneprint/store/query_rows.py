@@ -1,0 +1,375 @@
+"""Rows of queries: who asked which map, the outcome, and whether the answer is stored.
+
+NewQuery, ...  --add_queries-->  rows and events in one commit  --list_queries-->  QueryRow, ...
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    delete,
+    func,
+    insert,
+    literal_column,
+    or_,
+    select,
+    tuple_,
+    update,
+)
+
+from sceneprint.store.frames import not_purged
+from sceneprint.store.tables import (
+    among,
+    events,
+    frames,
+    keys,
+    maps,
+    queries,
+    rows_among,
+)
+from sceneprint_client.api import FrameState
+from sceneprint_client.api.frames import Kind
+from sceneprint_client.api.results import RecordStatus
+
+_c = queries.c
+#: Most characters of `reason`.
+MOST_REASON = 1000
+
+
+@dataclass(frozen=True)
+class _Query:
+    id: str
+    at: float
+    map: str
+    maps: Sequence[str] | None
+    robot: str | None
+    session: str | None
+    status: RecordStatus
+    cause: str | None
+    reason: str
+    pose_parent: str | None
+    pose: Sequence[float] | None
+    support: int | None
+    rival_ratio: float | None
+    alternatives: int
+    milliseconds: float
+    kind: Kind | None
+    frame_map: str | None
+    frame_id: str | None
+
+
+@dataclass(frozen=True)
+class NewQuery(_Query):
+    """A query that was answered, or that failed.
+
+    Parameters
+    ----------
+    id : of the answer
+    at : when the query came, seconds since 1970
+    map : name of the map that the row belongs to
+    maps : names of all maps that were searched; None: only `map`
+    robot, session : who sent it, and in which run, as far as is known
+    status, cause, reason : of the answer; or `failed`, the type of the error, and its text
+    pose_parent, pose : x, y, z, qx, qy, qz, qw of T_parent_query where it was found
+    support, rival_ratio : of that pose
+    alternatives : number of poses that the evidence supports as well
+    milliseconds : duration
+    kind : of the frame, if it was read
+    frame_map, frame_id : the stored frame that was the query
+    key_id : of the key that the request came with
+    listed : whether the history lists it; an event reports it then as well
+    bytes : of the stored answer; 0: it is not stored
+    shown : numbers of the frames that the answer shows
+    """
+
+    key_id: str | None
+    listed: bool
+    bytes: int = 0
+    shown: Sequence[int] = ()
+
+
+@dataclass(frozen=True)
+class QueryRow(_Query):
+    """A query as it is stored; other fields as in NewQuery.
+
+    Parameters
+    ----------
+    number : of the row
+    key : name of the key; None without one, and where it was revoked
+    bytes : of the answer; 0 where it is not stored, or no longer
+    kept_at : since when the answer is kept; None: it expires
+    title : of a kept answer
+    """
+
+    number: int
+    key: str | None
+    bytes: int
+    kept_at: float | None
+    title: str | None
+
+    @property
+    def searched(self) -> Sequence[str]:
+        """Names of all maps that were searched."""
+        return [self.map] if self.maps is None else self.maps
+
+
+#: How a row is read, without the answer itself.
+_ROW = select(
+    *(_c[one.name] for one in fields(QueryRow) if one.name not in ("map", "key")),
+    select(maps.c.name).where(maps.c.number == _c.map_number).scalar_subquery().label("map"),
+    select(keys.c.name).where(keys.c.id == _c.key_id).scalar_subquery().label("key"),
+)
+#: As the partial index says it: a planner does not know a bound value to be this one.
+_STORED: ColumnElement[bool] = literal_column("bytes > 0")
+#: Kind of the event that reports a query, and the columns that it repeats.
+EVENT = "query.answered"
+_REPORTED = ("status", "robot", "session", "cause", "support", "milliseconds")
+
+
+def add_queries(connection: Connection, new: Sequence[NewQuery]) -> None:
+    """Store queries, and an event for each that is listed.
+
+    Queries of a map that was deleted or created again since they came are left out.
+    """
+    names = sorted({one.map for one in new})
+    asked = select(maps.c.number, maps.c.name, maps.c.created_at).where(maps.c.name.in_(names))
+    known = {row.name: row for row in connection.execute(asked)}
+    found = [one for one in new if one.map in known and known[one.map].created_at <= one.at]
+    if not found:
+        return
+    connection.execute(insert(queries), [_values(one, known[one.map].number) for one in found])
+    if reported := [_event(one) for one in found if one.listed]:
+        connection.execute(insert(events), reported)
+
+
+def _values(one: NewQuery, map_number: int) -> dict[str, Any]:
+    row = {each.name: getattr(one, each.name) for each in fields(one) if each.name != "map"}
+    return row | {
+        "map_number": map_number,
+        "reason": one.reason.replace("\0", "")[:MOST_REASON],
+        "shown": sorted(set(one.shown)) if one.bytes else None,
+    }
+
+
+def _event(one: NewQuery) -> dict[str, Any]:
+    data: dict[str, Any] = {"query_id": one.id}
+    data |= {name: getattr(one, name) for name in _REPORTED if getattr(one, name) is not None}
+    if one.pose is not None:
+        x, y, z, qx, qy, qz, qw = one.pose
+        data["pose"] = {
+            "parent_frame": one.pose_parent,
+            "translation": {"x": x, "y": y, "z": z},
+            "rotation": {"x": qx, "y": qy, "z": qz, "w": qw},
+        }
+    own = one.frame_id if one.frame_map == one.map else None
+    # the time of the event, not of the query: events are in the order of their times
+    return {
+        "at": time.time(), "kind": EVENT, "map": one.map, "frame_id": own, "job_id": None,
+        "data": data,
+    }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class WantedQueries:
+    """Which queries to list.
+
+    Parameters
+    ----------
+    map_numbers : only of these maps; None: of all
+    statuses : one of these; none: any
+    robot : that sent it; None: any
+    since, until : that came at that time or later, and before that one, seconds since 1970
+    kept : only those with kept answers
+    """
+
+    map_numbers: tuple[int, ...] | None = None
+    statuses: tuple[str, ...] = ()
+    robot: str | None = None
+    since: float | None = None
+    until: float | None = None
+    kept: bool = False
+
+
+def list_queries(
+    connection: Connection, wanted: WantedQueries, before: tuple[float, int] | None, limit: int
+) -> list[QueryRow]:
+    """Return queries, the newest first.
+
+    Parameters
+    ----------
+    connection : of the database
+    wanted : which
+    before : time and number of the row that the previous page ended with
+    limit : at most so many
+    """
+    asked = _ROW.where(*_conditions(wanted))
+    if before is not None:
+        asked = asked.where(tuple_(_c.at, _c.number) < before)
+    asked = asked.order_by(_c.at.desc(), _c.number.desc()).limit(limit)
+    return [QueryRow(**row) for row in connection.execute(asked).mappings()]
+
+
+def _conditions(wanted: WantedQueries) -> Iterator[ColumnElement[bool]]:
+    yield _c.kept_at.is_not(None) if wanted.kept else or_(_c.listed, _c.kept_at.is_not(None))
+    numbers = wanted.map_numbers
+    if numbers is not None:
+        # a sum is in no index: the queries of a robot are few, and found by its own
+        own = _c.map_number if wanted.robot is None else _c.map_number + 0
+        yield own == numbers[0] if len(numbers) == 1 else own.in_(numbers)
+    if wanted.statuses:
+        yield _c.status.in_(wanted.statuses)
+    if wanted.robot is not None:
+        yield _c.robot == wanted.robot
+    if wanted.since is not None:
+        yield _c.at >= wanted.since
+    if wanted.until is not None:
+        yield _c.at < wanted.until
+
+
+def find_query(connection: Connection, query_id: str) -> QueryRow | None:
+    """Return a query by its id, or None."""
+    row = connection.execute(_ROW.where(_c.id == query_id)).mappings().first()
+    return None if row is None else QueryRow(**row)
+
+
+def read_kept(connection: Connection, number: int) -> bytes | None:
+    """Return the kept answer of a query, or None."""
+    found: bytes | None = connection.execute(select(_c.answer).where(_c.number == number)).scalar()
+    return found
+
+
+def is_current(connection: Connection, row: QueryRow) -> bool:
+    """Return whether the maps that a query searched, and the stored frame it named, still exist."""
+    names = set(row.searched)
+    asked = select(maps.c.name).where(maps.c.name.in_(names), maps.c.created_at <= row.at)
+    if len(connection.execute(asked).all()) < len(names):
+        return False
+    if row.frame_id is None:
+        return True
+    own = (
+        select(frames.c.number)
+        .join(maps, maps.c.number == frames.c.map_number)
+        .where(
+            maps.c.name == row.frame_map, frames.c.id == row.frame_id,
+            frames.c.state != FrameState.DELETED,
+        )
+    )  # fmt: skip
+    number = connection.execute(own).scalar()
+    shown = connection.execute(select(_c.shown).where(_c.number == row.number)).scalar()
+    return number is not None and number in (shown or [])  # else another frame has its id
+
+
+# Kept answers.
+
+
+def keep_answer(connection: Connection, number: int, data: bytes, at: float) -> None:
+    """Keep an answer in the database: it is in every snapshot."""
+    own = update(queries).where(_c.number == number)
+    connection.execute(own.values(answer=data, kept_at=at))
+
+
+def set_title(connection: Connection, number: int, title: str | None) -> None:
+    """Set the title of a kept answer."""
+    connection.execute(update(queries).where(_c.number == number).values(title=title))
+
+
+def release_answer(connection: Connection, number: int) -> None:
+    """Let an answer expire."""
+    gone = {"answer": None, "kept_at": None, "title": None}
+    connection.execute(update(queries).where(_c.number == number).values(gone))
+
+
+def count_kept(connection: Connection, map_name: str) -> tuple[int, int]:
+    """Return the number of kept answers of a map, and bytes of the kept answers of all maps."""
+    kept = select(func.count(), func.coalesce(func.sum(_c.bytes), 0)).where(_c.kept_at.is_not(None))
+    of_map = select(maps.c.number).where(maps.c.name == map_name).scalar_subquery()
+    count = connection.execute(kept.where(_c.map_number == of_map)).one()[0]
+    return int(count), int(connection.execute(kept).one()[1])
+
+
+# What is removed: old queries and those that a map has too many of, the oldest answers where room
+# is needed, and answers that show deleted frames.
+
+
+def old_queries(connection: Connection, before: float, limit: int) -> list[int]:
+    """Return numbers of the oldest queries that came before a time and are not kept."""
+    spent = select(_c.number).where(_c.at < before, _c.kept_at.is_(None))
+    return list(connection.execute(spent.order_by(_c.at, _c.number).limit(limit)).scalars())
+
+
+def surplus_queries(connection: Connection, most: int, limit: int) -> list[int]:
+    """Return numbers of the oldest queries of maps that have more than so many."""
+    span = connection.execute(select(func.max(_c.number) - func.min(_c.number))).scalar()
+    if (span or 0) < most:  # the usual case, without counting
+        return []
+    counts = select(_c.map_number, func.count()).group_by(_c.map_number)
+    found: list[int] = []
+    for map_number, count in connection.execute(counts.having(func.count() > most)).all():
+        own = select(_c.number).where(_c.map_number == map_number, _c.kept_at.is_(None))
+        least = min(count - most, limit - len(found))
+        found += connection.execute(own.order_by(_c.at, _c.number).limit(least)).scalars()
+    return found
+
+
+def queries_of_map(connection: Connection, map_number: int, limit: int) -> list[int]:
+    """Return numbers of some queries of a map."""
+    own = select(_c.number).where(_c.map_number == map_number).limit(limit)
+    return list(connection.execute(own).scalars())
+
+
+def remove_queries(connection: Connection, numbers: Sequence[int]) -> list[str]:
+    """Remove queries, a few hundred at most; returns the ids of those whose answers were stored."""
+    own = among(connection, _c.number, numbers)
+    stored = list(connection.execute(select(_c.id).where(own, _STORED)).scalars())
+    connection.execute(delete(queries).where(own))
+    return stored
+
+
+def stored_bytes(connection: Connection) -> int:
+    """Return the bytes of all stored answers."""
+    total = connection.execute(select(func.sum(_c.bytes)).where(_STORED)).scalar()
+    return int(total or 0)
+
+
+def oldest_answers(connection: Connection, limit: int) -> list[tuple[int, int]]:
+    """Return numbers and bytes of the oldest answers that are not kept."""
+    asked = select(_c.number, _c.bytes).where(_STORED, _c.kept_at.is_(None))
+    found = connection.execute(asked.order_by(_c.at, _c.number).limit(limit))
+    return [(row.number, row.bytes) for row in found]
+
+
+def shown_frames(connection: Connection, after: int, limit: int) -> list[tuple[int, list[int]]]:
+    """Return numbers of stored answers above `after`, and of the frames that each of them shows."""
+    asked = select(_c.number, _c.shown).where(_STORED, _c.number > after)
+    found = connection.execute(asked.order_by(_c.number).limit(limit))
+    return [(row.number, row.shown or []) for row in found]
+
+
+def unpurged_frames(connection: Connection, numbers: set[int]) -> set[int]:
+    """Return those of some frames that exist, or that can be restored."""
+    asked = select(frames.c.number).where(not_purged())
+    return {row.number for row in rows_among(connection, asked, frames.c.number, numbers)}
+
+
+def drop_answers(connection: Connection, numbers: Sequence[int]) -> list[str]:
+    """Remove stored answers, a few hundred at most, and queries that are not listed; returns the
+    ids of the answers.
+    """
+    own = among(connection, _c.number, numbers)
+    stored = list(connection.execute(select(_c.id).where(own, _STORED)).scalars())
+    connection.execute(delete(queries).where(own, ~_c.listed))
+    gone = {"answer": None, "bytes": 0, "shown": None, "kept_at": None, "title": None}
+    connection.execute(update(queries).where(own).values(gone))
+    return stored
+
+
+def stored_among(connection: Connection, query_ids: Sequence[str]) -> set[str]:
+    """Return those of some ids, a thousand at most, whose answers are stored in files."""
+    asked = select(_c.id).where(_c.id.in_(query_ids), _STORED, _c.kept_at.is_(None))
+    return set(connection.execute(asked).scalars())

@@ -1,0 +1,62 @@
+"""`sceneprint audit`: the newest entries, and all of them as JSON lines or syslog messages."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sceneprint.cli import main
+
+Run = Callable[..., Any]
+MESSAGE = re.compile(r"<109>1 \d{4}-\d\d-\d\dT[\d:.]{12}Z \S+ sceneprint - audit - (\{.*\})")
+
+
+@pytest.fixture
+def data(sceneprint: Run, tmp_path: Path) -> Path:
+    for arguments in (("--create", "robot"), ("--create", "screen"), ("--revoke", "robot")):
+        sceneprint("keys", *arguments, "--data", tmp_path)
+    sceneprint("tenants", "--create", "fleet", "--data", tmp_path)
+    return tmp_path
+
+
+def test_the_newest_entries_are_printed(sceneprint: Run, data: Path) -> None:
+    lines = sceneprint("audit", "--data", data).stdout.splitlines()
+    assert [line[22:] for line in lines] == [
+        "command  tenant.created fleet", "command  key.revoked robot",
+        "command  key.created screen", "command  key.created robot",
+    ]  # fmt: skip
+    for given, wanted in (
+        (("--limit", "1"), lines[:1]), (("--action", "key.c"), lines[2:]),
+        (("--actor", "robot"), []), (("--map", "yard"), []), (("--since", "1h"), lines),
+    ):  # fmt: skip
+        assert sceneprint("audit", *given, "--data", data).stdout.splitlines() == wanted
+
+
+def test_all_entries_are_exported(sceneprint: Run, data: Path) -> None:
+    export = ("audit", "--data", data, "--format")
+    lines = sceneprint(*export, "jsonl").stdout.splitlines()
+    found = [json.loads(line) for line in lines]
+    assert [(one["number"], one["action"]) for one in found] == [
+        (1, "key.created"), (2, "key.created"), (3, "key.revoked"), (4, "tenant.created"),
+    ]  # fmt: skip
+    assert found[0]["data"] == {
+        "name": "robot", "grants": {"*": "admin"}, "tenant": "robot", "expires_at": None
+    }  # fmt: skip
+    file = data / "audit.log"
+    assert sceneprint(*export, "syslog", "--output", file).stdout == ""
+    told = [MESSAGE.fullmatch(line) for line in file.read_text().splitlines()]
+    assert [one and one[1] for one in told] == lines
+    sceneprint(*export, "jsonl", "--output", file, "--actor", "command")
+    assert file.read_text().splitlines()[4:] == lines  # behind what was there
+
+
+def test_a_file_needs_a_format(sceneprint: Run, data: Path) -> None:
+    done = sceneprint("audit", "--output", data / "x", "--data", data, expect=2)
+    assert "--output needs --format" in done.stderr
+    with pytest.raises(SystemExit):
+        main(["audit", "--format", "xml"])

@@ -1,0 +1,140 @@
+"""A node without the index of a map: it reads the signatures once, and compares all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.fleet.bulk_load import fill, walk
+from sceneprint.engine import Engine
+from sceneprint.engine.search import local_index
+from sceneprint.geometry.retrieval.ranking import distances
+from sceneprint.models import Model
+from sceneprint.settings import Settings
+from sceneprint.types import Bytes
+from sceneprint_client.api import Answer, NamedFrame, Query
+
+Node = Callable[..., Engine]
+#: Frames of both maps, and bytes of a signature.
+SIZES, LENGTH = {"hall": 300, "yard": 200}, 64
+
+
+@pytest.fixture
+def node(store_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
+    """Nodes with indexes of their own on one database; they always look for a newer index."""
+    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
+    opened: list[Engine] = []
+
+    def engine(name: str) -> Engine:
+        values = {
+            "data_dir": tmp_path / "data", "index_dir": tmp_path / name, "database_url": store_url,
+            "tail_frames": 10, "decoders": 0,
+        }  # fmt: skip
+        (tmp_path / "data" / "blobs").mkdir(parents=True, exist_ok=True)
+        opened.append(Engine(Settings.model_validate(values)))
+        return opened[-1]
+
+    yield engine
+    for one in reversed(opened):
+        one.close()
+
+
+@pytest.fixture(scope="module")
+def places() -> dict[str, Bytes]:
+    """Signatures of both maps: two walks in each."""
+    return {name: walk(n, LENGTH, seed=i, walks=2) for i, (name, n) in enumerate(SIZES.items())}
+
+
+def ask(engine: Engine, frame: str, maps: list[str]) -> Answer:
+    query = Query(stages=("retrieve",), k=10, keep=False)
+    named = NamedFrame(map=frame.rpartition("-")[0], frame_id=frame)
+    return engine.queries.stored(maps, named, query)
+
+
+def found(answer: Answer) -> list[tuple[str, int]]:
+    return [(one.frame_id, one.distance) for one in answer.matches]
+
+
+def nearest(places: dict[str, Bytes], frame: str, metric: Any = "l2") -> list[tuple[str, int]]:
+    """The ten nearest frames of all maps: all compared; equal ones in the order they came."""
+    home, _, number = frame.rpartition("-")
+    query = places[home][int(number) - 1]
+    listed = [
+        (distance, order, f"{name}-{i + 1}")
+        for name, made in places.items()
+        for order, (i, distance) in enumerate(enumerate(distances(query, made, metric).tolist()))
+        if (name, i + 1) != (home, int(number))
+    ]
+    return [(name, distance) for distance, _, name in sorted(listed)[:10]]
+
+
+@contextmanager
+def rows_read(engine: Engine) -> Iterator[list[int]]:
+    """Count the signatures that are read for a map, by statement."""
+    read: list[int] = []
+
+    def changes(connection: Any, row: Any, revision: int, limit: int = 256) -> Iterator[Any]:
+        for block in real(connection, row, revision, limit):
+            read.append(len(block))
+            yield block
+
+    real = local_index.changes_since
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(local_index, "changes_since", changes)
+        yield read
+
+
+def test_signatures_are_read_once_and_compared_exactly_until_there_is_an_index(
+    node: Node, places: dict[str, Bytes], whitened_model: Model
+) -> None:
+    worker, service = node("worker"), node("service")
+    for name, made in places.items():
+        fill(worker.store.database, name, whitened_model, made)
+    wanted = nearest(places, "hall-77")
+    with rows_read(service) as read:
+        first = ask(service, "hall-77", ["hall", "yard"])
+        assert sum(read) == sum(SIZES.values())
+        again = ask(service, "hall-77", ["hall", "yard"])
+        assert sum(read) == sum(SIZES.values())
+    assert found(first) == found(again) == wanted
+    assert (first.exact, first.index_generation) == (True, 0)
+    assert first.counts.compared == sum(SIZES.values()) - 1
+    assert worker.publish_due() == 2
+    indexed = ask(worker, "hall-77", ["hall", "yard"])
+    assert (found(indexed), indexed.exact) == (wanted, True)
+    with rows_read(worker) as read:
+        ask(worker, "hall-78", ["hall"])
+        assert read == []  # it is all in the index
+
+
+def test_a_node_that_is_far_behind_begins_with_the_newest_index(
+    node: Node, places: dict[str, Bytes], whitened_model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(local_index, "READ_MOST", 50)
+    worker, service = node("shared"), node("shared")
+    made = places["hall"]
+    fill(worker.store.database, "hall", whitened_model, made[:100])
+    ask(service, "hall-7", ["hall"])
+    fill(worker.store.database, "hall", whitened_model, made[100:])
+    assert worker.publish_due() == 1
+    with rows_read(service) as read:
+        answer = ask(service, "hall-7", ["hall"])
+    assert sum(read) == 0
+    assert (answer.index_generation, answer.exact) == (1, True)
+    assert found(answer) == nearest({"hall": made}, "hall-7")
+
+
+def test_maps_of_psi_are_compared_whole_by_l1_without_an_index(
+    node: Node, small_model: Model
+) -> None:
+    engine = node("alone")
+    made = walk(100, small_model.signature_bytes, seed=4)
+    fill(engine.store.database, "old", small_model, made)
+    assert engine.publish_due() == 0
+    answer = ask(engine, "old-8", ["old"])
+    assert found(answer) == nearest({"old": made}, "old-8", "l1")
+    assert (answer.exact, answer.index_generation, answer.counts.compared) == (True, 0, 99)
