@@ -429,7 +429,7 @@ def add_reconstruct(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "reconstruct",
-        help="fuse the matches of a frame to a mesh and a picture",
+        help="fuse the matches of a frame to a mesh",
         description="Query a map with a depth frame, and let a worker fuse the accepted matches "
         "to a surface in the camera frame of the query. Exit code 1 if no match is accepted.",
     )

@@ -331,6 +331,17 @@ class Progress(ApiRecord):
     total: int | None = Field(default=None, description="Of so many, where that is known.")
 
 
+class MapJob(ApiRecord):
+    """A job that computes something of a map."""
+
+    map: str
+    state: JobState
+    progress: Progress | None = Field(description="Null until it has begun.")
+    error: str | None
+    created_at: datetime
+    finished_at: datetime | None
+
+
 class Job(ApiRecord):
     """A piece of work in the queue."""
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from typing import Literal
 
 from pydantic import Field, model_validator
 
-from sceneprint_client.api.admin import Progress
-from sceneprint_client.api.base import ApiRecord, Given, JobState, Label, Vector
+from sceneprint_client.api.admin import MapJob
+from sceneprint_client.api.base import ApiRecord, Given, Label, Vector
 from sceneprint_client.api.query import Cause
 
 #: Most frames that one coverage job queries.
@@ -141,23 +140,17 @@ class CoveragePlan(ApiRecord):
     )
 
 
-class MapCoverage(ApiRecord):
-    """A coverage job of a map and its result."""
+class MapCoverage(MapJob):
+    """A coverage job of a map and its result. Its steps are queried frames."""
 
     coverage_id: str = Field(description="Also the id of its job: GET /v1/jobs/{job_id}.")
-    map: str
     asked: NewMapCoverage
-    state: JobState
-    progress: Progress | None = Field(description="In queried frames.")
     result: CoverageResult | None = Field(description="When it has succeeded.")
     plans: list[CoveragePlan] | None = Field(
         default=None,
         description="One for each parent frame, that of most queried frames first; null in lists, "
         "and until it has succeeded.",
     )
-    error: str | None
-    created_at: datetime
-    finished_at: datetime | None
 
 
 class CoverageFrame(ApiRecord):

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sceneprint_client.api.admin import Progress
-from sceneprint_client.api.base import ApiRecord, Given, JobState, Label, Transform
+from sceneprint_client.api.admin import MapJob
+from sceneprint_client.api.base import ApiRecord, Given, Label, Transform
 from sceneprint_client.api.listing import Filter
 from sceneprint_client.api.query import ValidationOptions
 
@@ -158,18 +158,12 @@ class AssociationResult(ApiRecord):
     )
 
 
-class Association(ApiRecord):
-    """An association of sessions: a job and what it came to."""
+class Association(MapJob):
+    """An association of sessions: a job and what it came to. Its steps are frames."""
 
     association_id: str = Field(description="Also the id of its job: GET /v1/jobs/{job_id}.")
-    map: str
     asked: NewAssociation
-    state: JobState
-    progress: Progress | None = Field(description="In frames that are looked up.")
     result: AssociationResult | None = Field(description="When it has succeeded.")
-    error: str | None
-    created_at: datetime
-    finished_at: datetime | None
 
 
 class Vertex(ApiRecord):
@@ -255,15 +249,9 @@ class DifferenceResult(ApiRecord):
     skipped: int = Field(description="Frames that were deleted meanwhile, or are damaged.")
 
 
-class Difference(ApiRecord):
-    """A comparison of two sessions and its result."""
+class Difference(MapJob):
+    """A comparison of two sessions and its result. Its steps are frames; each is used twice."""
 
     difference_id: str = Field(description="Also the id of its job: GET /v1/jobs/{job_id}.")
-    map: str
     asked: NewDifference
-    state: JobState
-    progress: Progress | None = Field(description="In frames; each is used twice.")
     result: DifferenceResult | None = Field(description="When it has succeeded.")
-    error: str | None
-    created_at: datetime
-    finished_at: datetime | None

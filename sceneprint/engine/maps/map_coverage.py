@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.tasks import IsOver, LongJob, MapJobs, SliceResult, Tasks, ends_within
+from sceneprint.engine.jobs.map_jobs import BLOCK, MapJobs, page_of_items
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Tasks, ends_within
 from sceneprint.engine.maps.map_plans import (
     QueriedPosition,
     coverage_plans,
@@ -26,13 +27,12 @@ from sceneprint.engine.maps.map_plans import (
 from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.search.up_vectors import parent_axes
-from sceneprint.engine.serializers import job_progress, model_label, when
+from sceneprint.engine.serializers import model_label
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import (
     DamagedBlob,
     DamagedSignature,
     InvalidRequest,
-    NotIndexed,
     UnknownFrame,
     UnreadableGeometry,
 )
@@ -47,12 +47,11 @@ from sceneprint.store.frame_queries import (
 )
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import find_map, living_frame, living_map, model_names
-from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.queue import items_of
 from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats
-from sceneprint_client.api import Answer, Filter, JobState, Page, Progress, Query, Transform, Vector
+from sceneprint_client.api import Answer, Filter, Page, Query, Transform, Vector
 from sceneprint_client.api.coverage import (
     CELL_TRENDS,
     COVERAGE_OUTCOMES,
@@ -65,9 +64,6 @@ from sceneprint_client.api.coverage import (
     NewMapCoverage,
 )
 
-#: Items that are read at once.
-_BLOCK = 500
-
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
@@ -79,12 +75,14 @@ class _Measured:
     plans: list[CoveragePlan]
 
 
-class CoverageJobs:
+class CoverageJobs(MapJobs[MapCoverage]):
     """Coverage of maps."""
 
     def __init__(self, store: Store, tasks: Tasks) -> None:
-        self._store, self._tasks = store, tasks
-        self._jobs = MapJobs(store, COVERAGE, "coverage", "coverage")
+        super().__init__(
+            store, tasks, MapCoverage, kind=COVERAGE, noun="coverage", path="coverage",
+            priority=PRIORITY,
+        )  # fmt: skip
 
     def begin(self, map_name: str, asked: NewMapCoverage) -> MapCoverage:
         """Queue a coverage job.
@@ -96,32 +94,14 @@ class CoverageJobs:
         """
         with self._store.database.read() as connection:
             total = len(frames_to_query(connection, find_map(connection, map_name), asked))
-        data = asked.model_dump(mode="json", exclude_unset=True)
-        job, _ = self._tasks.begin(COVERAGE, map_name, data, PRIORITY)
-        return MapCoverage(
-            coverage_id=job.job_id, map=map_name, asked=asked, state=job.state,
-            progress=Progress(done=0, total=total), result=None, error=None,
-            created_at=job.created_at, finished_at=None,
-        )  # fmt: skip
-
-    def list_all(
-        self, map_name: str, cursor: str | None = None, limit: int = 100
-    ) -> Page[MapCoverage]:
-        """Coverage jobs of a map without their plans, the newest first; see `MapJobs.page`."""
-        found, more = self._jobs.page(map_name, cursor, limit)
-        items = [_coverage_record(job, map_name) for job in found]
-        return Page[MapCoverage](items=items, next_cursor=more)
+        return self.queue(map_name, asked, total)
 
     def get(self, map_name: str, job_id: str) -> MapCoverage:
-        """A coverage job; UnknownMap or UnknownJob where there is none."""
+        """Return a coverage job with its plans, which lists leave out."""
         with self._store.database.read() as connection:
-            job = self._jobs.find(connection, map_name, job_id)
+            job = self.find(connection, map_name, job_id)
             plans = None if job.result is None else _plans(connection, job)
-        return _coverage_record(job, map_name, plans)
-
-    def remove(self, map_name: str, job_id: str) -> None:
-        """Delete a coverage job with its result; see `MapJobs.remove`."""
-        self._jobs.remove(map_name, job_id)
+        return self.record(job, map_name, plans=plans)
 
     def frames(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
@@ -140,24 +120,22 @@ class CoverageJobs:
         UnknownMap, UnknownJob : there is none.
         InvalidRequest : a cursor that was not given out.
         """
-        after = row_of(cursor)
-        at = 0 if after is None else after + 1
-        found: list[CoverageFrame] = []
         with self._store.database.read() as connection:
-            job = self._jobs.find(connection, map_name, job_id)
-            while len(found) <= limit:
-                block = _frame_items(connection, job, at, _BLOCK)
+            job = self.find(connection, map_name, job_id)
+
+            def made(at: int, block: Sequence[dict[str, Any]]) -> list[CoverageFrame]:
                 stops = stops_of(connection, _numbers(block))
-                found += [
+                return [
                     _frame_record(at + i, item, stops)
                     for i, item in enumerate(block)
                     if item["frame"] in stops and outcome in (None, item["outcome"])
                 ]
-                at += len(block)
-                if len(block) < _BLOCK:
-                    break
-        more = str(found[limit - 1].number) if len(found) > limit else None
-        return Page[CoverageFrame](items=found[:limit], next_cursor=more)
+
+            items, more = page_of_items(
+                cursor, limit, lambda at: _frame_items(connection, job, at, BLOCK), made,
+                lambda frame: frame.number,
+            )  # fmt: skip
+        return Page[CoverageFrame](items=items, next_cursor=more)
 
     def changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
         """A result compared with an earlier one of the same map and the same options.
@@ -185,14 +163,10 @@ class CoverageJobs:
         )  # fmt: skip
 
     def _measured(self, connection: Connection, map_name: str, job_id: str) -> _Measured:
-        job = self._jobs.find(connection, map_name, job_id)
-        if job.state != JobState.SUCCEEDED or job.result is None:
-            raise NotIndexed(
-                f"Coverage {job.id} is {job.state}; its plans exist once it has succeeded. See "
-                f"GET /v1/maps/{map_name}/coverage/{job.id}."
-            )
+        job = self.find(connection, map_name, job_id)
+        found = self.require_success(job, map_name, "its plans exist")
         asked = NewMapCoverage.model_validate(job.data or {})
-        result = CoverageResult.model_validate(job.result)
+        result = CoverageResult.model_validate(found)
         return _Measured(job, asked, result, _plans(connection, job))
 
 
@@ -226,18 +200,6 @@ def _require_comparable(before: _Measured, after: _Measured) -> None:
                 "again.",
                 (("since", "another vertical"),),
             )
-
-
-def _coverage_record(
-    job: JobRow, map_name: str, plans: list[CoveragePlan] | None = None
-) -> MapCoverage:
-    return MapCoverage(
-        coverage_id=job.id, map=map_name, asked=NewMapCoverage.model_validate(job.data or {}),
-        state=job.state, progress=job_progress(job),
-        result=None if job.result is None else CoverageResult.model_validate(job.result),
-        plans=plans, error=job.error, created_at=when(job.created_at),
-        finished_at=when(job.finished_at),
-    )  # fmt: skip
 
 
 def _plans(connection: Connection, job: JobRow) -> list[CoveragePlan]:

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.tasks import MapJobs, Tasks
-from sceneprint.engine.serializers import job_progress, sensor_frame, transform, when
-from sceneprint.errors import InvalidRequest, NotIndexed
+from sceneprint.engine.jobs.map_jobs import BLOCK, MapJobs, page_of_items
+from sceneprint.engine.jobs.tasks import Tasks
+from sceneprint.engine.serializers import sensor_frame, transform, when
+from sceneprint.errors import InvalidRequest
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.formats.export import PoseEdge, g2o, information_of
 from sceneprint.geometry.rigid import inverse, rotation_angle
@@ -28,16 +29,14 @@ from sceneprint.store.frame_queries import (
     stops_of,
 )
 from sceneprint.store.maps import find_map
-from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.queue import items_of
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats
-from sceneprint_client.api import JobState, Page, Progress
+from sceneprint_client.api import Page
 from sceneprint_client.api.base import Transform
 from sceneprint_client.api.sessions import (
     APART,
     Association,
-    AssociationResult,
     Edge,
     Graph,
     GraphFormat,
@@ -131,16 +130,13 @@ def eligible(asked: NewAssociation, plan: Plan, place: int) -> Keys:
     return np.sort(before)
 
 
-#: Edges that are read at once where few of them are wanted.
-_BLOCK = 500
-
-
-class AssociationJobs:
+class AssociationJobs(MapJobs[Association]):
     """Associations of the sessions of maps."""
 
     def __init__(self, store: Store, tasks: Tasks) -> None:
-        self._store, self._tasks = store, tasks
-        self._jobs = MapJobs(store, ASSOCIATE, "association", "associations")
+        super().__init__(
+            store, tasks, Association, kind=ASSOCIATE, noun="association", path="associations"
+        )
 
     def begin(self, map_name: str, asked: NewAssociation) -> Association:
         """Queue an association.
@@ -152,42 +148,7 @@ class AssociationJobs:
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
-        total = len(runs_of(self._store, row, asked)[0])
-        data = asked.model_dump(mode="json", exclude_unset=True)
-        job, _ = self._tasks.begin(ASSOCIATE, map_name, data)
-        return Association(
-            association_id=job.job_id, map=map_name, asked=asked, state=job.state,
-            progress=Progress(done=0, total=total), result=None, error=None,
-            created_at=job.created_at, finished_at=None,
-        )  # fmt: skip
-
-    def list_all(
-        self, map_name: str, cursor: str | None = None, limit: int = 100
-    ) -> Page[Association]:
-        """Associations of a map, the newest first.
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        InvalidRequest : a cursor that was not given out.
-        """
-        found, more = self._jobs.page(map_name, cursor, limit)
-        items = [_association_record(job, map_name) for job in found]
-        return Page[Association](items=items, next_cursor=more)
-
-    def get(self, map_name: str, job_id: str) -> Association:
-        """An association; UnknownMap or UnknownJob where there is none."""
-        with self._store.database.read() as connection:
-            return _association_record(self._jobs.find(connection, map_name, job_id), map_name)
-
-    def remove(self, map_name: str, job_id: str) -> None:
-        """Forget an association with its edges; one that is not over is given up.
-
-        Raises
-        ------
-        UnknownMap, UnknownJob : there is none.
-        """
-        self._jobs.remove(map_name, job_id)
+        return self.queue(map_name, asked, len(runs_of(self._store, row, asked)[0]))
 
     def edges(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
@@ -208,26 +169,24 @@ class AssociationJobs:
         UnknownMap, UnknownJob : there is none.
         InvalidRequest : a cursor that was not given out.
         """
-        after = row_of(cursor)
-        at = 0 if after is None else after + 1
-        found: list[Edge] = []
         with self._store.database.read() as connection:
-            job = self._jobs.find(connection, map_name, job_id)
-            while len(found) <= limit:
-                block = _items(connection, job, at, _BLOCK)
+            job = self.find(connection, map_name, job_id)
+
+            def made(_: int, block: Sequence[dict[str, Any]]) -> list[Edge]:
                 stops = stops_of(connection, {item[s] for item in block for s in ("from", "to")})
-                found += [
+                return [
                     _edge(item, stops)
                     for item in block
                     if item["overlap"] >= min_overlap
                     and consistent in (None, item["consistent"])
                     and {item["from"], item["to"]} <= stops.keys()
                 ]
-                at += len(block)
-                if len(block) < _BLOCK:
-                    break
-        more = str(found[limit - 1].number) if len(found) > limit else None
-        return Page[Edge](items=found[:limit], next_cursor=more)
+
+            items, more = page_of_items(
+                cursor, limit, lambda at: _items(connection, job, at, BLOCK), made,
+                lambda edge: edge.number,
+            )  # fmt: skip
+        return Page[Edge](items=items, next_cursor=more)
 
     def graph(
         self, map_name: str, job_id: str, kind: GraphFormat = "g2o", min_overlap: float = 0.0,
@@ -244,13 +203,9 @@ class AssociationJobs:
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
-            job = self._jobs.find(connection, map_name, job_id)
-            if job.state != JobState.SUCCEEDED or job.result is None:
-                raise NotIndexed(
-                    f"Association {job.id} is {job.state}; its graph exists once it has "
-                    f"succeeded. See GET /v1/maps/{row.name}/associations/{job.id}."
-                )
-            items = _items(connection, job, 0, job.result["edges"])
+            job = self.find(connection, map_name, job_id)
+            result = self.require_success(job, row.name, "its graph exists")
+            items = _items(connection, job, 0, result["edges"])
             progress = job.progress or {}
             numbers = [progress["source"], progress["target"]]
             stops = stops_of(connection, {number for run in numbers for number in run})
@@ -264,17 +219,8 @@ class AssociationJobs:
             and (item["consistent"] or not consistent)
             and {item["from"], item["to"]} <= stops.keys()
         ]
-        graph = pose_graph(runs, chosen, job.result["joins"], odometry=odometry)
+        graph = pose_graph(runs, chosen, result["joins"], odometry=odometry)
         return graph_text(graph, kind)
-
-
-def _association_record(job: JobRow, map_name: str) -> Association:
-    return Association(
-        association_id=job.id, map=map_name, asked=NewAssociation.model_validate(job.data or {}),
-        state=job.state, progress=job_progress(job),
-        result=None if job.result is None else AssociationResult.model_validate(job.result),
-        error=job.error, created_at=when(job.created_at), finished_at=when(job.finished_at),
-    )  # fmt: skip
 
 
 def _items(connection: Connection, job: JobRow, first: int, limit: int) -> list[dict[str, Any]]:

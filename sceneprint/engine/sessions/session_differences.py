@@ -17,15 +17,14 @@ from typing import Any, Literal
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.tasks import IsOver, LongJob, MapJobs, SliceResult, Tasks, ends_within
+from sceneprint.engine.jobs.map_jobs import MapJobs
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Tasks, ends_within
 from sceneprint.engine.maps.surface_job import cell_width, surface_points
 from sceneprint.engine.search.up_vectors import parent_axes
-from sceneprint.engine.serializers import job_progress, when
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import (
     DamagedBlob,
     InvalidRequest,
-    NotIndexed,
     UnknownJob,
     UnknownMap,
     UnreadableGeometry,
@@ -61,7 +60,6 @@ from sceneprint.store.maps import find_map, geometry_blobs, living_map, map_of
 from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats, Geometry
-from sceneprint_client.api import Page
 from sceneprint_client.api import sessions as api
 from sceneprint_client.api.sessions import Difference, DifferenceResult, NewDifference
 from sceneprint_client.surface_encoding import NO_SESSION
@@ -119,12 +117,14 @@ def shared_parent(connection: Connection, row: MapRow, asked: NewDifference) -> 
     return asked.parent_frame or shared[0]
 
 
-class DifferenceJobs:
+class DifferenceJobs(MapJobs[Difference]):
     """Differences of sessions."""
 
     def __init__(self, store: Store, tasks: Tasks) -> None:
-        self._store, self._tasks = store, tasks
-        self._jobs = MapJobs(store, DIFFERENCE, "difference", "differences")
+        super().__init__(
+            store, tasks, Difference, kind=DIFFERENCE, noun="difference", path="differences",
+            priority=PRIORITY,
+        )  # fmt: skip
 
     def begin(self, map_name: str, asked: NewDifference) -> Difference:
         """Queue a comparison.
@@ -136,26 +136,7 @@ class DifferenceJobs:
         """
         with self._store.database.read() as connection:
             shared_parent(connection, find_map(connection, map_name), asked)
-        data = asked.model_dump(mode="json", exclude_unset=True)
-        job, _ = self._tasks.begin(DIFFERENCE, map_name, data, PRIORITY)
-        return self.get(map_name, job.job_id)
-
-    def list_all(
-        self, map_name: str, cursor: str | None = None, limit: int = 100
-    ) -> Page[Difference]:
-        """Differences of a map, the newest first; see `MapJobs.page`."""
-        found, more = self._jobs.page(map_name, cursor, limit)
-        items = [_difference_record(job, map_name) for job in found]
-        return Page[Difference](items=items, next_cursor=more)
-
-    def get(self, map_name: str, job_id: str) -> Difference:
-        """A difference; UnknownMap or UnknownJob where there is none."""
-        with self._store.database.read() as connection:
-            return _difference_record(self._jobs.find(connection, map_name, job_id), map_name)
-
-    def remove(self, map_name: str, job_id: str) -> None:
-        """Delete a difference with its points; see `MapJobs.remove`."""
-        self._jobs.remove(map_name, job_id)
+        return self.queue(map_name, asked)
 
     def points(self, map_name: str, job_id: str) -> queue.JobFile:
         """The file of its points.
@@ -164,14 +145,16 @@ class DifferenceJobs:
         ------
         UnknownMap, UnknownJob : there is none.
         NotIndexed : it did not succeed.
+        DamagedBlob : its points are lost.
         """
         with self._store.database.read() as connection:
-            job = self._jobs.find(connection, map_name, job_id)
+            job = self.find(connection, map_name, job_id)
+            self.require_success(job, map_name, "its points exist")
             found = queue.files_of(connection, job.number).get(POINTS)
         if found is None:
-            raise NotIndexed(
-                f"Difference {job.id} is {job.state}; its points exist once it has succeeded. "
-                f"See GET /v1/maps/{map_name}/differences/{job.id}."
+            raise DamagedBlob(
+                f"The points of difference {job_id} are lost. Delete it and compare the sessions "
+                "again."
             )
         return found
 
@@ -379,12 +362,3 @@ def _spread(numbers: Sequence[int], most: int) -> list[int]:
     if len(numbers) <= most:
         return list(numbers)
     return [numbers[i * len(numbers) // most] for i in range(most)]
-
-
-def _difference_record(job: JobRow, map_name: str) -> Difference:
-    return Difference(
-        difference_id=job.id, map=map_name, asked=NewDifference.model_validate(job.data or {}),
-        state=job.state, progress=job_progress(job),
-        result=None if job.result is None else DifferenceResult.model_validate(job.result),
-        error=job.error, created_at=when(job.created_at), finished_at=when(job.finished_at),
-    )  # fmt: skip

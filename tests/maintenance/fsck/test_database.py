@@ -146,7 +146,7 @@ def test_a_later_schema_is_refused(house: Any) -> None:
     house.sql("UPDATE alembic_version SET version_num = '9999'")
     house.sql("UPDATE schema_range SET least_revision = '9999'")
     before = house.files()
-    with pytest.raises(NewerSchema, match="has schema 9999"):
+    with pytest.raises(NewerSchema):
         house.look()
     assert house.files() == before
 

@@ -239,7 +239,7 @@ def test_databases_that_are_none_of_ours(archive, tmp_path, refused):
     def later(database: sqlite3.Connection) -> None:
         database.execute("UPDATE alembic_version SET version_num = '9999'")
 
-    assert "a later one wrote it" in refused(with_database(later), kind=NewerSchema)
+    refused(with_database(later), "9999", NewerSchema)
     refused(
         with_database(lambda database: database.execute("DELETE FROM maps")),
         "a row of (frames|jobs) refers to one of maps that is missing",
@@ -259,7 +259,7 @@ def test_databases_that_are_none_of_ours(archive, tmp_path, refused):
     page = bytearray(members[1][1])
     page[4096 * 3 : 4096 * 4] = bytes(4096)
     refused(with_bytes(bytes(page)), "its database is not sound")
-    refused(with_bytes(b"x" * 8192), "no database of sceneprint", UnusableStore)
+    refused(with_bytes(b"x" * 8192), "bad.tar", UnusableStore)
 
 
 @pytest.mark.parametrize("name", ["{}/evil/x", "../x", b"ab", b"\xff", 5])

@@ -221,7 +221,7 @@ def test_what_cannot_be_taken(data, tmp_path, sceneprint, monkeypatch):
     with closing(sqlite3.connect(data / "sceneprint.db")) as database:
         database.execute("UPDATE alembic_version SET version_num = '9999'")
         database.commit()
-    refused("a later one wrote it")
+    refused("9999")
     with closing(sqlite3.connect(data / "sceneprint.db")) as database:
         database.execute("DROP TABLE alembic_version")
         database.commit()
