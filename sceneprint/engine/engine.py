@@ -104,12 +104,9 @@ class Engine:
         from threadpoolctl import threadpool_limits
 
         self.settings = settings
-        replica = settings.replica_url
         self.store = open_store(
-            settings.database, settings.blobs,
-            None if replica is None else replica.get_secret_value(), settings.replica_lag_s,
-            settings.geometry_bytes, decoders_of(settings),
-        )  # fmt: skip
+            settings.database, settings.blobs, settings.geometry_bytes, decoders_of(settings)
+        )
         self.signers = Signers(self.store.database, settings.cache_dir)
         self._shared = open_shared(self.store, settings)
         self._upkeep = Upkeep(self.store, self.signers, settings, self._shared)

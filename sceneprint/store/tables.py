@@ -46,7 +46,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from sceneprint.process import current_actor, current_tenant, request_id, traceparent
+from sceneprint.process import current_actor, current_tenant, request_id
 from sceneprint_client.api import FrameState, JobState
 from sceneprint_client.api.frames import Kind
 
@@ -803,13 +803,10 @@ def job_values(
 
 
 def request_data() -> dict[str, Any] | None:
-    """What a job keeps of the request that queues it; None outside of one."""
+    """Return what a job keeps of the request that queues it; None outside of one."""
     if request_id() is None:
         return None
-    data: dict[str, Any] = {"request_id": request_id()}  # whose log its worker's lines belong to
-    if (parent := traceparent()) is not None:
-        data["traceparent"] = parent
-    return data
+    return {"request_id": request_id()}  # the worker's log lines name it
 
 
 def audit_values(
