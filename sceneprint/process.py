@@ -3,12 +3,7 @@
 Log lines, limits, stop signals, and secrets out of files: a log line is one JSON object on standard
 error, and container engines hand secrets over in files, in place of the environment.
 
-What is known of the request in hand goes with it into threads: its id, its tenant, and its span of
-OpenTelemetry, where SCENEPRINT_TRACES_URL names a collector. A job carries the `traceparent` of the
-request that queued it, so that an upload and its signing are one trace over processes and hosts.
-
-    request --(traceparent in the job)--> job --> decode, sign, artifact, commit
-    query   --> prepare, retrieve, diversify, validate, locate
+What is known of the current request goes with it into threads: its id, its tenant and its actor.
 
 Times are counted in histograms, which add up over processes.
 """
@@ -24,7 +19,6 @@ import resource
 import select
 import signal
 import sys
-import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager
@@ -33,13 +27,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
 
 from sceneprint.errors import InvalidRequest
-
-if TYPE_CHECKING:
-    from opentelemetry.trace import Tracer
-
 
 #: What every record has; the rest was given with `extra` and is written as it is.
 _OWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message"}
@@ -165,7 +154,7 @@ class StopSignal:
 
 #: Variables that hold a secret; the variable with `_FILE` at its end names a file instead.
 SECRETS = (
-    "SCENEPRINT_DATABASE_URL", "SCENEPRINT_REPLICA_URL", "PGPASSWORD", "AWS_ACCESS_KEY_ID",
+    "SCENEPRINT_DATABASE_URL", "PGPASSWORD", "AWS_ACCESS_KEY_ID",
     "AWS_SECRET_ACCESS_KEY", "AZURE_STORAGE_ACCOUNT_KEY",
 )  # fmt: skip
 #: A secret is one line; a larger file is another one.
@@ -205,108 +194,6 @@ def read_secret_files(environment: MutableMapping[str, str]) -> None:
             )
         environment[name] = text
         del environment[f"{name}_FILE"]  # processes that are started from here have it already
-
-
-# Spans of OpenTelemetry.
-
-#: Attributes of a span, by OpenTelemetry's names, such as `http.route`.
-Attributes = Mapping[str, str | int]
-#: Milliseconds between two messages to the collector, and for one of them at most.
-EVERY_MS, TIMEOUT_MS = 2000, 5000
-
-_tracer: Tracer | None = None
-
-
-@contextmanager
-def tracing(url: str | None, process: str, version: str) -> Iterator[None]:
-    """Send the spans that end meanwhile to a collector; what is left is sent at the end.
-
-    A collector that is away costs the spans, a line of the log, and nothing else.
-
-    Parameters
-    ----------
-    url : of a collector that speaks OTLP over HTTP, such as http://127.0.0.1:4318; None for none
-    process, version : what spans say of this process
-    """
-    global _tracer  # one for each process, as that of OpenTelemetry is
-    if url is None:
-        yield
-        return
-    from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
-    from opentelemetry.sdk.resources import Resource
-    from opentelemetry.sdk.trace import TracerProvider
-    from opentelemetry.sdk.trace.export import BatchSpanProcessor
-
-    exporter = OTLPSpanExporter(f"{url.rstrip('/')}/v1/traces", timeout=TIMEOUT_MS / 1e3)
-    about = {"service.name": process, "service.version": version}
-    provider = TracerProvider(resource=Resource.create(about), shutdown_on_exit=False)
-    provider.add_span_processor(
-        BatchSpanProcessor(
-            exporter, schedule_delay_millis=EVERY_MS, export_timeout_millis=TIMEOUT_MS
-        )
-    )
-    _tracer = provider.get_tracer("sceneprint", version)
-    try:
-        yield
-    finally:
-        _tracer = None
-        provider.shutdown()
-
-
-@contextmanager
-def span(
-    name: str,
-    parent: str | None = None,
-    kind: str = "INTERNAL",
-    attributes: Attributes | None = None,
-) -> Iterator[None]:
-    """A span of what is done meanwhile, below the current one; nothing where nothing is traced.
-
-    Parameters
-    ----------
-    name : short, of few kinds
-    parent : `traceparent` of another process; an invalid one is ignored
-    kind : of OpenTelemetry: SERVER, CONSUMER or INTERNAL
-    attributes : of the span
-    """
-    if _tracer is None:
-        yield
-        return
-    from opentelemetry.trace import SpanKind
-    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
-
-    given = None if parent is None else {"traceparent": parent}
-    context = None if given is None else TraceContextTextMapPropagator().extract(given)
-    with _tracer.start_as_current_span(name, context, SpanKind[kind], attributes):
-        yield
-
-
-def name_span(name: str, attributes: Attributes) -> None:
-    """Rename and describe the current span: a request's route is known only at its end."""
-    if _tracer is not None:
-        from opentelemetry.trace import get_current_span
-
-        current = get_current_span()
-        current.update_name(name)
-        current.set_attributes(attributes)
-
-
-def record_span(name: str, seconds: float) -> None:
-    """A span below the current one, of what ends now and took so long."""
-    if _tracer is not None:
-        end = time.time_ns()
-        _tracer.start_span(name, start_time=end - int(1e9 * seconds)).end(end)
-
-
-def traceparent() -> str | None:
-    """The current span for another process, as W3C's Trace Context writes it."""
-    if _tracer is None:
-        return None
-    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
-
-    carrier: dict[str, str] = {}
-    TraceContextTextMapPropagator().inject(carrier)
-    return carrier.get("traceparent")
 
 
 # Times of many answers in a few numbers that can be added up: a histogram of fixed bounds.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import unquote, urlsplit
@@ -41,10 +40,6 @@ class Settings(BaseSettings):
     data_dir: Path = Field(default_factory=default_data_dir)
     #: SQLAlchemy URL of the database; default: SQLite in the data folder.
     database_url: SecretStr | None = None
-    #: SQLAlchemy URL of a read replica of it, of PostgreSQL, that queries are answered from.
-    replica_url: SecretStr | None = None
-    #: Seconds that the replica may be behind; farther behind, the database itself is asked.
-    replica_lag_s: float = Field(default=5.0, ge=0, le=3600)
     #: Where blobs are kept: s3://bucket/prefix, gs://, az://, file:/// or memory:///; default:
     #: `blobs` in the data folder. Credentials come from the environment of the cloud, never here.
     blob_url: SecretStr | None = None
@@ -83,9 +78,6 @@ class Settings(BaseSettings):
     import_bytes: int = Field(default=4 << 30, ge=1024)
     #: Seconds for a body of hardly any bytes; each MiB of it may take 4 s more.
     body_s: float = Field(default=30.0, ge=1, le=3600)
-    #: Collector of OpenTelemetry that is sent spans of requests and jobs, over HTTP: such as
-    #: http://127.0.0.1:4318. Needs the extra `traces`; default: nothing is traced.
-    traces_url: str | None = Field(default=None, pattern=r"^https?://[^\s/@]+(/\S*)?$")
     #: Ask callers for a key on a loopback address as well, as behind a proxy.
     require_keys: bool = False
     #: Requests a second of each tenant, weighted by work, over five seconds; 0 for no limit.
@@ -120,8 +112,6 @@ class Settings(BaseSettings):
     answer_bytes: int = Field(default=256 << 20, ge=0)
     #: Seconds for which deleted frames can be restored; 0: a deletion is for good at once.
     undo_s: float = Field(default=600.0, ge=0, le=31_536_000)
-    #: Uploads of deleted frames of a map that are kept for it, bytes; more are deleted for good.
-    undo_bytes: int = Field(default=4 << 30, ge=0)
     #: Days for which rows of deleted and of redundant frames, and of their jobs, stay.
     deleted_rows_days: float = Field(default=7.0, ge=1, le=36_500)
     #: Streams of events that one service process keeps open at once; more are refused (503).
@@ -136,13 +126,6 @@ class Settings(BaseSettings):
     surfaces: Literal["auto", "asked"] = "auto"
     #: Seconds after which no byte of a deleted frame is left in the caches of this node.
     purge_s: float = Field(default=3600.0, ge=1, le=31_536_000)
-
-    @field_validator("replica_url")
-    @classmethod
-    def _has_primary(cls, given: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
-        if given is not None and info.data.get("database_url") is None:
-            raise ValueError("a replica needs its primary in SCENEPRINT_DATABASE_URL")
-        return given
 
     @field_validator("tls_key")
     @classmethod
@@ -163,13 +146,6 @@ class Settings(BaseSettings):
     def _holds_objects(cls, given: SecretStr | str | None) -> SecretStr | str | None:
         if given is not None:
             _require_objects(given if isinstance(given, str) else given.get_secret_value())
-        return given
-
-    @field_validator("traces_url")
-    @classmethod
-    def _can_trace(cls, given: str | None) -> str | None:
-        if given is not None and find_spec("opentelemetry") is None:
-            raise ValueError("it needs OpenTelemetry: run `pip install 'sceneprint[traces]'`")
         return given
 
     @field_validator("cors_origins", mode="before")
@@ -228,6 +204,11 @@ class Settings(BaseSettings):
     def blob_dir(self) -> Path:
         """Folder of uploads and geometry artifacts, where they are in one."""
         return self._blob_root / "blobs"
+
+    @property
+    def quarantine_dir(self) -> Path:
+        """Folder of damaged bytes that `sceneprint fsck --repair` has set aside."""
+        return self.data_dir / "quarantine"
 
     @property
     def query_dir(self) -> Path:

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import threading
 from collections.abc import AsyncIterator
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
+from contextlib import asynccontextmanager, nullcontext
 from typing import Any
 
 from anyio import to_thread
@@ -18,7 +18,6 @@ from sceneprint import __version__
 from sceneprint.engine import Engine
 from sceneprint.engine.compilation import compile_kernels
 from sceneprint.errors import SceneprintError
-from sceneprint.process import tracing
 from sceneprint.settings import Settings
 from sceneprint.store.database_errors import open_patiently
 from sceneprint_client.api import (
@@ -38,7 +37,6 @@ from sceneprint_client.api.listing import (
     FramesEdit,
     FrameSelection,
     MapEdit,
-    RestoreOptions,
     SessionEdit,
 )
 from sceneprint_client.api.results import KeepOptions
@@ -67,7 +65,6 @@ from service.routes import (
     sessions,
     surface,
 )
-from service.shared_rates import SharedRates, sharing
 
 # The OpenAPI document: FastAPI's, and the records that only bodies of our own reading use.
 
@@ -86,7 +83,6 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
                 (SessionEdit, "validation"),
                 (FrameSelection, "validation"),
                 (FramesEdit, "validation"),
-                (RestoreOptions, "validation"),
                 (KeepOptions, "validation"),
                 (MapEdit, "validation"),
                 (Filter, "validation"),
@@ -202,12 +198,8 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
             )  # fmt: skip
             loading = warming(engine) if warm else nullcontext()
             app.state.refusals = RefusalFilter()
-            shared: AbstractAsyncContextManager[None] = nullcontext()
-            if not engine.store.database.is_sqlite:  # which has one service
-                shared = sharing(SharedRates(engine.store.database, limits))
-            async with housekeeping(engine, figures.sampler), shared, loading:
-                with tracing(settings.traces_url, "sceneprint-service", __version__):
-                    yield
+            async with housekeeping(engine, figures.sampler), loading:
+                yield
             feed.close()
         finally:
             await to_thread.run_sync(engine.close)

@@ -42,7 +42,7 @@ def embedded_settings(path: Path) -> Settings:
     decoded here: no other process is started.
     """
     settings = Settings(
-        data_dir=path.absolute(), database_url=None, replica_url=None, index_dir=None,
+        data_dir=path.absolute(), database_url=None, index_dir=None,
         host="127.0.0.1", require_keys=False, cors_origins=(), requests_per_s=0,
         waiting=_MOST_WAITING, wait_s=_LONGEST_WAIT_S, event_streams=_MOST_STREAMS, decoders=0,
     )  # fmt: skip

@@ -11,7 +11,6 @@ long may be forgotten.
 from __future__ import annotations
 
 import asyncio
-import heapq
 import ipaddress
 import math
 import os
@@ -20,10 +19,9 @@ import tempfile
 import threading
 import time
 from collections import Counter, OrderedDict, defaultdict
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from operator import itemgetter
 from typing import Any, TypeVar, cast
 
 import anyio
@@ -303,7 +301,6 @@ class TokenBucket:
         self._name, self._per_s, self._burst = name, per_s, max(burst, 1.0)
         self._most, self._clock = most, clock
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
-        self._spent: dict[str, float] | None = None
         self._lock = threading.Lock()
 
     def take(self, caller: str, cost: float = 1.0) -> RateState | None:
@@ -317,8 +314,6 @@ class TokenBucket:
             allowed = tokens >= cost
             tokens -= cost * allowed
             self._keep(caller, tokens, now)
-            if allowed and self._spent is not None:
-                self._spend(self._spent, caller, cost)
         return RateState(
             self._name,
             int(self._burst),
@@ -337,43 +332,6 @@ class TokenBucket:
         self._buckets[caller] = (tokens, now)
         if len(self._buckets) > self._most:
             self._buckets.popitem(last=False)
-
-    def _spend(self, spent: dict[str, float], caller: str, cost: float) -> None:
-        if caller in spent or len(spent) < self._most:
-            spent[caller] = spent.get(caller, 0.0) + cost
-
-    def note_spending(self) -> None:
-        """From now on, note what each caller spends, for `take_spent`."""
-        with self._lock:
-            self._spent = {}
-
-    def take_spent(self, most: int) -> dict[str, float]:
-        """What callers have spent since it was last asked for: at most so many, the greatest; what
-        the others spent waits for the next time.
-        """
-        with self._lock:
-            spent, self._spent = self._spent or {}, {}
-            if len(spent) <= most:
-                return spent
-            told = dict(heapq.nlargest(most, spent.items(), key=itemgetter(1)))
-            self._spent = {caller: cost for caller, cost in spent.items() if caller not in told}
-        return told
-
-    def return_spent(self, spent: Mapping[str, float]) -> None:
-        """Take back what `take_spent` gave: it is for the next time."""
-        with self._lock:
-            if self._spent is not None:
-                for caller, cost in spent.items():
-                    self._spend(self._spent, caller, cost)
-
-    def charge(self, spent: Mapping[str, float]) -> None:
-        """Take tokens that callers have spent elsewhere, there or not: what is lacking is owed."""
-        if self._per_s <= 0:
-            return
-        with self._lock:
-            now = self._clock()
-            for caller, cost in spent.items():
-                self._keep(caller, self._tokens(caller, now) - cost, now)
 
     @property
     def name(self) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import os
 import platform
 import socket
@@ -29,7 +28,6 @@ from sceneprint.process import NOBODY, Latencies
 from sceneprint.store import Database
 from sceneprint.store.store_counts import add_sample
 from sceneprint_client.api import Answer, FrameState, JobState
-from sceneprint_client.api.admin import ReplicaSeen
 
 # What this process counted in the last seconds, written to the database now and then.
 #
@@ -220,7 +218,6 @@ class Metrics:
         self._disk = self._gauge("disk_bytes", "Disk space taken by each part.", "part")
         self._scrubbed = self._gauge("scrub_bytes", "Stored bytes that this scrub has read.")
         self._damaged = self._gauge("scrub_damaged", "What this scrub found lost or damaged.")
-        self._replica: tuple[Gauge, Gauge] | None = None  # told where there is one
         self._free = self._gauge("disk_free_bytes", "Left on the disk of the data folder.")
         self._gauge("build_info", "Version of the service.", "version", "python").labels(
             __version__, platform.python_version()
@@ -250,16 +247,6 @@ class Metrics:
         self.sampler.answer(answer)
         for stage, milliseconds in answer.milliseconds.items():
             self._stages.labels(stage).observe(milliseconds / 1e3)
-
-    def _tell_replica(self, seen: ReplicaSeen) -> None:
-        if self._replica is None:
-            self._replica = (
-                self._gauge("replica_used", "1 while queries are answered from the read replica."),
-                self._gauge("replica_behind_seconds", "How far the read replica is behind."),
-            )
-        used, behind = self._replica
-        used.set(seen.used)
-        behind.set(math.inf if seen.behind_s is None else seen.behind_s)
 
     def text(
         self, figures: Figures, streams: int, lost: int, held: Mapping[str, int],
@@ -297,8 +284,6 @@ class Metrics:
         self._workers.labels("idle").set(len(workers) - busy)
         self._began.set(figures.began)
         self._events.set(figures.events)
-        if stats.replica is not None:
-            self._tell_replica(stats.replica)
         self._disk.labels("database").set(stats.bytes.database or 0)
         self._disk.labels("blobs").set(stats.bytes.blobs)
         self._disk.labels("index").set(stats.bytes.index)

@@ -13,7 +13,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from sceneprint.errors import AmbiguousKey, Busy, SceneprintError
-from sceneprint.process import NOBODY, name_request, name_span, set_actor, set_tenant, span
+from sceneprint.process import NOBODY, name_request, set_actor, set_tenant
 from sceneprint.settings import Settings
 from service.auth import REFUSED, address_of, record_refusal
 from service.browser_security import (
@@ -46,8 +46,7 @@ _METHODS = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"
 _HUNG_UP = 499
 #: Refusals that come late to who does not stop.
 _HELD_BACK = (401, 403, 429)
-#: What machines request every few seconds, or anybody without a key: not traced, and in the log at
-#: DEBUG alone.
+#: Paths that machines request every few seconds, or anybody without a key: logged at DEBUG alone.
 _PROBES = ("/healthz", "/readyz", "/metrics", "/openapi.json")
 #: Requests that are answered at once, those that wait or stream among them.
 _MOST_AT_ONCE = 900
@@ -79,12 +78,7 @@ class RequestMiddleware:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        if scope["path"] in _PROBES:
-            await self._answer(scope, receive, send)
-            return
-        parent = dict(scope["headers"]).get(b"traceparent", b"").decode("latin-1")
-        with span(scope["method"], parent, "SERVER"):
-            await self._answer(scope, receive, send)
+        await self._answer(scope, receive, send)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         headers: dict[bytes, bytes] = dict(scope["headers"])
@@ -186,11 +180,6 @@ class RequestMiddleware:
         self._metrics.request(method, route, status, seconds, received, tenant)
         if status in REFUSED:
             self._note_refusal(scope, request_id, status)
-        about: dict[str, str | int] = {
-            "http.request.method": method, "http.route": route,
-            "http.response.status_code": status, "sceneprint.request": request_id,
-        }  # fmt: skip
-        name_span(f"{method} {route}", about)
         level = logging.DEBUG if route in _PROBES else logging.INFO
         log.log(
             level,

@@ -50,7 +50,7 @@ from sceneprint.types import DepthFrame
 TOGETHER = ("dashboard", "service", "client", "cli_service", "scenes", "ros2")
 #: Long files in them that begin all they need themselves, and so may run beside the others.
 APART = (
-    "service/test_lifecycle.py", "service/test_hostile.py", "service/test_tracing.py",
+    "service/test_lifecycle.py", "service/test_hostile.py",
     "service/test_kill.py", "service/test_connections.py",
     "service/test_tenancy.py", "service/test_server.py", "service/test_overload.py",
     "service/test_hostile_files.py", "service/test_faults.py", "client/test_tracker.py",
@@ -60,12 +60,12 @@ APART = (
 LONG = (
     "test_container.py", "test_on_postgres.py", "test_deployment.py", "test_shared_index.py",
     "test_commands.py", "test_surfaces.py", "test_quality.py",
-    "test_lookalikes.py", "test_lifecycle.py", "test_tracing.py",
+    "test_lookalikes.py", "test_lifecycle.py",
     "test_hostile.py", "test_pulled_copies.py", "test_fleets.py", "test_fuzz.py",
     "test_training.py", "test_survival.py", "test_work.py",
     "test_recovery.py", "test_siege.py", "test_cli.py", "test_map_copy.py", "test_failover.py",
     "test_connections.py", "test_kill.py", "test_tracker.py", "test_purging.py",
-    "test_associations.py", "test_evaluate.py", "test_equal_rooms.py", "test_shared_rates.py",
+    "test_associations.py", "test_evaluate.py", "test_equal_rooms.py",
     "test_sequences.py", "test_inspecting.py",
     "test_reencoding_switch.py", "test_decoders.py", "test_tenancy.py",
     "test_bench_rows.py", "test_same_as_evaluate.py", "test_soak.py", "test_tour.py",

@@ -12,7 +12,7 @@ import pytest
 from sceneprint.cli import parser
 from sceneprint.settings import Settings
 from sceneprint_client.api import AnswerStatus, FrameState, JobState
-from sceneprint_client.api.admin import KINDS, MISSED, ReplicaSeen
+from sceneprint_client.api.admin import KINDS, MISSED
 from service.metrics import Metrics
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -37,7 +37,6 @@ def families() -> dict[str, set[str]]:
     """Names of all that is told to Prometheus, with their labels."""
     found: dict[str, set[str]] = {}
     metrics = Metrics()
-    metrics._tell_replica(ReplicaSeen(used=True, behind_s=0.5))  # told only where there is one
     for collector in metrics.registry._collector_to_names:  # also those without data
         labels = set(getattr(collector, "_labelnames", ()))
         for family in collector.describe():

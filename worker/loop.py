@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from multiprocessing.reduction import DupFd
 from typing import Any
 
-from sceneprint import __version__
 from sceneprint.engine import Engine
 from sceneprint.engine.engine import open_engine
 from sceneprint.errors import NewerSchema, SceneprintError, StoreAway
@@ -27,8 +26,6 @@ from sceneprint.process import (
     log_as_json,
     of_request,
     raise_descriptors,
-    span,
-    tracing,
 )
 from sceneprint.settings import Settings
 from sceneprint.store.wakeup import Listening, process_name
@@ -74,11 +71,7 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
         opened = open_engine(settings, math.inf, may_go_on)
     except StoreAway:
         return
-    with (
-        tracing(settings.traces_url, "sceneprint-worker", __version__),
-        opened as engine,
-        engine.bell.listen() as listener,
-    ):
+    with opened as engine, engine.bell.listen() as listener:
         engine.warm()
         limit_memory(settings.worker_bytes)
         worker = Worker(engine, listener, trace, stop)
@@ -139,12 +132,6 @@ class Worker:
         seconds = self._engine.settings.job_s
         with (
             of_request(asked.get("request_id")),
-            span(
-                f"job {held.kind}",
-                asked.get("traceparent"),
-                "CONSUMER",
-                {"sceneprint.job": held.id},
-            ),
             self._trace.job(held.id, held.token, seconds),
         ):
             self._engine.run(claimed, self._break)

@@ -42,9 +42,6 @@ class Status(ApiRecord):
         description="How many jobs are in each state that has any; None as `frames`."
     )
     read_only: bool = Field(default=False, description="Whether it answers, and takes nothing.")
-    replica: str | None = Field(
-        default=None, description="What queries are answered from, where there is a read replica."
-    )
 
 
 class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMethods):

@@ -128,12 +128,11 @@ def version_check(url: str, status: Status) -> Check:
 
 
 def ready_check(status: Status) -> Check:
-    """Whether it takes uploads, and what it reads."""
-    replica = "" if status.replica is None else f"; {status.replica}"
+    """Return whether the service takes uploads."""
     if status.read_only:
         text = "read-only: it answers queries and rejects uploads. Make its data folder writable"
-        return Check("note", "ready", f"{text}{replica}.")
-    return Check("ok", "ready", f"takes uploads and answers queries{replica}")
+        return Check("note", "ready", f"{text}.")
+    return Check("ok", "ready", "takes uploads and answers queries")
 
 
 def clock_check(before: float, there: float, after: float) -> Check:
@@ -152,8 +151,6 @@ def store_check(stats: Stats) -> Check:
     # which database it is, no answer of the service tells
     place = "database" if sizes.database is None else f"database of {sizes.database / 1e6:.1f} MB"
     text = f"{place}, blobs of {sizes.blobs / 1e6:.1f} MB, indexes of {sizes.index / 1e6:.1f} MB"
-    if stats.replica is not None and not stats.replica.used:
-        return Check("note", "store", f"{text}; the replica is not in use: see the service's log")
     return Check("ok", "store", text)
 
 

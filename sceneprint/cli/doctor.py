@@ -212,7 +212,7 @@ def _looked_at(subject: str, setting: str, url: str) -> Check:
     return Check("ok", subject, text)
 
 
-# What `sceneprint doctor` says of a database server and its replica; they are only read.
+# What `sceneprint doctor` says of a database server, which is only read.
 
 #: What a commit that was acknowledged needs to survive the loss of power.
 _DURABLE = ("fsync", "full_page_writes")
@@ -229,15 +229,10 @@ SELECT current_setting('server_version') AS version,
   (SELECT count(*) FROM pg_stat_activity WHERE backend_type = 'client backend') AS taken,
   pg_is_in_recovery() AS standby
 """
-_BEHIND = """
-SELECT pg_is_in_recovery(), CASE WHEN pg_last_wal_receive_lsn() = pg_last_wal_replay_lsn() THEN 0
-  ELSE extract(epoch FROM clock_timestamp() - pg_last_xact_replay_timestamp()) END,
-  (SELECT count(*) FROM pg_stat_wal_receiver)
-"""
 
 
 def server(settings: Settings) -> Iterator[Check]:
-    """Findings about the database server, and the replica where one is named.
+    """Yield findings about the database server.
 
     Parameters
     ----------
@@ -253,11 +248,8 @@ def server(settings: Settings) -> Iterator[Check]:
         yield from _server_settings(database, settings)
     except SceneprintError as error:
         yield Check("WRONG", "database server", str(error))
-        return
     finally:
         database.close()
-    if settings.replica_url is not None:
-        yield _replica(settings.replica_url.get_secret_value(), settings)
 
 
 def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
@@ -327,40 +319,6 @@ def _clock(before: float, there: float, after: float, settings: Settings) -> Che
         verdict: Verdict = "WRONG" if apart > settings.lease_s else "note"
         return Check(verdict, "clock", f"{text}. Synchronize both with a time server.")
     return Check("ok", "clock", text)
-
-
-def _replica(url: str, settings: Settings) -> Check:
-    from sceneprint.errors import SceneprintError
-    from sceneprint.store.database import known_revisions, reach_database, revision_of
-
-    try:
-        database = reach_database(url)
-    except SceneprintError as error:
-        return Check("WRONG", "replica", f"SCENEPRINT_REPLICA_URL: {error}")
-    try:
-        if database.is_sqlite:
-            text = "SCENEPRINT_REPLICA_URL is not a PostgreSQL URL. Correct it, or unset it."
-            return Check("WRONG", "replica", text)
-        with database.read() as connection:
-            standby, behind, receives = connection.exec_driver_sql(_BEHIND).one()
-            schema = revision_of(connection)
-    except SceneprintError as error:
-        text = f"{error} Until then, queries go to the primary."
-        return Check("WRONG", "replica", text)
-    finally:
-        database.close()
-    if not standby:
-        return Check("note", "replica", f"{database.shown} is a primary, not a standby")
-    if schema != known_revisions()[0]:
-        return Check("note", "replica", f"{database.shown} has schema {schema}: not used yet")
-    text = f"{database.shown} is {'some time' if behind is None else f'{behind:.1f} s'} behind"
-    if not receives:
-        text += ", and does not receive from its primary. See its log."
-        return Check("note", "replica", text)
-    if behind is None or behind > settings.replica_lag_s:
-        text += f"; SCENEPRINT_REPLICA_LAG_S is {settings.replica_lag_s:g} s: it is not used"
-        return Check("note", "replica", text)
-    return Check("ok", "replica", text)
 
 
 # What `sceneprint doctor` looks at on this machine; nothing is changed by looking.

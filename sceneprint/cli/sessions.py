@@ -122,7 +122,7 @@ def _delete_session(client: Client, options: argparse.Namespace) -> None:
 
 
 def _undo(client: Client, map_name: str, deletion_id: str) -> None:
-    done = client.restore_frames(map_name, deletion_id)
+    done = client.restore_deletion(map_name, deletion_id)
     print(f"restored {done.frames} frames")
     for one in done.refused:
         print(f"not restored: {one.frame_id}: {one_line(one.reason)}")

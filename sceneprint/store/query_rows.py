@@ -269,7 +269,7 @@ def is_current(connection: Connection, row: QueryRow) -> bool:
 
 
 def keep_answer(connection: Connection, number: int, data: bytes, at: float) -> None:
-    """Keep an answer in the database: it is in every snapshot, and where a replica is."""
+    """Keep an answer in the database: it is in every snapshot."""
     own = update(queries).where(_c.number == number)
     connection.execute(own.values(answer=data, kept_at=at))
 

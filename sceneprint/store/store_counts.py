@@ -122,15 +122,12 @@ class Sample:
     data: dict[str, Any]
 
 
-def add_sample(
-    connection: Connection, kind: str, process: str, data: dict[str, Any], *,
-    kept_s: float = KEPT_S,
-) -> None:  # fmt: skip
-    """Keep a sample, and remove some of its kind that are older than `kept_s` seconds."""
+def add_sample(connection: Connection, kind: str, process: str, data: dict[str, Any]) -> None:
+    """Keep a sample, and remove some of its kind that are older than KEPT_S."""
     now = time.time()
     old = (
         select(samples.c.number)
-        .where(samples.c.kind == kind, samples.c.at < now - kept_s)
+        .where(samples.c.kind == kind, samples.c.at < now - KEPT_S)
         .order_by(samples.c.number)
         .limit(_SWEPT)
         .with_for_update(skip_locked=True)  # writers of samples wait for no turn, nor each other
@@ -143,23 +140,6 @@ def samples_since(connection: Connection, kind: str, at: float) -> list[Sample]:
     """Samples of all processes from a time on, the oldest first."""
     of_kind = select(samples.c.at, samples.c.data).where(samples.c.kind == kind, samples.c.at >= at)
     return [Sample(*row) for row in connection.execute(of_kind.order_by(samples.c.at))]
-
-
-def newest_sample(connection: Connection) -> int:
-    """Number of the newest sample of any kind; 0 where there is none."""
-    return int(connection.execute(select(func.max(samples.c.number))).scalar() or 0)
-
-
-def other_samples(
-    connection: Connection, kind: str, process: str, after: int
-) -> dict[int, dict[str, Any]]:
-    """Data of samples of all processes but one after a number, by their numbers, in order. Those of
-    processes that write at the same moment may be committed in another.
-    """
-    asked = select(samples.c.number, samples.c.data).where(
-        samples.c.number > after, samples.c.kind == kind, samples.c.process != process
-    )
-    return {row[0]: row[1] for row in connection.execute(asked.order_by(samples.c.number))}
 
 
 def count_samples(connection: Connection, kind: str, at: float) -> int:

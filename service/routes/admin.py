@@ -27,7 +27,6 @@ from sceneprint_client.api.admin import (
     ModelInfo,
     NewKey,
     NewModel,
-    ReplicaSeen,
     Stats,
 )
 from service.auth import Asking, Guest, Here, administers, may_admin, reads_every, v1_router
@@ -55,9 +54,6 @@ class Readiness(Health):
         description="How many are in each state; null for who may not read all maps."
     )
     jobs: dict[str, int] | None = Field(description="As `frames`.")
-    replica: str | None = Field(
-        default=None, description="What queries are answered from, where there is a read replica."
-    )
 
 
 @router.head("/healthz", include_in_schema=False)  # as balancers ask
@@ -98,16 +94,7 @@ def _look(engine: Engine) -> Readiness:
         read_only=engine.store.read_only,
         frames=None,
         jobs=None,
-        replica=_replica(engine.operations.statistics.replica()),
     )
-
-
-def _replica(seen: ReplicaSeen | None) -> str | None:
-    if seen is None:
-        return None
-    if not seen.used:
-        return "the replica is not in use: queries read the primary"
-    return f"queries read a replica, which is at most {seen.behind_s:.1f} s behind"
 
 
 @router.get(

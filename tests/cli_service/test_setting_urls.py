@@ -29,7 +29,6 @@ SERVER = "postgresql+psycopg://u:hunter2@host/db"
         ("INDEX_URL", "hunter2", "does not start with any of s3://"),
         ("BLOB_URL", "", "does not start with any of s3://"),
         ("BLOB_URL", "s3:///hunter2", "names no bucket"),
-        ("REPLICA_URL", SERVER, "a replica needs its primary"),
     ],
 )
 def test_a_url_that_is_none_is_refused_and_not_repeated(
@@ -48,14 +47,12 @@ def test_a_url_that_is_none_is_refused_and_not_repeated(
 
 def test_urls_are_taken_and_hide_what_is_in_them(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (
-        ("DATABASE_URL", SERVER), ("REPLICA_URL", SERVER), ("BLOB_URL", "s3://bucket/prefix"),
+        ("DATABASE_URL", SERVER), ("BLOB_URL", "s3://bucket/prefix"),
         ("INDEX_URL", "file:///srv/indexes"),
     ):  # fmt: skip
         monkeypatch.setenv(f"SCENEPRINT_{name}", value)
     found = settings_of(argparse.Namespace())
     assert found.database == SERVER
-    assert found.replica_url is not None
-    assert found.replica_url.get_secret_value() == SERVER
     assert found.blob_url is not None
     assert found.blob_url.get_secret_value() == "s3://bucket/prefix"
     assert found.index_url == "file:///srv/indexes"

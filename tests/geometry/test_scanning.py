@@ -1,32 +1,17 @@
-"""The loops behind the distances: at every width the integers of the oracle."""
+"""The loops behind the distances: the integers of the oracle."""
 
 from __future__ import annotations
 
 import mmap
-import os
-import subprocess
-import sys
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.geometry.retrieval.ranking import Ints64, frozen, scan
-from sceneprint.geometry.retrieval.scanners import QUERIES, SCANNERS, widths, widths_of
+from sceneprint.geometry.retrieval.ranking import Ints64, scan
 from sceneprint.types import Bytes
-
-WIDTHS = (64, 32, 16, 0)
-
-every_width = pytest.mark.parametrize(
-    "width",
-    [
-        pytest.param(w, marks=pytest.mark.skipif(w not in widths(), reason="not this processor's"))
-        for w in WIDTHS
-    ],
-)
 
 
 def oracle(queries: Bytes, database: Bytes, rows: Ints64) -> list[list[int]]:
@@ -41,31 +26,28 @@ def random_bytes(seed: int, *shape: int) -> Bytes:
     return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
 
 
-@every_width
 @pytest.mark.parametrize("n", [0, 1, 15, 16, 17, 31, 33, 63, 64, 65, 127, 200, 4095, 4161, 8193])
-def test_any_length(width: int, n: int) -> None:
+def test_any_length(n: int) -> None:
     """Multiples of no width, and past a tile; more rows and queries than go together."""
     queries, database, rows = random_bytes(n, 5, n), random_bytes(n + 1, 6, n), np.arange(6)
     expected = oracle(queries, database, rows)
-    assert scan(queries, database, rows, width=width).tolist() == expected
+    assert scan(queries, database, rows).tolist() == expected
     # one query is another way through the loop
-    assert scan(queries[3:4], database, rows, width=width).tolist() == expected[3:4]
+    assert scan(queries[3:4], database, rows).tolist() == expected[3:4]
 
 
-@every_width
 @settings(max_examples=60)
 @given(n_queries=st.integers(0, 10), n_rows=st.integers(0, 40), seed=st.integers(0, 9))
-def test_any_number_of_queries_and_rows(width: int, n_queries: int, n_rows: int, seed: int) -> None:
+def test_any_number_of_queries_and_rows(n_queries: int, n_rows: int, seed: int) -> None:
     """Rows in any order, some of them twice; full blocks, and what is left of them."""
     queries, database = random_bytes(seed, n_queries, 70), random_bytes(seed + 1, 9, 70)
     rows = np.random.default_rng(seed).integers(0, 9, n_rows)
-    found = scan(queries, database, rows, width=width)
+    found = scan(queries, database, rows)
     assert (found.shape, found.dtype) == ((n_queries, n_rows), np.int64)
     assert found.tolist() == oracle(queries, database, rows)
 
 
-@every_width
-def test_no_sum_is_taken_for_another(width: int) -> None:
+def test_no_sum_is_taken_for_another() -> None:
     """Every pair has a distance that no other has, and queries keep theirs in any order."""
     n = 4096 + 64 + 7
     queries = np.repeat(np.arange(9, dtype=np.uint8)[:, None], n, axis=1)
@@ -73,40 +55,33 @@ def test_no_sum_is_taken_for_another(width: int) -> None:
     rows = np.arange(len(database))
     expected = n * (database[None, :, 0].astype(int) - queries[:, None, 0])
     assert len(np.unique(expected)) == expected.size
-    np.testing.assert_array_equal(scan(queries, database, rows, width=width), expected)
+    np.testing.assert_array_equal(scan(queries, database, rows), expected)
     order = np.random.default_rng(0).permutation(9)
-    np.testing.assert_array_equal(
-        scan(queries[order], database, rows, width=width), expected[order]
-    )
+    np.testing.assert_array_equal(scan(queries[order], database, rows), expected[order])
     for q in range(9):
-        np.testing.assert_array_equal(
-            scan(queries[q : q + 1], database, rows, width=width)[0], expected[q]
-        )
+        np.testing.assert_array_equal(scan(queries[q : q + 1], database, rows)[0], expected[q])
 
 
-@every_width
 @pytest.mark.parametrize("number", [*range(10), 33])
-def test_half_of_all_pairs(width: int, number: int) -> None:
+def test_half_of_all_pairs(number: int) -> None:
     signatures, rows = random_bytes(number, number, 130), np.arange(number)
-    found = scan(signatures, signatures, rows, half=True, width=width)
+    found = scan(signatures, signatures, rows, half=True)
     expected = np.array(oracle(signatures, signatures, rows), np.int64).reshape(number, number)
     np.testing.assert_array_equal(np.triu(found, 1), np.triu(expected, 1))
 
 
-@every_width
-def test_sums_beyond_32_bits(width: int) -> None:
+def test_sums_beyond_32_bits() -> None:
     """The farthest there are, of a length at which even unsigned integers of 32 bits overflow."""
     n = 2**32 // 255 + 100
     database = np.vstack([np.zeros(n, np.uint8), np.full(n, 255, np.uint8)])
     rows = np.array([0, 1, 0, 1, 1])
     expected = [[0, n * 255, 0, n * 255, n * 255], [n * 255, 0, n * 255, 0, 0]]
-    assert scan(database, database, rows, width=width).tolist() == expected
-    assert scan(database[:1], database, rows, width=width).tolist() == expected[:1]
+    assert scan(database, database, rows).tolist() == expected
+    assert scan(database[:1], database, rows).tolist() == expected[:1]
 
 
-@every_width
 @pytest.mark.parametrize("offset", [1, 8, 31, 63])
-def test_any_place_in_memory_and_in_a_mapped_file(width: int, offset: int, tmp_path: Path) -> None:
+def test_any_place_in_memory_and_in_a_mapped_file(offset: int, tmp_path: Path) -> None:
     """Rows on no boundary, read-only; the last one ends where the file does."""
     n, rows = 4096 - 3, np.array([0, 1, 2, 3, 7, 5, 6])
     queries, database = random_bytes(1, 2, n), random_bytes(2, 8, n)
@@ -119,57 +94,5 @@ def test_any_place_in_memory_and_in_a_mapped_file(width: int, offset: int, tmp_p
     assert not stored.flags.writeable
     memory: Bytes = np.frombuffer(bytes(offset) + queries.tobytes(), np.uint8, offset=offset)
     asked = memory.reshape(2, n)
-    assert scan(asked, stored, rows, width=width).tolist() == expected
-    assert scan(asked[1:], stored, rows, width=width).tolist() == expected[1:]
-
-
-def test_what_a_processor_can_do() -> None:
-    linux = "x86_64-unknown-linux-gnu"
-    assert widths_of(linux, "+avx,+avx2,+avx512f,+avx512bw") == (64, 32, 16, 0)
-    assert widths_of(linux, "+avx,+avx2,+avx512f,-avx512bw") == (32, 16, 0)
-    assert widths_of(linux, "-avx2") == (16, 0)
-    assert widths_of(linux, "") == (16, 0)
-    assert widths_of("aarch64-apple-darwin", "+neon,+avx2") == (0,)
-    assert widths()[-1] == 0
-    assert set(widths()) <= set(WIDTHS)
-
-
-#: Run by a process that compiles for another processor than that it runs on.
-FOREIGN = """
-import numpy as np
-from sceneprint.geometry.retrieval.scanners import widths
-from sceneprint.geometry.retrieval.ranking import scan
-x = np.arange(7000, dtype=np.uint64).reshape(7, 1000).astype(np.uint8)
-right = np.abs(x.astype(int)[:, None] - x.astype(int)).sum(axis=2)
-assert all((scan(x, x, np.arange(7), width=w) == right).all() for w in widths())
-print(*widths())
-"""
-
-
-@pytest.mark.thorough
-@pytest.mark.skipif(16 not in widths(), reason="not an x86")
-def test_code_for_an_old_processor_uses_nothing_that_it_lacks(tmp_path: Path) -> None:
-    """The compiler aborts at what its target lacks; and no code is taken from another's cache."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    for name, own in (("generic", "16 0"), ("", " ".join(map(str, widths())))):
-        done = subprocess.run(
-            [sys.executable, "-c", FOREIGN],
-            env={**environment, "NUMBA_CPU_NAME": name} if name else environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert (done.stdout.strip(), done.returncode) == (own, 0), done.stderr
-
-
-@pytest.mark.parametrize("width", [w for w in widths() if w])
-def test_the_instruction_is_there(width: int) -> None:
-    """As often as rows and queries are compared at once: nothing is kept in memory between."""
-    compiled = numba.njit(SCANNERS[width].py_func)  # type: ignore[attr-defined]
-    x = random_bytes(0, 8, 300)
-    arrays = [frozen(a) for a in (x, x, np.arange(8))]
-    compiled(*arrays, False, 4096, np.zeros((8, 8), np.int64))
-    (code,) = compiled.inspect_asm().values()
-    register = {64: "%zmm", 32: "%ymm", 16: "%xmm"}[width]
-    lines = [line for line in code.splitlines() if "psadbw" in line and register in line]
-    assert len(lines) >= 4 * QUERIES[width] + 4 + 1
+    assert scan(asked, stored, rows).tolist() == expected
+    assert scan(asked[1:], stored, rows).tolist() == expected[1:]

@@ -13,7 +13,6 @@ from prometheus_client.metrics import MetricWrapperBase
 
 from sceneprint import settings
 from sceneprint.cli import parser
-from sceneprint_client.api.admin import ReplicaSeen
 from service.metrics import Metrics
 from tools.site.markup import cell, code, fenced, page, plain, table
 
@@ -150,7 +149,6 @@ class MetricFamily:
 def metric_families() -> list[MetricFamily]:
     """All families that a service serves, also those without data, by name."""
     metrics = Metrics()
-    metrics._tell_replica(ReplicaSeen(used=True, behind_s=0.5))  # told only where there is one
     found = set()
     for collector in metrics.registry._collector_to_names:  # `collect` leaves out empty ones
         assert isinstance(collector, MetricWrapperBase)

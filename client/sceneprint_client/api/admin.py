@@ -169,16 +169,6 @@ class WorkerSeen(ApiRecord):
     job_id: str | None = Field(description="What it is at.")
 
 
-class ReplicaSeen(ApiRecord):
-    """The read replica, as the process that answers sees it."""
-
-    used: bool = Field(description="Whether queries are answered from it; its log says why not.")
-    behind_s: float | None = Field(
-        description="What was stored or deleted so many seconds ago, or earlier, is in it; null: "
-        "not known."
-    )
-
-
 class Latency(ApiRecord):
     """Times within which so many of the answers came, seconds; right to a tenth."""
 
@@ -267,10 +257,6 @@ class Stats(ApiRecord):
     bytes: Sizes = Field(description="On the disk; measured at most twice a minute.")
     use: MapUse | None = Field(
         default=None, description="Against quota and retention; null where no map was asked for."
-    )
-    replica: ReplicaSeen | None = Field(
-        default=None,
-        description="Null where there is none, or a map was asked for.",
     )
     scrub: ScrubSeen | None = Field(
         default=None, description="Null where none has begun, or a map was asked for."
@@ -413,11 +399,10 @@ KINDS = {
         "It was removed; no query finds it. `data.reason` is `retention` where its map keeps none "
         "so old."
     ),
-    "frame.restored": "Its deletion was undone; what was indexed is signed again.",
+    "frame.restored": "Its deletion was undone; queries find it again at once if it was indexed.",
     "query.answered": (
         "A query was answered, or failed; `data` has `query_id`, `status`, `robot`, `pose` where "
-        "it was found, and more of its record; `offline` where a robot answered it itself, and "
-        "sent the record later."
+        "it was found, and more about it."
     ),
     "import.done": "An archive was imported, as far as it could be; `data` is its result.",
     "association.found": "A job that looked for associations is over; `data` is its result.",

@@ -598,12 +598,6 @@ class Answer(ApiRecord):
         default=None,
         description="Whether candidates were left out for want of time; null without a deadline.",
     )
-    replica_behind_s: float | None = Field(
-        default=None,
-        description="Answered from a read replica: what was stored or deleted so many seconds "
-        "before the query came, or earlier, is taken into account. Null: answered from the "
-        "database itself, as of now.",
-    )
     explanations: list[Explanation] | None = Field(
         default=None, description="With `explain`: every frame of the ranking, the nearest first."
     )

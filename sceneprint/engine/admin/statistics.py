@@ -49,7 +49,6 @@ from sceneprint_client.api.admin import (
     Latency,
     MapUse,
     Minute,
-    ReplicaSeen,
     ScrubSeen,
     Sizes,
     Stats,
@@ -330,7 +329,6 @@ class Statistics:
             workers=workers,
             bytes=taken,
             use=None if row is None else _use(row),
-            replica=self.replica() if row is None else None,
             scrub=scrub,
             total=Counted(**_recent_counts(happened, range(minutes), samples)),
             minutes=_minutes(happened, samples, start, minutes),
@@ -386,14 +384,6 @@ class Statistics:
         )
         self._counts = found
         return found
-
-    def replica(self) -> ReplicaSeen | None:
-        """How the read replica does, if there is one."""
-        if self._store.replica is None:
-            return None
-        found = self._store.replica.standing()
-        behind_s = None if found.behind_s is None else round(found.behind_s, 3)
-        return ReplicaSeen(used=found.used, behind_s=behind_s)
 
     def began(self, worker: str) -> None:
         """Note that a worker has begun; where that cannot be written, nobody will know."""

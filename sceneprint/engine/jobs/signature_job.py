@@ -22,7 +22,6 @@ from sceneprint.formats.artifact import write_geometry
 from sceneprint.geometry.retrieval.ranking import Metric, distance_share, distances
 from sceneprint.models import Model
 from sceneprint.pipeline import prepare
-from sceneprint.process import span
 from sceneprint.store import Database, Store, queue
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import find_map, frame_of, geometry_blobs, map_of
@@ -144,13 +143,10 @@ def _make(store: Store, signers: Signers, work: lifecycle.Work) -> Made:
     if work.model_id not in models_of(work.map):
         raise lifecycle.Outdated
     signer = signers(work.model_id)
-    with span("decode"):
-        frame = read_stored(store.blobs.get(work.frame.blob), work.frame, store.decoders)
-    with span("sign"):
-        signature, geometry = prepare(frame, signer)
+    frame = read_stored(store.blobs.get(work.frame.blob), work.frame, store.decoders)
+    signature, geometry = prepare(frame, signer)
     artifact = write_geometry(geometry)
-    with span("artifact"):
-        blob = store.blobs.put(artifact)
+    blob = store.blobs.put(artifact)
     stored = StoredSignature(
         model_id=signature.model_id,
         vector=signature.vector.tobytes(),
@@ -171,8 +167,7 @@ def _store_patiently(
     until = time.monotonic() + AWAY_S
     while True:
         try:
-            with span("commit"):
-                return _store(store, signers, readers, work, made)
+            return _store(store, signers, readers, work, made)
         except errors.StoreAway:
             if time.monotonic() > until:
                 raise

@@ -52,8 +52,7 @@ from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.localization import PoseEstimate, PosePrior, QueryFrame, unconfirmed
 from sceneprint.models import Model
 from sceneprint.pipeline import PairMatch, searched
-from sceneprint.process import record_span
-from sceneprint.store import Store, behind_s
+from sceneprint.store import Store
 from sceneprint.store.maps import frames_of
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats, Geometry
@@ -71,7 +70,6 @@ class _Clock:
     def stage(self, name: str) -> None:
         now = time.perf_counter()
         self.spent[name] = round(1e3 * (now - self._since), 2)
-        record_span(name, now - self._since)
         self._since = now
 
 
@@ -192,7 +190,7 @@ def _with_rivals(
     )  # fmt: skip
     if more is None:
         return last
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         rows = frames_of(connection, [one.index for one in more.matches])
     return replace(
         last,
@@ -258,7 +256,7 @@ def _attempt(
     tried = validated(store, searched, first, asked.geometry, query, deadline, p, asked.up)
     clock.stage("validate")
     shown = range(len(ranking)) if query.explain else chosen
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         rows = frames_of(connection, ranking.indices[list(shown)].tolist())
     matches = [one for one in tried.matches if one.index in rows]  # the rest was deleted meanwhile
     return _Attempt(asked, searched, selection, among, scales, chosen, tried, rows, matches)
@@ -319,7 +317,6 @@ def _answer(
         frames=1 + earlier,
         per_map=_per_map(places, counts) if len(places) > 1 else None,
         deadline_reached=None if tried.late is None else tried.late or last.late,
-        replica_behind_s=behind_s(),
         explanations=explanations,
         explained_frame=explained,
     )

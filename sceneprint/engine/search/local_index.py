@@ -38,7 +38,6 @@ from sceneprint.index import (
 )
 from sceneprint.index.generation_files import SCHEMA_VERSION, GenerationManifest, Keys
 from sceneprint.models import Model
-from sceneprint.store import require_primary
 from sceneprint.store.events import holds_anchor
 from sceneprint.store.signatures import SignatureChange, changes_since, count_indexed
 from sceneprint.store.tables import MapRow
@@ -266,7 +265,6 @@ def trusted(connection: Connection, row: MapRow, found: Published | None) -> Pub
         return None
     if found.revision <= row.revision and holds_anchor(connection, found.anchor):
         return found
-    require_primary("the state of an index")
     return None
 
 
@@ -322,8 +320,6 @@ class Reader:
         """The map as of the row's revision, or later."""
         self._asked = time.monotonic()
         behind = self._view.revision < row.revision
-        if self._view.revision > row.revision:
-            require_primary("what is held of a map")
         # who only looks for a newer generation waits for nobody
         if (behind or self._is_time()) and self._lock.acquire(blocking=behind):
             try:

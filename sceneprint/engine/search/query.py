@@ -40,7 +40,7 @@ from sceneprint.geometry.retrieval.ranking import distances, similarity
 from sceneprint.geometry.rigid import inverse
 from sceneprint.models import PRESETS, read_model
 from sceneprint.pipeline import Signer, validate
-from sceneprint.store import Store, read_through
+from sceneprint.store import Store
 from sceneprint.store.maps import find_maps, list_maps, model_names, unknown_map
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats
@@ -79,7 +79,7 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
     UnknownMap : one of them is none.
     Busy : a map switched again and again.
     """
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         rows = find_maps(connection, maps)
     for _ in range(TRIES):
         try:
@@ -117,7 +117,7 @@ def check_model(one: str, other: str) -> None:
 def _other_models(store: Store, rows: Sequence[MapRow]) -> list[MapRow] | None:
     """The maps where one of them has another model by now, or None."""
     try:
-        with store.queried.read() as connection:
+        with store.database.read() as connection:
             now = find_maps(connection, [row.name for row in rows])
     except UnknownMap:
         return None
@@ -167,7 +167,7 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
 
     names = [side.map for side in sides if isinstance(side, NamedFrame)]
     maps = list(dict.fromkeys(names))
-    return read_through(store.replica, lambda: steadily(store, maps, ask))
+    return steadily(store, maps, ask)
 
 
 def _compared(a: PreparedQuery, b: PreparedQuery, signer: Signer, how: Comparison) -> Similarity:
@@ -202,7 +202,7 @@ def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Compari
     """What signs the uploads: with the model of the stored frames, if there are any."""
     if not rows:
         return signers.of(read_model(how.model or PRESETS[0]))
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         names = model_names(connection)
     told = [f"{row.name} has {model_label(names[row.model_id], row.model_id)}" for row in rows]
     if len({row.model_id for row in rows}) > 1:
@@ -380,7 +380,7 @@ class Queries:
         earlier: Sequence[SequenceFrame] = (), sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
         """Answer from the maps as they are now; ModelMismatch where one has switched meanwhile."""
-        database = self._store.queried
+        database = self._store.database
         with database.read() as connection:
             rows = find_maps(connection, [one.name for one in asked_of])
             for row, one in zip(rows, asked_of, strict=True):
@@ -423,7 +423,7 @@ class Queries:
 
     def _steadily(self, maps: Sequence[str], ask: Callable[[list[MapRow]], Answer]) -> Answer:
         with self._cores.lent():
-            return read_through(self._store.replica, lambda: steadily(self._store, maps, ask))
+            return steadily(self._store, maps, ask)
 
     def compare(self, a: Side, b: Side, how: Comparison) -> Similarity:
         """Compare two frames; see `compare`."""
@@ -465,7 +465,7 @@ class Queries:
     def _check_models(self, rows: Sequence[MapRow]) -> None:
         if len({row.model_id for row in rows}) == 1:
             return
-        with self._store.queried.read() as connection:
+        with self._store.database.read() as connection:
             names = model_names(connection)
         told = {row.name: model_label(names[row.model_id], row.model_id) for row in rows}
         which = ", ".join(f"{name} has {model}" for name, model in told.items())

@@ -425,7 +425,7 @@ def _locate_frame(asking: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapS
     """The frame, and what is searched of its map: the first that has one which can be found."""
     parts, own = asking.searched.parts, asking.asked.frame
     held, missing = [], None
-    with asking.store.queried.read() as connection:
+    with asking.store.database.read() as connection:
         for part in parts:
             try:
                 held.append((part, find_frame(connection, part.place.row, frame_id)))
@@ -501,7 +501,7 @@ def _aligned(
                 status="skipped", reason="the deadline passed before it was validated"
             ), None
         model_id = part.place.row.model_id
-        with asking.store.queried.read() as connection:
+        with asking.store.database.read() as connection:
             blob = geometry_blobs(connection, [row.number], model_id).get(row.number)
             ranked = asking.searched.ranking.indices.tolist()
             up = known_ups(connection, [*ranked, row.number]).get(row.number)

@@ -213,7 +213,7 @@ def prepare_stored(
     DamagedBlob : what was made of it is damaged, and its upload too.
     """
     start = time.perf_counter()
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         row = find_map(connection, map_name)
         frame = find_frame(connection, row, frame_id)
         try:
@@ -223,7 +223,7 @@ def prepare_stored(
             vector, damaged = b"", True
         blobs = geometry_blobs(connection, [frame.number], row.model_id)
         up = known_ups(connection, [frame.number]).get(frame.number)
-    if vector is None:
+    if vector is None or frame.deletion is not None:
         raise errors.InvalidRequest(
             f"Frame {frame_id} is {frame.state}: {frame.state.sentence} Only an indexed frame "
             "can be a query.",
@@ -239,7 +239,7 @@ def prepare_stored(
             artifact = store.blobs.get(blobs[frame.number])
             geometry = read_geometry(artifact)
         except (errors.DamagedBlob, errors.UnreadableGeometry):
-            with store.queried.read() as connection:
+            with store.database.read() as connection:
                 if not refers_to(connection, blobs[frame.number]):
                     raise errors.UnknownFrame(
                         f"Frame {frame_id} of map {map_name!r} was deleted during the query."
@@ -435,6 +435,6 @@ def _among(
 ) -> Keys:
     """Frames of a view that pass a filter; the database may be newer or older than the view."""
     view = place.view
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         numbers = passing(connection, place.row.number, wanted, asked.taken)
     return numbers[view.has(numbers) & ~np.isin(numbers, list(dead))]

@@ -127,7 +127,7 @@ def validated(
     if geometry is None:
         return Validated(chosen, [], {}, NOT_ASKED, deadline.reached)
     ranking, model_id = searched.ranking, searched.parts[0].place.row.model_id
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         blobs = geometry_blobs(connection, ranking.indices[list(chosen)].tolist(), model_id)
         ups = {} if up is None else known_ups(connection, ranking.indices.tolist())
         viewpoints = [] if known is not None else viewpoints_among(connection, list(blobs))
@@ -185,7 +185,7 @@ def validate_elsewhere(
         return None
 
     def posed(numbers: Sequence[int]) -> dict[int, PosedFrame]:
-        with store.queried.read() as connection:
+        with store.database.read() as connection:
             found = viewpoints_among(connection, numbers)
         return {
             one.number: PosedFrame(parent_key(one), one.pose, not one.is_cloud) for one in found
@@ -291,7 +291,7 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
             (("prior.pose", "too far off"),),
         )
     row, name = places[0].row, str(given.pose.parent_frame)
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         if not has_parent_frame(connection, row.number, name):
             raise InvalidRequest(
                 f"No frame of map {row.name!r} has a pose in the parent frame {name!r} of the "
@@ -341,7 +341,7 @@ def nearest_first(
     store: Store, ranking: Ranking, chosen: Sequence[int], prior: PosePrior
 ) -> list[int]:
     """Candidates, positions in R, those that were taken near a prior first, else as they were."""
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         found = viewpoints_among(connection, ranking.indices[list(chosen)].tolist())
     posed = {one.number: one for one in found}
 
@@ -365,7 +365,7 @@ def _near_frames(
     part = next(one for one in searched.parts if one.place.row.number == int(number))
     cells = np.unique(np.round(at[:, :3, 3] / _CELL_M), axis=0, return_index=True)[1]
     found: dict[int, PlacedFrame] = {}
-    with store.queried.read() as connection:
+    with store.database.read() as connection:
         for centre in at[np.sort(cells)[:_MOST_PLACES], :3, 3].tolist():
             for within in reaches:
                 near = placed_frames(

@@ -28,34 +28,22 @@ from sceneprint.types import Bytes, Floats
 
 Ints64 = NDArray[np.int64]
 
-# Sec. III-C, the sums behind a similarity: the loops of `retrieval`, as fast as memory allows.
+# Sec. III-C, the sums behind a similarity.
 #
 #     queries (Q, n), database (N, n) uint8, rows (r,)  --scan-->  (Q, r) sums of integers
-#
-# On x86 sums of |x - y| are those of `psadbw`. Elsewhere, and for squares, the loop in plain words
-# serves. All give the same integers.
 
-#: Rows that take turns at one tile of columns, and bytes of a tile: these of all queries stay in
-#: a core's cache while the rows pass. A tile of a page each keeps the order of memory.
-GROUP, TILE = 16, 4096
+#: Rows that take turns at one tile of columns, and bytes of the tiles of all queries together:
+#: these stay in a core's cache while the rows pass. Shorter tiles cost more in calls.
+GROUP, _CACHED, _SHORTEST = 16, 262144, 4096
 
 #: Bytes summed in 32 bits before they move to 64: the last power of 2 of which 255^2 each fit.
 BLOCK = 32768
 
-#: The same of the loop in plain words, whose calls cost more than sums in shorter tiles.
-_CACHED, _SHORTEST = 262144, 4096
-
 
 def scan(
-    queries: Bytes,
-    database: Bytes,
-    rows: Ints64,
-    *,
-    squared: bool = False,
-    half: bool = False,
-    width: int | None = None,
+    queries: Bytes, database: Bytes, rows: Ints64, *, squared: bool = False, half: bool = False
 ) -> Ints64:
-    """Sums of |x - y|, or of (x - y)^2, over the bytes of every query and row.
+    """Sum |x - y|, or (x - y)^2, over the bytes of every query and row.
 
     Parameters
     ----------
@@ -64,25 +52,14 @@ def scan(
     rows : (r,) of the database, each from 0 to N - 1: not checked here
     squared : sum squares
     half : only entries (q, i) with q < i mean something; the others may be anything
-    width : bytes at a time, of `scanners.widths`; the widest where it is not given
 
     Returns
     -------
     (Q, r) int64
     """
     result = np.zeros((len(queries), len(rows)), np.int64)
-    if not squared and width != 0:
-        from sceneprint.geometry.retrieval.scanners import SCANNERS, widths
-
-        width = widths()[0] if width is None else width
-    if squared or width is None or width == 0:
-        tile = max(_CACHED // max(len(queries), 1), _SHORTEST)
-        _plain(frozen(queries), frozen(database), frozen(rows), squared, half, tile, result)
-    else:
-        # one query stays in the cache whole, and a row is read without a break
-        tile = TILE if len(queries) > 1 else max(queries.shape[1], TILE)
-        scanner = SCANNERS[width]
-        scanner(frozen(queries), frozen(database), frozen(rows), half, tile, result)
+    tile = max(_CACHED // max(len(queries), 1), _SHORTEST)
+    _sums(frozen(queries), frozen(database), frozen(rows), squared, half, tile, result)
     return result
 
 
@@ -115,7 +92,7 @@ def _squares(a: Bytes, b: Bytes) -> int:
 
 
 @kernel
-def _plain(
+def _sums(
     queries: Bytes,
     database: Bytes,
     rows: Ints64,
@@ -124,7 +101,7 @@ def _plain(
     tile: int,
     result: Ints64,
 ) -> None:
-    """Add to result (Q, r), on any processor."""
+    """Add to result (Q, r)."""
     n = queries.shape[1]
     for group in range(0, len(rows), GROUP):
         for start in range(0, n, tile):

@@ -1,1 +1,1 @@
-"""What only a PostgreSQL server has: locks, replicas."""
+"""What only a PostgreSQL server has: connections and locks."""

@@ -40,15 +40,8 @@ schema does, as Helm repeats a value that does not match, and with it the passwo
 {{/* The environment of every pod; no ConfigMap, as the migration runs before one would be there. */}}
 {{- define "sceneprint.env" -}}
 {{- include "sceneprint.checkUrl" (dict "name" "url" "url" .Values.database.url) -}}
-{{- with .Values.database.replicaUrl -}}
-{{- include "sceneprint.checkUrl" (dict "name" "replicaUrl" "url" .) -}}
-{{- end -}}
 - name: SCENEPRINT_DATABASE_URL
   value: {{ .Values.database.url | quote }}
-{{- with .Values.database.replicaUrl }}
-- name: SCENEPRINT_REPLICA_URL
-  value: {{ . | quote }}
-{{- end }}
 - name: SCENEPRINT_BLOB_URL
   value: {{ .Values.blobs.url | quote }}
 {{- range $name, $value := .Values.env }}
