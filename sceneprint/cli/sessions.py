@@ -275,7 +275,7 @@ def run_associate(options: argparse.Namespace) -> int:
     wanted = {name: value for name, value in times.items() if value is not None}
     with (
         open_client(options) as client,
-        open_scene(options, f"associate {options.map}") as stream,
+        open_scene(options) as stream,
         tqdm(desc="associate", unit="frame", disable=None) as bar,
     ):
 
