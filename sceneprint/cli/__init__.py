@@ -37,6 +37,7 @@ COMMANDS = {
     "associate": "sessions",
     "frames": "inventory",
     "sessions": "sessions",
+    "reconstruct": "reconstruct",
     "jobs": "inventory",
     "bag": "bag",
     "doctor": "doctor",

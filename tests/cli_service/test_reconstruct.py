@@ -1,0 +1,67 @@
+"""`sceneprint reconstruct` against a real service."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics
+from sceneprint.lab.synth import synthesise_room
+from sceneprint_client import Client
+
+Run = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six views of one room that overlap."""
+    folder = tmp_path_factory.mktemp("walk") / "room" / "seq-01"
+    folder.mkdir(parents=True)
+    for number, frame in enumerate(synthesise_room(33, 1, 6).frames):
+        write_intrinsics(folder, Camera(frame.intrinsics))
+        write_depth_png(folder / f"frame-{number:06d}.depth.png", frame.depth, 1000.0)
+    return folder
+
+
+def test_a_mesh_and_its_figures(
+    sceneprint: Run, service_url: str, walk: Path, tmp_path: Path, with_open3d: None
+) -> None:
+    with Client(service_url) as client:
+        client.create_map("walk", model="depth")
+    first, *rest = sorted(walk.glob("*.png"))
+    for path in rest:
+        sceneprint("upload", "walk", path)
+    mesh = tmp_path / "mesh.ply"
+    said = sceneprint("reconstruct", "walk", first, "--out", mesh, "--voxel", "0.05")
+    lines = said.stdout.splitlines()
+    total = re.search(r"(\d+) views show ([\d.]+) m2 of surface", lines[1])
+    assert total is not None
+    views = [line for line in lines if re.search(r"\+ *[\d.]+ m2", line)]
+    assert len(views) == int(total[1])
+    assert "the frame itself" in views[0]
+    assert float(views[-1].split()[-1]) == pytest.approx(float(total[2]), abs=0.01)
+    assert lines[-1] == f"wrote {mesh}"
+    assert mesh.read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\n")
+    # a stored frame finds the others, and is fused as it was sent
+    sceneprint("upload", "walk", first)
+    with Client(service_url) as client:
+        [*_, frame_id] = [frame.frame_id for frame in client.frames("walk")]
+    said = sceneprint("reconstruct", "walk", frame_id, "--out", mesh, "--cloud", "--voxel", "0.05")
+    assert "a cloud" in said.stdout
+    assert b"element face" not in mesh.read_bytes()[:1000]
+
+
+def test_what_cannot_be_reconstructed(sceneprint: Run, service_url: str, walk: Path) -> None:
+    with Client(service_url) as client:
+        client.create_map("nothing", model="depth")
+    first = min(walk.glob("*.png"))
+    said = sceneprint("reconstruct", "nothing", first, expect=1)
+    assert said.stdout == f"{first}: not found, so there is nothing to fuse\n"
+    said = sceneprint("reconstruct", "nothing", walk, expect=2)
+    assert "6 frames found. Name a single frame file." in said.stderr
+    said = sceneprint("reconstruct", "nothing", "nobody", expect=2)
+    assert "There is no frame 'nobody'" in said.stderr
