@@ -23,7 +23,6 @@ from sceneprint.cli.options import (
     open_client,
     open_scene,
     up_of,
-    wants_scene,
 )
 from sceneprint.errors import InvalidRequest
 from sceneprint.models import PRESETS
@@ -129,10 +128,10 @@ def run_frames(options: argparse.Namespace) -> int:
         raise InvalidRequest(f"--{of_one[0]} applies to one frame. Give its id after the map.")
     if options.trajectory is not None and len(options.session or ()) != 1:
         raise InvalidRequest("--trajectory needs a session. Name it with --session.")
-    if options.trajectory is not None and wants_scene(options):
+    if options.trajectory is not None and options.mcap is not None:
         raise InvalidRequest("--trajectory writes no scene. Run the command once for each.")
     check_scene(options)
-    with open_client(options) as client, open_scene(options, f"frames {options.map}") as stream:
+    with open_client(options) as client, open_scene(options) as stream:
         if options.frame_id is not None:
             frame = _one(client, options)
             if stream is not None:

@@ -168,7 +168,7 @@ def run_query(options: argparse.Namespace) -> int:
         how["maps"] = "*" if options.map == "*" else [options.map, *options.also]
     check_overlay(options, len(references))
     failed = 0
-    with open_client(options) as client, open_scene(options, f"query {options.map}") as stream:
+    with open_client(options) as client, open_scene(options) as stream:
         scene = _answer_scene(client, stream, references, options)
         for reference in references:
             try:
@@ -405,7 +405,7 @@ def run_localize(options: argparse.Namespace) -> int:
     chosen = _frames_to_localize(options, every)
     how = {**options_of(options), "prior": options.prior}
     lost = failed = 0
-    with open_client(options) as client, open_scene(options, f"localize {options.map}") as stream:
+    with open_client(options) as client, open_scene(options) as stream:
         scene = _answer_scene(client, stream, chosen, options)
         for reference in chosen:
             before = _frames_before(options, every, reference)

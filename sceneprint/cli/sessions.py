@@ -122,7 +122,7 @@ def _delete_session(client: Client, options: argparse.Namespace) -> None:
 
 
 def _undo(client: Client, map_name: str, deletion_id: str) -> None:
-    done = client.restore_frames(map_name, deletion_id)
+    done = client.restore_deletion(map_name, deletion_id)
     print(f"restored {done.frames} frames")
     for one in done.refused:
         print(f"not restored: {one.frame_id}: {one_line(one.reason)}")
@@ -275,7 +275,7 @@ def run_associate(options: argparse.Namespace) -> int:
     wanted = {name: value for name, value in times.items() if value is not None}
     with (
         open_client(options) as client,
-        open_scene(options, f"associate {options.map}") as stream,
+        open_scene(options) as stream,
         tqdm(desc="associate", unit="frame", disable=None) as bar,
     ):
 

@@ -25,13 +25,13 @@ from sqlalchemy import (
     union,
 )
 
+from sceneprint.store.frames import not_purged
 from sceneprint.store.maps import ROOMLESS
 from sceneprint.store.tables import (
     FRAME_COLUMNS,
     FrameRow,
     MapRow,
     count_rows,
-    deleted_frames,
     frame_rows,
     frame_tags,
     frames,
@@ -260,6 +260,8 @@ def _listing_conditions(map_number: int, wanted: FrameListing) -> list[ColumnEle
         found += _begins(c.name, wanted.name)
     if wanted.find is not None:
         found.append(_known_as(map_number, wanted.find))
+    if wanted.state == FrameState.DELETED and found:
+        found.append(c.deletion.is_(None))  # nothing is told of what a tombstone has
     return found
 
 
@@ -571,10 +573,7 @@ def _posed_in(map_number: int, session: str) -> list[ColumnElement[bool]]:
 def any_gone(connection: Connection, numbers: Iterable[int]) -> bool:
     """Whether any of some frames is not there any more, and cannot be restored either."""
     own = set(numbers)
-    there = (frames.c.state != FrameState.DELETED) | frames.c.number.in_(
-        select(deleted_frames.c.frame_number)
-    )
-    asked = select(frames.c.number).where(there)
+    asked = select(frames.c.number).where(not_purged())
     return len(own) > sum(1 for _ in rows_among(connection, asked, frames.c.number, own))
 
 
@@ -709,39 +708,6 @@ def weights_of(
 
 _OTHERS = tuple(state for state in FrameState if state != FrameState.INDEXED)
 _KEPT = tuple(state for state in FrameState if state not in ROOMLESS)
-
-
-def indexed_by_time(
-    connection: Connection, map_number: int, start: float, width_s: float
-) -> Counter[int]:
-    """How many frames that are indexed now became so in each interval since a time.
-
-    The index of times lacks the state, and reading every row for it would be slow: all are
-    counted, and those that are no longer indexed, which another index names, are taken off.
-
-    Parameters
-    ----------
-    connection : of the database
-    map_number : of the map
-    start : when the first interval begins, seconds since 1970
-    width_s : of an interval, seconds
-
-    Returns
-    -------
-    counts : by the number of the interval
-    """
-    at = frames.c.indexed_at
-    interval = (at - start) // width_s
-    asked = select(interval, func.count()).where(frames.c.map_number == map_number)
-    every = connection.execute(asked.where(at >= start).group_by(interval))
-    counts = Counter({int(place): n for place, n in every})
-    # adding 0 is how SQLite is told to go by the state
-    gone = connection.execute(
-        asked.where(frames.c.state.in_(_OTHERS), at + 0 >= start).group_by(interval)
-    )
-    for place, n in gone:
-        counts[int(place)] -= n
-    return counts
 
 
 def frames_with_uploads(

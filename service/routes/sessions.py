@@ -7,13 +7,12 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request, Response
 
-from sceneprint.engine.maps.map_frames import growth, list_sessions, trajectory, trajectory_file
+from sceneprint.engine.maps.map_frames import list_sessions, trajectory, trajectory_file
 from sceneprint.engine.maps.selections import delete_session, edit_session
 from sceneprint.engine.sessions.associations import MEDIA_TYPES
 from sceneprint_client.api import Page
 from sceneprint_client.api.base import Label
 from sceneprint_client.api.listing import Run, Session, SessionChange, SessionEdit, Trajectory
-from sceneprint_client.api.maps import Growth, GrowthOf
 from sceneprint_client.api.sessions import Association, Edge, Graph, GraphFormat, NewAssociation
 from service.auth import Here, may_read, may_write, v1_router
 from service.bodies import read_record
@@ -60,7 +59,7 @@ async def delete_session_frames(
     """Delete all frames of a session.
 
     A call ends after ten seconds: repeat it while `remaining` is not 0. Ten minutes by default,
-    POST /v1/maps/{map_name}/restore undoes it.
+    POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes it.
     """
     async with here.uploads.place():
         return await here.uploads.run(
@@ -69,8 +68,8 @@ async def delete_session_frames(
                 here.engine.store,
                 map_name,
                 session,
+                here.engine.tombstones,
                 robot,
-                undo=here.engine.undo_limits,
             )
         )
 
@@ -128,12 +127,6 @@ async def get_trajectory(
     async with here.gate.place():
         data = await here.gate.run(make)
     return Response(data, 200, {"Vary": "Accept"}, kind)
-
-
-@router.get("/growth", responses=declared(404, 422))
-def get_growth(map_name: str, here: Here, asked: Annotated[GrowthOf, Query()]) -> Growth:
-    """How many frames a map has, by the hour or the day (UTC) in which they were indexed."""
-    return growth(here.engine.store, map_name, asked.by, asked.last)
 
 
 # Associations: sessions joined, loops closed.

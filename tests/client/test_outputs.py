@@ -100,10 +100,6 @@ def test_a_run_and_its_poses(
         "r2", "room-0/seq-01", {"indexed": 3},
     )  # fmt: skip
     assert (session.first_captured_at, session.with_pose) == (START, 3)
-    grown = client.growth(map_name, "hour", 400)
-    assert grown.indexed == grown.buckets[-1].total == client.map(map_name).frames["indexed"]
-    with pytest.raises(InvalidRequest, match="last"):
-        client.growth(map_name, last=401)
     thin = client.trajectory(map_name, "room-0/seq-01", most=2)
     assert (len(thin.poses), thin.posed > 2) == (2, True)
     told = client.trajectory(map_name, "room-0/seq-01", captured_after=START + timedelta(seconds=1))

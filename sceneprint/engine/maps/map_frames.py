@@ -9,7 +9,6 @@ import base64
 import io
 import json
 import math
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -32,12 +31,10 @@ from sceneprint.store.frame_queries import (
     Held,
     TakenPosition,
     count_run,
-    indexed_by_time,
     list_runs,
     poses_of_run,
     stamps_of_run,
 )
-from sceneprint.store.frames import count_states
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs, model_names
 from sceneprint.store.opaque_ids import invalid_cursor
 from sceneprint.store.signatures import patch_counts, stored_vector
@@ -46,7 +43,6 @@ from sceneprint.types import Geometry, Hierarchy, Intrinsics, Ints32, Patches, S
 from sceneprint_client.api import Frame, FrameState, Page
 from sceneprint_client.api.base import MOST_SEQUENCE
 from sceneprint_client.api.listing import FrameListing, Run, Session, Trajectory
-from sceneprint_client.api.maps import By, Grown, Growth
 from sceneprint_client.api.results import CloudFrame, FramePatches, FrameSignature, PatchLevel, View
 from sceneprint_client.files import is_point_cloud
 
@@ -343,32 +339,6 @@ def _packed(values: list[Any]) -> str:
 
 def _unpacked(text: str) -> Any:
     return json.loads(base64.urlsafe_b64decode(text + "=" * (-len(text) % 4)))
-
-
-# How a map grew: frames by the hour or the day in which they were indexed.
-
-WIDTHS_S: dict[By, float] = {"hour": 3600.0, "day": 86400.0}
-
-
-def growth(store: Store, map_name: str, by: By = "day", last: int = 30) -> Growth:
-    """How many of a map's frames were indexed in each of the last hours or days, of UTC.
-
-    `last` is how many, with the one that is not over. UnknownMap where there is no such map.
-    """
-    width = WIDTHS_S[by]
-    start = (time.time() // width - last + 1) * width
-    with store.database.read() as connection:
-        row = find_map(connection, map_name)
-        indexed = count_states(connection, row.number).get(FrameState.INDEXED, 0)
-        counts = indexed_by_time(connection, row.number, start, width)
-    ahead = sum(n for place, n in counts.items() if place >= last)
-    counts[last - 1] += ahead  # by a clock that was set back since
-    total = before = indexed - sum(counts[place] for place in range(last))
-    buckets: list[Grown] = []
-    for place in range(last):
-        total += counts[place]
-        buckets.append(Grown(at=when(start + place * width), indexed=counts[place], total=total))
-    return Growth(map=row.name, by=by, indexed=indexed, before=before, buckets=buckets)
 
 
 # Something that can be made of a frame, and how it is told.

@@ -248,10 +248,9 @@ def _numbers(connection: Connection) -> Iterator[tuple[str, int]]:
 BUSY_S = 30.0
 #: The digests of all blobs that have to be there.
 _REFERRED = (
-    "SELECT blob AS digest FROM frames WHERE state NOT IN"
+    "SELECT blob AS digest FROM frames WHERE deletion IS NOT NULL OR state NOT IN"
     f" ('{FrameState.DELETED}', '{FrameState.REDUNDANT}')"
     " UNION ALL SELECT geometry FROM signatures"
-    " UNION ALL SELECT blob FROM deleted_frames WHERE blob IS NOT NULL"
     " UNION ALL SELECT blob FROM job_files"
     " UNION ALL SELECT blob FROM surface_tiles WHERE blob IS NOT NULL"
     " UNION ALL SELECT draft FROM surface_tiles WHERE draft IS NOT NULL"

@@ -1,4 +1,4 @@
-// A line of a few numbers as small as a word: growth on a map's card. No axes: the label tells the gist.
+// A line of a few numbers as small as a word: jobs that wait. No axes: the label tells the gist.
 // In a file of its own, since the first page has a budget that charts.js would burst.
 
 import { svg } from "./dom.js";

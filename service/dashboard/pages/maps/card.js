@@ -1,16 +1,12 @@
-// A map as a card: what is in it, how it grew, what it is signed with, how far its index is.
-import { at, get } from "../lib/api.js";
+// A map as a card: what is in it, what it is signed with, how far its index is.
+import { get } from "../lib/api.js";
 import { h, once, put, svg } from "../lib/dom.js";
 import { bytes, count } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
-import { sparkline } from "../lib/sparkline.js";
 
 const PENCIL = "M4 20h4L19 9l-4-4L4 16zM13 7l4 4";
 const BIN = "M5 7h14M10 7V4h4v3M7 7l1 13h8l1-13M10 11v5M14 11v5";
-const HOUR_MS = 3600e3;
-const YOUNG_H = 72; // days say nothing of a map of hours
-const DAYS = 30;
 const REST_MS = 4000; // between two looks at figures that cost the service more than counts
 
 /** The dialogs, when they are asked for: the first page does without them. */
@@ -32,7 +28,7 @@ export function mapCard(map, { signal, changed }) {
   const parts = {
     title: h("a", { href: link("maps", map.name, "place") }), name: h("p", { class: "muted mono map-name" }),
     number: h("strong", { class: "map-number" }), badges: h("div", { class: "toolbar badges" }),
-    growth: h("div", { class: "map-growth" }), model: h("dd", { class: "mono" }),
+    first: h("div", { class: "map-first" }), model: h("dd", { class: "mono" }),
     index: h("dd", {}, "…"), disk: h("dd", { class: "number" }, "…"),
   };
   const tools = may("admin", map.name) && h("div", { class: "map-tools" },
@@ -41,7 +37,7 @@ export function mapCard(map, { signal, changed }) {
   const element = h("article", { class: "card map", "aria-labelledby": id, dataset: { map: map.name } },
     h("div", { class: "map-head" }, h("div", {}, h("h2", { id }, parts.title), parts.name), tools),
     h("div", { class: "map-figures" },
-      h("a", { class: "map-count", href: link("maps", map.name) }, parts.number, h("span", { class: "muted" }, " indexed frames")), parts.growth),
+      h("a", { class: "map-count", href: link("maps", map.name) }, parts.number, h("span", { class: "muted" }, " indexed frames")), parts.first),
     parts.badges,
     h("dl", { class: "map-facts" },
       h("div", {}, h("dt", {}, "Model"), parts.model),
@@ -82,21 +78,15 @@ export function mapCard(map, { signal, changed }) {
     filled = Date.now();
     timer = null;
     const look = looks += 1;
-    const { name, created_at } = card.map;
-    const hours = Math.max(2, Math.ceil((Date.now() - Date.parse(created_at)) / HOUR_MS) + 1);
-    const young = hours <= YOUNG_H;
-    const span = young ? { by: "hour", last: hours } : { by: "day", last: DAYS };
+    const { name } = card.map;
     try {
-      const [stats, growth] = await Promise.all([
-        get("stats", { params: { map: name, minutes: 1 }, signal }),
-        get(at("maps", name, "growth"), { params: span, signal }),
-      ]);
+      const stats = await get("stats", { params: { map: name, minutes: 1 }, signal });
       if (look !== looks) return; // a newer one is under way, or was faster
       put(parts.index, lag(stats.indexes.find((one) => one.map === name), stats.frames.indexed ?? 0));
       const { database, blobs, index } = stats.bytes;
       put(parts.disk, h("span", { title: `${bytes(database ?? 0)} signatures, ${bytes(blobs)} uploads and geometry, ${bytes(index)} index` },
         bytes((database ?? 0) + blobs + index)));
-      put(parts.growth, growth.indexed === 0 ? first(name) : grown(growth, young ? "since its creation" : `in ${DAYS} days`));
+      put(parts.first, !stats.frames.indexed && first(name));
     } catch (error) {
       if (error.name === "AbortError" || error.status === 404) return; // left, or removed meanwhile
       if (error.status === 401) throw error;
@@ -132,15 +122,7 @@ function lag(index, indexed) {
   return `generation ${count(index.generation)}, ${index.tail ? `${count(index.tail)} behind` : "up to date"}`;
 }
 
-function grown({ before, indexed, buckets }, span) {
-  const more = indexed - before;
-  const values = [before, ...buckets.map((one) => one.total)];
-  const label = `Indexed frames ${span}: from ${count(before)} to ${count(indexed)}`;
-  return [sparkline(values, { label, width: 120, height: 30 }),
-    h("span", { class: "muted number" }, `${more < 0 ? "−" : "+"}${count(Math.abs(more))} ${span}`)];
-}
-
-/** In place of a line that would be flat: how the map comes by its first frames. */
+/** How an empty map comes by its first frames. */
 function first(map) {
   return may("write", map) && h("a", { class: "button", href: link("maps", map, "upload") }, "Upload frames");
 }

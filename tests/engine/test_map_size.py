@@ -1,4 +1,4 @@
-"""How a map grew, and what it takes on the disk: against counts by hand and the files."""
+"""What a map takes on the disk, and its trajectories: against counts by hand and the files."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import func, select, update
+from sqlalchemy import func, select
 
 from sceneprint.engine import Engine
 from sceneprint.engine.admin import statistics as measuring
-from sceneprint.engine.maps import map_frames as growing
-from sceneprint.engine.maps.map_frames import growth, trajectory, trajectory_file
+from sceneprint.engine.maps.map_frames import trajectory, trajectory_file
 from sceneprint.engine.maps.map_lifecycle import edit_frame
-from sceneprint.errors import UnknownMap
 from sceneprint.formats.dataset import read_trajectory
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, signatures
@@ -22,53 +20,6 @@ from sceneprint_client.api import NewMap
 from sceneprint_client.api.listing import Run
 
 Ids = Callable[[Engine], list[str]]
-HOUR_S = 3600.0
-#: Twenty past the hour, two hours into a day of UTC.
-NOW = 20_000 * 24 * HOUR_S + 2 * HOUR_S + 1200
-
-
-@pytest.fixture
-def grown(full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch) -> Engine:
-    """Twelve frames, of which the third was deleted and the fourth failed later."""
-    monkeypatch.setattr(growing.time, "time", lambda: NOW)
-    hours_ago = (0, 0.3, 0.3, 0.3, 0.34, 1, 1.5, 2.4, 26, 26, 40, 2000)
-    names = ids(full)
-    with full.store.database.write() as connection:
-        for name, ago in zip(names, hours_ago, strict=True):
-            at = NOW - ago * HOUR_S
-            connection.execute(update(frames).where(frames.c.id == name).values(indexed_at=at))
-        failed = update(frames).where(frames.c.id == names[3])
-        connection.execute(failed.values(state="failed"))
-    full.delete_frame("hall", names[2])
-    full.create_map(NewMap(name="shop", model="depth"))
-    return full
-
-
-def test_frames_are_counted_by_hour_and_day(grown: Engine) -> None:
-    told = growth(grown.store, "hall", "hour", 4)
-    assert [one.at.timestamp() - NOW for one in told.buckets] == [
-        -3 * HOUR_S - 1200, -2 * HOUR_S - 1200, -HOUR_S - 1200, -1200
-    ]  # fmt: skip
-    # 0.34 h ago is before the full hour, 20 minutes ago, and 0.3 h ago is not
-    assert [one.indexed for one in told.buckets] == [1, 1, 2, 2]
-    assert [one.total for one in told.buckets] == [5, 6, 8, 10]
-    assert (told.map, told.by, told.indexed, told.before) == ("hall", "hour", 10, 4)
-    told = growth(grown.store, "hall", "day", 2)
-    assert [one.at.timestamp() for one in told.buckets] == [19_999 * 86400, 20_000 * 86400]
-    assert [(one.indexed, one.total) for one in told.buckets] == [(3, 5), (5, 10)]
-    assert told.before == 2
-    empty = growth(grown.store, "shop", "day", 1)
-    assert (empty.indexed, empty.before, empty.buckets[0].total) == (0, 0, 0)
-    with pytest.raises(UnknownMap):
-        growth(grown.store, "nowhere")
-
-
-def test_a_clock_that_was_set_back_loses_no_frame(grown: Engine, ids: Ids) -> None:
-    with grown.store.database.write() as connection:
-        later = update(frames).where(frames.c.id == ids(grown)[0])
-        connection.execute(later.values(indexed_at=NOW + 5 * HOUR_S))
-    told = growth(grown.store, "hall", "hour", 4)
-    assert [one.indexed for one in told.buckets] == [1, 1, 2, 2]
 
 
 def test_a_map_is_weighed(full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch) -> None:
