@@ -112,8 +112,6 @@ class Settings(BaseSettings):
     answer_bytes: int = Field(default=256 << 20, ge=0)
     #: Seconds for which deleted frames can be restored; 0: a deletion is for good at once.
     undo_s: float = Field(default=600.0, ge=0, le=31_536_000)
-    #: Uploads of deleted frames of a map that are kept for it, bytes; more are deleted for good.
-    undo_bytes: int = Field(default=4 << 30, ge=0)
     #: Days for which rows of deleted and of redundant frames, and of their jobs, stay.
     deleted_rows_days: float = Field(default=7.0, ge=1, le=36_500)
     #: Streams of events that one service process keeps open at once; more are refused (503).
@@ -206,6 +204,11 @@ class Settings(BaseSettings):
     def blob_dir(self) -> Path:
         """Folder of uploads and geometry artifacts, where they are in one."""
         return self._blob_root / "blobs"
+
+    @property
+    def quarantine_dir(self) -> Path:
+        """Folder of damaged bytes that `sceneprint fsck --repair` has set aside."""
+        return self.data_dir / "quarantine"
 
     @property
     def query_dir(self) -> Path:

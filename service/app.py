@@ -37,7 +37,6 @@ from sceneprint_client.api.listing import (
     FramesEdit,
     FrameSelection,
     MapEdit,
-    RestoreOptions,
     SessionEdit,
 )
 from sceneprint_client.api.results import KeepOptions
@@ -84,7 +83,6 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
                 (SessionEdit, "validation"),
                 (FrameSelection, "validation"),
                 (FramesEdit, "validation"),
-                (RestoreOptions, "validation"),
                 (KeepOptions, "validation"),
                 (MapEdit, "validation"),
                 (Filter, "validation"),

@@ -181,8 +181,8 @@ def _session(attack: Attack, client: httpx.Client, _number: int) -> httpx.Respon
     attack.count(answer.status_code)
     if answer.status_code != 200:
         return answer
-    restored = {"deletion_id": answer.json().get("deletion_id") or "none"}
-    return client.post("/v1/maps/noisy/restore", json=restored)
+    deletion = (answer.json()["deletion"] or {}).get("deletion_id", "none")
+    return client.post(f"/v1/maps/noisy/deletions/{deletion}/restore")
 
 
 def _unknown_key(_attack: Attack, client: httpx.Client, number: int) -> httpx.Response:

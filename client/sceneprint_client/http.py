@@ -45,6 +45,7 @@ from sceneprint_client.api.base import checked, is_loopback
 from sceneprint_client.errors import (
     NotFound,
     SceneprintError,
+    UnknownDeletion,
     UnknownFrame,
     UnknownJob,
     UnknownMap,
@@ -139,6 +140,11 @@ def match_path(query_id: str, frame_id: str) -> str:
 def frame_path(map_name: str, frame_id: str) -> str:
     """Path of a frame; UnknownMap or UnknownFrame as `map_path`."""
     return f"{map_path(map_name)}/frames/{_part(frame_id, 'frame', UnknownFrame)}"
+
+
+def deletion_path(map_name: str, deletion_id: str) -> str:
+    """Path of a deletion; UnknownMap or UnknownDeletion as `map_path`."""
+    return f"{map_path(map_name)}/deletions/{_part(deletion_id, 'deletion', UnknownDeletion)}"
 
 
 def job_path(job_id: str) -> str:

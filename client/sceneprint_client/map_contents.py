@@ -47,6 +47,7 @@ from sceneprint_client.api.surface import (
 from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.http import (
     ServiceConnection,
+    deletion_path,
     frame_path,
     given,
     map_path,
@@ -217,7 +218,7 @@ class MapMethods(ServiceConnection):
         Raises
         ------
         UnknownMap, UnknownFrame : it does not exist, or can no longer be restored.
-        Conflict : another frame has its id or its content.
+        Conflict : its content was uploaded again.
         QuotaExceeded : the map has no room for it.
         """
         return self._ask(Frame, "POST", f"{frame_path(map_name, frame_id)}/restore")
@@ -239,7 +240,7 @@ class MapMethods(ServiceConnection):
         Returns
         -------
         count : number of deleted frames
-        deletions : for `restore_frames`
+        deletions : for `restore_deletion`
 
         Raises
         ------
@@ -289,26 +290,23 @@ class MapMethods(ServiceConnection):
                 return count, inverse
             body["after"] = done.last_frame_id
 
-    def restore_frames(
-        self, map_name: str, deletion_id: str | None = None, frame_ids: Sequence[str] | None = None
-    ) -> FramesRestored:
-        """Undo a deletion, or restore some deleted frames, within ten minutes by default.
+    def restore_deletion(self, map_name: str, deletion_id: str) -> FramesRestored:
+        """Restore the frames of a deletion, within ten minutes by default.
 
         Parameters
         ----------
         map_name : of the map
-        deletion_id : from `deletions`, `delete_frames` or `delete_session`
-        frame_ids : instead of it, at most 1000
+        deletion_id : from `deletions` or `delete_frames`
 
         Raises
         ------
         UnknownMap, UnknownDeletion : it does not exist, or can no longer be undone.
         QuotaExceeded : the map has no room for the frames.
         """
-        body = given(deletion_id=deletion_id, frame_ids=_listed(frame_ids))
+        path = f"{deletion_path(map_name, deletion_id)}/restore"
         count, refused = 0, dict[str, RefusedFrame]()
         while True:
-            done = self._ask(FramesRestored, "POST", f"{map_path(map_name)}/restore", json=body)
+            done = self._ask(FramesRestored, "POST", path)
             count += done.frames
             refused |= {one.frame_id: one for one in done.refused}
             if not done.remaining or not done.frames:
@@ -331,7 +329,7 @@ class MapMethods(ServiceConnection):
         return self._items(Page[Session], f"{map_path(map_name)}/sessions")
 
     def delete_session(self, map_name: str, session: str, robot: str | None = None) -> int:
-        """Delete all frames of a session and return their number; `restore_frames` undoes it.
+        """Delete all frames of a session and return their number; `restore_deletion` undoes it.
 
         Parameters
         ----------

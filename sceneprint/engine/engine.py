@@ -25,8 +25,8 @@ from sceneprint.engine.maps.map_coverage import COVERAGE, CoverageHandler, Cover
 from sceneprint.engine.maps.map_frames import FrameFiles, list_frames
 from sceneprint.engine.maps.map_lifecycle import Reencodings
 from sceneprint.engine.maps.map_surface import MapSurfaces, SurfaceUpkeep
-from sceneprint.engine.maps.selections import FrameUndo
 from sceneprint.engine.maps.surface_job import SURFACE, SurfaceHandler
+from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.engine.reconstruction import ReconstructionJobs
 from sceneprint.engine.results.query_entry import SentQuery
 from sceneprint.engine.results.query_log import QueryLog
@@ -62,7 +62,6 @@ from sceneprint.store.deletion import remove_map
 from sceneprint.store.events import number_events
 from sceneprint.store.reencoding_rows import models_of
 from sceneprint.store.tables import MapRow
-from sceneprint.store.undo_rows import UndoLimits
 from sceneprint.store.wakeup import Notices, Wakeup
 from sceneprint_client.api import (
     Added,
@@ -143,11 +142,10 @@ class Engine:
         self.points = PointClouds(self.store, self.signers, self.inspection.pairs, self.query_log)
         self.reconstructions = ReconstructionJobs(self.store, self.tasks)
         self.retiring = Retention(self.store, settings.deleted_rows_days)
-        self.undo_limits = UndoLimits(settings.undo_s, settings.undo_bytes)
-        self.undo = FrameUndo(self.store, self.bell.ring)
+        self.tombstones = Tombstones(self.store, settings.undo_s, self.bell.ring)
         self.purging = Purging(
-            self.store, self._upkeep, self.query_log, self.undo, self.reconstructions,
-            self.differences, settings.purge_s,
+            self.store, self._upkeep, self.query_log, self.tombstones, self.reconstructions,
+            self.differences, settings.purge_s, settings.quarantine_dir,
         )  # fmt: skip
         self._purged = time.monotonic()
         self.operations = OperatorTasks(self.store, settings, self.bell)
@@ -306,7 +304,7 @@ class Engine:
             return frame_records(connection, row, [frame])[0]
 
     def delete_frame(self, map_name: str, frame_id: str) -> None:
-        """Take a frame out of its map, effective at once; `undo` puts it back for some time.
+        """Delete a frame, effective at once; `tombstones` can restore it for some time.
 
         Raises
         ------
@@ -315,7 +313,7 @@ class Engine:
         with self.store.database.write() as connection:
             row = stored_maps.find_map(connection, map_name)
             frame = stored_maps.find_frame(connection, row, frame_id)
-            deletion = self.undo_limits.begin(connection, row.number)
+            deletion = self.tombstones.begin(row)
             blobs = stored_frames.delete_frame(connection, row, frame, deletion)
         collect_deleted_blobs(self.store, blobs)
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.store.deletion import DAY_S, count_old
+from sceneprint.store.deletion import DAY_S, count_old, without_content
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import model_names
 from sceneprint.store.queue import job_ids_of
@@ -147,9 +147,9 @@ def map_record(connection: Connection, row: MapRow) -> Map:
 
 
 def frame_records(connection: Connection, row: MapRow, found: list[FrameRow]) -> list[Frame]:
-    """Frames of one map."""
+    """Frames of one map; of deleted ones nothing is told that their purge will remove."""
     jobs = job_ids_of(connection, [frame.number for frame in found])
-    return [_frame(row, frame, jobs[frame.number]) for frame in found]
+    return [_frame(row, without_content(frame), jobs[frame.number]) for frame in found]
 
 
 def job_progress(job: JobRow) -> Progress | None:

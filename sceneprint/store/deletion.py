@@ -1,9 +1,10 @@
-"""Frames and maps deleted: what is left in the database, and which blobs must go.
+"""Frames and maps deleted: what is left in the database, and which blobs must be removed.
 
-Of a deleted frame the row stays for some days, as every reader learns by its revision that it is
-gone: its id, its state, when it came, and how its samples were to be read. Its blobs are noted as
-doomed in the same transaction, so that they go whatever happens to this process. Where the deletion
-can be undone, `undo_rows` has what the row was, and refers to the upload.
+A deletion that can be undone makes tombstones: frames that no search, list or count finds, and that
+keep their upload, signatures and metadata, see `tombstones`. Of a frame that is purged the row
+stays for some days, as every reader learns by its revision that it is gone: its id, its state, when
+it came, and how its samples were to be read. Its blobs are noted as doomed in the same transaction,
+so that they are removed whatever happens to this process.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from itertools import accumulate
 from typing import Any
 
 from sqlalchemy import (
@@ -34,14 +37,13 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from sceneprint.store.database import Database
 from sceneprint.store.events import record_event, record_events, remember
-from sceneprint.store.maps import ROOMLESS, count_on, next_revision
+from sceneprint.store.maps import ROOMLESS, count_on, next_revision, require_room, use_of
 from sceneprint.store.queue import cancel_jobs
 from sceneprint.store.tables import (
     ENDED,
+    FrameRow,
     MapRow,
     count_rows,
-    deleted_frames,
-    deletions,
     doomed,
     event_values,
     frame_tags,
@@ -60,60 +62,52 @@ from sceneprint.store.tables import (
     surfaces,
 )
 from sceneprint.store.tenants import keep_turns
-from sceneprint.store.undo_rows import Deletion, remember_frames
 from sceneprint_client.api import FrameState, JobState
 
-#: What is known of a frame, and not of its camera; cleared with it.
+#: What is known of a frame, and not of its camera; cleared when it is purged.
 _KNOWN = (
-    "content_id", "reason", "robot", "session", "captured_at", "pose_parent", "pose", "pose_x",
-    "pose_y", "pose_z", "base_frame", "base", "novelty", "up", "name", "sequence",
+    "reason", "robot", "session", "captured_at", "pose_parent", "pose", "pose_x", "pose_y",
+    "pose_z", "base_frame", "base", "novelty", "up", "name", "sequence", "deletion",
+    "deleted_from", "deleted_content",
 )  # fmt: skip
 
 
 def delete_frames(
     connection: Connection, row: MapRow, numbers: Sequence[int], reason: str | None = None,
-    deletion: Deletion | None = None,
+    deletion: int | None = None,
 ) -> list[str]:  # fmt: skip
-    """Take frames out of all searches, and forget what was made of them and known of them.
+    """Remove frames from all searches, lists and counts.
 
     Parameters
     ----------
     connection : of a writing transaction
     row : of the map
     numbers : of its frames, a few hundred at most; those that are deleted already are left out
-    reason : told with the events, where nobody deleted them
-    deletion : that can be undone; None: it cannot
+    reason : data of the events where nobody requested the deletion
+    deletion : of the tombstones that are made; None: the frames are purged at once
 
     Returns
     -------
-    blobs : that they referred to, and that are doomed: sweep them when this is committed, which
-        leaves those of uploads that can be restored
+    blobs : that are doomed: sweep them when this is committed
     """
     wanted = frames.c.number.in_(numbers), frames.c.state != FrameState.DELETED
-    asked = select(frames).where(*wanted).order_by(frames.c.number)
+    c = frames.c
+    asked = select(c.number, c.id, c.state).where(*wanted).order_by(c.number)
     found = connection.execute(asked).all()
     if not found:
         return []
-    if deletion is not None:
-        remember_frames(connection, deletion, [dict(one._mapping) for one in found])
     living = [one.number for one in found]
-    own = signatures.c.frame_number.in_(living)
-    made = connection.execute(select(signatures.c.geometry).where(own)).scalars()
-    blobs = list(dict.fromkeys([*(one.blob for one in found), *made]))
-    doom(connection, blobs)
-    connection.execute(delete(signatures).where(own))
-    connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(living)))
     cancel_jobs(connection, jobs.c.frame_number.in_(living))
-    counted = [one for one in found if one.state not in ROOMLESS]
-    count_on(connection, row.number, -len(counted), -sum(one.bytes for one in counted))
+    redundant = [one.number for one in found if one.state == FrameState.REDUNDANT]
+    count_on(connection, row.number, len(redundant) - len(found), 0)
     # each its own revision: who reads what has changed reads on after the last that he had
     last = next_revision(connection, row.number, len(living))
     connection.execute(
         update(frames)
-        .where(frames.c.number == bindparam("of"))
+        .where(c.number == bindparam("of"))
         .values(
-            state=FrameState.DELETED, revision=bindparam("at"), tags=[],
-            ended_at=now(connection), **dict.fromkeys(_KNOWN),
+            state=FrameState.DELETED, revision=bindparam("at"), ended_at=now(connection),
+            deletion=deletion, deleted_from=c.state, deleted_content=c.content_id, content_id=None,
         ),
         [{"of": n, "at": last - len(living) + i} for i, n in enumerate(living, 1)],
     )  # fmt: skip
@@ -122,6 +116,83 @@ def delete_frames(
         connection,
         [event_values("frame.deleted", row.name, one.id, None, data) for one in found],
     )
+    # a redundant frame has no upload that could be restored
+    return purge_frames(connection, row.number, living if deletion is None else redundant)
+
+
+def purge_frames(connection: Connection, map_number: int, numbers: Sequence[int]) -> list[str]:
+    """Forget what was uploaded with deleted frames, made of them and known of them.
+
+    Returns
+    -------
+    blobs : that are doomed: sweep them when this is committed
+    """
+    if not numbers:
+        return []
+    c, own = frames.c, frames.c.number.in_(numbers)
+    uploads = connection.execute(select(c.blob, c.bytes, c.deleted_from).where(own)).all()
+    signed = signatures.c.frame_number.in_(numbers)
+    made = connection.execute(select(signatures.c.geometry).where(signed)).scalars()
+    blobs = list(dict.fromkeys([*(one.blob for one in uploads), *made]))
+    doom(connection, blobs)
+    connection.execute(delete(signatures).where(signed))
+    connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(numbers)))
+    connection.execute(update(frames).where(own).values(tags=[], **dict.fromkeys(_KNOWN)))
+    size = sum(one.bytes for one in uploads if one.deleted_from != FrameState.REDUNDANT)
+    count_on(connection, map_number, 0, -size)
+    return blobs
+
+
+def without_content(frame: FrameRow) -> FrameRow:
+    """Return a frame as it will be after its purge, if it is deleted."""
+    if frame.deletion is None:
+        return frame
+    bare: dict[str, Any] = dict.fromkeys(_KNOWN)
+    return replace(frame, tags=[], **bare)
+
+
+#: Tombstones that are purged in one transaction.
+PURGED_AT_ONCE = 100
+
+
+def oldest_tombstones(
+    connection: Connection, map_number: int, limit: int = PURGED_AT_ONCE
+) -> list[tuple[int, int, float]]:
+    """Return numbers, bytes and times of deletion of the tombstones of a map, the oldest first."""
+    c = frames.c
+    asked = select(c.number, c.bytes, c.ended_at).where(
+        c.map_number == map_number, c.deletion.is_not(None)
+    )
+    found = connection.execute(asked.order_by(c.deletion, c.number).limit(limit))
+    return [(number, size, at) for number, size, at in found]
+
+
+def make_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> list[str]:
+    """Check that a quota leaves room, after purging the oldest tombstones where it lacks some.
+
+    Parameters
+    ----------
+    connection : of a writing transaction of the map
+    row, size, new : see `require_room`
+
+    Returns
+    -------
+    blobs : that are doomed: sweep them when this is committed
+
+    Raises
+    ------
+    QuotaExceeded : there is no room even without tombstones; none is purged.
+    """
+    require_room(connection, row, size, new=new)
+    blobs: list[str] = []
+    while size > 0 and row.quota_bytes is not None:
+        lacking = use_of(connection, row.number).bytes + size - row.quota_bytes
+        oldest = oldest_tombstones(connection, row.number)
+        if lacking <= 0 or not oldest:
+            break
+        before = accumulate((held for _, held, _ in oldest), initial=0)
+        numbers = [one[0] for one, freed in zip(oldest, before, strict=False) if freed < lacking]
+        blobs += purge_frames(connection, row.number, numbers)
     return blobs
 
 
@@ -155,9 +226,6 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
         connection.execute(delete(made).where(made.c.job_number.in_(of_map)))
     keep_turns(connection)
     connection.execute(delete(jobs).where(jobs.c.map_number == row.number))
-    # a tombstone has the blob of its upload still, so those that could be restored are among them
-    connection.execute(delete(deleted_frames).where(deleted_frames.c.frame_number.in_(own)))
-    connection.execute(delete(deletions).where(deletions.c.map_number == row.number))
     connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(own)))
     connection.execute(delete(frames).where(frames.c.map_number == row.number))
     connection.execute(delete(queries).where(queries.c.map_number == row.number))
@@ -376,9 +444,9 @@ def _unreferred() -> list[ColumnElement[bool]]:
     )
     shown = (
         select(table.c.frame_number).where(table.c.frame_number == frames.c.number)
-        for table in (deleted_frames, surface_frames, surface_touches)
+        for table in (surface_frames, surface_touches)
     )
-    return [not_(one.exists()) for one in (unfinished, *shown)]
+    return [frames.c.deletion.is_(None), *(not_(one.exists()) for one in (unfinished, *shown))]
 
 
 def _remove_rows(connection: Connection, numbers: Sequence[int]) -> None:

@@ -25,13 +25,12 @@ from sqlalchemy import (
     union,
 )
 
+from sceneprint.store.frames import not_purged
 from sceneprint.store.maps import ROOMLESS
 from sceneprint.store.tables import (
     FRAME_COLUMNS,
     FrameRow,
-    MapRow,
     count_rows,
-    deleted_frames,
     frame_rows,
     frame_tags,
     frames,
@@ -260,6 +259,8 @@ def _listing_conditions(map_number: int, wanted: FrameListing) -> list[ColumnEle
         found += _begins(c.name, wanted.name)
     if wanted.find is not None:
         found.append(_known_as(map_number, wanted.find))
+    if wanted.state == FrameState.DELETED and found:
+        found.append(c.deletion.is_(None))  # nothing is told of what a tombstone has
     return found
 
 
@@ -571,10 +572,7 @@ def _posed_in(map_number: int, session: str) -> list[ColumnElement[bool]]:
 def any_gone(connection: Connection, numbers: Iterable[int]) -> bool:
     """Whether any of some frames is not there any more, and cannot be restored either."""
     own = set(numbers)
-    there = (frames.c.state != FrameState.DELETED) | frames.c.number.in_(
-        select(deleted_frames.c.frame_number)
-    )
-    asked = select(frames.c.number).where(there)
+    asked = select(frames.c.number).where(not_purged())
     return len(own) > sum(1 for _ in rows_among(connection, asked, frames.c.number, own))
 
 
@@ -664,45 +662,6 @@ def has_parent_frame(connection: Connection, map_number: int, parent: str) -> bo
         c.map_number == map_number, c.pose_parent == parent, c.state != FrameState.DELETED
     )
     return connection.execute(asked.limit(1)).first() is not None
-
-
-# What frames of a map weigh, and which a session brought: for whoever thins it out.
-
-
-@dataclass(frozen=True)
-class Weight:
-    """A frame that is indexed."""
-
-    frame_id: str
-    upload_bytes: int
-    artifact: str
-
-
-def weights_of(
-    connection: Connection, row: MapRow, session: str | None = None
-) -> dict[int, Weight]:
-    """Indexed frames of a map by their numbers, in the order they came.
-
-    Parameters
-    ----------
-    connection : of a transaction
-    row : of the map
-    session : only frames of this one, where given
-    """
-    asked = (
-        select(frames.c.number, frames.c.id, frames.c.bytes, signatures.c.geometry)
-        .join(
-            signatures,
-            (signatures.c.frame_number == frames.c.number)
-            & (signatures.c.model_id == row.model_id),
-        )
-        .where(frames.c.map_number == row.number, frames.c.state == FrameState.INDEXED)
-        .order_by(frames.c.number)
-    )
-    if session is not None:
-        asked = asked.where(frames.c.session == session)
-    found = connection.execute(asked)
-    return {number: Weight(*rest) for number, *rest in found}
 
 
 # How a map grew, and what its frames weigh: counts over many rows that few are read for.

@@ -24,7 +24,6 @@ from sceneprint.store.surface_rows import FUSED_COLUMNS, note_edit
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
-    deleted_frames,
     frame_tags,
     frames,
     job_files,
@@ -33,7 +32,6 @@ from sceneprint.store.tables import (
     signatures,
     surface_tiles,
 )
-from sceneprint.store.undo_rows import Deletion
 from sceneprint_client.api import FrameState
 
 
@@ -81,15 +79,9 @@ def set_state(
 
 
 def delete_frame(
-    connection: Connection, row: MapRow, frame: FrameRow, deletion: Deletion | None = None
+    connection: Connection, row: MapRow, frame: FrameRow, deletion: int | None = None
 ) -> list[str]:
-    """Take a frame out of all searches and forget what was made of it, and known of it.
-
-    The row stays, so that every reader learns of it. `deletion`: see `delete_frames`.
-
-    Returns
-    -------
-    blobs : that it referred to
+    """Delete one frame; parameters and result as of `delete_frames`.
 
     Raises
     ------
@@ -102,8 +94,7 @@ def delete_frame(
 
 def not_purged() -> ColumnElement[bool]:
     """Return the condition that a frame exists, or was deleted and can be restored."""
-    restorable = frames.c.number.in_(select(deleted_frames.c.frame_number))
-    return or_(frames.c.state != FrameState.DELETED, restorable)
+    return or_(frames.c.state != FrameState.DELETED, frames.c.deletion.is_not(None))
 
 
 def refers_to(connection: Connection, blob: str) -> bool:
@@ -111,17 +102,24 @@ def refers_to(connection: Connection, blob: str) -> bool:
     return bool(referred_blobs(connection, [blob]))
 
 
+def is_frame_id(connection: Connection, frame_id: str) -> bool:
+    """Return whether a frame of any map that is there, or a tombstone, has an id."""
+    of_any = frames.c.map_number.in_(select(maps.c.number))  # as the index of ids begins
+    asked = select(frames.c.number).where(of_any, frames.c.id == frame_id, not_purged()).limit(1)
+    return connection.execute(asked).first() is not None
+
+
 def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
-    """Those of some blobs, a thousand at most, that a frame which is there or can be restored, a
+    """Those of some blobs, a thousand at most, that a frame which is there or a tombstone, a
     signature, a job or a tile refers to.
     """
+    has_upload = or_(frames.c.state.not_in(ROOMLESS), frames.c.deletion.is_not(None))
     referring = (
-        (frames.c.blob, frames.c.state.not_in(ROOMLESS)),
+        (frames.c.blob, has_upload),
         (signatures.c.geometry,),
         (job_files.c.blob,),
         (surface_tiles.c.blob,),
         (surface_tiles.c.draft,),
-        (deleted_frames.c.blob,),
     )
     asked = (select(column).where(column.in_(blobs), *more) for column, *more in referring)
     return set(connection.execute(union(*asked)).scalars())

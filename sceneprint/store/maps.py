@@ -168,9 +168,10 @@ def model_names(connection: Connection) -> dict[str, str]:
 
 # What a map holds and may hold: frames, and bytes of their uploads.
 #
-# Counted are frames that are neither deleted nor redundant, whatever else became of them, and their
-# uploads as they were sent, with what robots made of them while that waits, and the archives of
-# imports until these end. Not counted is what we make of them: signatures, artifacts, indexes.
+# Counted are frames that are neither deleted nor redundant, whatever became of them, and bytes:
+# their uploads and those of tombstones as they were sent, with what robots made of them while that
+# waits, and the archives of imports until these end. Not counted is what we make of them:
+# signatures, artifacts, indexes.
 # Two columns of the map count on in the transaction that changes it; writers take turns, so that a
 # quota holds to the frame whoever sends at once.
 
@@ -207,6 +208,7 @@ def counted_usage(connection: Connection, map_number: int) -> MapUsage:
         frames.c.map_number == map_number, frames.c.state.not_in(ROOMLESS)
     )
     n, size = connection.execute(asked).one()
+    size += tombstone_bytes(connection, map_number)
     archives = (
         select(func.coalesce(func.sum(job_files.c.bytes), 0))
         .join(jobs, jobs.c.number == job_files.c.job_number)
@@ -216,7 +218,9 @@ def counted_usage(connection: Connection, map_number: int) -> MapUsage:
 
 
 def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> None:
-    """See that a map's quota leaves room for one more frame, or for a larger upload of one.
+    """Check that a map's quota leaves room for one more frame, or for a larger upload of one.
+
+    Tombstones count as free: `make_room` purges as many as it takes.
 
     Parameters
     ----------
@@ -237,21 +241,23 @@ def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = 
             f"Map {row.name!r} holds {use.frames} frames of the {row.quota_frames} that its quota "
             f"allows, so the frame was not taken. {_todo(row.name)}"
         )
-    require_bytes(row, use.bytes, size)
-
-
-def require_bytes(row: MapRow, used: int, size: int) -> None:
-    """Check that the quota of a map allows `size` bytes beside the `used` ones.
-
-    Raises
-    ------
-    QuotaExceeded : it does not.
-    """
-    if size > 0 and row.quota_bytes is not None and used + size > row.quota_bytes:
+    if size <= 0 or row.quota_bytes is None or use.bytes + size <= row.quota_bytes:
+        return
+    held = use.bytes - tombstone_bytes(connection, row.number)  # these are purged for others
+    if held + size > row.quota_bytes:
         raise QuotaExceeded(
-            f"Map {row.name!r} holds {used} bytes of uploads of the {row.quota_bytes} that its "
+            f"Map {row.name!r} holds {held} bytes of uploads of the {row.quota_bytes} that its "
             f"quota allows, so {size} bytes more were not stored. {_todo(row.name)}"
         )
+
+
+def tombstone_bytes(connection: Connection, map_number: int) -> int:
+    """Return the bytes of uploads of the deleted frames that can be restored."""
+    c = frames.c
+    asked = select(func.coalesce(func.sum(c.bytes), 0)).where(
+        c.map_number == map_number, c.deletion.is_not(None)
+    )
+    return int(connection.execute(asked).scalar_one())
 
 
 def _todo(name: str) -> str:
@@ -356,10 +362,13 @@ def _frames_of_numbers(dialect: str) -> Select[Any]:
 
 
 def free_id(connection: Connection, map_number: int, frame_id: str) -> None:
-    """Let a deleted frame give its id up: its row stays, as readers learn of it by its number."""
+    """Let a deleted frame give its id up: its row stays, as readers learn of it by its number.
+
+    A tombstone without its id can no longer be restored.
+    """
     deleted = frames.c.state == FrameState.DELETED
     own = update(frames).where(frames.c.map_number == map_number, frames.c.id == frame_id, deleted)
-    connection.execute(own.values(id=uuid.uuid4().hex))
+    connection.execute(own.values(id=uuid.uuid4().hex, deleted_from=None))
 
 
 def _first(connection: Connection, *conditions: ColumnElement[bool]) -> FrameRow | None:

@@ -135,6 +135,10 @@ frames = Table(
     Column("name", _string(255)),  # of the original file or message; a label, never a path
     Column("sequence", WHOLE),  # place within the session
     Column("ended_at", Float),  # when it was deleted, or found redundant
+    # of a tombstone, a deleted frame that can be restored: the first revision of its deletion
+    Column("deletion", WHOLE),
+    Column("deleted_from", _string(16)),  # its state before; null: another frame has its id now
+    Column("deleted_content", _string(64)),  # its content_id before
     UniqueConstraint("map_number", "id"),
     Index(None, "map_number", "content_id"),
     Index(None, "map_number", "revision"),
@@ -157,6 +161,11 @@ frames = Table(
     Index("ix_frames_placed", "map_number", "pose_parent", "pose_x", "pose_y", "pose_z"),
     sqlite_autoincrement=True,
 )
+#: Tombstones of a map, the oldest deletions first.
+Index(
+    "ix_frames_tombstones", frames.c.map_number, frames.c.deletion, frames.c.number,
+    sqlite_where=frames.c.deletion.is_not(None), postgresql_where=frames.c.deletion.is_not(None),
+)  # fmt: skip
 #: The oldest frames of a map that are still there: rows of deleted ones stay for some days.
 Index(
     "ix_frames_aging", frames.c.map_number, frames.c.received_at,
@@ -519,33 +528,6 @@ surface_touches = Table(
     Index(None, "frame_number"),
 )
 
-#: Deletions of frames that can still be undone.
-deletions = Table(
-    "deletions",
-    metadata,
-    Column("number", WHOLE, primary_key=True),
-    Column("id", _string(32), nullable=False, unique=True),
-    Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
-    Column("at", Float, nullable=False),  # by the clock of the database, as `until`
-    Column("until", Float, nullable=False),
-    Index(None, "map_number", "number"),
-    Index(None, "until"),
-    sqlite_autoincrement=True,
-)
-
-#: What the rows of their frames were, and the uploads that must stay for that long.
-deleted_frames = Table(
-    "deleted_frames",
-    metadata,
-    Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
-    Column("deletion_number", WHOLE, ForeignKey("deletions.number"), nullable=False),
-    Column("blob", _string(64)),  # null: its upload was not kept
-    Column("bytes", BigInteger, nullable=False),
-    Column("data", JSON, nullable=False),  # columns of `frames`
-    Index(None, "deletion_number", "frame_number"),
-    Index(None, "blob"),
-)
-
 #: Blobs of what was deleted, until somebody has seen that they are removed.
 doomed = Table(
     "doomed",
@@ -684,6 +666,9 @@ class FrameRow:
     name: str | None = None
     sequence: int | None = None
     ended_at: float | None = None
+    deletion: int | None = None
+    deleted_from: FrameState | None = None
+    deleted_content: str | None = None
 
     @property
     def kind(self) -> Kind:

@@ -16,7 +16,6 @@ from sceneprint_client.api.listing import (
     FramesEdited,
     FrameSelection,
     FramesRestored,
-    RestoreOptions,
 )
 from service.auth import Here, may_read, may_write, v1_router
 from service.bodies import read_record
@@ -40,13 +39,14 @@ async def delete_frames(map_name: str, request: Request, here: Here) -> FramesDe
     """Delete frames by their ids, or all that pass a filter.
 
     No query finds them from then on. A call ends after ten seconds: repeat it while `remaining` is
-    not 0. Ten minutes by default, POST /v1/maps/{map_name}/restore undoes it.
+    not 0. Ten minutes by default, POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes
+    it.
     """
     wanted = await read_record(request, FrameSelection, "The selection")
     engine = here.engine
     async with here.uploads.place():
         return await here.uploads.run(
-            partial(delete_selection, engine.store, map_name, wanted, engine.undo_limits)
+            partial(delete_selection, engine.store, map_name, wanted, engine.tombstones)
         )
 
 
@@ -66,26 +66,14 @@ async def edit_frames(map_name: str, request: Request, here: Here) -> FramesEdit
 
 
 @router.post(
-    "/restore", responses=declared(400, 404, 413, 415, 422), openapi_extra=_body("RestoreOptions"),
-    dependencies=[Depends(may_write)],
-)  # fmt: skip
-async def restore_frames(map_name: str, request: Request, here: Here) -> FramesRestored:
-    """Undo a deletion, or restore some deleted frames, with all that was known of them.
-
-    Frames that were indexed are signed again. Quotas hold. A call ends after ten seconds: repeat it
-    while `remaining` is not 0.
-    """
-    wanted = await read_record(request, RestoreOptions, "The request to restore frames")
-    async with here.uploads.place():
-        return await here.uploads.run(partial(here.engine.undo.restore, map_name, wanted))
-
-
-@router.post(
     "/frames/{frame_id}/restore", responses=declared(404, 409), dependencies=[Depends(may_write)]
 )
 def restore_frame(map_name: str, frame_id: str, here: Here) -> Frame:
-    """Restore a deleted frame, while that can be done; 409 where another has its id or content."""
-    here.engine.undo.restore_one(map_name, frame_id)
+    """Restore a deleted frame, while that can be done; queries find it again at once.
+
+    404 where it is gone for good, or another frame has its id; 409 where its content came again.
+    """
+    here.engine.tombstones.restore_one(map_name, frame_id)
     return here.engine.get_frame(map_name, frame_id)
 
 
@@ -97,4 +85,19 @@ def list_deletions(
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> Page[FrameDeletion]:
     """Deletions of frames that can still be undone, the newest first."""
-    return here.engine.undo.list_all(map_name, cursor, limit)
+    return here.engine.tombstones.list_all(map_name, cursor, limit)
+
+
+@router.post(
+    "/deletions/{deletion_id}/restore", responses=declared(404), dependencies=[Depends(may_write)]
+)
+async def restore_deletion(map_name: str, deletion_id: str, here: Here) -> FramesRestored:
+    """Restore the frames of a deletion with all that was known of them, found again at once.
+
+    A call ends after ten seconds: repeat it while `remaining` is not 0. 403 where the map may not
+    hold so many frames.
+    """
+    async with here.uploads.place():
+        return await here.uploads.run(
+            partial(here.engine.tombstones.restore, map_name, deletion_id)
+        )

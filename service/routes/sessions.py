@@ -59,7 +59,7 @@ async def delete_session_frames(
     """Delete all frames of a session.
 
     A call ends after ten seconds: repeat it while `remaining` is not 0. Ten minutes by default,
-    POST /v1/maps/{map_name}/restore undoes it.
+    POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes it.
     """
     async with here.uploads.place():
         return await here.uploads.run(
@@ -68,8 +68,8 @@ async def delete_session_frames(
                 here.engine.store,
                 map_name,
                 session,
+                here.engine.tombstones,
                 robot,
-                undo=here.engine.undo_limits,
             )
         )
 

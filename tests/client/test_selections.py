@@ -34,12 +34,12 @@ def test_frames_are_deleted_edited_and_restored(
     assert (count, deletion.frames) == (3, 3)
     assert list(client.deletions(map_name)) == [deletion]
     assert list(client.frames(map_name)) == []
-    restored = client.restore_frames(map_name, frame_ids=ids[:1])
-    assert (restored.frames, restored.refused) == (1, [])
-    assert client.restore_frames(map_name, deletion.deletion_id).frames == 2
+    assert client.restore_frame(map_name, ids[0]).tags == ["door"]
+    restored = client.restore_deletion(map_name, deletion.deletion_id)
+    assert (restored.frames, restored.refused) == (2, [])
     assert {one.frame_id: (one.session, one.tags) for one in client.frames(map_name)} == before
     with pytest.raises(UnknownDeletion):
-        client.restore_frames(map_name, deletion.deletion_id)
+        client.restore_deletion(map_name, deletion.deletion_id)
     client.delete_frame(map_name, ids[0])
     assert client.restore_frame(map_name, ids[0]).tags == ["door"]
     with pytest.raises(UnknownFrame):

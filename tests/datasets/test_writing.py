@@ -104,6 +104,6 @@ def test_a_trajectory_by_hand() -> None:
     (line,) = trajectory_text([trajectory_row(12.5, T)]).splitlines()
     half = 0.5**0.5
     assert [float(word) for word in line.split()] == pytest.approx(
-        [12.5, 1, -2, 0.5, 0, 0, half, half], abs=1e-15
+        [12.5, 1, -2, 0.5, 0, 0, half, half], abs=1e-13
     )
     assert trajectory_text([], ["nobody"]) == "# nobody\n"

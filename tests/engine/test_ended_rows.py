@@ -12,6 +12,7 @@ import pytest
 from sqlalchemy import event, insert, select, update
 
 from sceneprint.engine import Engine
+from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.engine.search import local_index
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.upkeep.purge import Retention
@@ -19,7 +20,6 @@ from sceneprint.errors import UnknownFrame, UnknownJob
 from sceneprint.store.deletion import DAY_S, maps_with_ended
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, jobs, maps, surface_frames
-from sceneprint.store.undo_rows import NO_UNDO
 from sceneprint_client.api import FrameState, Query
 
 Make = Callable[..., Engine]
@@ -72,7 +72,7 @@ def ended_ago(engine: Engine, state: FrameState) -> list[float | None]:
 def test_rows_of_deleted_frames_go_with_their_jobs_once_their_days_are_over(
     full: Engine, ids: Ids
 ) -> None:
-    full.undo_limits = NO_UNDO
+    full.tombstones = Tombstones(full.store, 0.0, full.bell.ring)
     names, use = ids(full), full.get_map("hall").used_frames
     with full.store.database.read() as connection:
         of = select(jobs.c.id).join(frames, frames.c.number == jobs.c.frame_number)
@@ -102,14 +102,14 @@ def test_a_frame_that_can_be_restored_keeps_its_row(full: Engine, ids: Ids) -> N
     full.delete_frame("hall", name)
     assert after(full, 2 * DAYS) == 0
     assert (name, "deleted") in rows(full)
-    full.undo.restore_one("hall", name)
+    full.tombstones.restore_one("hall", name)
     with full.store.database.read() as connection:
         assert connection.execute(select(frames.c.ended_at)).scalars().all() == [None] * 12
 
 
 @pytest.mark.parametrize("needed", ["job", "surface"])
 def test_a_row_that_is_needed_stays(full: Engine, ids: Ids, needed: str) -> None:
-    full.undo_limits = NO_UNDO
+    full.tombstones = Tombstones(full.store, 0.0, full.bell.ring)
     full.delete_frame("hall", ids(full)[0])
     with full.store.database.write() as connection:
         number = connection.execute(
@@ -153,7 +153,7 @@ def test_a_reader_that_missed_deletions_begins_anew(
     assert builder.publish_due() == (tail_frames == 3)
     names = ids(builder)
     assert found(reader, uploads) == sorted(names)
-    builder.undo_limits = NO_UNDO
+    builder.tombstones = Tombstones(builder.store, 0.0, builder.bell.ring)
     for name in names[4:6]:
         builder.delete_frame("hall", name)
     assert after(builder, DAYS + 1) == 2
@@ -169,7 +169,7 @@ def test_an_index_is_published_before_it_would_be_too_old(
     """Of ten thousand frames, one deletion would else be no reason for a year."""
     engine = make_engine(data, tail_frames=5, deleted_rows_days=DAYS)
     assert engine.publish_due() == 1
-    engine.undo_limits = NO_UNDO
+    engine.tombstones = Tombstones(engine.store, 0.0, engine.bell.ring)
     names = ids(engine)
     engine.delete_frame("hall", names[4])
     assert engine.publish_due() == 0
@@ -193,7 +193,7 @@ def test_purging_leaves_no_byte_of_a_frame_whose_row_is_gone(
     """On a node that was off meanwhile, where too little is left for another index."""
     engine = make_engine(data, tail_frames=11)
     assert engine.publish_due() == 1
-    engine.undo_limits = NO_UNDO
+    engine.tombstones = Tombstones(engine.store, 0.0, engine.bell.ring)
     for name in ids(engine)[:6]:
         engine.delete_frame("hall", name)
     assert after(engine, DAYS + 1) == 6

@@ -16,11 +16,11 @@ from sceneprint.engine import Engine
 from sceneprint.engine.engine import stored_maps
 from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.jobs.signature_job import look
+from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.errors import InvalidRequest
 from sceneprint.pipeline import Signature, Signer
 from sceneprint.store.signatures import StoredSignature
 from sceneprint.store.tables import events, signatures
-from sceneprint.store.undo_rows import NO_UNDO
 from sceneprint.types import Geometry
 from sceneprint_client.api import FrameState, JobState, NewMap, Query
 from sceneprint_client.api.base import NOVEL, novelty_of
@@ -128,7 +128,7 @@ def test_what_is_gone_is_no_place_and_a_frame_may_come_again(
     assert redundant.state == FrameState.REDUNDANT
     still = send(empty, 1, 1.0)
     assert (still.state, still.frame_id) == (FrameState.REDUNDANT, redundant.frame_id)
-    empty.undo_limits = NO_UNDO
+    empty.tombstones = Tombstones(empty.store, 0.0, empty.bell.ring)
     empty.delete_frame("hall", first.frame_id)
     kept = send(empty, 1, 1.0)
     assert (kept.state, kept.reason) == (FrameState.INDEXED, None)

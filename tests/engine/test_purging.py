@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sqlalchemy import inspect, text
+from sqlalchemy import inspect, text, update
 
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
@@ -23,10 +23,12 @@ from sceneprint.engine.upkeep.purge import Purging
 from sceneprint.errors import BusyIndex, UnknownJob, UnknownQuery
 from sceneprint.index import newest, newest_number
 from sceneprint.index.generation_files import building
+from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.store.frames import delete_frame, write_frame
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.signatures import stored_vector
+from sceneprint.store.tables import signatures
 from sceneprint_client.api import NewMap, Query
 from sceneprint_client.api.surface import NewReconstruction
 
@@ -171,6 +173,33 @@ def test_no_byte_of_a_map_is_left(lived_in, secret, ids, uploads, tmp_path):
     assert list(engine.store.blobs.digests()) == []
 
 
+@pytest.mark.sqlite_only("the files of a data folder are damaged")
+def test_bytes_in_quarantine_go_with_their_frame(full, ids):
+    """An upload and a signature are found damaged and set aside; then their frames are deleted."""
+    with full.store.database.write() as connection:
+        row = find_map(connection, "hall")
+        first, second = (find_frame(connection, row, name) for name in ids(full)[:2])
+        signed = update(signatures).where(signatures.c.frame_number == second.number)
+        connection.execute(signed.values(vector=b"damaged" * 100))
+    damaged = full.store.blobs.path(first.blob)
+    damaged.write_bytes(b"damaged" * 100)
+    assert len(list(fsck(full.settings, repair=True, grace_s=0))) == 2
+    aside = full.settings.quarantine_dir
+    (aside / "notes.txt").write_text("of an operator")
+    names = sorted(one.name for one in aside.iterdir())
+    assert names == sorted(
+        [
+            f"blob-{first.blob}", f"signature-{second.id}-{row.model_id[:12]}.bin", "notes.txt",
+        ]
+    )  # fmt: skip
+    full.purging.now()
+    assert sorted(one.name for one in aside.iterdir()) == names  # their frames are there
+    full.delete_frame("hall", first.id)
+    full.delete_frame("hall", second.id)
+    full.purging.now()
+    assert [one.name for one in aside.iterdir()] == ["notes.txt"]
+
+
 def test_readers_let_go_of_what_was_deleted(empty, uploads, work_off):
     engine = empty
     for one in uploads[:3]:
@@ -225,8 +254,8 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
     second = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2, purge_s=1)
     workers = [
         Purging(
-            one.store, one._upkeep, one.query_log, one.undo, one.reconstructions,
-            one.differences, 0.0,
+            one.store, one._upkeep, one.query_log, one.tombstones, one.reconstructions,
+            one.differences, 0.0, one.settings.quarantine_dir,
         )
         for one in (second, second)
     ]  # fmt: skip

@@ -503,10 +503,10 @@ def test_an_answer_goes_with_a_purged_frame_that_it_shows(full, uploads):
     full.query_log.keep(answer.query_id, None)
     full.delete_frame("hall", shown)
     assert full.query_log.purge() == 0  # its deletion can be undone
-    full.undo.restore_one("hall", shown)
+    full.tombstones.restore_one("hall", shown)
     assert full.query_log.purge() == 0
     full.delete_frame("hall", shown)
-    full.undo.purge(everything=True)
+    full.tombstones.purge(everything=True)
     assert full.query_log.purge() == 1
     with pytest.raises(UnknownQuery):
         full.query_log.find(answer.query_id)

@@ -47,6 +47,8 @@ def test_a_map_takes_what_its_quota_allows(empty, uploads):
     again, new = empty.add_frame("hall", a.data, a.meta)  # no new frame
     assert (again.frame_id, new) == (first.frame_id, False)
     empty.delete_frame("hall", first.frame_id)
+    assert used(empty) == MapUsage(1, len(a.data) + len(b.data))  # it can be restored
+    assert empty.tombstones.purge(everything=True) == 1
     assert used(empty) == MapUsage(1, len(b.data))
     batch = [Upload(one.data, one.meta) for one in (b, c, d)]
     outcomes, _ = empty.uploads.add_all("hall", batch)

@@ -11,9 +11,8 @@ from sceneprint.engine import Engine
 from sceneprint.engine.maps import selections as module
 from sceneprint.engine.maps.selections import delete_selection, edit_selection
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
-from sceneprint.store.undo_rows import NO_UNDO
 from sceneprint_client.api import FrameMeta
-from sceneprint_client.api.listing import FrameListing, FramesEdit, FrameSelection, RestoreOptions
+from sceneprint_client.api.listing import FrameListing, FramesEdit, FrameSelection
 
 #: Session, robot and tags of each of twelve uploads.
 TAKEN = [("a", "r1", ["x"])] * 5 + [("b", "r2", ["x", "y"])] * 4 + [(None, None, [])] * 3
@@ -42,7 +41,7 @@ def known(engine: Engine) -> dict[str, tuple[Any, ...]]:
 
 
 def delete(engine: Engine, **wanted: Any) -> Any:
-    return delete_selection(engine.store, "hall", FrameSelection(**wanted), engine.undo_limits)
+    return delete_selection(engine.store, "hall", FrameSelection(**wanted), engine.tombstones)
 
 
 def edit(engine: Engine, seconds: float = 10.0, **wanted: Any) -> Any:
@@ -55,9 +54,9 @@ def test_frames_are_deleted_by_their_ids_once(empty: Engine, ids: list[str]) -> 
     assert list(known(empty)) == [one for one in ids if one not in (ids[0], ids[3], ids[7])]
     again = delete(empty, frame_ids=[ids[0], ids[7]])
     assert (again.frames, again.remaining, again.deletion) == (0, 0, None)
-    assert len(empty.undo.list_all("hall", None, 9).items) == 1
+    assert len(empty.tombstones.list_all("hall", None, 9).items) == 1
     with pytest.raises(UnknownMap):
-        delete_selection(empty.store, "attic", FrameSelection(frame_ids=ids), NO_UNDO)
+        delete_selection(empty.store, "attic", FrameSelection(frame_ids=ids), empty.tombstones)
 
 
 @pytest.mark.parametrize(
@@ -82,13 +81,13 @@ def test_frames_are_deleted_by_a_filter(
 def test_a_call_that_runs_out_of_time_says_what_is_left(empty: Engine, ids: list[str]) -> None:
     wanted = FrameSelection(filter=FrameListing(session=["a"]))
     told = [
-        delete_selection(empty.store, "hall", wanted, empty.undo_limits, seconds=0.0)
+        delete_selection(empty.store, "hall", wanted, empty.tombstones, seconds=0.0)
         for _ in range(4)
     ]
     assert [(one.frames, one.remaining) for one in told] == [(2, 3), (2, 1), (1, 0), (0, 0)]
     assert [one.deletion and one.deletion.frames for one in told] == [2, 2, 1, None]
     for one in told[:3]:
-        empty.undo.restore("hall", RestoreOptions(deletion_id=one.deletion.deletion_id))
+        empty.tombstones.restore("hall", one.deletion.deletion_id)
     assert list(known(empty)) == ids
 
 
@@ -164,6 +163,3 @@ def test_an_edit_changes_something() -> None:
     for given in ({}, {"add_tags": []}, {"after": "a"}):
         with pytest.raises(ValidationError, match="name session, robot, add_tags or remove_tags"):
             FramesEdit.model_validate({"frame_ids": ["a"]} | given)
-    for given in ({}, {"deletion_id": "a", "frame_ids": ["b"]}):
-        with pytest.raises(ValidationError, match="give either `deletion_id` or `frame_ids`"):
-            RestoreOptions.model_validate(given)

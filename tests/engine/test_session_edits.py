@@ -39,23 +39,26 @@ def frames(engine: Engine) -> dict[str, Frame]:
 
 def test_a_session_is_deleted_with_its_frames_and_blobs(empty: Engine, ids: list[str]) -> None:
     before = frames(empty)
-    change = delete_session(empty.store, "hall", "a", "r1")
+    change = delete_session(empty.store, "hall", "a", empty.tombstones, "r1")
     assert (change.session, change.robot, change.frames, change.remaining) == ("a", "r1", 5, 0)
     assert frames(empty) == {one: before[one] for one in ids[5:]}
+    assert empty.tombstones.purge(everything=True) == 5
     assert len(list(empty.store.blobs.digests())) == 7
     assert empty.get_map("hall").used_frames == 7
-    assert delete_session(empty.store, "hall", "a").frames == 3
-    assert delete_session(empty.store, "hall", "a/..").frames == 2
+    assert delete_session(empty.store, "hall", "a", empty.tombstones).frames == 3
+    assert delete_session(empty.store, "hall", "a/..", empty.tombstones).frames == 2
     assert list(frames(empty)) == ids[10:]
     for name, robot in (("a", None), ("", None), ("a", "r1")):
         with pytest.raises(UnknownSession, match="has no frame of session"):
-            delete_session(empty.store, "hall", name, robot)
+            delete_session(empty.store, "hall", name, empty.tombstones, robot)
     with pytest.raises(UnknownMap):
-        delete_session(empty.store, "hall-2", "a")
+        delete_session(empty.store, "hall-2", "a", empty.tombstones)
 
 
 def test_a_call_that_runs_out_of_time_says_what_is_left(empty: Engine, ids: list[str]) -> None:
-    told = [delete_session(empty.store, "hall", "a", seconds=0.0) for _ in range(4)]
+    told = [
+        delete_session(empty.store, "hall", "a", empty.tombstones, seconds=0.0) for _ in range(4)
+    ]
     assert [(one.frames, one.remaining) for one in told] == [(2, 6), (2, 4), (2, 2), (2, 0)]
     assert list(frames(empty)) == ids[8:]
 
@@ -70,7 +73,7 @@ def test_a_session_is_renamed_and_joins_another(empty: Engine, ids: list[str]) -
         free = {"etag": "", "revision": 0}
         now = after[one].model_copy(update=free)
         assert now == before[one].model_copy(update={**wanted, **free})
-    assert delete_session(empty.store, "hall", "a", "r2").frames == 3 + 2
+    assert delete_session(empty.store, "hall", "a", empty.tombstones, "r2").frames == 3 + 2
 
 
 def test_tags_are_added_once_and_removed(empty: Engine, ids: list[str]) -> None:

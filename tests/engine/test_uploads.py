@@ -13,6 +13,7 @@ from sqlalchemy import Connection, event, update
 
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.write_groups import Grouping
+from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.engine.upkeep import garbage_collection
 from sceneprint.errors import (
     FrameConflict,
@@ -22,7 +23,6 @@ from sceneprint.errors import (
     UselessFrame,
 )
 from sceneprint.store.tables import jobs
-from sceneprint.store.undo_rows import NO_UNDO
 from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
 
 Told = Callable[[Engine], list[str]]
@@ -219,7 +219,7 @@ def test_a_deleted_frame_is_found_no_more_and_may_come_again(
     data, meta, gone = uploads[3].data, uploads[3].meta, ids(full)[3]
     assert full.queries.upload(["hall"], data, meta, ASK).matches[0].frame_id == gone
     before = set(blobs(full))
-    full.undo_limits = NO_UNDO
+    full.tombstones = Tombstones(full.store, 0.0, full.bell.ring)
     full.delete_frame("hall", gone)
     assert len(before - set(blobs(full))) == 2  # upload and artifact
     answer = full.queries.upload(["hall"], data, meta, ASK)
@@ -252,7 +252,7 @@ def test_blobs_stay_while_another_map_refers_to_them(
     assert work_off(empty) == [JobState.SUCCEEDED] * 2
     both = blobs(empty)
     assert len(both) == 2
-    empty.undo_limits = NO_UNDO
+    empty.tombstones = Tombstones(empty.store, 0.0, empty.bell.ring)
     for name, left in (("hall", both), ("other", [])):
         if how == "map":
             empty.delete_map(name)

@@ -12,9 +12,9 @@ from PIL import Image
 
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs import signature_job as working
+from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import changes_since
-from sceneprint.store.undo_rows import NO_UNDO
 from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
 
 Told = Callable[[Engine], list[str]]
@@ -67,7 +67,7 @@ def test_a_frame_with_nothing_to_sign_is_rejected_with_the_reason(
     assert (new, again.state, again.reason) == (False, FrameState.REJECTED, frame.reason)
     assert changes(empty) == []
     assert empty.get_map("hall").revision == 0
-    empty.undo_limits = NO_UNDO
+    empty.tombstones = Tombstones(empty.store, 0.0, empty.bell.ring)
     empty.delete_frame("hall", added.frame_id)
     assert list(empty.store.blobs.digests()) == []
     assert empty.get_job(added.job_id).state == JobState.FAILED

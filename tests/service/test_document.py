@@ -44,7 +44,7 @@ def test_the_document_is_whole(document):
             place = place[step]
         assert isinstance(place, dict)
     names = [operation["operationId"] for operation in operations(document).values()]
-    assert len(names) == len(set(names)) == 106
+    assert len(names) == len(set(names))  # how many there are, its golden tells
     used = {reference.rpartition("/")[2] for reference in found}
     assert set(document["components"]["schemas"]) == used  # nothing that nothing refers to
 

@@ -61,7 +61,7 @@ OF_A_MAP = {
         "write", body={"frame_ids": ["{frame}"], "add_tags": ["x"]}
     ),
     "POST /v1/maps/{map_name}/frames/{frame_id}/restore": Case("write"),
-    "POST /v1/maps/{map_name}/restore": Case("write", body={"frame_ids": ["{frame}"]}),
+    "POST /v1/maps/{map_name}/deletions/{deletion_id}/restore": Case("write"),
     "GET /v1/maps/{map_name}/deletions": Case(),
     "GET /v1/maps/{map_name}/frames/{frame_id}/cloud.ply": Case(),
     "GET /v1/maps/{map_name}/frames/{frame_id}/preview.png": Case(),
@@ -142,7 +142,7 @@ MADE_OF_ANYTHING = (
     "PUT /v1/maps/{map_name}/frames/{frame_id}", "POST /v1/maps/{map_name}/associations",
     "POST /v1/maps/{map_name}/coverage", "POST /v1/maps/{map_name}/differences",
     "POST /v1/maps/{map_name}/frames/delete", "POST /v1/maps/{map_name}/frames/edit",
-    "POST /v1/maps/{map_name}/restore", "POST /v1/maps/{map_name}/queries/records",
+    "POST /v1/maps/{map_name}/queries/records",
 )  # fmt: skip
 #: The operator's: 403 for who has a map, whatever is asked for.
 OF_ALL = (
@@ -183,7 +183,7 @@ class There:
         jobs = [one for kind, one in kinds.items() if f"/{kind}" in operation]
         return {
             "map_name": self.map, "frame_id": self.frame, "query_id": self.query,
-            "job_id": (jobs or [self.job])[0], "key_name": "keeper",
+            "deletion_id": "1", "job_id": (jobs or [self.job])[0], "key_name": "keeper",
             "digest": self.artifact if "/artifacts/" in operation else self.tile,
         }[what]  # fmt: skip
 

@@ -27,7 +27,7 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.tables import MapRow, metadata
 
 TABLES = [
-    "audit", "deleted_frames", "deletions", "doomed", "events", "former_maps",
+    "audit", "doomed", "events", "former_maps",
     "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs", "keys", "maps",
     "models", "pending_events", "queries", "samples", "schema_range",
     "scrubs", "secrets", "signatures", "surface_frames",

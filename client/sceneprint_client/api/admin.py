@@ -399,7 +399,7 @@ KINDS = {
         "It was removed; no query finds it. `data.reason` is `retention` where its map keeps none "
         "so old."
     ),
-    "frame.restored": "Its deletion was undone; what was indexed is signed again.",
+    "frame.restored": "Its deletion was undone; queries find it again at once if it was indexed.",
     "query.answered": (
         "A query was answered, or failed; `data` has `query_id`, `status`, `robot`, `pose` where "
         "it was found, and more about it."

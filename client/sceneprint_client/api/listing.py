@@ -441,19 +441,6 @@ class FramesDeleted(ApiRecord):
     )
 
 
-class RestoreOptions(Given):
-    """Which deleted frames to restore."""
-
-    deletion_id: Label | None = Field(default=None, description="All frames of this deletion.")
-    frame_ids: _Ids | None = Field(default=None, description="These frames.")
-
-    @model_validator(mode="after")
-    def _names_one(self) -> RestoreOptions:
-        if (self.deletion_id is None) == (self.frame_ids is None):
-            raise ValueError("give either `deletion_id` or `frame_ids`")
-        return self
-
-
 class RefusedFrame(ApiRecord):
     """A frame that was not restored."""
 
@@ -466,10 +453,11 @@ class FramesRestored(ApiRecord):
 
     map: str
     frames: int = Field(
-        description="How many this call restored. Workers sign again those that were indexed."
+        description="How many this call restored. Queries find those that were indexed at once, "
+        "unless the map has another model since: then workers sign them again."
     )
     refused: list[RefusedFrame] = Field(
-        description=f"Frames that were not restored, at most {MOST_REFUSED} of them: another has "
-        "the id, or the same content was uploaded since."
+        description=f"Frames that were not restored, at most {MOST_REFUSED} of them: the same "
+        "content was uploaded since."
     )
     remaining: int = Field(description="How many are left as time was over: repeat the call.")

@@ -32,8 +32,9 @@ from sceneprint.formats.dataset.frame_reference import (
 from sceneprint.store import Store, queue
 from sceneprint.store.blobs.folder import IncomingBlob
 from sceneprint.store.database_errors import unusable
+from sceneprint.store.deletion import make_room
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import find_map, living_map, require_bytes
+from sceneprint.store.maps import find_map, living_map
 from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.tables import ARCHIVE, MapRow
 from sceneprint_client.api import Job, Page
@@ -241,7 +242,7 @@ class Imports:
         def reserve(size: int) -> None:
             nonlocal reserved
             reserved += size
-            self._require_room(row, incoming.add(row.number, size), size)
+            self._require_room(row, incoming.add(row.number, size))
 
         try:
             with self._store.blobs.incoming() as blob:
@@ -249,11 +250,15 @@ class Imports:
         finally:
             incoming.add(row.number, -reserved)
 
-    def _require_room(self, row: MapRow, incoming: int, size: int) -> None:
-        """Check that the last `size` of the bytes that come in have room in a map."""
+    def _require_room(self, row: MapRow, incoming: int) -> None:
+        """Check that a map has room for all bytes that come in, and purge tombstones for them."""
         with self._store.database.read() as connection:
             row = living_map(connection, row)
-        require_bytes(row, row.used_bytes + incoming - size, size)
+        if row.quota_bytes is None or row.used_bytes + incoming <= row.quota_bytes:
+            return
+        with self._store.database.write(map_number=row.number) as connection:
+            gone = make_room(connection, living_map(connection, row), incoming, new=False)
+        collect_deleted_blobs(self._store, gone)
 
     def begin(
         self,

@@ -25,6 +25,7 @@ from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upl
 from sceneprint.engine.ingest.write_groups import Grouping, NewFrames
 from sceneprint.engine.upkeep import garbage_collection, repair
 from sceneprint.store import Store
+from sceneprint.store.deletion import make_room
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import loosen, renew_frame
 from sceneprint.store.keys import IdempotentRequest, Overtaken
@@ -577,7 +578,7 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
     # a failed one is counted already, and may come packed otherwise
     held = 0 if frame is None or new else frame.bytes
     try:
-        require_room(connection, row, ready.size - held, new=new)
+        left.extend(make_room(connection, row, ready.size - held, new=new))
     except errors.QuotaExceeded as error:
         left.append(ready.blob)
         return UploadResult(None, error=error)

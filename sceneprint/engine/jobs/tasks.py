@@ -34,9 +34,10 @@ from sceneprint.errors import (
 )
 from sceneprint.store import Store, queue
 from sceneprint.store.audit_log import record_change
+from sceneprint.store.deletion import make_room
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import find_map, map_of, require_bytes
+from sceneprint.store.maps import find_map, map_of
 from sceneprint.store.tables import ARCHIVE, JobRow, MapRow
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Job, JobState
@@ -177,15 +178,15 @@ class Tasks:
                     there = queue.find_job(connection, before["job_id"])
                     return job_record(there, None, map_name), True
             self._check(files)
-            if row is not None:
-                size = sum(one.bytes for one in files if one.name == ARCHIVE)
-                require_bytes(row, row.used_bytes, size)
+            size = sum(one.bytes for one in files if one.name == ARCHIVE)
+            gone = [] if row is None else make_room(connection, row, size, new=False)
             number = None if row is None else row.number
             job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
             queue.add_files(connection, job.number, files)
             record_change(connection, "job.queued", map_name, job.id, kind=kind)
             if once is not None:
                 once.keep(connection, {"job_id": job.id})
+        collect_deleted_blobs(self._store, gone)
         self._bell.ring()
         return job_record(job, None, map_name), False
 

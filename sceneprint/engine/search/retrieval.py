@@ -223,7 +223,7 @@ def prepare_stored(
             vector, damaged = b"", True
         blobs = geometry_blobs(connection, [frame.number], row.model_id)
         up = known_ups(connection, [frame.number]).get(frame.number)
-    if vector is None:
+    if vector is None or frame.deletion is not None:
         raise errors.InvalidRequest(
             f"Frame {frame_id} is {frame.state}: {frame.state.sentence} Only an indexed frame "
             "can be a query.",

@@ -12,15 +12,17 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from pathlib import Path
 
 from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store import Store
 from sceneprint.store.blobs.folder import LONGEST_S
 from sceneprint.store.deletion import doom, doomed_blobs, settle
-from sceneprint.store.frames import referred_blobs
+from sceneprint.store.frames import is_frame_id, referred_blobs, refers_to
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +31,9 @@ log = logging.getLogger(__name__)
 SWEPT_AT_ONCE = 200
 #: Seconds to wait for another removal.
 _PATIENCE_S = 5.0
+#: Names of files in quarantine.
+_BLOB = re.compile("blob-(?P<digest>[0-9a-f]{64})")
+_SIGNATURE = re.compile(r"signature-(?P<frame_id>.+)-[0-9a-f]{12}\.bin")
 #: Blobs of deleted frames that are asked for at once.
 _LEFT_AT_ONCE = 1_000
 
@@ -93,6 +98,32 @@ def collect_deleted_blobs(store: Store, blobs: Sequence[str]) -> None:
         collect_blobs(store, blobs)
     except UnusableStore as error:
         log.warning("blob removal failed", extra={"blobs": len(blobs), "error": str(error)})
+
+
+def collect_quarantined(store: Store, folder: Path) -> int:
+    """Remove damaged bytes that were set aside, once what they belonged to is gone.
+
+    Parameters
+    ----------
+    store : see Store
+    folder : with `blob-DIGEST` and `signature-FRAME-MODEL.bin`
+
+    Returns
+    -------
+    removed : number of files
+    """
+    removed = 0
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        blob, signature = _BLOB.fullmatch(path.name), _SIGNATURE.fullmatch(path.name)
+        with store.database.read() as connection:
+            if blob is not None:
+                needed = refers_to(connection, blob["digest"])
+            else:  # what else lies there is none of ours
+                needed = signature is None or is_frame_id(connection, signature["frame_id"])
+        if not needed:
+            path.unlink(missing_ok=True)
+            removed += 1
+    return removed
 
 
 def collect_doomed_blobs(

@@ -17,14 +17,19 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain
+from pathlib import Path
 
 from sqlalchemy import Connection
 
-from sceneprint.engine.maps.selections import FrameUndo
+from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.engine.reconstruction import ReconstructionJobs
 from sceneprint.engine.results.query_log import QueryLog
 from sceneprint.engine.sessions.session_differences import DifferenceJobs
-from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs, collect_doomed_blobs
+from sceneprint.engine.upkeep.garbage_collection import (
+    collect_deleted_blobs,
+    collect_doomed_blobs,
+    collect_quarantined,
+)
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.errors import BusyIndex, SceneprintError, UnknownJob, UnknownMap
 from sceneprint.store import Store
@@ -150,7 +155,7 @@ class Purged:
 
     Parameters
     ----------
-    blobs : that were doomed, and left behind
+    blobs : that were doomed, and left behind; with files in quarantine
     answers, reconstructions, differences : that showed what is gone
     indexes : that were made anew or removed
     """
@@ -167,15 +172,18 @@ class Purging:
 
     Parameters
     ----------
-    store, upkeep, query_log, undo, reconstructions, differences : of the engine
+    store, upkeep, query_log, tombstones, reconstructions, differences : of the engine
     purge_s : seconds after which nothing may be left
+    quarantine : folder of damaged bytes that were set aside
     """
 
     def __init__(
-        self, store: Store, upkeep: Upkeep, query_log: QueryLog, undo: FrameUndo,
+        self, store: Store, upkeep: Upkeep, query_log: QueryLog, tombstones: Tombstones,
         reconstructions: ReconstructionJobs, differences: DifferenceJobs, purge_s: float,
+        quarantine: Path,
     ) -> None:  # fmt: skip
-        self._store, self._upkeep, self._log, self._undo = store, upkeep, query_log, undo
+        self._store, self._upkeep, self._log = store, upkeep, query_log
+        self._tombstones, self._quarantine = tombstones, quarantine
         self._reconstructions, self._differences = reconstructions, differences
         self._every_s = purge_s / 2  # what is deleted just after a look is gone in time too
         self._next = time.monotonic() + self._every_s
@@ -219,11 +227,12 @@ class Purging:
                     failed.append(error)
                 return 0
 
-        tried(lambda: self._undo.purge(everything=before is None))
+        tried(lambda: self._tombstones.purge(everything=before is None))
         with self._store.database.read() as connection:
             rows = [row for row in list_maps(connection) if wanted(row)]
         found = Purged(
-            blobs=tried(lambda: collect_doomed_blobs(self._store, before, seconds)),
+            blobs=tried(lambda: collect_doomed_blobs(self._store, before, seconds))
+            + tried(lambda: collect_quarantined(self._store, self._quarantine)),
             reconstructions=tried(self._reconstructions.forget),
             differences=tried(self._differences.forget),
             answers=tried(self._log.purge),

@@ -179,7 +179,9 @@ def _faults(folder: Folder, one: _Known) -> Iterator[_Fault]:
 
 
 def _stray(one: _Known) -> frozenset[str]:
-    """Models with which a frame should not be signed."""
+    """Return the models that a frame should have no signature of."""
+    if one.frame.deletion is not None:
+        return frozenset()  # it may be restored
     if one.frame.state in _GONE:
         return one.signed
     # another's signature would keep the frame from being signed

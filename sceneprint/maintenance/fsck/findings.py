@@ -90,11 +90,6 @@ class Folder:
     counts: Counter[str] = field(default_factory=Counter)
     _models: dict[str, Model | None] = field(default_factory=dict)
 
-    @property
-    def quarantine(self) -> Path:
-        """Where damaged bytes are moved to."""
-        return self.settings.data_dir / "quarantine"
-
     def model(self, model_id: str) -> Model | None:
         """A model; None where it is missing or damaged, which is a finding of its own."""
         if model_id not in self._models:
@@ -247,13 +242,13 @@ def quarantine_blob(folder: Folder, digest: str) -> str:
     with folder.store.blobs.removing() as allowed:
         if not allowed:
             raise StoreError(BUSY_BLOBS)
-        place = folder.store.blobs.quarantine(digest, folder.quarantine)
+        place = folder.store.blobs.quarantine(digest, folder.settings.quarantine_dir)
     return "" if place is None else f"moved to {place}; "
 
 
 def quarantine_bytes(folder: Folder, name: str, data: bytes) -> Path:
     """Keep damaged bytes that are about to be removed from the database."""
-    place = folder.quarantine / name
+    place = folder.settings.quarantine_dir / name
     make_folder(place.parent)
     write_durable(place, data)
     return place

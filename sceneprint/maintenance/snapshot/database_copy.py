@@ -331,10 +331,10 @@ def _check(file: sqlite3.Connection, form: Form, known: tuple[int, str]) -> None
 BUSY_S = 30.0
 #: The frames that blobs belong to: (digest, number of the frame, role).
 _USES_OF_FRAMES = (
-    "SELECT blob AS digest, number, 'upload' AS role FROM frames WHERE state NOT IN"
+    "SELECT blob AS digest, number, CASE WHEN deletion IS NULL THEN 'upload' ELSE 'deleted' END"
+    " AS role FROM frames WHERE deletion IS NOT NULL OR state NOT IN"
     f" ('{FrameState.DELETED}', '{FrameState.REDUNDANT}')"
     " UNION ALL SELECT geometry, frame_number, 'geometry' FROM signatures"
-    " UNION ALL SELECT blob, frame_number, 'deleted' FROM deleted_frames WHERE blob IS NOT NULL"
 )
 #: The jobs: (digest, number of the job, role).
 _USES_OF_JOBS = "SELECT blob AS digest, job_number AS number, 'job' AS role FROM job_files"

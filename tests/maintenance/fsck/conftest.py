@@ -16,12 +16,12 @@ import pytest
 from sqlalchemy import NullPool, create_engine, make_url
 
 from sceneprint.engine import Engine
+from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.maintenance.fsck.check import FindingOutcome, fsck
 from sceneprint.models import Model, open_table, write_model
 from sceneprint.settings import Settings
 from sceneprint.store.maps import add_map, keep_model
-from sceneprint.store.undo_rows import NO_UNDO
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, JobState, Query
 
@@ -147,7 +147,7 @@ def master(
         add("attic", uploads[HALL : HALL + 2])
         while (work := engine.claim("w")) is not None:
             assert engine.run(work) == JobState.SUCCEEDED
-        engine.undo_limits = NO_UNDO
+        engine.tombstones = Tombstones(engine.store, 0.0, engine.bell.ring)
         engine.delete_frame("attic", engine.list_frames("attic").items[0].frame_id)
         add("attic", [uploads[HALL + 2]])
     return house

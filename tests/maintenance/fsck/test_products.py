@@ -27,7 +27,6 @@ from sceneprint.store.query_rows import (
 from sceneprint.store.queue import JobFile, add_files, files_of, find_job
 from sceneprint.store.surface_rows import add_surface, find_surface, tiles_to_rebuild, write_tile
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, NewMap
-from sceneprint_client.api.listing import RestoreOptions
 
 
 @pytest.fixture
@@ -147,7 +146,7 @@ def deletion(settings: Settings) -> str:
             add_queries(connection, [query_of("a"), query_of("b"), query_of("c", listed=False)])
             keep_answer(connection, 1, b"an answer", 1.0)
         engine.delete_frame("hall", frame.frame_id)
-        (found,) = engine.undo.list_all("hall", None, 9).items
+        (found,) = engine.tombstones.list_all("hall", None, 9).items
     return found.deletion_id
 
 
@@ -174,7 +173,7 @@ def test_a_snapshot_has_kept_answers_and_what_can_be_restored(settings, deletion
                 ("b", None, 0), ("a", 1.0, 9)
             ]  # fmt: skip
             assert read_kept(connection, rows[1].number) == b"an answer"
-        done = engine.undo.restore("hall", RestoreOptions(deletion_id=deletion))
+        done = engine.tombstones.restore("hall", deletion)
         assert done.frames == 1
         assert [one.robot for one in engine.list_frames("hall").items] == ["r1"]
     assert list(fsck(again, grace_s=0)) == []

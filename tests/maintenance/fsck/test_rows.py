@@ -41,7 +41,7 @@ FAULTS = {
     ),
     "a signature of a frame that waits": (
         f"INSERT INTO signatures SELECT {WAITING}, model_id, vector, checksum, geometry,"
-        f" n_patches, n_pairs, NULL FROM signatures WHERE frame_number = {FIRST}",
+        f" n_patches, n_pairs FROM signatures WHERE frame_number = {FIRST}",
         "stray-signature",
         f"SELECT COUNT(*) FROM signatures WHERE frame_number = {WAITING}",
         [(0,)],
@@ -50,7 +50,7 @@ FAULTS = {
         (
             "INSERT INTO models SELECT 'other', name, content, created_at FROM models",
             "INSERT INTO signatures SELECT frame_number, 'other', vector, checksum, geometry,"
-            f" n_patches, n_pairs, NULL FROM signatures WHERE frame_number = {FIRST}",
+            f" n_patches, n_pairs FROM signatures WHERE frame_number = {FIRST}",
         ),
         "stray-signature",
         f"SELECT COUNT(*) FROM signatures WHERE frame_number = {FIRST}",
@@ -212,7 +212,7 @@ def test_an_index_that_lacks_a_frame_is_made_again(house: Any) -> None:
     )
     house.sql(
         "INSERT INTO signatures SELECT 99, model_id, vector, checksum, geometry, n_patches,"
-        " n_pairs, NULL FROM signatures WHERE frame_number = 1"
+        " n_pairs FROM signatures WHERE frame_number = 1"
     )
     house.sql("INSERT INTO frame_tags SELECT 99, tag FROM frame_tags WHERE frame_number = 1")
     house.sql(

@@ -4,7 +4,11 @@ import { h, put } from "../lib/dom.js";
 import { count, time } from "../lib/format.js";
 import { toast } from "../lib/states.js";
 
-const EDIT_UNDO_S = 60;
+/** For how long a message offers to undo a change; the page of sessions lists deletions for longer. */
+const UNDO_S = 60;
+/** Of each deletion whose message is still shown, by its map and id, what takes the message away.
+ * @type {Map<string, () => void>} */
+const offered = new Map();
 
 /**
  * @typedef {{frame_ids?: string[], filter?: Object<string, any>}} Selection one of the two
@@ -52,7 +56,8 @@ function offerRestore(map, text, deletions, changed) {
   const until = Math.min(...deletions.map((one) => Date.parse(one.until)));
   const clock = new Date(until).toTimeString().slice(0, 5);
   const act = async () => { await restore(map, deletions); await changed(); };
-  toast(`${text} You can undo it until ${clock}.`, { action: { text: "Undo", act, seconds: Math.max((until - Date.now()) / 1000, 1) } });
+  const close = toast(`${text} You can undo it until ${clock}.`, { action: { text: "Undo", act, seconds: UNDO_S } });
+  for (const { deletion_id: id } of deletions) offered.set(`${map}/${id}`, close);
 }
 
 /** Restore the frames of deletions. @param {string} map @param {Object<string, any>[]} deletions */
@@ -60,8 +65,10 @@ async function restore(map, deletions) {
   const refused = new Map();
   let done = 0;
   for (const { deletion_id: id } of deletions) {
+    offered.get(`${map}/${id}`)?.(); // undone from a list, nothing is left to offer
+    offered.delete(`${map}/${id}`);
     for (let left = 1; left > 0;) {
-      const { data } = await send("POST", at("maps", map, "restore"), { json: { deletion_id: id } });
+      const { data } = await send("POST", at("maps", map, "deletions", id, "restore"));
       for (const one of data.refused) refused.set(one.frame_id, one.reason);
       [done, left] = [done + data.frames, data.frames ? data.remaining : 0];
     }
@@ -98,7 +105,7 @@ export async function editFrames(map, edit, { say = () => {}, changed = () => {}
     toast(`${framesText(done)} ${done === 1 ? "is" : "are"} as before.`);
     await changed();
   };
-  toast(done ? `Changed ${framesText(done)}.` : "Nothing had to be changed.", done ? { action: { text: "Undo", act, seconds: EDIT_UNDO_S } } : {});
+  toast(done ? `Changed ${framesText(done)}.` : "Nothing had to be changed.", done ? { action: { text: "Undo", act, seconds: UNDO_S } } : {});
   return done;
 }
 

@@ -67,6 +67,7 @@ export function gone(back, signal) {
  * @param {string} text
  * @param {{kind?: "good" | "bad", action?: {text: string, act: () => void, seconds: number}}} [how]
  *   action: a button, and for how long it is there
+ * @returns {() => void} take it away
  */
 export function toast(text, { kind = "good", action } = {}) {
   const region = document.getElementById("toasts");
@@ -77,6 +78,7 @@ export function toast(text, { kind = "good", action } = {}) {
   while (region.children.length > 4) region.firstChild?.remove();
   // what went wrong stays until it was seen
   if (kind === "good") setTimeout(() => one.remove(), 1000 * (action?.seconds ?? TOAST_S));
+  return () => one.remove();
 }
 
 /**

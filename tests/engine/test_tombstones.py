@@ -1,0 +1,332 @@
+"""Deleted frames: found by nothing, restored as they were while that can be done, then gone."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import update
+
+from sceneprint.engine import Engine
+from sceneprint.engine.ingest.uploads import Upload
+from sceneprint.engine.maps import selections, tombstones
+from sceneprint.engine.maps.map_lifecycle import begin_reencoding, edit_map
+from sceneprint.engine.maps.selections import delete_selection, delete_session
+from sceneprint.errors import (
+    Conflict,
+    InvalidRequest,
+    QuotaExceeded,
+    UnknownDeletion,
+    UnknownFrame,
+    UnknownMap,
+)
+from sceneprint.models import Model
+from sceneprint.store.frames import set_state
+from sceneprint.store.maps import MapUsage, counted_usage, find_frame, find_map
+from sceneprint.store.tables import frames as frames_table
+from sceneprint_client.api import Frame, FrameMeta, FrameState, JobState, NewMap, Query
+from sceneprint_client.api.listing import FrameListing, FrameSelection
+
+#: What a restored frame has anew.
+FRESH = {"revision", "job_id", "indexed_at", "state"}
+
+
+def frames(engine: Engine) -> dict[str, Any]:
+    return {
+        one.frame_id: one.model_dump(exclude=FRESH)
+        for one in engine.list_frames("hall", None, 100).items
+    }
+
+
+def delete(engine: Engine, frame_ids: list[str]) -> Any:
+    wanted = FrameSelection(frame_ids=frame_ids)
+    return delete_selection(engine.store, "hall", wanted, engine.tombstones)
+
+
+def restore(engine: Engine, deletion: Any) -> Any:
+    return engine.tombstones.restore("hall", deletion.deletion_id)
+
+
+def end_undo(engine: Engine) -> None:
+    """Let the time of all deletions be over."""
+    with engine.store.database.write() as connection:
+        connection.execute(update(frames_table).values(ended_at=frames_table.c.ended_at - 601))
+
+
+def used(engine: Engine) -> MapUsage:
+    """Return what `hall` is counted to hold, which a count over its rows confirms."""
+    with engine.store.database.read() as connection:
+        row = find_map(connection, "hall")
+        assert counted_usage(connection, row.number) == MapUsage(row.used_frames, row.used_bytes)
+    return MapUsage(row.used_frames, row.used_bytes)
+
+
+def bytes_on_disk(engine: Engine) -> int:
+    return sum(
+        os.lstat(Path(folder, name)).st_size
+        for folder, _, names in os.walk(engine.settings.blob_dir)
+        for name in names
+    )
+
+
+def nearest(engine: Engine, upload: Any) -> tuple[str, float]:
+    answer = engine.queries.upload(["hall"], upload.data, upload.meta, Query(seed=5))
+    return answer.matches[0].frame_id, answer.matches[0].distance
+
+
+def test_a_deleted_frame_is_found_by_nothing(full: Engine, uploads: Any) -> None:
+    [first, second, *_] = frames(full)
+    meta = full.get_frame("hall", first)
+    assert nearest(full, uploads[0])[0] == first
+    full.delete_frame("hall", first)
+    assert nearest(full, uploads[0])[0] != first
+    assert first not in frames(full)
+    assert full.get_map("hall").frames == {"deleted": 1, "indexed": len(uploads) - 1}
+    for wanted in (
+        FrameListing(find=first), FrameListing(content_id=meta.content_id),
+        FrameListing(parent_frame=uploads[0].room, has_pose=True),
+        FrameListing(state=FrameState.DELETED, parent_frame=uploads[0].room),
+    ):  # fmt: skip
+        assert first not in {one.frame_id for one in full.list_frames("hall", wanted=wanted).items}
+    bare = full.get_frame("hall", first)
+    assert (bare.state, bare.pose, bare.content_id, bare.tags) == ("deleted", None, None, [])
+    assert full.list_frames("hall", state=FrameState.DELETED).items == [bare]
+    with pytest.raises(UnknownFrame):
+        full.outputs.upload("hall", first)
+    with pytest.raises(InvalidRequest, match="Only an indexed frame can be a query"):
+        full.query_frame("hall", first, Query())
+    answer = full.query_frame("hall", second, Query())
+    assert first not in {one.frame_id for one in answer.matches}
+
+
+def test_a_restored_frame_is_as_it_was_and_found_at_once(
+    full: Engine, uploads: Any, told: Callable[[Engine], list[str]]
+) -> None:
+    """No worker runs: its signature was there all the while."""
+    before, use = frames(full), used(full)
+    first = next(iter(before))
+    found = nearest(full, uploads[0])
+    full.delete_frame("hall", first)
+    full.rebuild_index("hall")  # an index that was published without it
+    assert nearest(full, uploads[0])[0] != first
+    full.tombstones.restore_one("hall", first)
+    assert nearest(full, uploads[0]) == found
+    assert frames(full) == before
+    assert used(full) == use
+    assert full.claim("w") is None
+    assert full.get_frame("hall", first).state == FrameState.INDEXED
+    assert told(full)[-2:] == ["frame.deleted", "frame.restored"]
+    assert full.tombstones.list_all("hall", None, 9).items == []
+    for name in (first, "none"):
+        with pytest.raises(UnknownFrame, match="was not deleted, or cannot be restored"):
+            full.tombstones.restore_one("hall", name)
+
+
+def test_a_frame_of_a_map_that_has_another_model_now_is_signed_again(
+    full: Engine, work_off: Callable[[Engine], list[Any]], small_model: Model
+) -> None:
+    first = next(iter(frames(full)))
+    full.delete_frame("hall", first)
+    begin_reencoding(full.store, "hall", small_model)
+    full.publish_due()
+    work_off(full)
+    full.publish_due()
+    assert full.get_map("hall").model_id == small_model.id
+    full.tombstones.restore_one("hall", first)
+    assert full.get_frame("hall", first).state == FrameState.RECEIVED
+    assert work_off(full) == [JobState.SUCCEEDED]
+    assert full.get_frame("hall", first).state == FrameState.INDEXED
+
+
+def test_a_session_is_restored_with_names_tags_and_states(
+    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (selections, tombstones):
+        monkeypatch.setattr(module, "AT_ONCE", 2)
+    for number, upload in enumerate(uploads[:7]):
+        known = {
+            "session": "a" if number < 5 else "b", "robot": "r", "tags": ["x", f"{number}"],
+            "name": f"{number}.png", "sequence": number,
+        }  # fmt: skip
+        meta = FrameMeta.model_validate(upload.meta.model_dump() | known)
+        empty.add_frame("hall", upload.data, meta)
+    before = frames(empty)
+    change = delete_session(empty.store, "hall", "a", empty.tombstones)
+    assert change.deletion is not None
+    assert change.deletion.frames == 5
+    (deletion,) = empty.tombstones.list_all("hall", None, 9).items
+    assert deletion == change.deletion
+    assert (deletion.until - deletion.at).total_seconds() == pytest.approx(600, abs=0.01)
+    assert len(frames(empty)) == 2
+    assert empty.list_frames("hall", wanted=FrameListing(tag=["0"])).items == []
+    assert len(list(empty.store.blobs.digests())) == 7
+    part = empty.tombstones.restore("hall", deletion.deletion_id, seconds=0.0)
+    assert (part.frames, part.refused, part.remaining) == (2, [], 3)
+    assert restore(empty, deletion).frames == 3
+    assert frames(empty) == before
+    assert {one.state for one in empty.list_frames("hall").items} == {FrameState.RECEIVED}
+    assert len(empty.list_frames("hall", wanted=FrameListing(tag=["x"])).items) == 7
+    for unknown in (deletion.deletion_id, "0", "none", "9" * 40, "²"):
+        with pytest.raises(UnknownDeletion):
+            empty.tombstones.restore("hall", unknown)
+
+
+def test_what_has_come_again_is_not_restored(full: Engine, uploads: Any) -> None:
+    first, second, third = list(frames(full))[:3]
+    deletion = delete(full, [first, second, third]).deletion
+    again, new = full.add_frame("hall", uploads[0].data, uploads[0].meta)
+    assert new
+    other = uploads[8].meta.model_copy(update={"name": "other"})
+    put = Upload(uploads[8].data, other, frame_id=second)  # another frame under the second's id
+    assert full.uploads.add("hall", put)[0].taken.frame_id == second
+    (left,) = full.tombstones.list_all("hall", None, 9).items
+    assert left.frames == 2
+    with pytest.raises(Conflict, match=f"uploaded again, as frame {again.frame_id}"):
+        full.tombstones.restore_one("hall", first)
+    with pytest.raises(UnknownFrame):
+        full.tombstones.restore_one("hall", second)
+    done = restore(full, deletion)
+    assert (done.frames, done.remaining) == (1, 0)
+    reasons = {one.frame_id: one.reason for one in done.refused}
+    assert reasons == {first: f"it was uploaded again, as frame {again.frame_id}"}
+    assert third in frames(full)
+    assert full.get_frame("hall", second).name == "other"
+    assert full.tombstones.purge(everything=True) == 2
+    assert used(full).frames == len(uploads)
+
+
+def test_a_quota_of_frames_holds(full: Engine) -> None:
+    names = list(frames(full))
+    deletion = delete(full, names[:3]).deletion
+    edit_map(full.store, "hall", {"quota_frames": len(names) - 1})
+    with pytest.raises(QuotaExceeded, match="The deletion has 3 frames"):
+        restore(full, deletion)
+    assert len(frames(full)) == len(names) - 3
+    for name in names[:2]:
+        full.tombstones.restore_one("hall", name)
+    with pytest.raises(QuotaExceeded):
+        full.tombstones.restore_one("hall", names[2])
+
+
+def test_bytes_of_deleted_frames_count_until_they_are_purged(full: Engine) -> None:
+    names, use = list(frames(full)), used(full)
+    size = sum(len(full.outputs.upload("hall", one).make()) for one in names[:2])
+    delete(full, names[:2])
+    assert used(full) == MapUsage(use.frames - 2, use.bytes)
+    end_undo(full)
+    assert full.tombstones.purge() == 2
+    assert used(full) == MapUsage(use.frames - 2, use.bytes - size)
+
+
+def test_an_upload_beyond_the_quota_purges_the_oldest_deletions(
+    empty: Engine, uploads: Any
+) -> None:
+    names = [empty.add_frame("hall", one.data, one.meta)[0].frame_id for one in uploads[:4]]
+    sizes = [len(one.data) for one in uploads]
+    quota = sum(sizes[:4])
+    edit_map(empty.store, "hall", {"quota_bytes": quota})
+    for name in names[:3]:
+        empty.delete_frame("hall", name)
+    empty.add_frame("hall", uploads[4].data, uploads[4].meta)  # as large as one, or as two
+    assert names[0] not in restorable(empty, names)
+    assert names[2] in restorable(empty, names)
+    assert used(empty).bytes == bytes_on_disk(empty) <= quota
+    batch = [Upload(one.data, one.meta) for one in uploads[5:7]]
+    results, _ = empty.uploads.add_all("hall", batch)
+    assert [one.new for one in results] == [True, sum(sizes[3:7]) <= quota]
+    assert used(empty).bytes == bytes_on_disk(empty) <= quota
+    # what would not fit anyway purges nothing
+    left = restorable(empty, names)
+    edit_map(empty.store, "hall", {"quota_bytes": 1})
+    with pytest.raises(QuotaExceeded):
+        empty.add_frame("hall", uploads[8].data, uploads[8].meta)
+    assert restorable(empty, names) == left
+
+
+def restorable(engine: Engine, names: list[str]) -> set[str]:
+    """Return the names of the frames that can be restored, by restoring and deleting them."""
+    found = set()
+    for name in names:
+        try:
+            engine.tombstones.restore_one("hall", name)
+        except UnknownFrame:
+            continue
+        engine.delete_frame("hall", name)
+        found.add(name)
+    return found
+
+
+def test_after_its_time_a_deletion_is_for_good(full: Engine) -> None:
+    names = list(frames(full))
+    deletion = delete(full, names[:2]).deletion
+    blobs = len(list(full.store.blobs.digests()))
+    assert full.tombstones.purge() == 0
+    end_undo(full)
+    with pytest.raises(UnknownDeletion, match="its time is over"):
+        restore(full, deletion)
+    with pytest.raises(UnknownFrame, match="cannot be restored any more"):
+        full.tombstones.restore_one("hall", names[0])
+    assert full.tombstones.list_all("hall", None, 9).items == []
+    assert full.tombstones.purge() == 2
+    assert len(list(full.store.blobs.digests())) == blobs - 4  # uploads and artifacts
+    assert full.tombstones.purge() == 0
+
+
+def test_without_time_to_undo_a_deletion_is_for_good(
+    full: Engine, make_engine: Callable[..., Engine]
+) -> None:
+    names, blobs = list(frames(full)), len(list(full.store.blobs.digests()))
+    never = make_engine(undo_s=0)
+    done = delete(never, names[:1])
+    assert (done.frames, done.deletion) == (1, None)
+    assert len(list(full.store.blobs.digests())) == blobs - 2
+    assert used(full).frames == len(names) - 1
+
+
+def test_deletions_are_listed_a_page_at_a_time(full: Engine) -> None:
+    names = list(frames(full))
+    made = [delete(full, [one]).deletion for one in names[:3]]
+    page = full.tombstones.list_all("hall", None, 2)
+    assert page.items == [made[2], made[1]]
+    assert full.tombstones.list_all("hall", page.next_cursor, 2).items == [made[0]]
+    with pytest.raises(InvalidRequest):
+        full.tombstones.list_all("hall", "x", 2)
+    with pytest.raises(UnknownMap):
+        full.tombstones.list_all("attic", None, 2)
+    full.delete_map("hall")
+    assert list(full.store.blobs.digests()) == []
+
+
+def test_what_could_not_be_signed_is_restored_as_it_was(empty: Engine, uploads: Any) -> None:
+    """A redundant frame has no upload any more, and is deleted for good."""
+    made: list[Frame] = []
+    for one, state in zip(uploads, (FrameState.REJECTED, FrameState.REDUNDANT), strict=False):
+        name = empty.add_frame("hall", one.data, one.meta)[0].frame_id
+        with empty.store.database.write() as connection:
+            found = find_frame(connection, find_map(connection, "hall"), name)
+            set_state(connection, found.number, state, "as a test says")
+        made.append(empty.get_frame("hall", name))
+    use = used(empty)
+    deletion = delete(empty, [one.frame_id for one in made]).deletion
+    assert deletion.frames == 1
+    assert restore(empty, deletion).frames == 1
+    now = empty.get_frame("hall", made[0].frame_id)
+    assert (now.state, now.reason) == (FrameState.REJECTED, "as a test says")
+    assert empty.get_frame("hall", made[1].frame_id).state == FrameState.DELETED
+    assert used(empty) == use
+
+
+def test_maps_do_not_share_their_deletions(full: Engine, uploads: Any) -> None:
+    full.create_map(NewMap(name="attic", model="depth"))
+    other = full.add_frame("attic", uploads[0].data, uploads[0].meta)[0].frame_id
+    first = next(iter(frames(full)))
+    deletion = delete(full, [first]).deletion
+    full.delete_frame("attic", other)
+    with pytest.raises(UnknownDeletion):
+        full.tombstones.restore("attic", deletion.deletion_id)
+    with pytest.raises(UnknownFrame):
+        full.tombstones.restore_one("attic", first)
+    assert restore(full, deletion).frames == 1
