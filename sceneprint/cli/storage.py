@@ -355,8 +355,7 @@ def name_damaged(snapshot: Snapshot, advice: str) -> bool:
     if not snapshot.damaged:
         return False
     for one in snapshot.damaged[:_SHOWN]:
-        of = ", ".join(f"{use.role} of {use.map}/{use.frame}" for use in one.of)
-        print(one_line(f"not in it: blob {one.digest[:12]}, {one.why}: {of}"), file=sys.stderr)
+        print(f"not in it: blob {one.digest[:12]}, {one.why}", file=sys.stderr)
     more = len(snapshot.damaged) - _SHOWN
     if more > 0:
         print(f"... and {more} more, in damaged.jsonl of the archive", file=sys.stderr)
@@ -375,8 +374,7 @@ def add_restore(commands: Any) -> None:
         description="Verify a snapshot and restore it to a data folder, all or nothing. With "
         "the URL of an empty PostgreSQL database, its rows go there in one transaction, and its "
         "blobs to SCENEPRINT_BLOB_URL or else the data folder. A folder that is not empty stays "
-        "untouched unless you give --replace, which moves it aside and never deletes it: stop "
-        "every process that uses it first. Exit code 1 if the snapshot lists blobs that were "
+        "untouched. Exit code 1 if the snapshot lists blobs that were "
         "damaged when it was taken; 2 if nothing was restored.",
     )
     command.add_argument(
@@ -387,13 +385,11 @@ def add_restore(commands: Any) -> None:
     )
     add_data_option(command)
     add_database_option(command)
-    choice = command.add_mutually_exclusive_group()
-    choice.add_argument(
+    command.add_argument(
         "--verify-only",
         action="store_true",
         help="read and check the whole snapshot without restoring it",
     )
-    choice.add_argument("--replace", action="store_true", help="move the existing folder aside")
     command.set_defaults(run=run_restore)
 
 
@@ -403,20 +399,18 @@ def run_restore(options: argparse.Namespace) -> int:
     archive: Path = options.archive
     with ended_by_signals():
         if options.verify_only:
-            snapshot, done, aside = *_verified(archive), None
+            snapshot, done = _verified(archive)
         elif settings.database_url is not None:
-            snapshot, done, aside = *_filled(archive, settings, options), None
+            snapshot, done = _filled(archive, settings)
         else:
-            snapshot, done, aside = _restore_to_folder(archive, settings, options)
+            snapshot, done = _restore_to_folder(archive, settings)
     seconds = time.perf_counter() - start
     shown = one_line(str(options.archive))
     print(f"{shown} {done}: {contents(snapshot)} of "
           f"{snapshot.manifest.created_at:%Y-%m-%dT%H:%M:%SZ} in {seconds:.1f} s")  # fmt: skip
-    if aside is not None:
-        print(f"the previous contents are now in {one_line(str(aside))}", file=sys.stderr)
     advice = (
-        "These frames were already damaged when the snapshot was taken. Delete them, or upload "
-        "them again."
+        "These blobs were damaged when the snapshot was taken. Run `sceneprint fsck` on the "
+        "restored store to see whose they are."
     )
     return 1 if name_damaged(snapshot, advice) else 0
 
@@ -428,8 +422,8 @@ def _verified(archive: Path) -> tuple[Snapshot, str]:
         return verify_snapshot(archive, progress), "is complete"
 
 
-def _filled(archive: Path, settings: Settings, options: argparse.Namespace) -> tuple[Snapshot, str]:
-    """Restored into the database of a fleet."""
+def _filled(archive: Path, settings: Settings) -> tuple[Snapshot, str]:
+    """Restore into the database of a fleet."""
     from sceneprint.maintenance.snapshot.postgres_restore import restore_to_fleet
     from sceneprint.store.database import reach_database
 
@@ -441,20 +435,13 @@ def _filled(archive: Path, settings: Settings, options: argparse.Namespace) -> t
             "folder, where no service would look for it. Unset the variable, for the service "
             "too."
         )
-    if options.replace:
-        raise InvalidRequest(
-            "--replace moves a folder aside, which a database cannot do. Create an empty "
-            "database (CREATE DATABASE), and name that."
-        )
     with byte_progress("restore") as progress:
         snapshot = restore_to_fleet(archive, settings, progress)
     return snapshot, f"is restored to {one_line(database.shown)}"
 
 
-def _restore_to_folder(
-    archive: Path, settings: Settings, options: argparse.Namespace
-) -> tuple[Snapshot, str, Path | None]:
-    """Restored to a folder."""
+def _restore_to_folder(archive: Path, settings: Settings) -> tuple[Snapshot, str]:
+    """Restore to a folder."""
     from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 
     if settings.blob_url is not None:
@@ -464,10 +451,8 @@ def _restore_to_folder(
             "--database."
         )
     with byte_progress("restore") as progress:
-        snapshot, aside = restore_snapshot(
-            archive, settings.data_dir, replace=options.replace, progress=progress
-        )
-    return snapshot, f"is restored to {one_line(str(settings.data_dir))}", aside
+        snapshot = restore_snapshot(archive, settings.data_dir, progress)
+    return snapshot, f"is restored to {one_line(str(settings.data_dir))}"
 
 
 # `sceneprint pull`: a robot's copies of maps, to localise without network.
