@@ -209,7 +209,7 @@ def test_operators_see_what_goes_on(outputs: dict[str, list[str]]) -> None:
     assert (rotated["name"], rotated["secret"] != made["secret"]) == ("robot-7", True)
     assert rotated["previous_until"] is not None
     restored, deleted = one(outputs, "Take out")
-    assert restored["state"] == "received"
+    assert restored["state"] == "indexed"
     assert deleted["frames"] == deleted["deletion"]["frames"] == 1
     assert one(outputs, "When something is wrong")[0]["type"] == "/problems/unknown-map"
 
