@@ -20,7 +20,7 @@ export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell echo $$((2 * $$(env -u OMP_NUM_T
 	screenshots docs docs-serve soak siege fleet models lock sbom advisories dist clean
 
 help:
-	@echo "make demo    find frames among others with their pose [DATASET=folder]"
+	@echo "make demo    find frames among others with their pose, and draw one [DATASET=folder]"
 	@echo "make test    lint, types, import contracts and the tests"
 	@echo "make test-thorough  tests that make test leaves out, as they take minutes or seldom fail"
 	@echo "make test-portable  numeric tests as other processors compute them, one after another [TARGET=generic]"
@@ -50,7 +50,7 @@ $(STAMP): $(RUNTIME) requirements-dev.lock
 	@touch $@
 
 demo: $(RUNTIME)
-	$(BIN)/sceneprint demo $(if $(DATASET),--dataset "$(DATASET)")
+	$(BIN)/sceneprint demo --out demo $(if $(DATASET),--dataset "$(DATASET)")
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -176,7 +176,7 @@ dist: $(STAMP)
 	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist dist/*.tar.gz
 	@tools/install $(PYTHON) dist/try requirements.lock
 	dist/try/bin/python -m pip install --quiet --no-deps dist/*.whl
-	cd dist && try/bin/sceneprint demo
+	cd dist && try/bin/sceneprint demo --out demo
 	@rm -rf dist/try && ls -l dist
 
 clean:

@@ -1,6 +1,7 @@
 """Frames as small pictures: depth, normals or patches.
 
 Surface, labels  --depth_view | normals_view | patches_view-->  colours  --picture-->  PNG
+Surfaces, transform  --overlay_picture-->  PNG
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneprint.geometry.rigid import moved
 from sceneprint.types import (
     Bytes,
     Floats,
@@ -279,6 +281,55 @@ def picture(colours: Bytes, width: int, text: Mapping[str, str]) -> bytes:
         info.add_text(name, value)
     buffer = io.BytesIO()
     Image.fromarray(colours[rows[:, None], columns]).save(buffer, "PNG", pnginfo=info)
+    return buffer.getvalue()
+
+
+# Two frames, laid on each other by a transform.
+
+#: Colours of the query and of the match, red, green, blue; the same as on the dashboard.
+QUERY_COLOUR, MATCH_COLOUR = (217, 119, 43), (43, 108, 176)
+#: Pixels along the longer side of a panel, and the points that give a pixel its full colour.
+_PANEL, _FULL = 480, 1.5
+
+
+def overlay_picture(query: Surface, match: Surface, T_match_query: Floats, title: str) -> bytes:
+    """Draw two frames from above, before and after the transform, side by side as a PNG.
+
+    Parameters
+    ----------
+    query, match : points in their own cameras, metres
+    T_match_query : (4, 4) query coordinates to the match's
+    title : one line of ASCII above the panels
+    """
+    from PIL import Image, ImageDraw
+
+    # from above: x to the right and z up the picture, where the match's camera looks
+    of_query, of_match = (one.points[one.valid].astype(np.float64) for one in (query, match))
+    aligned = moved(T_match_query, of_query)
+    everything = np.concatenate([of_match, of_query, aligned])[:, [0, 2]]
+    low, high = np.percentile(everything, (1, 99), axis=0)  # a few stray points lie far out
+    scale = (_PANEL - 1) / (high - low).max()
+    columns, rows = np.ceil((high - low) * scale).astype(int) + 1
+    panels = []
+    for points in (of_query, aligned):
+        panel = np.ones((rows, columns, 3))
+        for drawn, colour in ((of_match, MATCH_COLOUR), (points, QUERY_COLOUR)):
+            x, y = np.rint((drawn[:, [0, 2]] - low) * scale).astype(int).T
+            inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+            counts = np.zeros((rows, columns))
+            np.add.at(counts, (rows - 1 - y[inside], x[inside]), 1.0)
+            ink = np.minimum(counts / _FULL, 1.0)[..., None]
+            panel *= 1.0 - ink * (1.0 - np.array(colour) / 255)
+        panels.append(np.pad(panel, ((44, 4), (8, 8), (0, 0)), constant_values=1.0))
+    image = Image.fromarray(np.rint(np.concatenate(panels, axis=1) * 255).astype(np.uint8))
+    pen = ImageDraw.Draw(image)
+    pen.text((8, 4), title, "black")
+    for i, when in enumerate(("before", "after")):
+        pen.text((8 + i * (columns + 16), 24), f"{when} alignment, from above:", "black")
+        pen.text((218 + i * (columns + 16), 24), "query", QUERY_COLOUR)
+        pen.text((256 + i * (columns + 16), 24), "match", MATCH_COLOUR)
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG")
     return buffer.getvalue()
 
 

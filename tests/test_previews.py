@@ -9,10 +9,13 @@ import pytest
 from PIL import Image
 
 from sceneprint.pictures import (
+    MATCH_COLOUR,
     MOST_ROWS,
+    QUERY_COLOUR,
     UNKNOWN,
     depth_view,
     normals_view,
+    overlay_picture,
     patches_view,
     picture,
 )
@@ -101,3 +104,21 @@ def test_no_picture_is_larger_than_it_may_be() -> None:
     for width in (63, 1281):
         with pytest.raises(ValueError, match="from 64 to 1280"):
             picture(np.zeros((2, 2, 3), np.uint8), width, {})
+
+
+def test_an_overlay_by_hand() -> None:
+    """Two points 4 m apart in x and z, seen from 2 m to the right: 479 pixels stand for 6 m."""
+    match = surface([[1.0] * 50, [1.0] * 50])
+    match.points[:] = 0.0
+    match.points[1, :, 0] = match.points[1, :, 2] = 4.0
+    query = surface([[1.0] * 50, [1.0] * 50])
+    query.points[:] = match.points - np.float32([2, 0, 0])
+    transform = np.eye(4)
+    transform[0, 3] = 2.0
+    with Image.open(io.BytesIO(overlay_picture(query, match, transform, "hall"))) as image:
+        pixels = np.asarray(image)
+    before, after = pixels[44:, 8:488], pixels[44:, 504:984]
+    assert before[1, 479].tolist() == list(MATCH_COLOUR)
+    assert before[1, 319].tolist() == list(QUERY_COLOUR)  # at x = 2
+    assert after[1, 319].tolist() == [255, 255, 255]
+    assert after[1, 479].tolist() == [37, 50, 30]  # the product of both

@@ -123,7 +123,7 @@ def map_path(name: str) -> str:
 
 
 def query_path(query_id: str) -> str:
-    """Path of a kept answer; UnknownQuery where no answer can have that id."""
+    """Path of a past query; UnknownQuery where no answer can have that id."""
     return f"/v1/queries/{_part(query_id, 'query', UnknownQuery)}"
 
 
@@ -133,7 +133,7 @@ def reconstruction_path(job_id: str) -> str:
 
 
 def match_path(query_id: str, frame_id: str) -> str:
-    """Path of a match of a kept answer; UnknownQuery or UnknownFrame as `query_path`."""
+    """Path of a match of a past query; UnknownQuery or UnknownFrame as `query_path`."""
     return f"{query_path(query_id)}/matches/{_part(frame_id, 'frame', UnknownFrame)}"
 
 

@@ -546,7 +546,7 @@ class JobMethods(ServiceConnection):
 
         Parameters
         ----------
-        query : the answer, or the id of its query; answers are kept for an hour
+        query : the answer, or the id of its query
         frames, strength, include_query, voxel_m, output : see NewReconstruction
         wait_s : seconds to wait for it; default: none
 
@@ -556,7 +556,7 @@ class JobMethods(ServiceConnection):
 
         Raises
         ------
-        UnknownQuery : the answer is not kept, or no longer.
+        UnknownQuery : the answer is not stored, or no longer.
         InvalidRequest : it has no accepted match, or lacks a named one.
         """
         chosen = None if frames is None else tuple(frames)

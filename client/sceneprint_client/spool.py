@@ -454,9 +454,9 @@ class Spool:
         # a full disk may have no room for these: whoever reads them is told so
         with suppress(errors.StoreFull), self._transaction() as database:
             database.executemany(
-                "INSERT OR REPLACE INTO reasons SELECT id, ?2 FROM frames "
-                "WHERE id = ?1 AND reason IS NOT NULL",
-                list(refused.items()),
+                "INSERT OR REPLACE INTO reasons SELECT id, ? FROM frames "
+                "WHERE id = ? AND reason IS NOT NULL",
+                [(reason, number) for number, reason in refused.items()],
             )
 
     # the file

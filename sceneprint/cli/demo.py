@@ -20,8 +20,10 @@ from selectors import EVENT_READ, DefaultSelector
 from tempfile import TemporaryDirectory
 from typing import IO, Any
 
+import numpy as np
 from tqdm import tqdm
 
+from sceneprint.atomic_files import write_whole
 from sceneprint.cli import positive
 from sceneprint.cli.options import ended_by_signals
 from sceneprint.engine.search.verification import CANDIDATES
@@ -35,8 +37,10 @@ from sceneprint.formats.dataset import (
     write_pose,
 )
 from sceneprint.lab.evaluation.report import FramePlace, answer_rows, judge_answers
-from sceneprint.models import PRESETS
+from sceneprint.models import PRESETS, read_model
+from sceneprint.pictures import overlay_picture
 from sceneprint.settings import Settings
+from sceneprint.signing import see
 from sceneprint_client import Client, meta_of
 from sceneprint_client.api import Added, Answer, JobState
 
@@ -158,8 +162,10 @@ def add_demo(commands: Any) -> None:
         help="run a service, upload a map, query it over HTTP and print the accuracy",
         description="Start a service with an empty folder, upload the frames of a small "
         "synthetic building (or of --dataset) to a map, query it with other frames, print the "
-        "rows of the paper with true pose errors. The service and its data are removed at the end.",
+        "rows of the paper with true pose errors, and draw a match. The service and its data are "
+        "removed at the end.",
     )
+    command.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR")
     command.add_argument(
         "--dataset",
         type=Path,
@@ -185,6 +191,7 @@ def run_demo(options: argparse.Namespace) -> int:
     from sceneprint.cli.options import prepare_presets
     from sceneprint_client import Client
 
+    options.out.mkdir(parents=True, exist_ok=True)
     begun = time.perf_counter()
     with ended_by_signals(), TemporaryDirectory(prefix="sceneprint-demo-") as temporary:
         folder = Path(temporary)
@@ -196,6 +203,7 @@ def run_demo(options: argparse.Namespace) -> int:
             known = fill(client, options.model, choice)
             asked = run_queries(client, choice)
         report(known, asked)
+        draw(known, asked, options.model, options.out)
     print(f"whole demo: {time.perf_counter() - begun:.1f} s")
     print(
         "next: `sceneprint serve`; then, in another terminal, `sceneprint upload MAP PATH` and "
@@ -315,7 +323,7 @@ def _upload(client: Client, one: DemoFrame) -> Added:
     return client.upload(DEMO_MAP, one.reference.path, meta)
 
 
-# What the demo found: the paper's rows with true pose errors.
+# What the demo found: the paper's rows with true pose errors, and a picture.
 
 _NAMES = {
     "R": "R    nearest frame",
@@ -370,6 +378,31 @@ def table(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
             line += f"{spread:>32}"
         lines.append(line)
     return lines
+
+
+def draw(
+    known: Mapping[str, DemoFrame], asked: Sequence[DemoQuery], preset: str, out: Path
+) -> None:
+    """Draw the accepted match that turns the query most, as there alignment shows best."""
+    found = [
+        (one, match, np.array(match.transform.matrix))
+        for one in asked
+        for match in one.diverse.matches[:1]
+        if match.validation.status == "accepted" and match.transform is not None
+    ]
+    if not found:
+        print("no picture: no match was accepted")
+        return
+    one, match, transform = min(found, key=lambda each: each[2][:3, :3].trace())
+    parameters = read_model(preset).parameters
+    query, database = one.chosen.reference, known[match.frame_id].reference
+    title = f"{query.name} in {database.name}: {match.validation.overlap:.0%} of the surfaces agree"
+    picture = overlay_picture(
+        see(query.read(), parameters), see(database.read(), parameters), transform,
+        title.encode("ascii", "replace").decode(),
+    )  # fmt: skip
+    write_whole(out / "overlay.png", picture)
+    print(f"picture: {out / 'overlay.png'}")
 
 
 def place_of(one: DemoFrame) -> FramePlace | None:

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic_core import from_json
 
 from sceneprint.atomic_files import write_whole
-from sceneprint.cli import positive, whole_number
+from sceneprint.cli import positive
 from sceneprint.cli.options import (
     add_scene_options,
     add_service_options,
@@ -23,7 +23,6 @@ from sceneprint.cli.options import (
     open_client,
     open_scene,
     up_of,
-    wants_scene,
 )
 from sceneprint.errors import InvalidRequest
 from sceneprint.models import PRESETS
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     from sceneprint.scenes.scene import SceneStream
     from sceneprint_client import Client
     from sceneprint_client.api import Frame, Job, Map
-    from sceneprint_client.api.admin import Event
     from sceneprint_client.api.results import QueryRecord
 
 #: Options that take a file for something of one frame.
@@ -129,10 +127,10 @@ def run_frames(options: argparse.Namespace) -> int:
         raise InvalidRequest(f"--{of_one[0]} applies to one frame. Give its id after the map.")
     if options.trajectory is not None and len(options.session or ()) != 1:
         raise InvalidRequest("--trajectory needs a session. Name it with --session.")
-    if options.trajectory is not None and wants_scene(options):
+    if options.trajectory is not None and options.mcap is not None:
         raise InvalidRequest("--trajectory writes no scene. Run the command once for each.")
     check_scene(options)
-    with open_client(options) as client, open_scene(options, f"frames {options.map}") as stream:
+    with open_client(options) as client, open_scene(options) as stream:
         if options.frame_id is not None:
             frame = _one(client, options)
             if stream is not None:
@@ -276,82 +274,6 @@ def _changes(text: str) -> dict[str, Any]:
     return given
 
 
-# `sceneprint events`: what happened in the maps of a service, and what happens.
-
-#: Events listed unless told otherwise.
-LISTED = 20
-
-
-def add_events(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "events",
-        help="list or follow the events of a service",
-        description="List the latest events of a service, oldest first, or follow them until "
-        "Ctrl-C. A broken stream resumes where it stopped.",
-    )
-    command.add_argument("--map", metavar="MAP", help="only events of this map")
-    command.add_argument(
-        "--kind", action="append", default=[], metavar="KIND",
-        help="only kinds with this prefix, such as frame. or frame.indexed; repeatable",
-    )  # fmt: skip
-    command.add_argument("--follow", action="store_true", help="keep printing new events")
-    command.add_argument(
-        "--after",
-        metavar="ID",
-        help="start after the event with this id; 0: start with the oldest stored event",
-    )
-    command.add_argument(
-        "--limit", type=whole_number, metavar="N",
-        help=f"maximum number of events (default: {LISTED}; with --after or --follow: all)",
-    )  # fmt: skip
-    command.add_argument("--json", action="store_true", help="print JSON, one event per line")
-    add_service_options(command)
-    command.set_defaults(run=run_events)
-
-
-def run_events(options: argparse.Namespace) -> int:
-    """List, or follow."""
-    with open_client(options) as client:
-        if options.follow:
-            found = client.events(options.map, kinds=options.kind, after=options.after)
-        elif options.after is not None:
-            found = client.events(
-                options.map, kinds=options.kind, after=options.after, follow=False
-            )
-        else:
-            found = iter(_latest(client, options))
-        _print(islice(found, options.limit), as_json=options.json)
-    return 0
-
-
-def _latest(client: Client, options: argparse.Namespace) -> list[Event]:
-    """The newest events, the oldest of them first."""
-    found: list[Event] = []
-    cursor, most = None, LISTED if options.limit is None else options.limit
-    while len(found) < most:
-        page = client.event_page(
-            options.map, kinds=options.kind, cursor=cursor,
-            limit=min(most - len(found), 500),
-        )  # fmt: skip
-        found += page.items
-        cursor = page.next_cursor
-        if cursor is None:
-            break
-    return found[::-1]
-
-
-def _print(found: Iterable[Event], *, as_json: bool) -> None:
-    for event in found:
-        if as_json:
-            print(event.model_dump_json())
-        else:
-            about = [event.map, event.frame_id, *(f"{k}={v}" for k, v in event.data.items())]
-            told = "  ".join(one_line(one) for one in about if one is not None)
-            print(f"{event.id}  {event.at:%Y-%m-%d %H:%M:%S}  {event.kind:22}  {told}".rstrip())
-        sys.stdout.flush()  # who follows wants it now, also through a pipe
-
-
 # `sceneprint queries`: what robots asked, and what came of it.
 
 
@@ -380,8 +302,8 @@ def add_queries(commands: Any) -> None:
         "--until", type=_time, metavar="TIME", help="only queries that came before this time"
     )
     command.add_argument(
-        "--limit", type=positive, default=LISTED, metavar="N",
-        help=f"maximum number to list (default: {LISTED})",
+        "--limit", type=positive, default=20, metavar="N",
+        help="maximum number to list (default: 20)",
     )  # fmt: skip
     command.add_argument("--json", action="store_true", help="print JSON, one query per line")
     add_service_options(command)

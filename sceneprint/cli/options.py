@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -33,7 +33,7 @@ from sceneprint_client.frame_files import FrameFile
 from sceneprint_client.http import DEFAULT_URL
 
 if TYPE_CHECKING:
-    from sceneprint.scenes.scene import SceneStream, SceneWriter
+    from sceneprint.scenes.scene import SceneStream
     from sceneprint_client import Client
     from sceneprint_client.api import Answer
 
@@ -511,32 +511,18 @@ def _wall() -> DepthFrame:
     return DepthFrame(np.full((192, 256), 2.0, np.float32), camera)
 
 
-# Scenes for viewers: Rerun, Foxglove.
+# Scenes for viewers: Foxglove, and Rerun, which reads the same files.
 
 
 def add_scene_options(command: argparse.ArgumentParser) -> None:
-    """`--rrd` and its like."""
+    """Add `--mcap` and `--map-frames`."""
     group = command.add_argument_group(
         "scene", "what was found, in 3-D, for a viewer; see docs/viewers.md"
     )
     group.add_argument(
-        "--rrd", type=Path, metavar="FILE", help="write a recording for Rerun (sceneprint[rerun])"
-    )
-    group.add_argument(
         "--mcap", type=Path, metavar="FILE",
-        help="write an MCAP file for Foxglove (sceneprint[foxglove])",
+        help="write an MCAP file for Foxglove or Rerun (sceneprint[foxglove])",
     )  # fmt: skip
-    group.add_argument(
-        "--rerun",
-        action="store_true",
-        help="show it in the Rerun viewer of this machine, which is started if none listens",
-    )
-    group.add_argument(
-        "--rerun-url",
-        metavar="URL",
-        help="show it in the Rerun viewer at this address, such as "
-        "rerun+http://192.168.1.20:9876/proxy",
-    )
     group.add_argument(
         "--map-frames",
         type=whole_number,
@@ -546,82 +532,49 @@ def add_scene_options(command: argparse.ArgumentParser) -> None:
     )
 
 
-def wants_scene(options: argparse.Namespace) -> bool:
-    """Whether any of the options asks for a scene."""
-    return bool(options.rrd or options.mcap or options.rerun or options.rerun_url)
-
-
 def check_scene(options: argparse.Namespace) -> None:
-    """See before any work that the scene can be written and shown.
+    """Check before any work that the scene can be written.
 
     Raises
     ------
     MissingDependency : a package that it needs is not installed.
-    InvalidRequest : two files are one, or the address is none of a viewer.
-    Unreachable : no viewer listens at the address.
-    OSError : a file cannot be written.
+    OSError : the file cannot be written.
     """
-    if not wants_scene(options):
-        return
-    if options.rrd or options.rerun or options.rerun_url:
-        from sceneprint.scenes.rerun_writer import check_viewer, require_rerun
-
-        require_rerun()
-        if options.rerun_url:
-            check_viewer(options.rerun_url)
-    if options.mcap:
+    if options.mcap is not None:
         from sceneprint.scenes.mcap_writer import require_foxglove
 
         require_foxglove()
-    files = [path for path in (options.rrd, options.mcap) if path is not None]
-    if len(files) > 1 and files[0].absolute() == files[1].absolute():
-        raise InvalidRequest(f"--rrd and --mcap both name {files[0]}. Give each a file of its own.")
-    for path in files:
-        check_writable(path)
+        check_writable(options.mcap)
 
 
 def check_kept(options: argparse.Namespace) -> None:
-    """See that answers are stored, as a scene is made of what the service keeps of them.
+    """Check that the service stores the answers, from which a scene is drawn.
 
     Raises
     ------
-    InvalidRequest : they are not.
+    InvalidRequest : it does not.
     """
-    if wants_scene(options) and options.no_keep:
+    if options.mcap is not None and options.no_keep:
         raise InvalidRequest("A scene is made of stored answers. Leave --no-keep out.")
 
 
 @contextmanager
-def open_scene(options: argparse.Namespace, title: str) -> Iterator[SceneStream | None]:
-    """Where the scene goes that the options ask for; None where they ask for none.
+def open_scene(options: argparse.Namespace) -> Iterator[SceneStream | None]:
+    """Open the scene that `--mcap` names; None without that option.
 
-    Files are there when the block ends well, and else none of them.
+    The file is there only when the block ends without an error.
     """
-    if not wants_scene(options):
+    if options.mcap is None:
         yield None
         return
+    from sceneprint.scenes.mcap_writer import mcap_file
     from sceneprint.scenes.scene import SceneStream
 
-    with ExitStack() as stack:
-        stack.enter_context(ended_by_signals())
-        writers: list[SceneWriter] = []
-        if options.rrd:
-            from sceneprint.scenes.rerun_writer import rerun_file
-
-            writers.append(stack.enter_context(rerun_file(options.rrd, title)))
-        if options.rerun or options.rerun_url:
-            from sceneprint.scenes.rerun_writer import rerun_viewer
-
-            writers.append(stack.enter_context(rerun_viewer(options.rerun_url, title)))
-        if options.mcap:
-            from sceneprint.scenes.mcap_writer import mcap_file
-
-            writers.append(stack.enter_context(mcap_file(options.mcap)))
-        stream = SceneStream(writers)
+    with ended_by_signals(), mcap_file(options.mcap) as writer:
+        stream = SceneStream(writer)
         yield stream
-    for path in (options.rrd, options.mcap):
-        if path is not None and not stream.is_empty:
-            print(f"wrote {one_line(str(path))}", file=sys.stderr)
+    if not stream.is_empty:
+        print(f"wrote {one_line(str(options.mcap))}", file=sys.stderr)
 
 
 def stamps_of(references: Sequence[FrameFile]) -> list[int | None]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -28,8 +27,6 @@ from sceneprint.cli.options import (
     open_client,
     open_scene,
     options_of,
-    setting,
-    settings_of,
     stamps_of,
 )
 from sceneprint.errors import DatasetError, FrameError, MissingDependency, TooLarge, UnknownFrame
@@ -47,7 +44,6 @@ if TYPE_CHECKING:
         Localization,
         Location,
         Match,
-        Similarity,
         Transform,
     )
 
@@ -168,7 +164,7 @@ def run_query(options: argparse.Namespace) -> int:
         how["maps"] = "*" if options.map == "*" else [options.map, *options.also]
     check_overlay(options, len(references))
     failed = 0
-    with open_client(options) as client, open_scene(options, f"query {options.map}") as stream:
+    with open_client(options) as client, open_scene(options) as stream:
         scene = _answer_scene(client, stream, references, options)
         for reference in references:
             try:
@@ -405,7 +401,7 @@ def run_localize(options: argparse.Namespace) -> int:
     chosen = _frames_to_localize(options, every)
     how = {**options_of(options), "prior": options.prior}
     lost = failed = 0
-    with open_client(options) as client, open_scene(options, f"localize {options.map}") as stream:
+    with open_client(options) as client, open_scene(options) as stream:
         scene = _answer_scene(client, stream, chosen, options)
         for reference in chosen:
             before = _frames_before(options, every, reference)
@@ -492,69 +488,3 @@ def localization_lines(name: str, there: Localization) -> list[str]:
         best = frame_label(there.best.frame_id, there.best.name)
         lines.append(f"  at {metres(there.best.transform)} m from frame {best}")
     return lines + _alternative_lines(there.alternatives)
-
-
-# `sceneprint similarity`: how alike are two frames, and do they see one place?
-
-
-def add_similarity(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "similarity",
-        help="compare two frames",
-        description="Compare two frames, each a file or a stored frame, MAP:FRAME_ID. Uploaded "
-        "files are not stored. Exit code 0: they show the same place; 1: they do not, or it is "
-        "ambiguous.",
-    )
-    command.add_argument("a", metavar="A")
-    command.add_argument("b", metavar="B")
-    command.add_argument(
-        "--no-validate", action="store_true", help="compare only the signatures (exit code 0)"
-    )
-    command.add_argument(
-        "--validation", type=setting, action="append", metavar="NAME=VALUE",
-        help="set a validation option, such as mode=paper; repeatable",
-    )  # fmt: skip
-    command.add_argument(
-        "--seed",
-        type=whole_number,
-        default=0,
-        metavar="S",
-        help="random seed (default: 0)",
-    )
-    command.add_argument("--model", help="model that signs two uploaded files (default: depth)")
-    command.add_argument("--json", action="store_true", help="print JSON")
-    add_service_options(command)
-    command.set_defaults(run=run_similarity)
-
-
-def run_similarity(options: argparse.Namespace) -> int:
-    """Compare; returns 1 where the frames do not see one place."""
-    with open_client(options) as client:
-        found = client.similarity(
-            frame_argument(options.a), frame_argument(options.b), validate=not options.no_validate,
-            validation=settings_of(options.validation), seed=options.seed, model=options.model,
-        )  # fmt: skip
-    print(found.model_dump_json() if options.json else line_of(found))
-    return 0 if found.validation is None or found.validation.status == "accepted" else 1
-
-
-def frame_argument(text: str) -> Path | tuple[str, str]:
-    """A file, or the map and the id of a stored frame."""
-    path = Path(text)
-    stored = re.fullmatch(r"([a-z0-9][a-z0-9_-]*):([A-Za-z0-9._:-]+)", text)
-    if stored is not None and not path.exists():
-        return stored[1], stored[2]
-    return path
-
-
-def line_of(found: Similarity) -> str:
-    """A comparison for people."""
-    told = f"similarity {found.similarity:.3f} (distance {found.distance}, {found.model})"
-    made = found.validation
-    if made is not None:
-        status = f"{made.status} {made.strength}" if made.strength else made.status
-        told += f"; {status}: {one_line(made.reason)}"
-    if found.transform is not None:
-        told += f"; b lies at {metres(found.transform)} m from a"
-    return told

@@ -1,9 +1,8 @@
-"""`sceneprint sessions`, `associate`, `difference`, `reconstruct`: runs, and what comes of them."""
+"""`sceneprint sessions` and `associate`: list and edit sessions, and join them."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,25 +12,20 @@ from tqdm import tqdm
 from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli import positive, whole_number
 from sceneprint.cli.options import (
-    add_filter_options,
     add_scene_options,
     add_service_options,
     check_scene,
-    filter_of,
     one_line,
     open_client,
     open_scene,
 )
-from sceneprint.errors import DatasetError, InvalidRequest
-from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint.errors import InvalidRequest
 from sceneprint_client.api import JobState
 
 if TYPE_CHECKING:
     from sceneprint_client import Client
-    from sceneprint_client.api import Answer
     from sceneprint_client.api.listing import FrameDeletion, Session
-    from sceneprint_client.api.sessions import Association, Difference, GraphFormat, Join
-    from sceneprint_client.api.surface import Coverage, Reconstruction
+    from sceneprint_client.api.sessions import Association, GraphFormat, Join
 
 #: What a file is by its name's end.
 _FORMATS: dict[str, GraphFormat] = {".g2o": "g2o", ".txt": "tum", ".tum": "tum", ".json": "json"}
@@ -275,7 +269,7 @@ def run_associate(options: argparse.Namespace) -> int:
     wanted = {name: value for name, value in times.items() if value is not None}
     with (
         open_client(options) as client,
-        open_scene(options, f"associate {options.map}") as stream,
+        open_scene(options) as stream,
         tqdm(desc="associate", unit="frame", disable=None) as bar,
     ):
 
@@ -333,221 +327,3 @@ def _join(one: Join) -> list[str]:
         f"  translation {t.x:.4f} {t.y:.4f} {t.z:.4f} m, rotation {r.x:.6f} {r.y:.6f} {r.z:.6f} "
         f"{r.w:.6f} (x y z w)",
     ]
-
-
-# `sceneprint reconstruct`: what a place looks like, fused from the frames found there.
-
-#: Longest wait for a worker, seconds.
-_PATIENCE_S = 600.0
-
-
-def add_difference(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "difference",
-        help="compare two sessions: what is gone, what is new",
-        description="Compare two sessions of a map whose frames have poses in one parent frame. "
-        "Counts cells that are the same, gone, new, or seen by one session only, and can write "
-        "them as a coloured point cloud: gone orange, new blue, same grey, unseen dark grey.",
-    )
-    command.add_argument("map", metavar="MAP")
-    command.add_argument("before", metavar="BEFORE", help="the earlier session")
-    command.add_argument("after", metavar="AFTER", help="the later session")
-    command.add_argument(
-        "--parent-frame", metavar="NAME", help="of the poses (default: the one of most frames)"
-    )
-    command.add_argument("--out", type=Path, metavar="FILE", help="write the cells as a PLY")
-    command.add_argument("--json", action="store_true", help="print JSON")
-    add_service_options(command)
-    command.set_defaults(run=run_difference)
-
-
-def run_difference(options: argparse.Namespace) -> int:
-    """Compare, and wait; returns 2 where it did not succeed."""
-    if options.out is not None:
-        check_writable(options.out)
-    with open_client(options) as client, tqdm(desc="difference", disable=None) as bar:
-
-        def progress(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        told = client.compare_sessions(
-            options.map, options.before, options.after, parent_frame=options.parent_frame,
-            progress=progress,
-        )  # fmt: skip
-        if told.result is not None and options.out is not None:
-            write_whole(options.out, _difference_ply(client, told))
-    print(told.model_dump_json() if options.json else "\n".join(difference_lines(told)))
-    if told.result is not None and options.out is not None and not options.json:
-        print(f"wrote {one_line(str(options.out))}")
-    return 0 if told.state is JobState.SUCCEEDED else 2
-
-
-def difference_lines(told: Difference) -> list[str]:
-    """A difference for people."""
-    name, result = f"difference {told.difference_id}", told.result
-    if result is None:
-        why = "" if told.error is None else f": {one_line(told.error)}"
-        return [f"{name} is {told.state}{why}"]
-    before, after = one_line(told.asked.before), one_line(told.asked.after)
-    skipped = f", {result.skipped} skipped" if result.skipped else ""
-    counts = {
-        "same": result.same, f"gone since {before}": result.gone, f"new in {after}": result.new,
-        f"only {before} saw": result.unseen_after, f"only {after} saw": result.unseen_before,
-    }  # fmt: skip
-    return [
-        f"{name}: {result.frames_before} frames of {before}, {result.frames_after} of {after}"
-        f"{skipped}; cells of {result.cell_m:g} m in {one_line(result.parent_frame)}",
-        *(f"  {count:7} {what}" for what, count in counts.items()),
-    ]
-
-
-#: Colours of points in a file, by what they are: see `sceneprint_client.api.sessions`.
-_DIFFERENCE_COLOURS = (
-    (165, 170, 175), (230, 110, 20), (40, 110, 220), (95, 100, 105), (95, 100, 105),
-)  # fmt: skip
-
-
-def _difference_ply(client: Client, told: Difference) -> bytes:
-    """The cells of both sessions as a PLY file."""
-    import numpy as np
-
-    from sceneprint.formats.export import write_ply
-
-    found = client.difference_points(told.map, told.difference_id)
-    colours = np.array(_DIFFERENCE_COLOURS, np.uint8)[found.patches]
-    parent = "" if told.result is None else told.result.parent_frame
-    comments = [
-        f"sessions {told.asked.before} and {told.asked.after} of map {told.map}",
-        f"points of {parent}, metres; gone orange, new blue, same grey, unseen dark grey",
-    ]
-    return write_ply(found.points, colours=colours, comments=comments)
-
-
-def add_reconstruct(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "reconstruct",
-        help="fuse the matches of a frame to a mesh",
-        description="Query a map with a depth frame, and let a worker fuse the accepted matches "
-        "to a surface in the camera frame of the query. Exit code 1 if no match is accepted.",
-    )
-    command.add_argument("map", metavar="MAP")
-    command.add_argument(
-        "frame", metavar="FRAME", help="a depth image, or the id of a frame of the map"
-    )
-    command.add_argument(
-        "--out", type=Path, default=Path("mesh.ply"), metavar="FILE",
-        help="PLY to write (default: mesh.ply)",
-    )  # fmt: skip
-    command.add_argument(
-        "--k",
-        type=positive,
-        default=10,
-        metavar="K",
-        help="number of accepted matches to fuse (default: 10)",
-    )
-    command.add_argument(
-        "--seed",
-        type=whole_number,
-        default=0,
-        metavar="S",
-        help="random seed (default: 0)",
-    )
-    command.add_argument(
-        "--voxel",
-        type=float,
-        metavar="METRES",
-        help="size of a voxel (default: the finest that fits)",
-    )
-    command.add_argument(
-        "--strong", action="store_true", help="fuse only strongly accepted matches"
-    )
-    command.add_argument("--cloud", action="store_true", help="write points without triangles")
-    command.add_argument(
-        "--without-query", action="store_true", help="fuse only the matches, not the frame itself"
-    )
-    add_filter_options(command)
-    add_service_options(command)
-    command.set_defaults(run=run_reconstruct)
-
-
-def run_reconstruct(options: argparse.Namespace) -> int:
-    """Query, reconstruct, and write the files; returns 1 where nothing could be fused."""
-    check_writable(options.out)
-    with open_client(options) as client:
-        answer = _query(client, options)
-        name = one_line(options.frame)
-        if answer.status != "found":
-            print(f"{name}: {answer.status.replace('_', ' ')}, so there is nothing to fuse")
-            return 1
-        made = client.reconstruct(
-            answer,
-            strength="strong" if options.strong else "any",
-            include_query=not options.without_query,
-            voxel_m=options.voxel,
-            output="cloud" if options.cloud else "mesh",
-        )
-        made = _waited(client, made, answer.counts.accepted)
-        if made.coverage is None:
-            why = one_line(made.error or "no worker has finished it yet; see `sceneprint jobs`")
-            print(f"sceneprint reconstruct: job {made.job_id} is {made.state}: {why}",
-                  file=sys.stderr)  # fmt: skip
-            return 2
-        print("\n".join([f"{name}:", *coverage_lines(made.coverage)]))
-        write_whole(options.out, client.reconstruction_mesh(made.job_id))
-        print(f"wrote {one_line(str(options.out))}")
-    return 0
-
-
-def coverage_lines(coverage: Coverage) -> list[str]:
-    """What the views show together, for people."""
-    lines = [
-        f"  {len(coverage.views)} views show {coverage.area_m2:.2f} m2 of surface and "
-        f"{coverage.observed_volume_m3:.2f} m3 of space; {coverage.query_explained:.0%} of the "
-        "frame is covered by the others"
-    ]
-    total = 0.0
-    for view in coverage.views:
-        total += view.added_m2
-        who = "the frame itself" if view.frame_id is None else view.frame_id
-        rank = "" if view.rank is None else f"rank {view.rank}, {view.strength}"
-        lines.append(f"  {who:34} {rank:18} +{view.added_m2:6.2f} m2  {total:7.2f}".rstrip())
-    lines += [f"  skipped: {one.frame_id}: {one_line(one.reason)}" for one in coverage.left_out]
-    kind = f"{coverage.triangles} triangles" if coverage.triangles else "a cloud"
-    lines.append(f"  {coverage.points} points, {kind}, voxels of {1000 * coverage.voxel_m:.0f} mm")
-    return lines
-
-
-def _query(client: Client, options: argparse.Namespace) -> Answer:
-    wanted, path = filter_of(options), Path(options.frame)
-    if not path.exists():
-        return client.query(
-            options.map, frame_id=options.frame, k=options.k, seed=options.seed, filter=wanted
-        )
-    return client.query(options.map, _only(path), k=options.k, seed=options.seed, filter=wanted)
-
-
-def _only(path: Path) -> FrameReference:
-    """The one frame at a path.
-
-    Raises
-    ------
-    DatasetError : none, or several.
-    """
-    found = [frame for sequence in find_sequences(path) for frame in sequence.frames]
-    if len(found) != 1:
-        raise DatasetError(f"{path}: {len(found)} frames found. Name a single frame file.")
-    return found[0]
-
-
-def _waited(client: Client, made: Reconstruction, views: int) -> Reconstruction:
-    """The reconstruction when its job is over, or patience is; a bar shows that it goes on."""
-    with tqdm(total=1, desc=f"fuse {views} views", unit="job", disable=None) as bar:
-
-        def progress(done: int, _: int) -> None:
-            bar.update(done - bar.n)
-
-        client.wait([made.job_id], timeout_s=_PATIENCE_S, progress=progress)
-    return client.reconstruction(made.job_id)

@@ -1,16 +1,14 @@
-"""Care of a store: `sceneprint migrate | fsck | index | snapshot | pull | thin` and their like."""
+"""Commands on a store: `migrate`, `fsck`, `purge`, `snapshot`, `restore`, `pull`, `reencode`."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
-from sceneprint.cli import positive, whole_number
+from sceneprint.cli import whole_number
 from sceneprint.cli.options import (
     add_service_options,
     ended_by_signals,
@@ -33,9 +31,7 @@ from sceneprint.process import COMMAND, acting_as
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
     from sceneprint.maintenance.fsck.check import FindingOutcome
-    from sceneprint.maintenance.fsck.indexes import IndexStats
     from sceneprint.maintenance.snapshot.creation import Snapshot
-    from sceneprint.maintenance.thin import Proposal
     from sceneprint.settings import Settings
     from sceneprint.store import Database
     from sceneprint_client.api import Map
@@ -132,7 +128,6 @@ def add_fsck(commands: Any) -> None:
 
 def run_fsck(options: argparse.Namespace) -> int:
     """Check, tell, and repair if asked to; returns 1 where something is left."""
-    from sceneprint.atomic_files import check_writable, write_whole
     from sceneprint.engine import Engine
     from sceneprint.maintenance.fsck.check import GRACE_S, fsck
 
@@ -217,127 +212,36 @@ def _progress_bar() -> Iterator[Callable[[str, int, int], None]]:
         yield progress
 
 
-# `sceneprint index`: the search indexes of a data folder, looked at, verified, made anew.
+# `sceneprint purge`: deletions made final now.
 
 
-def add_index(commands: Any) -> None:
+def add_purge(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
-        "index",
-        help="inspect, verify, rebuild or purge the search indexes",
-        description="Manage the search indexes of a data folder. They are caches: a damaged "
-        "index loses no frame, and `rebuild` restores it from the database.",
-    )
-    what = command.add_subparsers(dest="what", required=True, metavar="ACTION")
-    stats = what.add_parser(
-        "stats", help="show frames, lag, bytes per frame, and recall against exact search"
-    )
-    stats.add_argument(
-        "--sample", type=whole_number, default=100, metavar="N",
-        help="number of queries to measure recall (default: 100)",
-    )  # fmt: skip
-    stats.add_argument("--seed", type=whole_number, default=0, metavar="N", help="random seed")
-    stats.add_argument("--json", action="store_true", help="print JSON, one line per map")
-    verify = what.add_parser(
-        "verify", help="read and check the whole index; exit code 1 if something is wrong"
-    )
-    rebuild = what.add_parser("rebuild", help="rebuild the index from the database")
-    purge = what.add_parser(
         "purge",
-        help="erase every byte of deleted frames on this node now, without waiting for PURGE_S",
+        help="erase every byte of deleted frames on this node now",
+        description="Erase every byte of deleted frames on this node now, without waiting for "
+        "SCENEPRINT_PURGE_S. Their deletion cannot be undone afterwards.",
     )
-    add_data_option(purge)
-    for one in (stats, verify, rebuild):
-        one.add_argument("map", nargs="*", metavar="MAP", help="default: all maps")
-        add_data_option(one)
-    command.set_defaults(run=run_index)
+    add_data_option(command)
+    command.set_defaults(run=run_purge)
 
 
-def run_index(options: argparse.Namespace) -> int:
-    """Do what was asked for with the indexes of the data folder."""
+def run_purge(options: argparse.Namespace) -> int:
+    """Purge; returns 1 where the database's log could not be emptied."""
     from sceneprint.engine import Engine
 
     settings = settings_of(options)
     require_database(settings)
     with Engine(settings) as engine:
-        if options.what == "purge":
-            return _purge(engine)
-        do = {"stats": _stats, "verify": _verify, "rebuild": _rebuild}[options.what]
-        for name in options.map:  # all of them are there, before anything is done with one
-            engine.get_map(name)
-        names = options.map or [one.name for one in engine.list_maps().items]
-        if not names:
-            print("no maps yet")
-        return max((do(engine, name, options) for name in names), default=0)
-
-
-def _stats(engine: Engine, name: str, options: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
-    from sceneprint.maintenance.fsck.indexes import describe_index
-
-    with tqdm(unit="query", leave=False, disable=not sys.stderr.isatty()) as bar:
-
-        def progress(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        found = describe_index(engine, name, options.sample, options.seed, progress)
-    if options.json:
-        print(json.dumps(asdict(found) | {"bytes_beyond_upload": found.bytes_beyond_upload}))
-    else:
-        print("\n".join(_lines(found)))
-    return 0
-
-
-def _lines(s: IndexStats) -> list[str]:
-    index = "no index" if s.generation == 0 else f"generation {s.generation}"
-    recall = "1 (queries compare every frame)" if s.recall is None else f"{s.recall:.3f}"
-    compared = f", {s.probes} frames compared" if s.probes else ""
-    spread = "" if s.spread is None else f"; 100th neighbour at {s.spread:.2f} of the 10th"
-    return [
-        f"map {s.map}, {s.model}",
-        f"  frames      {s.frames}, {index}",
-        f"  lag         {s.lag_frames} frames, {s.lag_s:.0f} s; {s.deleted} deleted entries",
-        f"  bytes       {s.bytes_beyond_upload} per frame besides its upload of "
-        f"{s.upload_bytes}: signature {s.signature_bytes}, artifact {s.artifact_bytes}, index "
-        f"{s.index_bytes}",
-        f"  recall@10   {recall}{compared} ({s.sample} frames){spread}",
-    ]
-
-
-def _verify(engine: Engine, name: str, _: argparse.Namespace) -> int:
-    from sceneprint.maintenance.fsck.indexes import verify_index
-
-    wrong = verify_index(engine, name)
-    for line in wrong:
-        print(f"map {name}: {line}")
-    if wrong:
-        print(f"map {name}: rebuild it with `sceneprint index rebuild {name}`")
-    else:
-        print(f"map {name}: ok")
-    return int(bool(wrong))
-
-
-def _rebuild(engine: Engine, name: str, options: argparse.Namespace) -> int:
-    try:
-        print(f"map {name}: generation {engine.rebuild_index(name)}")
-    except InvalidRequest as error:  # of all maps, those are passed over that can have none
-        if options.map:
-            raise
-        print(f"map {name}: {error}")
-    return 0
-
-
-def _purge(engine: Engine) -> int:
-    found = engine.purging.now()
-    print(
-        f"purged {found.blobs} blobs, {found.answers} stored answers, {found.reconstructions} "
-        f"reconstructions; rebuilt {found.indexes} indexes"
-    )
-    if not engine.store.database.shrink_log():
-        print("the database log is in use: run this again when nothing reads the database")
-        return 1
+        found = engine.purging.now()
+        print(
+            f"purged {found.blobs} blobs, {found.answers} stored answers, "
+            f"{found.reconstructions} reconstructions; rebuilt {found.indexes} indexes"
+        )
+        if not engine.store.database.shrink_log():
+            print("the database log is in use: run this again when nothing reads the database")
+            return 1
     return 0
 
 
@@ -451,8 +355,7 @@ def name_damaged(snapshot: Snapshot, advice: str) -> bool:
     if not snapshot.damaged:
         return False
     for one in snapshot.damaged[:_SHOWN]:
-        of = ", ".join(f"{use.role} of {use.map}/{use.frame}" for use in one.of)
-        print(one_line(f"not in it: blob {one.digest[:12]}, {one.why}: {of}"), file=sys.stderr)
+        print(f"not in it: blob {one.digest[:12]}, {one.why}", file=sys.stderr)
     more = len(snapshot.damaged) - _SHOWN
     if more > 0:
         print(f"... and {more} more, in damaged.jsonl of the archive", file=sys.stderr)
@@ -471,8 +374,7 @@ def add_restore(commands: Any) -> None:
         description="Verify a snapshot and restore it to a data folder, all or nothing. With "
         "the URL of an empty PostgreSQL database, its rows go there in one transaction, and its "
         "blobs to SCENEPRINT_BLOB_URL or else the data folder. A folder that is not empty stays "
-        "untouched unless you give --replace, which moves it aside and never deletes it: stop "
-        "every process that uses it first. Exit code 1 if the snapshot lists blobs that were "
+        "untouched. Exit code 1 if the snapshot lists blobs that were "
         "damaged when it was taken; 2 if nothing was restored.",
     )
     command.add_argument(
@@ -483,13 +385,11 @@ def add_restore(commands: Any) -> None:
     )
     add_data_option(command)
     add_database_option(command)
-    choice = command.add_mutually_exclusive_group()
-    choice.add_argument(
+    command.add_argument(
         "--verify-only",
         action="store_true",
         help="read and check the whole snapshot without restoring it",
     )
-    choice.add_argument("--replace", action="store_true", help="move the existing folder aside")
     command.set_defaults(run=run_restore)
 
 
@@ -499,20 +399,18 @@ def run_restore(options: argparse.Namespace) -> int:
     archive: Path = options.archive
     with ended_by_signals():
         if options.verify_only:
-            snapshot, done, aside = *_verified(archive), None
+            snapshot, done = _verified(archive)
         elif settings.database_url is not None:
-            snapshot, done, aside = *_filled(archive, settings, options), None
+            snapshot, done = _filled(archive, settings)
         else:
-            snapshot, done, aside = _restore_to_folder(archive, settings, options)
+            snapshot, done = _restore_to_folder(archive, settings)
     seconds = time.perf_counter() - start
     shown = one_line(str(options.archive))
     print(f"{shown} {done}: {contents(snapshot)} of "
           f"{snapshot.manifest.created_at:%Y-%m-%dT%H:%M:%SZ} in {seconds:.1f} s")  # fmt: skip
-    if aside is not None:
-        print(f"the previous contents are now in {one_line(str(aside))}", file=sys.stderr)
     advice = (
-        "These frames were already damaged when the snapshot was taken. Delete them, or upload "
-        "them again."
+        "These blobs were damaged when the snapshot was taken. Run `sceneprint fsck` on the "
+        "restored store to see whose they are."
     )
     return 1 if name_damaged(snapshot, advice) else 0
 
@@ -524,8 +422,8 @@ def _verified(archive: Path) -> tuple[Snapshot, str]:
         return verify_snapshot(archive, progress), "is complete"
 
 
-def _filled(archive: Path, settings: Settings, options: argparse.Namespace) -> tuple[Snapshot, str]:
-    """Restored into the database of a fleet."""
+def _filled(archive: Path, settings: Settings) -> tuple[Snapshot, str]:
+    """Restore into the database of a fleet."""
     from sceneprint.maintenance.snapshot.postgres_restore import restore_to_fleet
     from sceneprint.store.database import reach_database
 
@@ -537,20 +435,13 @@ def _filled(archive: Path, settings: Settings, options: argparse.Namespace) -> t
             "folder, where no service would look for it. Unset the variable, for the service "
             "too."
         )
-    if options.replace:
-        raise InvalidRequest(
-            "--replace moves a folder aside, which a database cannot do. Create an empty "
-            "database (CREATE DATABASE), and name that."
-        )
     with byte_progress("restore") as progress:
         snapshot = restore_to_fleet(archive, settings, progress)
     return snapshot, f"is restored to {one_line(database.shown)}"
 
 
-def _restore_to_folder(
-    archive: Path, settings: Settings, options: argparse.Namespace
-) -> tuple[Snapshot, str, Path | None]:
-    """Restored to a folder."""
+def _restore_to_folder(archive: Path, settings: Settings) -> tuple[Snapshot, str]:
+    """Restore to a folder."""
     from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 
     if settings.blob_url is not None:
@@ -560,10 +451,8 @@ def _restore_to_folder(
             "--database."
         )
     with byte_progress("restore") as progress:
-        snapshot, aside = restore_snapshot(
-            archive, settings.data_dir, replace=options.replace, progress=progress
-        )
-    return snapshot, f"is restored to {one_line(str(settings.data_dir))}", aside
+        snapshot = restore_snapshot(archive, settings.data_dir, progress)
+    return snapshot, f"is restored to {one_line(str(settings.data_dir))}"
 
 
 # `sceneprint pull`: a robot's copies of maps, to localise without network.
@@ -620,160 +509,6 @@ def run_pull(options: argparse.Namespace) -> int:
         finally:
             store.close()
     return 0
-
-
-# `sceneprint thin`: which frames a map can lose, and losing them.
-
-#: Frames that are listed on the screen.
-SHOWN = 5
-
-
-def add_thin(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "thin",
-        help="find redundant frames of a map, and delete them with --yes",
-        description="Find frames whose signatures are close to those of other frames in the "
-        "same map. Deletes nothing without --yes. Works on the data folder, also while a "
-        "service runs on it.",
-    )
-    command.add_argument("map", metavar="MAP")
-    how = command.add_mutually_exclusive_group(required=True)
-    how.add_argument(
-        "--keep",
-        type=positive,
-        metavar="N",
-        help="keep the N most diverse frames (by a determinantal point process)",
-    )
-    how.add_argument(
-        "--novelty",
-        type=_share,
-        metavar="D",
-        help="in order of upload, keep a frame if no kept frame is within D, as a share of the "
-        "distance of unrelated frames; 0.2 is cautious",
-    )
-    command.add_argument("--session", metavar="NAME", help="only frames of this session")
-    command.add_argument(
-        "--seed",
-        type=whole_number,
-        default=0,
-        metavar="S",
-        help="random seed for --keep (default: 0)",
-    )
-    command.add_argument(
-        "--json", type=Path, metavar="FILE", help="write the list of redundant frames"
-    )
-    command.add_argument("--yes", action="store_true", help="delete the frames")
-    add_data_option(command)
-    command.set_defaults(run=run_thin)
-
-
-def run_thin(options: argparse.Namespace) -> int:
-    """Propose, and carry it out where told to."""
-    from sceneprint.engine import Engine
-    from sceneprint.maintenance.thin import carry_out, propose
-
-    if options.json is not None:
-        check_writable(options.json)
-    settings = settings_of(options)
-    require_database(settings)
-    with Engine(settings) as engine:
-        with _Bar("compare") as bar:
-            proposal = propose(
-                engine, options.map, keep=options.keep, novelty=options.novelty,
-                session=options.session, seed=options.seed, progress=bar.tell,
-            )  # fmt: skip
-        _print_proposal(proposal, options)
-        if options.json is not None:
-            write_whole(options.json, json.dumps(_document(proposal, options), indent=1).encode())
-        if not options.yes:
-            if proposal.losses:
-                print("nothing was deleted; add --yes to delete them")
-            return 0
-        with acting_as(COMMAND), _Bar("delete") as bar:
-            deleted = carry_out(engine, proposal, bar.tell)
-    left = len(proposal.losses) - deleted
-    why = (
-        f", {left} were not: they, or the frames that stand for them, are already gone"
-        if left
-        else ""
-    )
-    print(f"{deleted} frames deleted{why}")
-    return 0
-
-
-def _print_proposal(proposal: Proposal, options: argparse.Namespace) -> None:
-    n, lost = proposal.n_frames, len(proposal.losses)
-    where = f"map {proposal.map}, model {proposal.model}"
-    if options.session is not None:
-        where += f", session {one_line(options.session)}"
-    if options.keep is not None:
-        where += f", seed {options.seed}"
-    print(where)
-    if not lost:
-        print(f"none of {n} frames is redundant")
-        return
-    median, largest = proposal.shares
-    print(
-        f"{lost} of {n} frames are redundant, {n - lost} stay; frees about "
-        f"{_size(proposal.freed_bytes)}"
-    )
-    print(
-        f"distance to the nearest frame that stays: {median:.3f} of that of unrelated frames "
-        f"(median), {largest:.3f} (maximum)"
-    )
-    for one in sorted(proposal.losses, key=lambda loss: -loss.share)[:SHOWN]:
-        print(f"  {one.frame_id}  {one.share:.3f} from {one.like}")
-    if lost > SHOWN:
-        print(f"  and {lost - SHOWN} nearer ones (--json FILE lists all)")
-
-
-def _document(proposal: Proposal, options: argparse.Namespace) -> dict[str, Any]:
-    median, largest = proposal.shares
-    return {
-        "map": proposal.map,
-        "model": proposal.model,
-        "session": options.session,
-        "keep": options.keep,
-        "novelty": options.novelty,
-        "seed": None if options.keep is None else options.seed,
-        "frames": proposal.n_frames,
-        "freed_bytes": proposal.freed_bytes,
-        "median_share": median,
-        "largest_share": largest,
-        "losses": [asdict(one) for one in proposal.losses],
-    }
-
-
-class _Bar:
-    """A bar that is told of steps done and their total."""
-
-    def __init__(self, what: str) -> None:
-        self._bar = tqdm(desc=what, unit="frame", disable=None, delay=0.5)
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def tell(self, done: int, total: int) -> None:
-        self._bar.total = total
-        self._bar.update(done - self._bar.n)
-
-
-def _share(text: str) -> float:
-    try:
-        share = float(text)
-    except ValueError:
-        share = math.nan
-    if not 0 <= share <= 2:  # false for NaN as well
-        raise argparse.ArgumentTypeError(f"{text!r} is not a share from 0 to 2")
-    return share
-
-
-def _size(n_bytes: int) -> str:
-    return f"{n_bytes / 1e9:.1f} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.1f} MB"
 
 
 # `sceneprint reencode`: a map signed with another model, to which it then switches.

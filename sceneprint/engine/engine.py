@@ -28,7 +28,8 @@ from sceneprint.engine.maps.map_surface import MapSurfaces, SurfaceUpkeep
 from sceneprint.engine.maps.surface_job import SURFACE, SurfaceHandler
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.engine.reconstruction import ReconstructionJobs
-from sceneprint.engine.results.query_log import QueryLog, SentQuery
+from sceneprint.engine.results.query_entry import SentQuery
+from sceneprint.engine.results.query_log import QueryLog
 from sceneprint.engine.results.result_views import Inspection, PointClouds
 from sceneprint.engine.search.local_index import IndexView
 from sceneprint.engine.search.query import Queries

@@ -17,7 +17,7 @@ from sqlalchemy import Connection, select
 from sceneprint.engine.ingest.frame_decoder import read_stored
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept, Tasks
 from sceneprint.engine.maps.map_frames import living
-from sceneprint.engine.results.query_log import StoredAnswer
+from sceneprint.engine.results.query_entry import StoredAnswer
 from sceneprint.engine.serializers import when
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import (

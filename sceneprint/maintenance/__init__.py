@@ -1,1 +1,1 @@
-"""What an operator does to a data folder: check it, copy it, put it back, thin it out."""
+"""Tasks of an operator on a data folder: check, repair, copy and restore it."""

@@ -1,1 +1,1 @@
-"""Answers and maps as scenes that Rerun and Foxglove draw."""
+"""Answers and maps as scenes that Foxglove and Rerun draw."""

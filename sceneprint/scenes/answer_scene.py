@@ -128,7 +128,7 @@ class AnswerScene:
 
         Raises
         ------
-        UnknownQuery : the answer is not kept, or no longer.
+        UnknownQuery : the answer is not stored, or no longer.
         """
         for map_name in _maps_of(answer):
             if map_name not in self._drawn:

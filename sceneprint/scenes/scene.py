@@ -1,6 +1,6 @@
 """A scene as entities over time, in the terms of no viewer, and how things look in it.
 
-Moment  --SceneStream.write-->  SceneWriter (Rerun, MCAP)
+Moment  --SceneStream.write-->  SceneWriter (MCAP)
 
 Entities form a tree by their paths. The first part of a path is the space: the name of the frame
 of coordinates that all of it lies in, such as the parent frame of a map's poses. Below an entity
@@ -140,22 +140,22 @@ class Moment:
 
 
 class SceneWriter(Protocol):
-    """A file or viewer that takes a scene."""
+    """A file that takes a scene."""
 
     def write(self, moment: Moment, gone: Collection[SceneEntity]) -> None:
         """Add a moment; `gone` are entities of the one before that it does not have."""
 
 
 class SceneStream:
-    """A scene while it is written, to several files and viewers at once.
+    """A scene while it is written, which knows what each moment replaces.
 
     Parameters
     ----------
-    writers : of each; nothing is opened before the first moment
+    writer : of the scene's file
     """
 
-    def __init__(self, writers: Sequence[SceneWriter]) -> None:
-        self._writers = writers
+    def __init__(self, writer: SceneWriter) -> None:
+        self._writer = writer
         self.is_empty = True
         self._there: dict[EntityPath, SceneEntity] = {}
 
@@ -169,8 +169,7 @@ class SceneStream:
             there = {one.path: one for one in moment.entities}
             gone = [one for path, one in self._there.items() if path not in there]
             self._there = there
-        for writer in self._writers:
-            writer.write(moment, gone)
+        self._writer.write(moment, gone)
 
 
 def space_of(path: EntityPath) -> str:

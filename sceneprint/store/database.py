@@ -64,7 +64,6 @@ def migration_config() -> Config:
 
     config = Config()
     config.set_main_option("script_location", str(_FOLDER))
-    config.attributes["metadata"] = metadata
     return config
 
 

@@ -30,7 +30,6 @@ from sceneprint.store.maps import ROOMLESS
 from sceneprint.store.tables import (
     FRAME_COLUMNS,
     FrameRow,
-    MapRow,
     count_rows,
     frame_rows,
     frame_tags,
@@ -663,45 +662,6 @@ def has_parent_frame(connection: Connection, map_number: int, parent: str) -> bo
         c.map_number == map_number, c.pose_parent == parent, c.state != FrameState.DELETED
     )
     return connection.execute(asked.limit(1)).first() is not None
-
-
-# What frames of a map weigh, and which a session brought: for whoever thins it out.
-
-
-@dataclass(frozen=True)
-class Weight:
-    """A frame that is indexed."""
-
-    frame_id: str
-    upload_bytes: int
-    artifact: str
-
-
-def weights_of(
-    connection: Connection, row: MapRow, session: str | None = None
-) -> dict[int, Weight]:
-    """Indexed frames of a map by their numbers, in the order they came.
-
-    Parameters
-    ----------
-    connection : of a transaction
-    row : of the map
-    session : only frames of this one, where given
-    """
-    asked = (
-        select(frames.c.number, frames.c.id, frames.c.bytes, signatures.c.geometry)
-        .join(
-            signatures,
-            (signatures.c.frame_number == frames.c.number)
-            & (signatures.c.model_id == row.model_id),
-        )
-        .where(frames.c.map_number == row.number, frames.c.state == FrameState.INDEXED)
-        .order_by(frames.c.number)
-    )
-    if session is not None:
-        asked = asked.where(frames.c.session == session)
-    found = connection.execute(asked)
-    return {number: Weight(*rest) for number, *rest in found}
 
 
 # How a map grew, and what its frames weigh: counts over many rows that few are read for.

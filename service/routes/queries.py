@@ -18,7 +18,7 @@ from fastapi import Depends, Request
 from pydantic import BaseModel, ValidationError
 from starlette.datastructures import FormData, UploadFile
 
-from sceneprint.engine.results.query_log import SentQuery, query_row, unknown_query
+from sceneprint.engine.results.query_entry import SentQuery, query_row, unknown_query
 from sceneprint.engine.search.query import check_localizes, localization_of
 from sceneprint.errors import InvalidRequest, MalformedBody, NotFound
 from sceneprint.store.query_rows import QueryRow

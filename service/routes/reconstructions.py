@@ -8,7 +8,7 @@ from typing import Any
 from fastapi import Request, Response
 
 from sceneprint.engine.reconstruction import MEDIA_TYPE, MESH
-from sceneprint.engine.results.query_log import StoredAnswer, unknown_query
+from sceneprint.engine.results.query_entry import StoredAnswer, unknown_query
 from sceneprint.errors import DamagedBlob
 from sceneprint.store.queue import unknown_job
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction

@@ -13,7 +13,6 @@ import pytest
 
 from benchmarks.rooms import circled
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.cli.query import frame_argument
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta
 
@@ -197,29 +196,6 @@ def test_a_prior_is_a_file_or_json(
             sceneprint("localize", "sides", file, "--prior", wrong)
         assert ended.value.code == 2
         assert text in capsys.readouterr().err
-
-
-def test_two_frames_are_compared(sceneprint: Run, maps: dict[str, list[str]], rooms: Path) -> None:
-    image = rooms / "room-0" / "seq-01" / "frame-000000.depth.png"
-    own, far = f"near:{maps['near'][0]}", f"far:{maps['far'][1]}"
-    same = sceneprint("similarity", own, image).stdout
-    assert same.startswith("similarity 1.000 (distance 0, depth-")
-    assert "; accepted strong: " in same
-    assert same.rstrip().endswith("; b lies at 0.000 0.000 0.000 m from a")
-    told = json.loads(sceneprint("similarity", own, far, "--json", expect=1).stdout)
-    assert told["validation"]["status"] in ("rejected", "ambiguous")
-    assert told["b"] == {"map": "far", "frame_id": maps["far"][1]}
-    bare = sceneprint("similarity", own, far, "--no-validate").stdout
-    assert bare.startswith(f"similarity {told['similarity']:.3f} (distance {told['distance']}, ")
-    assert "'nobody'" in sceneprint("similarity", own, "near:nobody", expect=2).stderr
-
-
-def test_a_side_is_a_file_or_a_stored_frame(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert frame_argument("hall:a.b-1") == ("hall", "a.b-1")
-    assert frame_argument("depth/a.png") == Path("depth/a.png")
-    Path("hall:a").touch()
-    assert frame_argument("hall:a") == Path("hall:a")
 
 
 def test_queries_that_came_are_listed(sceneprint: Run, service_url: str, rooms: Path) -> None:

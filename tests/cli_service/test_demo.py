@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import demo as served
@@ -35,7 +36,7 @@ def demo(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     def start(*arguments: object) -> subprocess.Popen[str]:
         return subprocess.Popen(
             [sys.executable, "-m", "sceneprint", "demo", "--workers", "1",
-             *map(str, arguments)],
+             "--out", str(tmp_path / "out"), *map(str, arguments)],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             env={**os.environ, "TMPDIR": str(tmp_path / "tmp"), "PYTHONUNBUFFERED": "1"},
         )  # fmt: skip
@@ -80,7 +81,20 @@ def test_demo_goes_the_whole_way_and_leaves_nothing(
     assert head.split()[:4] == ["first", "answer", "within", "5cm/5deg"]
     assert [line.split()[0] for line in lines[:5]] == ["R", "VR", "DR", "VDR", "pose"]
     assert lines[-1].startswith("next: `sceneprint serve`")
+    assert lines[-3] == "no picture: no match was accepted"  # these frames hardly overlap
     leaves_nothing(tmp_path / "tmp")
+
+
+@pytest.mark.thorough
+def test_demo_draws_a_match_of_its_building(
+    demo: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    process = demo("--rooms", 1)
+    out, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, err
+    assert f"picture: {tmp_path / 'out' / 'overlay.png'}" in out.splitlines()
+    with Image.open(tmp_path / "out" / "overlay.png") as picture:
+        assert (picture.format, picture.width) == ("PNG", 992)
 
 
 @pytest.mark.parametrize(

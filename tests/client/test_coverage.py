@@ -1,8 +1,7 @@
-"""Coverage by client, raw HTTP and command."""
+"""Coverage by client and raw HTTP."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 
@@ -10,22 +9,14 @@ import httpx
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.cli import main
-from sceneprint.cli.coverage import change_lines, coverage_lines
 from sceneprint.errors import InvalidRequest, JobOver, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.lab.synth import SynthRoom
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.coverage import (
-    CellChange,
-    CoverageCell,
-    CoverageChanges,
-    CoveragePlan,
-    CoverageResult,
     MapCoverage,
     NewMapCoverage,
-    PlanChanges,
 )
 
 MAP = "covered"
@@ -140,88 +131,3 @@ def test_over_http(covered: Client, whole: MapCoverage, service_url: str) -> Non
             assert refused.headers["Content-Type"] == "application/problem+json"
         assert http.delete(place).status_code == 204
         assert http.get(place).status_code == 404
-
-
-def test_the_command(
-    covered: Client, whole: MapCoverage, service_url: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    of = ["coverage", MAP, "--url", service_url]
-    assert main([*of, "--every", "2", "--not-within", "0"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    newest = next(iter(covered.coverage_jobs(MAP)))
-    assert (newest.asked.every, newest.asked.not_within_s) == (2, 0.0)
-    told = covered.coverage_result(MAP, newest.coverage_id)
-    assert lines == coverage_lines(told)
-    assert main([*of, "--since", newest.coverage_id, "--json"]) == 0
-    changes = json.loads(capsys.readouterr().out)
-    assert changes["before"] == newest.coverage_id
-    assert changes["trends"]["worse"] == 0
-    begun = len(list(covered.coverage_jobs(MAP)))
-    for arguments, why in (
-        (["--since", whole.coverage_id, "--every", "2"], "Leave the other options out"),
-        (["--tolerance", "0"], "tolerance_m"),
-    ):
-        assert main([*of, *arguments]) == 2
-        assert why in capsys.readouterr().err
-    assert len(list(covered.coverage_jobs(MAP))) == begun  # refused before a job began
-
-
-# What people read, by hand.
-
-RESULT = CoverageResult(
-    found=7, wrong=1, ambiguous=0, not_found=2, frames=10, skipped=1, unchecked=2, model="depth",
-    revision=12, last_revision=12, map_frames=12, cell_m=0.5,
-)  # fmt: skip
-CELLS = [
-    CoverageCell(column=-1, row=0, frames=1, found=0, wrong=1, ambiguous=0, not_found=0),
-    CoverageCell(column=2, row=3, frames=9, found=1, wrong=0, ambiguous=0, not_found=2),
-    CoverageCell(column=3, row=3, frames=2, found=6, wrong=0, ambiguous=0, not_found=0),
-]
-TOLD = MapCoverage.model_validate(
-    {
-        "coverage_id": "5c1e", "map": "hall", "asked": {}, "state": "succeeded", "progress": None,
-        "result": RESULT, "error": None, "created_at": datetime(2026, 1, 1, tzinfo=UTC),
-        "finished_at": None,
-        "plans": [
-            CoveragePlan(
-                parent_frame="hall", x_axis=[1, 0, 0], y_axis=[0, 1, 0], up_from="map", cells=CELLS
-            )
-        ],
-    }
-)  # fmt: skip
-
-
-def test_the_summary_names_the_worst_cells() -> None:
-    assert coverage_lines(TOLD) == [
-        "coverage 5c1e: 10 frames queried against the rest of 12, 1 skipped",
-        "  found          7  70.0%",
-        "  wrong          1  10.0%",
-        "  ambiguous      0   0.0%",
-        "  not found      2  20.0%",
-        "  2 of those found have no pose to check them with",
-        "worst cells, 0.5 m wide:",
-        "  hall at 1.25 1.75 m: 1 found, 2 not found; 9 frames there",
-        "  hall at -0.25 0.25 m: 1 wrong; 1 frame there",
-    ]
-    failed = TOLD.model_copy(update={"result": None, "state": JobState.FAILED, "error": "no\nmap"})
-    assert coverage_lines(failed) == ["coverage 5c1e is failed: no\\nmap"]
-
-
-def test_the_changes_name_what_became_worse() -> None:
-    before = RESULT.model_copy(update={"found": 9, "wrong": 0, "not_found": 1})
-    cells = [
-        CellChange(column=-1, row=0, trend="worse", before=CELLS[2], after=CELLS[0]),
-        CellChange(column=3, row=3, trend="new", before=None, after=CELLS[2]),
-    ]
-    trends = {"better": 0, "worse": 1, "same": 0, "new": 1, "gone": 0}
-    changes = CoverageChanges.model_validate(
-        {
-            "before": "a1", "after": "b2", "cell_m": 0.5, "trends": trends,
-            "result_before": before, "result_after": RESULT,
-            "plans": [PlanChanges(parent_frame="hall", cells=cells)],
-        }
-    )  # fmt: skip
-    assert change_lines(changes) == [
-        "since a1: found 90.0% before, 70.0% now; cells: 1 worse, 1 new",
-        "  worse: hall at -0.25 0.25 m: 1 wrong; 1 frame there",
-    ]

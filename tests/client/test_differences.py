@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,8 +9,6 @@ import httpx
 import numpy as np
 import pytest
 
-from sceneprint.cli import main
-from sceneprint.cli.sessions import difference_lines
 from sceneprint.errors import InvalidRequest, UnknownJob
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.lab.synth import SynthRoom
@@ -70,17 +67,6 @@ def test_a_difference_is_told_listed_and_deleted(
     again = httpx.get(url, headers={"If-None-Match": sent.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
 
-    out = tmp_path / "difference.ply"
-    command = ["difference", MAP, "a", "b", "--url", service_url]
-    assert main([*command, "--out", str(out)]) == 0
-    printed = capsys.readouterr().out.splitlines()
-    assert printed[1:-1] == difference_lines(told)[1:]
-    assert f"{result.new:7} new in b" in "\n".join(printed)
-    head = out.read_bytes().split(b"end_header")[0].decode()
-    assert f"element vertex {len(found.points)}" in head
-    assert main([*command, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["result"] == result.model_dump(mode="json")
-
     changed.delete_difference(*of)
     with pytest.raises(UnknownJob, match="no difference"):
         changed.difference(*of)
@@ -91,7 +77,7 @@ def test_what_cannot_be_compared_is_refused(
 ) -> None:
     with pytest.raises(InvalidRequest, match="Name two sessions"):
         changed.compare_sessions(MAP, "a", "a")
-    assert main(["difference", MAP, "a", "z", "--url", service_url]) == 2
-    assert "no indexed frame with a pose of session 'z'" in capsys.readouterr().err
+    with pytest.raises(InvalidRequest, match="no indexed frame with a pose of session 'z'"):
+        changed.compare_sessions(MAP, "a", "z")
     raw = httpx.post(f"{service_url}/v1/maps/{MAP}/differences", json={"before": "a"})
     assert (raw.status_code, raw.headers["content-type"]) == (422, "application/problem+json")

@@ -1,22 +1,19 @@
-"""The surface of a map by client, raw HTTP and command."""
+"""The surface of a map by client and raw HTTP."""
 
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprint.cli import main
+from benchmarks.waiting import until
 from sceneprint.errors import InvalidRequest, NotFound, UnknownMap
 from sceneprint.formats.dataset import write_depth_png
-from sceneprint.formats.points.ply import read_ply
 from sceneprint.lab.synth import SynthRoom
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
@@ -136,47 +133,18 @@ def test_a_tile_is_kept_for_ever_and_a_plan_asked_for_again(
     assert (image.mode, image.size) == ("RGBA", (parent.plan.width, parent.plan.height))
 
 
-def test_the_command_writes_plan_and_points(
-    fused: Client, service_url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    plan, points = tmp_path / "plan.png", tmp_path / "surface.ply"
-    given = ["--url", service_url]
-    assert main(["surface", MAP, "--out", str(plan), *given]) == 0
-    (parent,) = fused.surface(MAP).parents
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == f"surface of map {MAP} is ready: 4 frames"
-    assert lines[1].startswith("room: 4 frames, ")
-    finest = parent.levels[0]
-    assert lines[2].startswith(f"  cells of 0.05 m: {finest.cells} in {finest.tiles} tiles, ")
-    assert lines[-1] == f"wrote {plan}"
-    assert plan.read_bytes() == fused.surface_plan(MAP)
-    assert main(["surface", MAP, "--out", str(points), "--level", "1", "--json", *given]) == 0
-    assert json.loads(capsys.readouterr().out)["frames"] == 4
-    assert read_ply(points.read_bytes()).count == parent.levels[1].cells
-    for wrong, message in (
-        (["--out", "plan.jpg"], "end the name with .png"),
-        (["--out", str(points), "--parent-frame", "x"], "has no surface in that parent frame"),
-        (["--delete", "--out", str(plan)], "leaves nothing to write"),
-    ):
-        assert main(["surface", MAP, *wrong, *given]) == 2
-        assert message in capsys.readouterr().err
-
-
 def test_a_deleted_surface_comes_back_when_asked_for(
     fused: Client, service_url: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = fused.surface(MAP)
     tile = next(fused.surface_tiles(MAP))
-    assert main(["surface", MAP, "--delete", "--url", service_url]) == 0
-    assert capsys.readouterr().out == f"deleted the surface of map {MAP}\n"
+    fused.delete_surface(MAP)
     told = fused.surface(MAP)
     assert (told.state, told.frames, told.parents, told.job_id) == ("none", 0, [], None)
     with pytest.raises(NotFound):
         fused.surface_tile(MAP, tile.digest)
     assert list(fused.surface_tiles(MAP)) == []
-    assert main(["surface", MAP, "--no-build", "--url", service_url]) == 0
-    assert capsys.readouterr().out == f"surface of map {MAP} is none: 0 frames, 4 left\n"
-    assert main(["surface", MAP, "--url", service_url]) == 0
-    again = fused.surface(MAP)
+    fused.begin_surface(MAP)
+    again = until(lambda: (one := fused.surface(MAP)).state == "ready" and one)
     assert again.parents == before.parents
     assert next(fused.surface_tiles(MAP)) == tile

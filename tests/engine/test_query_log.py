@@ -13,14 +13,14 @@ import pytest
 from sqlalchemy import event, func, select, update
 
 from sceneprint.engine.results import query_log
-from sceneprint.engine.results.query_log import (
-    QueryLog,
+from sceneprint.engine.results.query_entry import (
     SentQuery,
     StoredAnswer,
     decode_answer,
     encode_answer,
     query_row,
 )
+from sceneprint.engine.results.query_log import QueryLog
 from sceneprint.errors import (
     FrameError,
     InvalidRequest,

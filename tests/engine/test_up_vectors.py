@@ -12,7 +12,7 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.engine.maps.map_lifecycle import edit_frame, edit_map
-from sceneprint.engine.results.query_log import decode_answer, encode_answer
+from sceneprint.engine.results.query_entry import decode_answer, encode_answer
 from sceneprint.engine.search.query import localization_of
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.errors import FrameConflict, InvalidRequest, MapExists

@@ -1,4 +1,4 @@
-"""Readers of scenes, a real service with a map, and a way to run commands."""
+"""A reader of scenes, a real service with a map, and a way to run commands."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ from sceneprint.types import DepthFrame
 from sceneprint_client import Client, meta_of
 
 MAP, WALK = "rooms", 8
+#: What Rerun, which does not draw them, calls lines and labels.
+UPDATE = "foxglove.SceneUpdate:message"
 
 
 @dataclass
@@ -34,43 +36,46 @@ class Logged:
     """What a file has at one path and time: components by their names, one row each."""
 
     path: str
-    index: int | None
     time_ns: int | None
     values: dict[str, Any]
 
 
-def _rows(reader: Any, index: str, time: str) -> Iterator[Logged]:
-    for chunk in reader.stream():
+def _rows(path: Path) -> Iterator[Logged]:
+    from rerun.chunk import McapReader  # half a second
+
+    for chunk in McapReader(path).stream():
         batch = chunk.to_record_batch()
         for i in range(batch.num_rows):
             row = {name: batch.column(name)[i] for name in batch.schema.names}
-            at = row.pop(time, None)
-            number = row.pop(index, None)
+            at = row.pop("message_log_time", None)
             values = {
                 name: one.as_py() for name, one in row.items() if ":" in name and one.is_valid
             }
-            yield Logged(
-                chunk.entity_path,
-                None if chunk.is_static or number is None else number.as_py(),
-                None if chunk.is_static or at is None else at.cast("int64").as_py(),
-                values,
-            )
-
-
-def rrd_rows(path: Path) -> list[Logged]:
-    """All of an .rrd file, in the order in which it was logged, but for what Rerun adds."""
-    from rerun.chunk import RrdReader  # half a second
-
-    rows = _rows(RrdReader(path), "frame", "time")
-    return [one for one in rows if not one.path.startswith("/__")]
+            time_ns = None if chunk.is_static or at is None else at.cast("int64").as_py()
+            yield Logged(chunk.entity_path, time_ns, values)
 
 
 def mcap_rows(path: Path) -> list[Logged]:
     """All messages of an MCAP file as Rerun understands them: a reader that is not Foxglove's."""
-    from rerun.chunk import McapReader
+    return [one for one in _rows(path) if not one.path.startswith("/__")]
 
-    rows = _rows(McapReader(path), "no index", "message_log_time")
-    return [one for one in rows if not one.path.startswith("/__")]
+
+def moves_of(rows: list[Logged], child: str) -> list[Logged]:
+    """The transforms of a frame of coordinates, in the order of time."""
+    key = "Transform3D:child_frame"
+    return [one for one in rows if one.values.get(key) == [child]]
+
+
+def drawn_at(rows: list[Logged], topic: str) -> dict[str, Any]:
+    """The lines and labels that a topic holds in the end, by their paths."""
+    drawn: dict[str, Any] = {}
+    for row in rows:
+        if row.path == topic and UPDATE in row.values:
+            [update] = row.values[UPDATE]
+            for one in update["deletions"] or ():
+                del drawn[one["id"]]
+            drawn |= {one["id"]: one for one in update["entities"] or ()}
+    return drawn
 
 
 @dataclass

@@ -42,7 +42,7 @@ def answer(client: Client, frame: FrameReference) -> Answer:
 
 def drawn(client: Client, answer: Answer, map_frames: int = 3) -> ListWriter:
     writer = ListWriter()
-    scene = AnswerScene(SceneStream([writer]), client, map_frames=map_frames)
+    scene = AnswerScene(SceneStream(writer), client, map_frames=map_frames)
     camera = next(client.frames(MAP)).intrinsics
     scene.add(answer, "my frame", "what is said", camera)
     return writer
@@ -165,7 +165,7 @@ def test_a_query_without_validation_has_no_points(client: Client, frame: FrameRe
 
 def test_the_map_is_drawn_once_and_where_its_frames_are(client: Client, answer: Answer) -> None:
     writer = ListWriter()
-    scene = AnswerScene(SceneStream([writer]), client, MANY)
+    scene = AnswerScene(SceneStream(writer), client, MANY)
     for index in (0, 3):
         scene.add(answer, "my frame", "", None, index, 10**9 * index)
     *maps, first, second = writer.moments
@@ -205,7 +205,7 @@ def test_without_poses_the_query_lies_in_its_best_match(
     assert match.validation.status == "accepted"
     assert match.transform is not None
     writer = ListWriter()
-    AnswerScene(SceneStream([writer]), client).add(answer, "my frame", "", None)
+    AnswerScene(SceneStream(writer), client).add(answer, "my frame", "", None)
     there = writer.contents()
     space = f"{match.frame_id}.optical"
     np.testing.assert_array_equal(there[f"{space}/query"].T_parent_child, match.transform.matrix)
@@ -226,7 +226,7 @@ def test_frames_are_taken_evenly(client: Client) -> None:
 
 def test_a_moment_takes_the_place_of_the_one_before() -> None:
     writer = ListWriter()
-    stream = SceneStream([writer])
+    stream = SceneStream(writer)
     assert stream.is_empty
     a, b = (SceneEntity((name,), TextPage(name)) for name in "ab")
     for moment in (Moment([a]), Moment([a, b], 0), Moment([]), Moment([b], 1), Moment([], 2)):

@@ -1,26 +1,17 @@
-"""Scenes written and read again: by Rerun's reader of its files, and by its reader of MCAP files,
-which is not that of the library that wrote them.
-"""
+"""Scenes written, and read again by Rerun: not by the library that wrote them."""
 
 from __future__ import annotations
 
 import resource
 import subprocess
 import sys
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rerun_cli
-from rerun.chunk import RrdReader
 
-from benchmarks.waiting import PATIENCE_S
-from sceneprint.errors import InvalidRequest, Unreachable
 from sceneprint.scenes.mcap_writer import mcap_file, upright
-from sceneprint.scenes.rerun_writer import check_viewer, rerun_file, rerun_viewer
 from sceneprint.scenes.scene import (
     LineSet,
     Moment,
@@ -28,14 +19,13 @@ from sceneprint.scenes.scene import (
     PointSet,
     SceneEntity,
     SceneStream,
-    SceneWriter,
     TextLabel,
     TextPage,
     UpAxis,
 )
 from sceneprint_client.poses import rotation_of
 
-from .conftest import Logged, mcap_rows, rrd_rows
+from .conftest import UPDATE, Logged, drawn_at, mcap_rows, moves_of
 
 #: 2023-11-14, and the second moment 1.5 s later.
 START = 1_700_000_000_123_456_789
@@ -84,45 +74,10 @@ def at(rows: list[Logged], path: str, component: str) -> list[Logged]:
     return [one for one in rows if one.path == path and component in one.values]
 
 
-def test_a_recording_for_rerun(tmp_path: Path) -> None:
-    path = tmp_path / "a.rrd"
-    with rerun_file(path, "a title") as writer:
-        written(SceneStream([writer]))
-    rows = rrd_rows(path)
-    [cloud] = at(rows, "/my\\ hall/map/points", "Points3D:positions")
-    assert (cloud.index, cloud.values["Points3D:positions"]) == (None, POINTS.tolist())
-    assert cloud.values["Points3D:colors"] == packed(COLOURS)
-    assert cloud.values["Points3D:radii"] == pytest.approx([0.006])
-    [up] = at(rows, "/my\\ hall", "ViewCoordinates:xyz")
-    assert up.values["ViewCoordinates:xyz"] == [[3, 2, 5]]  # right, down, forward
-    [placed] = at(rows, "/my\\ hall/query", "Transform3D:translation")
-    assert (placed.index, placed.time_ns) == (0, START)
-    assert placed.values["Transform3D:translation"] == [[1.5, -2.0, 0.25]]
-    [q] = placed.values["Transform3D:quaternion"]
-    np.testing.assert_allclose(rotation_of(np.array(q)), T[:3, :3], atol=1e-7)
-    [query] = at(rows, "/my\\ hall/query/points", "Points3D:positions")
-    assert query.values["Points3D:positions"] == (-POINTS).tolist()
-    [lines] = at(rows, "/my\\ hall/query/sensor", "LineStrips3D:strips")
-    assert lines.values["LineStrips3D:strips"] == [SQUARE.tolist(), SQUARE[:2].tolist()]
-    assert lines.values["LineStrips3D:colors"] == packed([(255, 0, 0)] * 2)
-    [label] = at(rows, "/my\\ hall/query/label", "Points3D:labels")
-    assert label.values["Points3D:labels"] == ["#1 name"]
-    assert label.values["Points3D:positions"] == [[0, 1, 0]]
-    texts = at(rows, "/answer", "TextDocument:text")
-    assert [(one.index, one.time_ns, one.values["TextDocument:text"]) for one in texts] == [
-        (0, START, ["```\nfound\n  at 'here'\n```"]), (1, LATER, ["```\nlost\n```"]),
-    ]  # fmt: skip
-    cleared = {one.path for one in rows if "Clear:is_recursive" in one.values and one.index == 1}
-    assert cleared == {f"/my\\ hall/query{part}" for part in ("", "/points", "/sensor", "/label")}
-    reader = RrdReader(path)  # the layout is sent again where there is more to lay out
-    assert (len(reader.recordings()), len(reader.blueprints())) == (1, 2)
-    assert [one.name for one in tmp_path.iterdir()] == ["a.rrd"]
-
-
 def test_an_mcap_file_for_foxglove(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with mcap_file(path) as writer:
-        written(SceneStream([writer]))
+        written(SceneStream(writer))
     rows = mcap_rows(path)
     [cloud] = at(rows, "/my_hall/map/points", "Points3D:positions")
     assert cloud.time_ns == START  # what stays has the time of the first moment
@@ -133,18 +88,14 @@ def test_an_mcap_file_for_foxglove(tmp_path: Path) -> None:
     assert first.values["Points3D:positions"] == (-POINTS).tolist()
     assert first.values["CoordinateFrame:frame"] == ["query.optical"]
     assert (emptied.time_ns, emptied.values.get("Points3D:positions", [])) == (LATER, [])
-    moves = {
-        one.values["Transform3D:child_frame"][0]: one
-        for one in rows
-        if "Transform3D:child_frame" in one.values
-    }
-    assert set(moves) == {"query.optical", "my hall"}
-    query = moves["query.optical"].values
+    [move] = moves_of(rows, "query.optical")
+    query = move.values
     assert query["Transform3D:parent_frame"] == ["my hall"]
     assert query["Transform3D:translation"] == [[1.5, -2.0, 0.25]]
     [q] = query["Transform3D:quaternion"]
     np.testing.assert_allclose(rotation_of(np.array(q)), T[:3, :3], atol=1e-7)
-    hall = moves["my hall"].values
+    [move] = moves_of(rows, "my hall")
+    hall = move.values
     assert hall["Transform3D:parent_frame"] == ["my hall upright"]
     [q] = hall["Transform3D:quaternion"]
     np.testing.assert_allclose(rotation_of(np.array(q)) @ (0, -1, 0), (0, 0, 1), atol=1e-7)
@@ -158,12 +109,10 @@ def test_an_mcap_file_for_foxglove(tmp_path: Path) -> None:
 def test_lines_and_labels_for_foxglove(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with mcap_file(path) as writer:
-        written(SceneStream([writer]))
-    component = "foxglove.SceneUpdate:message"
-    first, second = at(mcap_rows(path), "/my_hall/query", component)
+        written(SceneStream(writer))
+    first, second = at(mcap_rows(path), "/my_hall/query", UPDATE)
     assert (first.time_ns, second.time_ns) == (START, LATER)
-    [update] = first.values[component]
-    entities = {one["id"]: one for one in update["entities"]}
+    entities = drawn_at([first], "/my_hall/query")
     assert set(entities) == {"/my_hall/query/sensor", "/my_hall/query/label"}
     sensor = entities["/my_hall/query/sensor"]
     assert sensor["frame_id"] == "query.optical"
@@ -174,7 +123,7 @@ def test_lines_and_labels_for_foxglove(tmp_path: Path) -> None:
     [label] = entities["/my_hall/query/label"]["texts"]
     assert (label["text"], label["billboard"]) == ("#1 name", True)
     assert label["pose"]["position"] == {"x": 0.0, "y": 1.0, "z": 0.0}
-    [update] = second.values[component]
+    [update] = second.values[UPDATE]
     assert {one["id"] for one in update["deletions"]} == set(entities)
     assert not update["entities"]
 
@@ -187,45 +136,35 @@ def test_up_is_turned_to_z(up: tuple[float, float, float]) -> None:
     assert np.linalg.det(R) == pytest.approx(1)
 
 
-def to_rerun(path: Path) -> AbstractContextManager[SceneWriter]:
-    return rerun_file(path, "a title")
-
-
-@pytest.mark.parametrize("write_to", [to_rerun, mcap_file])
-def test_a_file_is_there_whole_or_not_at_all(
-    tmp_path: Path, write_to: Callable[[Path], AbstractContextManager[SceneWriter]]
-) -> None:
+def test_a_file_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "scene"
-    with write_to(path):
+    with mcap_file(path):
         pass
     assert list(tmp_path.iterdir()) == []  # nothing was shown, as all frames were refused
     path.write_bytes(b"old")
 
     def interrupted() -> None:
-        with write_to(path) as writer:
-            written(SceneStream([writer]))
+        with mcap_file(path) as writer:
+            written(SceneStream(writer))
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert [(one.name, one.read_bytes()) for one in tmp_path.iterdir()] == [("scene", b"old")]
-    with write_to(path) as writer:
-        written(SceneStream([writer]))
+    with mcap_file(path) as writer:
+        written(SceneStream(writer))
     assert [one.name for one in tmp_path.iterdir()] == ["scene"]
     assert len(path.read_bytes()) > 1000
 
 
-@pytest.mark.parametrize("write_to", [to_rerun, mcap_file])
-def test_a_full_disk_is_told_and_nothing_is_left(
-    tmp_path: Path, write_to: Callable[[Path], AbstractContextManager[SceneWriter]]
-) -> None:
+def test_a_full_disk_is_told_and_nothing_is_left(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     cloud = PointSet(rng.uniform(size=(100_000, 3)), np.zeros((100_000, 3), np.uint8), 0.01)
     path = tmp_path / "scene"
 
     def fill() -> None:
-        with write_to(path) as writer:
-            stream = SceneStream([writer])
+        with mcap_file(path) as writer:
+            stream = SceneStream(writer)
             for i in range(3):
                 stream.write(Moment([SceneEntity(("a", "b"), cloud)], i))
 
@@ -241,65 +180,16 @@ def test_a_full_disk_is_told_and_nothing_is_left(
 
 
 def test_without_stamps_moments_are_a_second_apart(tmp_path: Path) -> None:
-    rrd, mcap = tmp_path / "a.rrd", tmp_path / "a.mcap"
-    with rerun_file(rrd, "a") as one, mcap_file(mcap) as other:
-        stream = SceneStream([one, other])
+    path = tmp_path / "a.mcap"
+    with mcap_file(path) as writer:
+        stream = SceneStream(writer)
         for i in (0, 1, 4):
             stream.write(Moment([SceneEntity(("answer",), TextPage(f"{i}"))], i))
-    texts = at(rrd_rows(rrd), "/answer", "TextDocument:text")
-    assert [(row.index, row.time_ns) for row in texts] == [(0, None), (1, None), (4, None)]
-    logs = at(mcap_rows(mcap), "/log", "TextLog:text")
+    logs = at(mcap_rows(path), "/log", "TextLog:text")
     assert [row.time_ns for row in logs] == [0, 1_000_000_000, 4_000_000_000]
 
 
-def test_a_viewer_gets_what_a_file_would(tmp_path: Path) -> None:
-    """Rerun's own program, which saves what it receives."""
-    path = tmp_path / "live.rrd"
-    program = Path(str(rerun_cli.__file__)).parent / "rerun"
-    command = [program, "--bind", "127.0.0.1", "--port", "0", "--save", path]
-    port = _free_port()
-    command[4] = str(port)
-    url = f"rerun+http://127.0.0.1:{port}/proxy"
-    viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        while True:
-            try:
-                check_viewer(url)
-                break
-            except Unreachable:
-                assert viewer.poll() is None
-        with rerun_viewer(url, "a title") as writer:
-            written(SceneStream([writer]))
-        while b"map/points" not in (path.read_bytes() if path.exists() else b""):
-            assert viewer.poll() is None
-    finally:
-        viewer.terminate()
-        viewer.wait(PATIENCE_S)
-
-
-def _free_port() -> int:
-    import socket
-
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
-
-
-@pytest.mark.parametrize(
-    "url", ["http://127.0.0.1:9876/proxy", "rerun+http://:9/proxy", "rerun+http://host:9/x",
-            "rerun+http://host:99999999/proxy", "here"]
-)  # fmt: skip
-def test_an_address_that_is_no_viewers_is_refused(url: str) -> None:
-    with pytest.raises(InvalidRequest, match="is not the address of a Rerun viewer"):
-        check_viewer(url)
-
-
-def test_an_address_where_nobody_listens_is_told() -> None:
-    with pytest.raises(Unreachable, match="No Rerun viewer listens at"):
-        check_viewer(f"rerun+http://127.0.0.1:{_free_port()}/proxy")
-
-
-def test_nothing_is_loaded_that_is_not_asked_for() -> None:
+def test_nothing_is_loaded_that_no_option_needs() -> None:
     code = "import sys; import sceneprint.cli.query; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert {"rerun", "foxglove", "pyarrow"} & set(done.stdout.split()) == set()
+    assert "foxglove" not in done.stdout.split()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.engine.results.query_log import SentQuery, StoredAnswer, query_row
+from sceneprint.engine.results.query_entry import SentQuery, StoredAnswer, query_row
 from sceneprint.settings import Settings
 from sceneprint.store.maps import add_frame, find_map
 from sceneprint_client.api import Answer, Counts, NewMap, Query

@@ -1,1 +1,1 @@
-"""Answers that are kept, inspected and computed again."""
+"""The log of queries, and what can be looked at after one."""

@@ -20,7 +20,8 @@ import numpy as np
 
 from sceneprint import errors
 from sceneprint.engine.maps.map_frames import FORM, Output, find_indexed, geometry_of, placed
-from sceneprint.engine.results.query_log import QueryLog, StoredAnswer
+from sceneprint.engine.results.query_entry import StoredAnswer
+from sceneprint.engine.results.query_log import QueryLog
 from sceneprint.engine.search.response import uncertainty_record, validation_record
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import thresholds

@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
-from sceneprint.engine.results.query_log import QueryLog, SentQuery, StoredAnswer, query_row
+from sceneprint.engine.results.query_entry import SentQuery, StoredAnswer, query_row
+from sceneprint.engine.results.query_log import QueryLog
 from sceneprint.engine.search.answer import SequenceFrame, answer
 from sceneprint.engine.search.response import uncertainty_record, validation_record
 from sceneprint.engine.search.retrieval import (

@@ -786,10 +786,6 @@ class FrameStore:
         np.save(self.folder / f"{number}.depth.npy", np.ascontiguousarray(frame.depth))
         np.save(self.folder / f"{number}.camera.npy", camera)
 
-    def is_depth(self, member: SignedFrame) -> bool:
-        """Whether the frame is a depth image and no cloud."""
-        return (self.folder / f"{member.number}.depth.npy").exists()
-
     def frame(self, member: SignedFrame) -> AnyFrame:
         """The depth image or cloud again, with the pose of the evaluation."""
         for has_viewpoint, seen in ((True, "seen"), (False, "fused")):

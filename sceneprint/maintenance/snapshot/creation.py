@@ -262,8 +262,7 @@ def _write(
     damaged, count, size = [], 0, 0
     for one in copied_blobs(blobs, database_copy.referred(copy)):
         if isinstance(one, Untaken):
-            of = database_copy.uses(copy, one.digest)
-            damaged.append(LostBlob(digest=one.digest, why=one.why, of=of))
+            damaged.append(LostBlob(digest=one.digest, why=one.why))
             continue
         writer.add(BLOBS + one.digest, one.size, one.chunks)
         count, size = count + 1, size + one.size

@@ -7,10 +7,9 @@ Of PostgreSQL it is a SQLite file as well: one format, whatever the store is kep
 
 from __future__ import annotations
 
-import hashlib
 import json
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -22,9 +21,7 @@ from sqlalchemy import (
     JSON,
     URL,
     Boolean,
-    Column,
     Connection,
-    Float,
     LargeBinary,
     String,
     Table,
@@ -33,7 +30,6 @@ from sqlalchemy import (
 from sqlalchemy.exc import ArgumentError
 
 from sceneprint.errors import NewerSchema, SnapshotError, UnusableStore
-from sceneprint.maintenance.snapshot.files import BlobUse
 from sceneprint.store.database import Database, known_revisions, open_database
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.read_only import look_at
@@ -41,10 +37,9 @@ from sceneprint.store.sqlite import ReadOnlyFile, read_only_file
 from sceneprint.store.tables import metadata, pending_events
 from sceneprint_client.api import FrameState
 
-# The same rows in both databases: how they are asked for, and how they are compared.
+# The same rows in both databases: how they are asked for.
 #
 #     Form   --of_file | of_server-->  SQL
-#     rows   --Sum-->  how many, and a digest that is the same for the same rows
 #
 # Documents (JSON) travel as the text that they are: nothing is parsed and written anew.
 
@@ -88,15 +83,13 @@ class Form:
         """SQL that reads all rows of a SQLite file, in the order of their keys."""
         return f"SELECT {self.names} FROM {self.table.name} ORDER BY {self._order(server=False)}"
 
-    def of_server(self, *, hashed: bool = False) -> str:
-        """The same of PostgreSQL.
-
-        Parameters
-        ----------
-        hashed : have bytes hashed there, where only a digest of the rows is wanted
-        """
-        told = ", ".join(_column_text(column, hashed) for column in self.table.columns)
-        return f"SELECT {told} FROM {self.table.name} ORDER BY {self._order(server=True)}"
+    def of_server(self) -> str:
+        """Return the same of PostgreSQL."""
+        columns = ", ".join(
+            f'"{one.name}"::text' if isinstance(one.type, JSON) else f'"{one.name}"'
+            for one in self.table.columns
+        )
+        return f"SELECT {columns} FROM {self.table.name} ORDER BY {self._order(server=True)}"
 
     def for_server(self, row: Row) -> list[Any]:
         """A row of a SQLite file as PostgreSQL takes it."""
@@ -108,21 +101,6 @@ class Form:
                 values[i] = json.dumps(values[i])
         return values
 
-    def compared(self, row: Row) -> bytes:
-        """A row as it enters a digest, whichever database it is of."""
-        values = self.for_server(row)
-        for i in self._blobs:
-            if isinstance(values[i], bytes):
-                values[i] = hashlib.sha256(values[i]).hexdigest()
-        for i in self._floats:
-            if values[i] is not None:  # SQLite knows neither -0.0 nor NaN
-                values[i] = values[i] + 0.0 if values[i] == values[i] else None
-        for i in self._documents:
-            text = values[i]
-            if text is not None and text[:1] not in tuple('[{"ntf'):  # 5, or 5.0, or 5e0
-                values[i] = repr(float(text))
-        return repr(values).encode("utf-8", "surrogateescape")
-
     @cached_property
     def _flags(self) -> list[int]:
         return self.places(Boolean)
@@ -131,57 +109,12 @@ class Form:
     def _documents(self) -> list[int]:
         return self.places(JSON)
 
-    @cached_property
-    def _blobs(self) -> list[int]:
-        return self.places(LargeBinary)
-
-    @cached_property
-    def _floats(self) -> list[int]:
-        return self.places(Float)
-
     def _order(self, *, server: bool) -> str:
         # SQLite orders texts by their bytes
         return ", ".join(
             f'"{one.name}"' + (' COLLATE "C"' if server and isinstance(one.type, String) else "")
             for one in self.table.primary_key.columns
         )
-
-
-def _column_text(column: Column[Any], hashed: bool) -> str:
-    if isinstance(column.type, JSON):
-        return f'"{column.name}"::text'
-    if hashed and isinstance(column.type, LargeBinary):
-        return f"encode(sha256(\"{column.name}\"), 'hex')"
-    return f'"{column.name}"'
-
-
-class Sum:
-    """How many rows went by, and a digest of them.
-
-    Parameters
-    ----------
-    form : of their table
-    """
-
-    def __init__(self, form: Form) -> None:
-        self._form, self._hashed, self._count = form, hashlib.sha256(), 0
-
-    def add(self, row: Row) -> None:
-        """Take another row; they come in the order of their keys."""
-        data = self._form.compared(row)
-        self._hashed.update(b"%d " % len(data) + data)
-        self._count += 1
-
-    def over(self, rows: Iterable[Row]) -> Iterator[Row]:
-        """Rows that go by."""
-        for row in rows:
-            self.add(row)
-            yield row
-
-    @property
-    def told(self) -> tuple[int, str]:
-        """What two tables of the same rows have in common."""
-        return self._count, self._hashed.hexdigest()
 
 
 def rows_of_file(file: sqlite3.Connection, form: Form) -> Iterator[Row]:
@@ -231,16 +164,14 @@ def copy_server(database: Database, to: Path, written: Written) -> None:
             indexes = _without_indexes(file)
             with database.read() as connection:
                 allow(connection, 0)  # what is on the way may be large, and the disk slow
-                sums = [_copy(connection, file, Form(one), written, to)
-                        for one in metadata.sorted_tables]  # fmt: skip
+                for one in metadata.sorted_tables:
+                    _copy(connection, file, Form(one), written, to)
                 file.execute("BEGIN")
                 file.execute("DELETE FROM sqlite_sequence")
                 file.executemany("INSERT INTO sqlite_sequence VALUES (?, ?)", _numbers(connection))
                 file.execute("COMMIT")
             for statement in indexes:
                 file.execute(statement)
-            for table, known in zip(metadata.sorted_tables, sums, strict=True):
-                _check(file, Form(table), known)
             number_pending_events(file)
     except sqlite3.Error as error:
         raise UnusableStore(
@@ -258,10 +189,10 @@ def number_pending_events(file: sqlite3.Connection) -> None:
     file.execute("COMMIT")
 
 
-def rows_of_server(connection: Connection, form: Form, *, hashed: bool = False) -> Iterator[Row]:
-    """All rows of a table, in the order of their keys; a block of them at a time."""
-    asked, streamed = form.of_server(hashed=hashed), {"stream_results": True}
-    with closing(connection.exec_driver_sql(asked, execution_options=streamed)) as found:
+def rows_of_server(connection: Connection, form: Form) -> Iterator[Row]:
+    """Yield all rows of a table, in the order of their keys; a block of them is held at a time."""
+    options = {"stream_results": True}
+    with closing(connection.exec_driver_sql(form.of_server(), execution_options=options)) as found:
         while block := found.fetchmany(form.block):
             yield from block
 
@@ -283,14 +214,13 @@ def _without_indexes(file: sqlite3.Connection) -> list[str]:
 
 def _copy(
     connection: Connection, file: sqlite3.Connection, form: Form, written: Written, to: Path
-) -> tuple[int, str]:
-    total = Sum(form)
+) -> None:
     marks = ", ".join("?" * len(form.table.columns))
     insert = f"INSERT INTO {form.table.name} ({form.names}) VALUES ({marks})"
     file.execute("BEGIN")
     file.execute(f"DELETE FROM {form.table.name}")  # a new database has a secret of its own
     waiting: list[Row] = []
-    for row in total.over(rows_of_server(connection, form)):
+    for row in rows_of_server(connection, form):
         waiting.append(tuple(row))
         if len(waiting) == form.block:
             file.executemany(insert, waiting)
@@ -299,7 +229,6 @@ def _copy(
     file.executemany(insert, waiting)
     file.execute("COMMIT")
     written(to.stat().st_size)
-    return total.told
 
 
 def _numbers(connection: Connection) -> Iterator[tuple[str, int]]:
@@ -315,36 +244,17 @@ def _numbers(connection: Connection) -> Iterator[tuple[str, int]]:
             yield table.name, last
 
 
-def _check(file: sqlite3.Connection, form: Form, known: tuple[int, str]) -> None:
-    found = Sum(form)
-    for row in rows_of_file(file, form):
-        found.add(row)
-    if found.told != known:
-        raise UnusableStore(
-            f"The copy of table {form.table.name} is not what the database holds: "
-            f"{found.told[0]} rows, where {known[0]} were read. Take the snapshot again; where "
-            "this comes again, see the disk it is written to."
-        )
-
-
 #: Seconds to wait for whoever recovers the database.
 BUSY_S = 30.0
-#: The frames that blobs belong to: (digest, number of the frame, role).
-_USES_OF_FRAMES = (
-    "SELECT blob AS digest, number, CASE WHEN deletion IS NULL THEN 'upload' ELSE 'deleted' END"
-    " AS role FROM frames WHERE deletion IS NOT NULL OR state NOT IN"
+#: The digests of all blobs that have to be there.
+_REFERRED = (
+    "SELECT blob AS digest FROM frames WHERE deletion IS NOT NULL OR state NOT IN"
     f" ('{FrameState.DELETED}', '{FrameState.REDUNDANT}')"
-    " UNION ALL SELECT geometry, frame_number, 'geometry' FROM signatures"
+    " UNION ALL SELECT geometry FROM signatures"
+    " UNION ALL SELECT blob FROM job_files"
+    " UNION ALL SELECT blob FROM surface_tiles WHERE blob IS NOT NULL"
+    " UNION ALL SELECT draft FROM surface_tiles WHERE draft IS NOT NULL"
 )
-#: The jobs: (digest, number of the job, role).
-_USES_OF_JOBS = "SELECT blob AS digest, job_number AS number, 'job' AS role FROM job_files"
-#: The surfaces: (digest, number of the map, role).
-_USES_OF_SURFACES = " UNION ALL ".join(
-    f"SELECT {column} AS digest, map_number AS number, 'surface' AS role FROM surface_tiles"
-    f" WHERE {column} IS NOT NULL"
-    for column in ("blob", "draft")
-)
-_USES = " UNION ALL ".join([_USES_OF_FRAMES, _USES_OF_JOBS, _USES_OF_SURFACES])
 
 
 @dataclass(frozen=True)
@@ -542,43 +452,15 @@ def counts(connection: sqlite3.Connection) -> dict[str, Any]:
 def referred(connection: sqlite3.Connection) -> Iterator[str]:
     """Yield the digests of all blobs that have to be there, each once, in order."""
     # as text, whatever a database that somebody has edited holds
-    asked = f"SELECT DISTINCT CAST(digest AS TEXT) AS digest FROM ({_USES}) ORDER BY 1"
+    asked = f"SELECT DISTINCT CAST(digest AS TEXT) AS digest FROM ({_REFERRED}) ORDER BY 1"
     for (digest,) in connection.execute(asked):
         yield digest
 
 
 def count_referred(connection: sqlite3.Connection) -> int:
     """Return how many blobs `referred` yields."""
-    asked = f"SELECT count(DISTINCT digest) FROM ({_USES})"
+    asked = f"SELECT count(DISTINCT digest) FROM ({_REFERRED})"
     return int(connection.execute(asked).fetchone()[0])
-
-
-def uses(connection: sqlite3.Connection, digest: str) -> tuple[BlobUse, ...]:
-    """Return what a blob is used for."""
-    rows = connection.execute(
-        "SELECT maps.name, frames.id, used.role FROM"
-        f" ({_USES_OF_FRAMES}) AS used JOIN frames ON frames.number = used.number"
-        " JOIN maps ON maps.number = frames.map_number WHERE CAST(digest AS TEXT) = ?"
-        " ORDER BY frames.number",
-        (digest,),
-    )
-    found = [BlobUse(map=name, frame=frame, role=role) for name, frame, role in rows]
-    rows = connection.execute(
-        "SELECT maps.name, jobs.id FROM"
-        f" ({_USES_OF_JOBS}) AS used JOIN jobs ON jobs.number = used.number"
-        " JOIN maps ON maps.number = jobs.map_number WHERE CAST(digest AS TEXT) = ?"
-        " ORDER BY jobs.number",
-        (digest,),
-    )
-    found += [BlobUse(map=name, job=job, role="job") for name, job in rows]
-    rows = connection.execute(
-        f"SELECT DISTINCT maps.name FROM ({_USES_OF_SURFACES}) AS used"
-        " JOIN maps ON maps.number = used.number WHERE CAST(digest AS TEXT) = ?"
-        " ORDER BY maps.name",
-        (digest,),
-    )
-    found += [BlobUse(map=name, role="surface") for (name,) in rows]
-    return tuple(found)
 
 
 def _connect(path: Path, how: str) -> sqlite3.Connection:

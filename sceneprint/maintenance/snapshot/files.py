@@ -174,7 +174,7 @@ class ArchiveReader:
 # manifest.json   this; as many bytes as MANIFEST_BYTES, so that it can be written last
 # sceneprint.db   the database, SQLite, in one file
 # blobs/DIGEST    every blob it refers to, ordered by digest, which is the SHA-256 of the content;
-# damaged.jsonl   the blobs that were missing or damaged when it was taken, and whose they are
+# damaged.jsonl   the blobs that were missing or damaged when it was taken
 
 #: Of the archive and of what it means. Raise it when either changes.
 VERSION = 1
@@ -210,21 +210,11 @@ class Damaged(ArchiveMember):
     count: int = Field(ge=0)
 
 
-class BlobUse(_Record):
-    """What a blob is for."""
-
-    map: str
-    frame: str | None = None
-    job: str | None = None
-    role: Literal["upload", "geometry", "job", "surface", "deleted"]
-
-
 class LostBlob(_Record):
     """A line of `damaged.jsonl`: a blob that could not be taken along."""
 
     digest: str
     why: Literal["missing", "damaged"]
-    of: tuple[BlobUse, ...]
 
 
 class SnapshotManifest(_Record):

@@ -153,8 +153,7 @@ def test_a_snapshot_makes_up_for_no_disk(
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 @pytest.mark.parametrize(
     "command",
-    [["index", "stats"], ["index", "rebuild"], ["thin", "hall", "--keep", "3"],
-     ["reencode", "hall", "--status"]],
+    [["purge"], ["reencode", "hall", "--status"]],
 )  # fmt: skip
 def test_a_mistyped_folder_is_not_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str]

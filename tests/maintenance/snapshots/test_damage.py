@@ -69,7 +69,7 @@ def places(archive: Path) -> dict[str, list[tuple[int, int]]]:
 def test_one_byte_is_another(archive, places, tmp_path, content):
     """Anywhere: what comes back is what was there, or nothing does."""
     rng, good = random.Random(8), archive.read_bytes()
-    sound, _ = restore_snapshot(archive, tmp_path / "sound")
+    sound = restore_snapshot(archive, tmp_path / "sound")
     expected = content(tmp_path / "sound")
     harmless = 0
     for kind, n in (
@@ -83,7 +83,7 @@ def test_one_byte_is_another(archive, places, tmp_path, content):
             flipped[where] ^= rng.choice([1, 32, 128, rng.randrange(1, 256)])
             (tmp_path / "bad.tar").write_bytes(flipped)
             try:
-                taken, _ = restore_snapshot(tmp_path / "bad.tar", tmp_path / f"{kind}{where}")
+                taken = restore_snapshot(tmp_path / "bad.tar", tmp_path / f"{kind}{where}")
             except SnapshotError:
                 assert names_in(tmp_path) == ["bad.tar", "sound"]
                 continue
@@ -204,7 +204,7 @@ def test_a_list_of_damaged_blobs_that_lies(archive, tmp_path, refused):
     def with_list(
         body: Members, named: str, blobs: dict[str, int], why: str = "missing", **told: object
     ) -> bytes:
-        line = json.dumps({"digest": named, "why": why, "of": []}).encode() + b"\n"
+        line = json.dumps({"digest": named, "why": why}).encode() + b"\n"
         fits = {"count": 1, "bytes": len(line), "sha256": hashlib.sha256(line).hexdigest()}
         return rebuilt([*body[:-1], (body[-1][0], line)], damaged=fits | told, blobs=blobs)
 

@@ -83,8 +83,8 @@ def test_there_and_back(archive, data, uploads, postgres_url, tmp_path, content,
     asked = uploads[SIGNED - 1 : SIGNED + 2]
     before = answers_of(settings(data), asked)
     assert all(one.matches for one in before)
-    assert answers_of(fleet, asked) == before
     back = take_snapshot(fleet, tmp_path / "back.tar")
+    assert answers_of(fleet, asked) == before
     assert back.manifest.frames == told.manifest.frames
     restore_snapshot(tmp_path / "back.tar", tmp_path / "home")
     restore_snapshot(archive, tmp_path / "straight")
@@ -140,31 +140,13 @@ def test_a_damaged_archive_leaves_nothing(archive, postgres, tmp_path):
     assert not (tmp_path / "fleet" / "blobs").exists()
 
 
-def test_what_postgresql_cannot_hold_is_found_before(data, postgres, tmp_path, settings):
-    frame, url = "number = (SELECT min(number) FROM frames)", postgres.create("choosy")
-    changed(
-        data,
-        ("UPDATE maps SET title = ?", ("a\0b",)),
-        f"UPDATE frames SET robot = '{'r' * 129}', intrinsics = '[NaN]' WHERE {frame}",
-        f"UPDATE frames SET base_frame = robot WHERE {frame}",
-        f"UPDATE frames SET session = CAST(x'41ff' AS TEXT), bytes = 'many' WHERE {frame}",
-        "UPDATE keys SET created_at = 'today'",
-    )
+def test_what_postgresql_cannot_hold_is_not_restored(data, postgres, tmp_path, settings):
+    url = postgres.create("choosy")
+    changed(data, "UPDATE frames SET robot = printf('%.*c', 129, 'r')")
     take_snapshot(settings(data), tmp_path / "a.tar")
-    with pytest.raises(SnapshotError) as refused:
+    with pytest.raises(SnapshotError, match=r"a row of table frames .*character varying"):
         restore_to_fleet(tmp_path / "a.tar", fleet_of(tmp_path / "fleet", url))
-    for said in (
-        "created_at of row '",
-        "title of row 1 of table maps (a zero byte in a text)",
-        "robot of row 1 of table frames (129 characters, where 128 have room)",
-        "bytes of row 1 of table frames (no such whole number)",
-        "intrinsics of row 1 of table frames (no JSON)",
-        "session of row 1 of table frames (no UTF-8)",
-        "; and 1 more values",
-    ):
-        assert said in str(refused.value)
-    assert ask(url, "SELECT count(*) FROM pg_tables WHERE schemaname = 'public'") == [(0,)]
-    assert not (tmp_path / "fleet" / "blobs").exists()
+    assert ask(url, "SELECT count(*) FROM frames") == [(0,)]
 
 
 RESTORE = "import sys; from sceneprint.cli import main; sys.exit(main(sys.argv[1:]))"
@@ -250,7 +232,6 @@ def test_commands(archive, postgres, tmp_path, sceneprint, monkeypatch):
         assert said.stderr.startswith("sceneprint restore: --database: ")
         assert "hidden" not in said.stderr
     again = ("restore", archive, "--data", data, "--database", url)
-    assert "--replace moves a folder" in sceneprint(*again, "--replace", expect=2).stderr
     shown = url.replace("+psycopg", "")
     assert f"is restored to {shown}: 1 maps" in sceneprint(*again).stdout
     assert "nothing is overwritten" in sceneprint(*again, expect=2).stderr

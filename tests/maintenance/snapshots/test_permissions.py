@@ -39,12 +39,14 @@ def test_all_that_is_made_is_its_owners_alone(no_umask, tmp_path, uploads, setti
         while (work := engine.claim("w")) is not None:
             engine.run(work)
         engine.rebuild_index("hall")
-        engine.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query())
+        engine.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query(keep=True))
         assert {path.name for path in data.iterdir()} >= {
-            "sceneprint.db", "sceneprint.db-wal", "sceneprint.db-shm", "blobs", "index", "queries",
+            "sceneprint.db", "sceneprint.db-wal", "sceneprint.db-shm", "blobs", "index",
         }  # fmt: skip
         assert len(list((data / "index").rglob("*.json"))) == 1
         assert public_paths(data.parent) == set()
+    assert list((data / "queries").iterdir())  # written by then
+    assert public_paths(data.parent) == set()
     take_snapshot(settings(data), tmp_path / "backup.tar")
     restore_snapshot(tmp_path / "backup.tar", tmp_path / "restored")
     assert (tmp_path / "backup.tar").stat().st_mode & 0o777 == 0o600

@@ -97,7 +97,7 @@ def test_it_holds_one_state_and_all_of_it(data, tmp_path, uploads, rows, answers
     unfinished = 0
     for path, start, end in zip(archives, began, ended, strict=True):
         new = tmp_path / f"of {path.stem}"
-        snapshot, _ = restore_snapshot(path, new)  # which finds every blob that is referred to
+        snapshot = restore_snapshot(path, new)  # which finds every blob that is referred to
         assert snapshot.damaged == []
         states = dict(rows(new, "SELECT id, state FROM frames"))
         # what was acknowledged before is in it; what was not yet asked to go when it ended, too

@@ -86,8 +86,7 @@ def test_the_blobs_are_those_that_no_sweep_would_remove(master, archive, setting
 def test_what_is_restored_is_what_was_there(
     data, archive, tmp_path, content, answers, uploads, settings
 ):
-    snapshot, aside = restore_snapshot(archive, tmp_path / "new" / "data")
-    assert aside is None
+    snapshot = restore_snapshot(archive, tmp_path / "new" / "data")
     new = tmp_path / "new" / "data"
     assert names_in(tmp_path / "new") == ["data"]
     assert names_in(new) == ["blobs", "sceneprint.db"]
@@ -174,8 +173,8 @@ def test_damaged_blobs_are_left_out_and_named(data, tmp_path, sceneprint, rows, 
     said = sceneprint("snapshot", "--data", data, "--out", out, expect=1)
     lines = sorted(
         [
-            f"not in it: blob {first[1][:12]}, damaged: upload of hall/{first[0]}",
-            f"not in it: blob {artifact[:12]}, missing: geometry of hall/{second[0]}",
+            f"not in it: blob {first[1][:12]}, damaged",
+            f"not in it: blob {artifact[:12]}, missing",
         ]
     )
     told = said.stderr.splitlines()
@@ -188,10 +187,13 @@ def test_damaged_blobs_are_left_out_and_named(data, tmp_path, sceneprint, rows, 
         names = tar.getnames()
         listed = [json.loads(line) for line in tar.extractfile("damaged.jsonl")]
     assert len([name for name in names if name.startswith("blobs/")]) == 7
-    assert {one["digest"]: (one["why"], one["of"]) for one in listed} == {
-        first[1]: ("damaged", [{"map": "hall", "frame": first[0], "role": "upload"}]),
-        artifact: ("missing", [{"map": "hall", "frame": second[0], "role": "geometry"}]),
-    }
+    assert listed == sorted(
+        [
+            {"digest": first[1], "why": "damaged"},
+            {"digest": artifact, "why": "missing"},
+        ],
+        key=lambda one: one["digest"],
+    )
     assert sceneprint("restore", "--verify-only", out, expect=1).stderr.splitlines()[:-1] == lines
     said = sceneprint("restore", out, "--data", tmp_path / "new", expect=1)
     assert said.stderr.splitlines()[:-1] == lines

@@ -11,27 +11,9 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.errors import SnapshotError
-from sceneprint.maintenance.snapshot.restoration import RestoreTarget, restore_snapshot
+from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 
 #: Holds the database as an idle service does, and as any other reader.
-ENGINE = """
-import sys
-from pathlib import Path
-from sceneprint.engine import Engine
-from sceneprint.settings import Settings
-with Engine(Settings(data_dir=Path(sys.argv[1]), database_url=None)) as engine:
-    print("held", flush=True)
-    sys.stdin.read()
-"""
-
-READER = """
-import sqlite3, sys
-database = sqlite3.connect(sys.argv[1] + "/sceneprint.db")
-database.execute("SELECT * FROM maps").fetchall()
-print("held", flush=True)
-sys.stdin.read()
-"""
-
 MOUNTED = """
 import os, subprocess, sys
 from pathlib import Path
@@ -49,7 +31,6 @@ for place, size in ((volume, "64m"), (small, "100k")):
 restore_snapshot(archive, volume)
 print(sorted(os.listdir(volume)))
 for attempt in (
-    lambda: restore_snapshot(archive, volume, replace=True),
     lambda: restore_snapshot(archive, small),
     lambda: take_snapshot(Settings(data_dir=volume, database_url=None), small / "a.tar"),
 ):
@@ -70,16 +51,14 @@ def test_what_is_there_stays(archive, data, tmp_path, content, sceneprint):
     before = content(data)
     said = sceneprint("restore", archive, "--data", data, expect=2)
     assert "data holds blobs, sceneprint.db" in said.stderr
-    assert "--replace" in said.stderr
     (tmp_path / "notes").mkdir()
     for name in "dcba":
         (tmp_path / "notes" / name).touch()
     said = sceneprint("restore", archive, "--data", tmp_path / "notes", expect=2)
     assert "notes holds a, b, c and 1 more" in said.stderr
     (tmp_path / "file").write_bytes(b"x")
-    for flags in ([], ["--replace"]):
-        said = sceneprint("restore", archive, "--data", tmp_path / "file", *flags, expect=2)
-        assert "file is no folder" in said.stderr
+    said = sceneprint("restore", archive, "--data", tmp_path / "file", expect=2)
+    assert "file is no folder" in said.stderr
     assert names_in(tmp_path) == ["data", "file", "notes"]
     assert content(data) == before
 
@@ -96,53 +75,6 @@ def test_an_empty_folder_is_filled_and_stays_the_same_one(archive, tmp_path, con
     assert names_in(folder) == ["blobs", "sceneprint.db"]
     restore_snapshot(archive, tmp_path / "new")
     assert content(folder) == content(tmp_path / "new")
-
-
-@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
-def test_replaced_it_is_moved_aside(archive, data, tmp_path, content, sceneprint, rows):
-    rows(data, "UPDATE maps SET title = 'as it was'")
-    (data / "index").mkdir()
-    (data / "note").write_text("mine")
-    data.chmod(0o710)
-    before = content(data)
-    said = sceneprint("restore", archive, "--data", data, "--replace")
-    (aside,) = set(names_in(tmp_path)) - {"data"}
-    assert aside.startswith("data.before-2")
-    assert said.stderr == f"the previous contents are now in {tmp_path / aside}\n"
-    assert content(tmp_path / aside) == before
-    assert (tmp_path / aside / "note").read_text() == "mine"
-    assert names_in(data) == ["blobs", "sceneprint.db"]
-    assert data.stat().st_mode & 0o777 == 0o710
-    assert rows(data, "SELECT title FROM maps") == [(None,)]
-
-
-def test_a_link_to_it_stays_one(archive, data, tmp_path, content):
-    before, link = content(data), tmp_path / "elsewhere" / "link"
-    link.parent.mkdir()
-    link.symlink_to(data)
-    _, aside = restore_snapshot(archive, link, replace=True)
-    assert aside is not None
-    assert aside.parent == tmp_path
-    assert content(aside) == before
-    assert names_in(link.parent) == ["link"]
-    assert link.is_symlink()
-    assert names_in(link) == ["blobs", "sceneprint.db"]
-
-
-@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
-def test_in_use_it_is_not_replaced(archive, data, tmp_path, sceneprint):
-    with subprocess.Popen(
-        [sys.executable, "-c", ENGINE, str(data)],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    ) as holder:  # fmt: skip
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == "held\n"
-        said = sceneprint("restore", archive, "--data", data, "--replace", expect=2)
-        assert "data is in use" in said.stderr
-        assert names_in(tmp_path) == ["data"]
-        holder.communicate()
-    sceneprint("restore", archive, "--data", data, "--replace")
-    assert len(names_in(tmp_path)) == 2
 
 
 @contextmanager
@@ -173,39 +105,6 @@ def test_somebody_else_is_faster(archive, tmp_path, exists, name):
                 restore_snapshot(archive, folder, progress=come)
             assert names_in(folder) == [name]
     assert names_in(tmp_path) == ["new"]
-
-
-@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
-def test_a_replacement_that_fails_is_undone(archive, data, tmp_path, content):
-    """The database is opened at the last moment, by nobody who could be seen before."""
-    before, holders = content(data), []
-
-    def come(done: int, total: int) -> None:
-        if not holders:
-            holders.append(
-                subprocess.Popen(
-                    [sys.executable, "-c", READER, str(data)],
-                    stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-                )
-            )  # fmt: skip
-            assert holders[0].stdout.readline() == "held\n"
-
-    with pytest.raises(SnapshotError, match="in use"):
-        restore_snapshot(archive, data, replace=True, progress=come)
-    holders[0].communicate()
-    assert names_in(tmp_path) == ["data"]
-    assert content(data) == before
-
-
-def test_what_was_moved_aside_comes_back(data, tmp_path, content):
-    """What should take its place goes with it, and is then not where it was."""
-    before = content(data)
-    with pytest.raises(SnapshotError, match="Nothing was changed"):
-        RestoreTarget(data, replace=True).put(
-            data / "blobs", blobs="blobs", database="sceneprint.db"
-        )
-    assert names_in(tmp_path) == ["data"]
-    assert content(data) == before
 
 
 def test_what_killed_ones_have_left_is_removed_and_nothing_else(archive, tmp_path):
@@ -252,10 +151,9 @@ def test_a_mount_is_filled_and_never_moved(archive, tmp_path):
     lines = done.stdout.splitlines()
     held = "['blobs', 'lost+found', 'sceneprint.db']"
     assert lines[0] == held
-    assert "is a mount of its own" in lines[1]
-    assert "small: what is in the snapshot takes" in lines[3]
-    assert "small: a snapshot of the database alone takes" in lines[5]
-    assert lines[2::2] == [f"{held} []"] * 3
+    assert "small: what is in the snapshot takes" in lines[1]
+    assert "small: a snapshot of the database alone takes" in lines[3]
+    assert lines[2::2] == [f"{held} []"] * 2
 
 
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")

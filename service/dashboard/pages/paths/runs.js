@@ -167,7 +167,7 @@ export class Runs {
     this.asks.hidden = !this.asked && !this.gone;
     if (this.gone) {
       put(this.asks, h("section", { class: "card paths-section" }, h("h2", {}, "Query"),
-        h("p", { class: "muted" }, "Its answer has expired: answers are stored for an hour. Query again to see it here.")));
+        h("p", { class: "muted" }, "Its answer has expired: answers are stored while there is room. Query again to see it here.")));
       return;
     }
     if (!this.asked) { this.scene.ask(null); return; }

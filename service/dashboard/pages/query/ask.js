@@ -36,7 +36,7 @@ export async function render(root, { params, search, signal, go, title }) {
   page.show();
 }
 
-// what is no longer kept cannot be asked again, but another frame can
+// what is no longer stored cannot be asked again, but another frame can
 function kept(error) {
   if (error.status !== 404) throw error;
   return undefined;
