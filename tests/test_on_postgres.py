@@ -14,6 +14,7 @@ TESTS = Path(__file__).resolve().parent
 GROUPS = {
     "engine": (
         "on_postgres/test_switch.py", "engine/test_uploads.py", "engine/test_jobs.py",
+        "engine/test_tombstones.py",
     ),
     "service": (
         "service/test_maps_and_frames.py", "service/test_events.py", "service/test_idempotency.py",

@@ -22,6 +22,7 @@ from sceneprint.engine.maps.map_lifecycle import edit_map
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import Conflict, LostLease, QuotaExceeded, UnknownMap
 from sceneprint.formats.archive import Archive
+from sceneprint.store.blobs.folder import MARK
 from sceneprint.store.maps import MapUsage, counted_usage, find_map
 from sceneprint.store.queue import MAXIMUM_FAILURES, files_of
 from sceneprint_client.api import Job, JobState, NewMap
@@ -183,6 +184,7 @@ def bytes_on_disk(engine: Engine) -> int:
         os.lstat(Path(folder, name)).st_size
         for folder, _, names in os.walk(engine.settings.blob_dir)
         for name in names
+        if name != MARK  # it says whose the blobs are
     )
 
 

@@ -24,6 +24,7 @@ from sceneprint.errors import (
     UnknownMap,
 )
 from sceneprint.models import Model
+from sceneprint.store.blobs.folder import MARK
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import MapUsage, counted_usage, find_frame, find_map
 from sceneprint.store.tables import frames as frames_table
@@ -69,6 +70,7 @@ def bytes_on_disk(engine: Engine) -> int:
         os.lstat(Path(folder, name)).st_size
         for folder, _, names in os.walk(engine.settings.blob_dir)
         for name in names
+        if name != MARK  # it says whose the blobs are
     )
 
 
