@@ -88,8 +88,9 @@ def test_each_change_has_its_lines(recorder: Recorder, small_shots: Any, until: 
     do("patch_session", ["frame.edited"] * 2, hall, json={"add_tags": ["c"]}, **session)
     do("delete_frame", ["frame.deleted"], put)
     do("restore_frame", ["frame.restored"], put)
-    do("delete_frames", ["frame.deleted"], hall, json={"frame_ids": ["mine"]})
-    do("restore_frames", ["frame.restored"], hall, json={"frame_ids": ["mine"]})
+    done = do("delete_frames", ["frame.deleted"], hall, json={"frame_ids": ["mine"]}).json()
+    deletion = {**hall, "deletion_id": done["deletion"]["deletion_id"]}
+    do("restore_deletion", ["frame.restored"], deletion)
 
     query = client.post("/v1/maps/hall/queries", json={"frame_id": taken[0]}).json()["query_id"]
     answer = {"query_id": query}
