@@ -122,7 +122,12 @@ def test_the_answers_are_those_of_the_library(
         assert one["ranking"] == [names[database[j]] for j in ranking.indices[:10]]
         assert one["selection"] == [names[database[ranking.indices[j]]] for j in chosen.indices]
         assert {match.validation.seed for match in matches} == {seed}
-        assert one["answer"] == answer_by_library(room, i, stored, ranking, chosen, seed)
+        # the average turns on the last bits of sums, whose order differs with where arrays lie
+        expected = answer_by_library(room, i, stored, ranking, chosen, seed)
+        assert one["answer"] == {
+            name: value if isinstance(value, str) else pytest.approx(value, rel=1e-9)
+            for name, value in expected.items()
+        }
         assert one["matches"] == [
             {
                 "match": names[database[match.index]],
