@@ -93,7 +93,7 @@ def test_no_call_gets_by_without_a_key(
     own = GIVEN | {
         "frame": references[0], "frames": [references[0]], "archive": archive,
         "file": archive, "path": archive, "target": tmp_path / "target", "into": tmp_path / "into",
-        "association": None, "coverage": None,
+        "association": None, "coverage": None, "deletion_id": "0",
     }  # fmt: skip
     asked = []
     for name, method in inspect.getmembers(Client, inspect.isfunction):

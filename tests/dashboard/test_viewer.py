@@ -363,8 +363,7 @@ def test_nothing_is_drawn_unless_something_changed(stage: Page) -> None:
     light = drawn(stage)[0, 0].tolist()
     first = frames()
     stage.emulate_media(color_scheme="dark")
-    stage.wait_for_timeout(200)
-    assert frames() > first  # the theme turned
+    stage.wait_for_function("first => view.frames > first", arg=first)  # the theme turned
     dark = drawn(stage)[0, 0].tolist()
     assert sum(dark) < 200 < sum(light)
     told = stage.evaluate("getComputedStyle(document.documentElement).getPropertyValue('--sunken')")

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import psycopg
 import pytest
 from sqlalchemy import text
 
@@ -18,12 +19,24 @@ from sceneprint.store.events import Wanted, list_events, record_event
 WAITING = "FROM pg_stat_activity WHERE wait_event = 'SyncRep'"
 
 
+def waits_for_standby(server: Server) -> bool:
+    """Return whether a commit waited for a standby; its time limit ends the wait."""
+    notices: list[Any] = []
+    url = server.url("postgres").replace("+psycopg", "")
+    with psycopg.connect(url, autocommit=True) as connection:
+        connection.add_notice_handler(notices.append)
+        connection.execute("SET statement_timeout = '500ms'")
+        connection.execute("CREATE TEMP TABLE probe ()")
+    return bool(notices)
+
+
 @pytest.fixture
-def forsaken(postgres: Server) -> Iterator[Server]:
+def forsaken(postgres: Server, until: Callable[..., Any]) -> Iterator[Server]:
     """A server whose standby is away."""
     for statement in ("ALTER SYSTEM SET synchronous_standby_names = 'nobody'",
                       "SELECT pg_reload_conf()"):  # fmt: skip
         postgres.execute(statement)
+    until(lambda: waits_for_standby(postgres))  # the server reads its settings a little later
     yield postgres
     postgres.execute("ALTER SYSTEM RESET synchronous_standby_names")
     postgres.execute("SELECT pg_reload_conf()")

@@ -51,7 +51,8 @@ def test_a_flipped_byte_anywhere_in_it_breaks_no_check(house: Any) -> None:
                 found["rows"] += 1
             else:  # nothing that has a checksum, and one word of one row at the most
                 found["nothing"] += 1
-                changed = dump(path) ^ content
+                # a damaged entry of the schema hides an index, which holds nothing of its own
+                changed = {one for one in dump(path) ^ content if "CREATE INDEX" not in one}
                 assert len(changed) in (0, 2)
                 assert not any(line.startswith(CHECKED) for line in changed)
         except (UnusableStore, NewerSchema) as error:
