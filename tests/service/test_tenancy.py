@@ -120,4 +120,4 @@ def test_an_answer_goes_with_its_map_and_with_its_frame(house, refused, small_sh
             refused(answer, 404, "unknown-query")
         body = {"maps": ["alpha"], "query_id": asked[1]}
         again = house.ask("robot", "POST", "/v1/queries", json=body)
-        refused(again, 404, "unknown-query" if made_anew else "unknown-map")
+        refused(again, 404, "unknown-query")

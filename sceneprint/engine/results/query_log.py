@@ -84,7 +84,7 @@ AT_ONCE_PUT = 8
 #: Seconds after which what could not be written is tried again, and that closing waits for it.
 AGAIN_S, CLOSING_S = 2.0, 5.0
 #: Seconds that a reader waits for queries of this process to be written.
-PATIENCE_S = 1.0
+PATIENCE_S = 10.0
 #: Seconds between two looks for what has to go, how many rows go after one, and in one commit.
 TIDY_S, TIDY_MOST, BLOCK = 60.0, 20_000, 100
 #: Queries of a map, and kept answers of a map.
