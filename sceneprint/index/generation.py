@@ -113,33 +113,15 @@ class Generation:
         ValueError : there is no such frame in it.
         """
         result = np.empty((len(keys), self.manifest.dimension), np.uint8)
-        for one, at, rows in self._located(keys):
-            result[at] = one.vectors[rows]
-        return result
-
-    def distances_to(self, query: Bytes, keys: Keys, metric: Metric) -> NDArray[np.int64]:
-        """Exact distances (r,) of a signature (D,) to some frames, by the metric of their model.
-
-        Raises
-        ------
-        ValueError : there is no such frame in it.
-        """
-        result = np.empty(len(keys), np.int64)
-        for one, at, rows in self._located(keys):
-            result[at] = distances(query, one.vectors, metric, rows)
-        return result
-
-    def _located(self, keys: Keys) -> list[tuple[Segment, NDArray[np.intp], NDArray[np.int64]]]:
-        """Segments, the places in `keys` of the frames that each holds, and their rows there."""
-        found, missing = [], np.ones(len(keys), np.bool_)
+        missing = np.ones(len(keys), np.bool_)
         for one in self.segments:
             rows = one.rows_of(keys)
             at = np.flatnonzero(rows >= 0)
+            result[at] = one.vectors[rows[at]]
             missing[at] = False
-            found.append((one, at, rows[at]))
         if missing.any():
             raise ValueError(f"no frames {keys[missing][:5].tolist()} in this index")
-        return found
+        return result
 
 
 def newest(

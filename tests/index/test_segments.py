@@ -170,9 +170,6 @@ def test_any_history_is_searched_as_one_map(
             signatures_of(held, generation, tail),
             np.reshape([everything[key] for key in held.tolist()], (-1, LENGTH)),
         )
-        own_keys = np.array(list(frames), np.int64)
-        distant = [int(((frames[k].astype(int) - query) ** 2).sum()) for k in own_keys.tolist()]
-        assert generation.distances_to(query, own_keys, "l2").tolist() == distant
 
 
 def test_what_is_gone_counts_in_no_segment(published: Publish) -> None:
@@ -188,7 +185,7 @@ def test_what_is_gone_counts_in_no_segment(published: Publish) -> None:
     with pytest.raises(ValueError, match=r"no frames \[98\]"):
         made.vectors_of(np.array([98, 97]))
     with pytest.raises(ValueError, match=r"no frames \[96\]"):
-        made.distances_to(rows[0], np.array([97, 96]), "l2")
+        made.vectors_of(np.array([97, 96]))
     assert made.holds_any(np.array([5000]))  # as some of it is gone
     clean = published(*NONE, made, clean=True)
     assert not clean.holds_any(np.array([5000, 98]))
