@@ -268,10 +268,10 @@ def is_current(connection: Connection, row: QueryRow) -> bool:
 # Kept answers.
 
 
-def keep_answer(connection: Connection, number: int, data: bytes, at: float) -> None:
-    """Keep an answer in the database: it is in every snapshot."""
-    own = update(queries).where(_c.number == number)
-    connection.execute(own.values(answer=data, kept_at=at))
+def keep_answer(connection: Connection, number: int, data: bytes, at: float) -> bool:
+    """Keep an answer in the database, as part of every snapshot; return whether it is stored."""
+    own = update(queries).where(_c.number == number, _STORED)
+    return connection.execute(own.values(answer=data, kept_at=at)).rowcount == 1
 
 
 def set_title(connection: Connection, number: int, title: str | None) -> None:

@@ -34,7 +34,7 @@ from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.deletion import DAY_S
 from sceneprint.store.events import Wanted, list_events
 from sceneprint.store.frame_queries import QueryOrigin
-from sceneprint.store.query_rows import NewQuery, WantedQueries
+from sceneprint.store.query_rows import NewQuery, WantedQueries, drop_answers, keep_answer
 from sceneprint.store.tables import queries
 from sceneprint_client.api import Answer, Counts, NamedFrame, NewMap, Query, SeveralQuery
 
@@ -467,6 +467,22 @@ def test_a_kept_answer_stays_until_it_is_released(engine, make_engine):
     ):  # fmt: skip
         with pytest.raises(UnknownQuery):
             missing()
+
+
+def test_a_lost_answer_is_not_kept(engine):
+    """Answers are not synced to disk: after a power cut a row may be without its file."""
+    lost = log_answer(engine)
+    open_answers(engine.store.blobs, engine.settings.query_dir).delete([lost])
+    for look in (engine.query_log.find, lambda one: engine.query_log.keep(one, None)):
+        with pytest.raises(UnknownQuery):
+            look(lost)
+    assert numbers(engine, kept=True) == []
+    removed = log_answer(engine)
+    found = engine.query_log.find_row(removed)
+    with engine.store.database.write() as connection:
+        assert drop_answers(connection, [found.number]) == [removed]
+        assert not keep_answer(connection, found.number, b"late", time.time())
+    assert numbers(engine, kept=True) == []
 
 
 def test_so_many_answers_are_kept(engine, monkeypatch):

@@ -323,15 +323,22 @@ class QueryLog:
         row = self.find_row(query_id)
         try:
             return decode_answer(self._data(row))
-        except (OSError, *DAMAGED):
+        except DAMAGED:
             raise unknown_query(query_id) from None
 
     def _data(self, row: QueryRow) -> bytes:
-        """Return the bytes of a stored answer; FileNotFoundError where they are lost."""
-        if row.kept_at is None:
-            return self._files.get(row.id)
-        with self._store.database.read() as connection:
-            return read_kept(connection, row.number) or b""
+        """Return the bytes of a stored answer; UnknownQuery where they are lost."""
+        if row.kept_at is not None:
+            with self._store.database.read() as connection:
+                data = read_kept(connection, row.number)
+        else:
+            try:
+                data = self._files.get(row.id)
+            except OSError:
+                data = None
+        if data is None:
+            raise unknown_query(row.id)
+        return data
 
     def record(
         self, query_id: str, may_read: Callable[[str], bool] = lambda _: True
@@ -354,7 +361,8 @@ class QueryLog:
         with self._store.database.write() as connection:
             if row.kept_at is None:
                 self._require_room(connection, row)
-                keep_answer(connection, row.number, data, read_clock(connection))
+                if not keep_answer(connection, row.number, data, read_clock(connection)):
+                    raise unknown_query(query_id)  # it was removed meanwhile
             set_title(connection, row.number, title)
             record_change(connection, "answer.kept", row.map, query_id)
         if row.kept_at is None:
