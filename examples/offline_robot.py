@@ -3,7 +3,7 @@
     python examples/offline_robot.py drives/mapping office --spool office.spool
     python examples/offline_robot.py drives/mapping office --spool office.spool --copy copy
 
-With `--copy`, a folder that `sceneprint pull` made, it also localises by itself.
+With `--copy FOLDER`, a copy of the map by `sceneprint pull`, it also localises without the service.
 
 `frames_of` stands for a camera: put your own there. While the service cannot be reached the
 program goes on; each frame is on disk before the next is taken, so a crash or an empty battery

@@ -101,7 +101,7 @@ class Plan:
 
     @property
     def is_crowd(self) -> bool:
-        """Whether so many robots walk that no map of theirs is to have a surface."""
+        """Return whether there are too many robots for their maps to have surfaces."""
         return self.robots >= CROWD
 
     @property

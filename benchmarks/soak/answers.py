@@ -88,13 +88,19 @@ def state_of(data: Path, url: str | None) -> State:
 
 def _separated(connection: Connection) -> int:
     """Count the changes of clients to the map whose event or line of the audit log is missing."""
-    columns = events.c.kind, events.c.map, events.c.frame_id
-    asked = select(*columns).where(events.c.map == MAP, events.c.kind.in_(CHANGES))
-    told = Counter(tuple(one) for one in connection.execute(asked))
-    columns = audit.c.action, audit.c.map, audit.c.target
-    asked = select(*columns).where(audit.c.map == MAP, audit.c.action.in_(CHANGES))
-    lines = Counter(tuple(one) for one in connection.execute(asked))
-    return (told - lines).total() + (lines - told).total()
+    by_event, by_line = (
+        Counter(
+            tuple(row)
+            for row in connection.execute(
+                select(kind, name, target).where(name == MAP, kind.in_(CHANGES))
+            )
+        )
+        for kind, name, target in (
+            (events.c.kind, events.c.map, events.c.frame_id),
+            (audit.c.action, audit.c.map, audit.c.target),
+        )
+    )
+    return (by_event - by_line).total() + (by_line - by_event).total()
 
 
 def _told(answer: Answer, contents: dict[str, str]) -> dict[str, Any]:

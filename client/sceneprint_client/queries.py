@@ -203,7 +203,7 @@ class QueryMethods(ServiceConnection):
         status : this one, or one of these
         robot : only of this robot
         since, until : from that time on, and before that time; with a zone
-        kept : only those whose answers somebody keeps, see `keep_answer`
+        kept : only queries with a kept answer, see `keep_answer`
 
         Raises
         ------

@@ -30,8 +30,9 @@ def add_audit(commands: Any) -> None:
     command = commands.add_parser(
         "audit",
         help="print or export the audit log",
-        description="Print the newest entries of the audit log, newest first: who changed what, "
-        "from which address, and who was refused. With --format, export all entries, oldest first.",
+        description="Print the newest entries of the audit log, newest first. Each entry names "
+        "the key, its address, and the change or the refused request. With --format, export all "
+        "entries, oldest first.",
     )
     command.add_argument(
         "--actor",

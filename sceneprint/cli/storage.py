@@ -273,7 +273,7 @@ def add_snapshot(commands: Any) -> None:
 
 
 def run_snapshot(options: argparse.Namespace) -> int:
-    """Take a snapshot; returns 1 where something could not be taken along."""
+    """Take a snapshot; return 1 if blobs were damaged, and so are not in it."""
     from sceneprint.maintenance.snapshot.creation import take_snapshot
 
     name = f"sceneprint-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tar"
@@ -283,9 +283,9 @@ def run_snapshot(options: argparse.Namespace) -> int:
     start = time.perf_counter()
     settings = named_database(options)
     with ended_by_signals(), byte_progress("snapshot") as progress:
-        taken = take_snapshot(settings, path, progress)
-    print(f"{one_line(str(path))}: {contents(taken)} in {time.perf_counter() - start:.1f} s")
-    return 1 if name_damaged(taken, "Run `sceneprint fsck` to see what can be repaired.") else 0
+        snapshot = take_snapshot(settings, path, progress)
+    print(f"{one_line(str(path))}: {contents(snapshot)} in {time.perf_counter() - start:.1f} s")
+    return 1 if name_damaged(snapshot, "Run `sceneprint fsck` to see what can be repaired.") else 0
 
 
 def add_database_option(command: argparse.ArgumentParser) -> None:

@@ -105,20 +105,20 @@ def list_lines(
 ) -> list[AuditRow]:  # fmt: skip
     """Return lines, the newest first; with `after`, those above that number, the oldest first."""
     order = audit.c.number.desc() if after is None else audit.c.number
-    asked = select(audit).order_by(order).limit(limit)
+    statement = select(audit).order_by(order).limit(limit)
     if after is not None:
-        asked = asked.where(audit.c.number > after)
+        statement = statement.where(audit.c.number > after)
     if before is not None:
-        asked = asked.where(audit.c.number < before)
+        statement = statement.where(audit.c.number < before)
     if wanted.actor is not None:
-        asked = asked.where(audit.c.actor == wanted.actor)
+        statement = statement.where(audit.c.actor == wanted.actor)
     if wanted.map is not None:
-        asked = asked.where(audit.c.map == wanted.map)
+        statement = statement.where(audit.c.map == wanted.map)
     if wanted.action is not None:
-        asked = asked.where(audit.c.action.startswith(wanted.action, autoescape=True))
+        statement = statement.where(audit.c.action.startswith(wanted.action, autoescape=True))
     if wanted.since is not None:
-        asked = asked.where(audit.c.at >= wanted.since)
-    return [AuditRow(**row) for row in connection.execute(asked).mappings()]
+        statement = statement.where(audit.c.at >= wanted.since)
+    return [AuditRow(**row) for row in connection.execute(statement).mappings()]
 
 
 def spent_lines(

@@ -1,4 +1,4 @@
-"""Rows of queries: who asked which map, the outcome, and whether the answer is stored.
+"""Rows of queries: who statement which map, the outcome, and whether the answer is stored.
 
 NewQuery, ...  --add_queries-->  rows and events in one commit  --list_queries-->  QueryRow, ...
 """
@@ -138,8 +138,8 @@ def add_queries(connection: Connection, new: Sequence[NewQuery]) -> None:
     Queries of a map that was deleted or created again since they came are left out.
     """
     names = sorted({one.map for one in new})
-    asked = select(maps.c.number, maps.c.name, maps.c.created_at).where(maps.c.name.in_(names))
-    known = {row.name: row for row in connection.execute(asked)}
+    statement = select(maps.c.number, maps.c.name, maps.c.created_at).where(maps.c.name.in_(names))
+    known = {row.name: row for row in connection.execute(statement)}
     found = [one for one in new if one.map in known and known[one.map].created_at <= one.at]
     if not found:
         return
@@ -208,11 +208,11 @@ def list_queries(
     before : time and number of the row that the previous page ended with
     limit : at most so many
     """
-    asked = _ROW.where(*_conditions(wanted))
+    statement = _ROW.where(*_conditions(wanted))
     if before is not None:
-        asked = asked.where(tuple_(_c.at, _c.number) < before)
-    asked = asked.order_by(_c.at.desc(), _c.number.desc()).limit(limit)
-    return [QueryRow(**row) for row in connection.execute(asked).mappings()]
+        statement = statement.where(tuple_(_c.at, _c.number) < before)
+    statement = statement.order_by(_c.at.desc(), _c.number.desc()).limit(limit)
+    return [QueryRow(**row) for row in connection.execute(statement).mappings()]
 
 
 def _conditions(wanted: WantedQueries) -> Iterator[ColumnElement[bool]]:
@@ -247,8 +247,8 @@ def read_kept(connection: Connection, number: int) -> bytes | None:
 def is_current(connection: Connection, row: QueryRow) -> bool:
     """Return whether the maps that a query searched, and the stored frame it named, still exist."""
     names = set(row.searched)
-    asked = select(maps.c.name).where(maps.c.name.in_(names), maps.c.created_at <= row.at)
-    if len(connection.execute(asked).all()) < len(names):
+    statement = select(maps.c.name).where(maps.c.name.in_(names), maps.c.created_at <= row.at)
+    if len(connection.execute(statement).all()) < len(names):
         return False
     if row.frame_id is None:
         return True
@@ -339,22 +339,22 @@ def stored_bytes(connection: Connection) -> int:
 
 def oldest_answers(connection: Connection, limit: int) -> list[tuple[int, int]]:
     """Return numbers and bytes of the oldest answers that are not kept."""
-    asked = select(_c.number, _c.bytes).where(_STORED, _c.kept_at.is_(None))
-    found = connection.execute(asked.order_by(_c.at, _c.number).limit(limit))
+    statement = select(_c.number, _c.bytes).where(_STORED, _c.kept_at.is_(None))
+    found = connection.execute(statement.order_by(_c.at, _c.number).limit(limit))
     return [(row.number, row.bytes) for row in found]
 
 
 def shown_frames(connection: Connection, after: int, limit: int) -> list[tuple[int, list[int]]]:
     """Return numbers of stored answers above `after`, and of the frames that each of them shows."""
-    asked = select(_c.number, _c.shown).where(_STORED, _c.number > after)
-    found = connection.execute(asked.order_by(_c.number).limit(limit))
+    statement = select(_c.number, _c.shown).where(_STORED, _c.number > after)
+    found = connection.execute(statement.order_by(_c.number).limit(limit))
     return [(row.number, row.shown or []) for row in found]
 
 
 def unpurged_frames(connection: Connection, numbers: set[int]) -> set[int]:
     """Return those of some frames that exist, or that can be restored."""
-    asked = select(frames.c.number).where(not_purged())
-    return {row.number for row in rows_among(connection, asked, frames.c.number, numbers)}
+    statement = select(frames.c.number).where(not_purged())
+    return {row.number for row in rows_among(connection, statement, frames.c.number, numbers)}
 
 
 def drop_answers(connection: Connection, numbers: Sequence[int]) -> list[str]:
@@ -371,5 +371,5 @@ def drop_answers(connection: Connection, numbers: Sequence[int]) -> list[str]:
 
 def stored_among(connection: Connection, query_ids: Sequence[str]) -> set[str]:
     """Return those of some ids, a thousand at most, whose answers are stored in files."""
-    asked = select(_c.id).where(_c.id.in_(query_ids), _STORED, _c.kept_at.is_(None))
-    return set(connection.execute(asked).scalars())
+    statement = select(_c.id).where(_c.id.in_(query_ids), _STORED, _c.kept_at.is_(None))
+    return set(connection.execute(statement).scalars())

@@ -62,12 +62,12 @@ def list_deletions(
     before : number of the deletion that the page before ended with
     """
     c = frames.c
-    asked = select(c.deletion, func.min(c.ended_at), func.count()).where(
+    statement = select(c.deletion, func.min(c.ended_at), func.count()).where(
         *_restorable(connection, map_number, seconds)
     )
     if before is not None:
-        asked = asked.where(c.deletion < before)
-    found = asked.group_by(c.deletion).order_by(c.deletion.desc()).limit(limit)
+        statement = statement.where(c.deletion < before)
+    found = statement.group_by(c.deletion).order_by(c.deletion.desc()).limit(limit)
     return [Deletion(*row) for row in connection.execute(found)]
 
 
@@ -90,11 +90,11 @@ def tombstones_of(
     deletion : number of the deletion
     after : number of the last frame before
     """
-    asked = select(frames).where(
+    statement = select(frames).where(
         *_restorable(connection, map_number, seconds), frames.c.deletion == deletion,
         frames.c.number > after,
     )  # fmt: skip
-    found = connection.execute(asked.order_by(frames.c.number).limit(limit)).mappings()
+    found = connection.execute(statement.order_by(frames.c.number).limit(limit)).mappings()
     return [frame_row(one) for one in found]
 
 
@@ -103,19 +103,19 @@ def find_tombstone(
 ) -> FrameRow | None:
     """Return the tombstone of an id if it can be restored; see `list_deletions`."""
     own = _restorable(connection, map_number, seconds)
-    asked = select(frames).where(*own, frames.c.id == frame_id)
-    row = connection.execute(asked).mappings().first()
+    statement = select(frames).where(*own, frames.c.id == frame_id)
+    row = connection.execute(statement).mappings().first()
     return None if row is None else frame_row(row)
 
 
 def successor_of(connection: Connection, frame: FrameRow) -> str | None:
     """Return the id of a frame with the same content that came after a tombstone's deletion."""
     c = frames.c
-    asked = select(c.id).where(
+    statement = select(c.id).where(
         c.map_number == frame.map_number, c.content_id == frame.deleted_content,
         c.received_at >= frame.ended_at, c.state != FrameState.DELETED,
     )  # fmt: skip
-    return connection.execute(asked.limit(1)).scalar()
+    return connection.execute(statement.limit(1)).scalar()
 
 
 def restore_frame(connection: Connection, row: MapRow, frame: FrameRow) -> None:

@@ -101,7 +101,7 @@ class StoredQuery(QueryRecord):
     )
     model: str
     options: dict[str, Any] = Field(
-        description="As they were sent; what was left out had its default."
+        description="The options that the request set. Every other option had its default."
     )
 
 

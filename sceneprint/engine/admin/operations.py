@@ -270,9 +270,9 @@ class Audit:
             audit_log.record_change(connection, action, map_name, target, **data)
 
     def tidy(self, now: float | None = None) -> int:
-        """Remove lines that are no longer kept, if it is time; returns how many.
+        """Remove expired lines if the last removal was long enough ago; return their number.
 
-        What goes wrong is logged and tried again.
+        Errors are logged, and the next call tries again.
 
         Parameters
         ----------

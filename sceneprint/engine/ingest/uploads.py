@@ -322,7 +322,7 @@ class Uploads:
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : a frame id that is none; or see `read_upload`.
+        InvalidRequest : the frame id is not valid; or see `read_upload`.
         FrameError : see `read_upload`.
         FrameConflict : the frame is there with other content or metadata.
         QuotaExceeded : the map's quota has no room for one more; nothing was taken.
@@ -536,15 +536,16 @@ def _keep(connection: Connection, once: IdempotentRequest, came: list[UploadResu
 
 
 def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = None) -> NewFrame:
-    """An upload as a frame that its map may lack.
+    """Return the row of a frame that its map may lack.
 
-    With `once`, which PostgreSQL alone takes, what came of it is remembered in the same statement.
+    With `once`, on PostgreSQL alone, the same statement stores the outcome under the request's
+    idempotency key.
     """
     frame_id = uuid.uuid4().hex
-    kept = None
+    outcome = None
     if once is not None:
-        kept = once.columns({"frames": [{"frame_id": frame_id, "new": True}]})
-    return NewFrame(row, ready.columns, ready.upload.priority, kept, frame_id)
+        outcome = once.columns({"frames": [{"frame_id": frame_id, "new": True}]})
+    return NewFrame(row, ready.columns, ready.upload.priority, outcome, frame_id)
 
 
 def _new_result(new: NewFrame) -> UploadResult:

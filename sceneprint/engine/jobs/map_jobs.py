@@ -1,6 +1,6 @@
-"""Jobs that compute something of a map: begun, listed, read by their ids, and removed.
+"""Begin, list, read and remove the jobs that compute something of a map.
 
-    request  --MapJobs.begin-->  queued job  --get | list_all-->  record of the API
+    request  --MapJobs.queue-->  queued job  --get | list_all-->  record of the API
 
 A kind of such jobs has a request, a result and a record; its jobs are done in slices, see `tasks`.
 """
@@ -39,9 +39,9 @@ class MapJobs(Generic[Record]):
     Parameters
     ----------
     store, tasks : see there
-    record : of the API; its fields `asked` and `result` say what a request and a result are
+    record : of the API, with the request in `asked` and the result in `result`
     kind : of the jobs, such as associate
-    noun : what one is called in errors and in the name of its id, such as association
+    noun : name of such a job in errors and in the field of its id, such as association
     path : of the list below a map's path, such as associations
     priority : of the jobs
     """
@@ -53,19 +53,20 @@ class MapJobs(Generic[Record]):
         self._store, self._tasks, self._record = store, tasks, record
         self._kind, self._noun, self._path, self._priority = kind, noun, path, priority
 
-    def queue(self, map_name: str, asked: Given, total: int | None = None) -> Record:
+    def queue(self, map_name: str, request: Given, total: int | None = None) -> Record:
         """Queue a job.
 
         Parameters
         ----------
-        map_name, asked : of the job
-        total : steps that it takes, where that is known
+        map_name : of the job
+        request : what it computes
+        total : number of its steps, if known
 
         Raises
         ------
         UnknownMap : no such map.
         """
-        data = asked.model_dump(mode="json", exclude_unset=True)
+        data = request.model_dump(mode="json", exclude_unset=True)
         job, _ = self._tasks.begin(self._kind, map_name, data, self._priority)
         begun = self.get(map_name, job.job_id)
         if total is not None and begun.progress is None:
