@@ -293,6 +293,17 @@ def one_line(text: str) -> str:
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
+def add_seed_option(command: argparse.ArgumentParser) -> None:
+    """Add --seed, of the random choices of a validation."""
+    command.add_argument(
+        "--seed",
+        type=whole_number,
+        default=0,
+        metavar="S",
+        help="random seed (default: 0)",
+    )
+
+
 def add_asking_options(command: argparse.ArgumentParser) -> None:
     """`--k` and its like, with the filter."""
     command.add_argument(
@@ -303,13 +314,7 @@ def add_asking_options(command: argparse.ArgumentParser) -> None:
         help="number of accepted matches to return (default: 5)",
     )
     command.add_argument("--exact", action="store_true", help="compare every frame of the map")
-    command.add_argument(
-        "--seed",
-        type=whole_number,
-        default=0,
-        metavar="S",
-        help="random seed (default: 0)",
-    )
+    add_seed_option(command)
     command.add_argument(
         "--candidates",
         type=positive,

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
-from sceneprint.cli import positive, whole_number
+from sceneprint.cli import positive
 from sceneprint.cli.options import (
     add_filter_options,
+    add_seed_option,
     add_service_options,
     filter_of,
     one_line,
@@ -53,13 +54,7 @@ def add_reconstruct(commands: Any) -> None:
         metavar="K",
         help="number of accepted matches to fuse (default: 10)",
     )
-    command.add_argument(
-        "--seed",
-        type=whole_number,
-        default=0,
-        metavar="S",
-        help="random seed (default: 0)",
-    )
+    add_seed_option(command)
     command.add_argument(
         "--voxel",
         type=float,

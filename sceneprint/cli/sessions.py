@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
-from sceneprint.cli import positive, whole_number
+from sceneprint.cli import positive
 from sceneprint.cli.options import (
     add_scene_options,
+    add_seed_option,
     add_service_options,
     check_scene,
     one_line,
@@ -221,13 +222,7 @@ def add_associate(commands: Any) -> None:
         metavar="N",
         help="candidates to try per frame until it has K edges (default: 10)",
     )
-    command.add_argument(
-        "--seed",
-        type=whole_number,
-        default=0,
-        metavar="S",
-        help="random seed (default: 0)",
-    )
+    add_seed_option(command)
     command.add_argument(
         "--min-overlap",
         type=float,
