@@ -20,7 +20,7 @@ export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell echo $$((2 * $$(env -u OMP_NUM_T
 	screenshots docs docs-serve soak siege fleet models lock sbom advisories dist clean
 
 help:
-	@echo "make demo    find frames among others with their pose, and draw one [DATASET=folder]"
+	@echo "make demo    find frames among others with their pose, and draw one, into demo/ [DATASET=folder]"
 	@echo "make test    lint, types, import contracts and the tests"
 	@echo "make test-thorough  tests that make test leaves out, as they take minutes or seldom fail"
 	@echo "make test-portable  numeric tests as other processors compute them, one after another [TARGET=generic]"
@@ -177,7 +177,7 @@ dist: $(STAMP)
 	@tools/install $(PYTHON) dist/try requirements.lock
 	dist/try/bin/python -m pip install --quiet --no-deps dist/*.whl
 	cd dist && try/bin/sceneprint demo --out demo
-	@rm -rf dist/try && ls -l dist
+	@rm -rf dist/try dist/demo && ls -l dist
 
 clean:
-	rm -rf $(VENV) build client/build dist out *.egg-info client/*.egg-info tools/javascript/node_modules
+	rm -rf $(VENV) build client/build dist out demo *.egg-info client/*.egg-info tools/javascript/node_modules
