@@ -163,7 +163,7 @@ def test_a_cloud_that_cannot_be_unpacked_here_costs_no_reconstruction(
     ]
     model = empty.get_map("hall").model_id
     wanted = NewReconstruction()
-    coverage, ply, _ = fused(empty.store, views, None, None, wanted, model, "query.sensor", 1e12)
+    coverage, ply = fused(empty.store, views, None, None, wanted, model, "query.sensor", 1e12)
     assert [one.frame_id for one in coverage.views] == [image_id]
     assert "is a point cloud" in coverage.left_out[0].reason
     # nobody knows the axes of the sensor of a cloud
