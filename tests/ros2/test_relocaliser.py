@@ -39,6 +39,13 @@ class ScriptedLocalizer:
 
     def localize(self, map_name: str, frame: Any, meta: Any = None, **how: Any) -> Localization:
         self.asked.append({"frame": frame, "meta": meta, **how})
+        return self._answer()
+
+    def localize_sequence(self, map_name: str, frames: Any, metas: Any, **how: Any) -> Localization:
+        self.asked.append({"frame": frames[-1], "meta": metas[-1], **how})
+        return self._answer()
+
+    def _answer(self) -> Localization:
         matrix = self.found_at(len(self.asked) - 1)
         pose = None
         if matrix is not None:
