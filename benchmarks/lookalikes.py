@@ -1,6 +1,6 @@
 """Whole answers at places that look alike: `python -m benchmarks.lookalikes --seed S --sites N`.
 
-seed  --synthesise_lookalike-->  sites  --answer_of-->  Told, ...  --table-->  shares by kind
+seed  --synthesise_lookalike-->  sites  --ask_site-->  SiteAnswer, ...  --table-->  shares by kind
 
 Seeds 1 to 99 are for choosing numbers; judge by seeds from 1000 on that nobody has looked at.
 """
@@ -11,147 +11,25 @@ import argparse
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-from sceneprint.errors import UselessFrame
-from sceneprint.lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
 from sceneprint.lab.evaluation.measures import answers
-from sceneprint.lab.evaluation.protocol import (
-    JudgedAnswer,
-    SignedFrame,
-    map_over,
-    overlaps,
-    view_of,
-)
-from sceneprint.lab.synth import synthesise_lookalike
+from sceneprint.lab.evaluation.protocol import map_over
+from sceneprint.lab.evaluation.sites import SiteAnswer, ask_site
 from sceneprint.lab.synth.lookalikes import KINDS
-from sceneprint.localization import PosePrior
 from sceneprint.models import PRESETS, read_model
-from sceneprint.pipeline import Signer, open_signer, prepare
-from sceneprint.types import DepthFrame, Floats, Geometry
-from sceneprint_client.poses import rotation_of
+from sceneprint.pipeline import Signer, open_signer
 
-#: From this overlap, smaller direction, a frame of the map is enough to answer a query.
-ANSWERABLE = 0.3
 #: Queries of one site when absent scenes are asked by the thousand.
 ABSENT_BLOCK = 100
-#: Deviations that a robot gives with its prior, and how far that is turned at most, degrees.
-PRIOR_M, PRIOR_DEG = 0.3, 10.0
 
 
-@dataclass(frozen=True)
-class Told:
-    """What one query was told.
-
-    Parameters
-    ----------
-    site, kind, query : where it was asked, and its number there
-    answerable : whether a frame of the map overlaps it enough
-    answer : see JudgedAnswer
-    """
-
-    site: str
-    kind: str
-    query: int
-    answerable: bool
-    answer: JudgedAnswer
-
-
-def signed(
-    frames: Sequence[DepthFrame], scene: str, signer: Signer, first: int
-) -> tuple[list[DepthFrame], list[SignedFrame], list[Geometry]]:
-    """Those frames that show anything, as an evaluation has them, and their geometry."""
-    kept: list[DepthFrame] = []
-    members: list[SignedFrame] = []
-    geometries: list[Geometry] = []
-    for frame in frames:
-        try:
-            signature, geometry = prepare(frame, signer)
-        except UselessFrame:
-            continue
-        pose = np.eye(4) if frame.pose is None else frame.pose
-        number = first + len(members)
-        members.append(SignedFrame(number, frame.name, scene, pose, signature.vector))
-        geometries.append(geometry)
-        kept.append(frame)
-    return kept, members, geometries
-
-
-def prior_about(
-    pose: Floats, parent: str, least: float, most: float, rng: np.random.Generator
-) -> PosePrior:
-    """What a robot believes that is off by `least` to `most` metres, any way, and up to 10 degrees.
-
-    It says of itself 30 cm and 10 degrees, whatever it is.
-    """
-    directions = rng.standard_normal((2, 3))
-    shift, axis = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    T = np.eye(4)
-    half = np.deg2rad(rng.uniform(0.0, PRIOR_DEG)) / 2
-    T[:3, :3] = rotation_of(np.array([*(np.sin(half) * axis), np.cos(half)])) @ pose[:3, :3]
-    T[:3, 3] = pose[:3, 3] + shift * rng.uniform(least, most)
-    told = [PRIOR_M] * 3 + [np.deg2rad(PRIOR_DEG)] * 3
-    return PosePrior(parent, T, np.diag(np.square(told)))
-
-
-def ask_site(
-    signer: Signer,
-    work: tuple[str, int, int],
-    *,
-    seed: int,
-    candidates: int = 10,
-    prior: tuple[float, float] | None = None,
-) -> list[Told]:
-    """Build one site and ask all its queries.
-
-    Parameters
-    ----------
-    work : kind, index and number of queries
-    seed : of the collection
-    candidates : size of C
-    prior : least and most metres that the robot's belief is off; None: it has none
-    """
-    kind, index, queries = work
-    rng = np.random.default_rng([seed, index, KINDS.index(kind)])
-    site = synthesise_lookalike(kind, seed, index, queries=queries)
-    shown, database, of_map = signed(site.map, site.name, signer, 0)
-    # of another place: a pose in its own frame is a pose in no map
-    scene = site.name if site.same_frame else f"{site.name}, elsewhere"
-    sent, asked, of_queries = signed(site.queries, scene, signer, len(database))
-    geometries = [*of_map, *of_queries]
-    p = signer.model.parameters.validation
-    judge = Judge(geometries.__getitem__, "full", 0, p, database=database)
-    ranked = rank(
-        np.stack([q.signature for q in asked]), np.stack([d.signature for d in database]),
-        np.ones((len(asked), len(database)), np.bool_), metric=signer.model.metric,
-        candidates=candidates,
-    )  # fmt: skip
-    able = _answerable(shown, sent) if site.present else [False] * len(sent)
-    told = []
-    for number, (query, one) in enumerate(zip(asked, ranked, strict=True)):
-        among = tuple(
-            Candidate(j, j, database[j].scene, database[j].pose, 0.0, 0.0) for j in one.selection
-        )
-        rows = np.arange(len(database))
-        task = QueryTask(
-            query.number, scene, query.pose, [], one.selection, among, rows, one.retrieved
-        )  # fmt: skip
-        believed = None if prior is None else prior_about(query.pose, site.name, *prior, rng)
-        told.append(Told(site.name, kind, number, able[number], answer_of(judge, task, believed)))
-    return told
-
-
-def _answerable(shown: Sequence[DepthFrame], sent: Sequence[DepthFrame]) -> list[bool]:
-    seen = overlaps([view_of(q) for q in sent], [view_of(d) for d in shown])
-    return [bool(most >= ANSWERABLE) for most in seen.least.max(axis=1)]
-
-
-def table(told: Sequence[Told]) -> list[str]:
+def table(told: Sequence[SiteAnswer]) -> list[str]:
     """Shares by kind as lines of Markdown, and over all."""
     lines = [
         "| kind | queries | answerable | found and right | found and wrong "

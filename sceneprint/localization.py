@@ -2,10 +2,10 @@
 
 matches, poses, MapViews  --localize-->  PoseEstimate
 
-Accepted matches vote with their poses. Their votes are clustered, and the best cluster is the
-answer only where nothing comes near it: neither another cluster, nor any other pose that the
-candidates suggest, judged on all frames of the map that would see it. Where the matches decide
-nothing, the map alone may, if one pose explains the query far better than every other.
+Accepted matches vote with their poses. These poses, and all others that candidates suggest, are
+judged on the frames of the map that would see the same surfaces. What speaks for and against each
+of them gives its confidence: the probability that it is right. The best one is `found` where its
+confidence reaches the one that the query asks for, and no other place has more than the rest.
 """
 
 from __future__ import annotations
@@ -22,6 +22,12 @@ from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import PoseAverage, average_poses, inverse
 from sceneprint.geometry.validation.acceptance import Strength
+from sceneprint.geometry.validation.confidence import (
+    ConfidenceParameters,
+    PlaceEvidence,
+    confidence_of,
+    weakest_evidence,
+)
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
     MapViews,
@@ -36,40 +42,31 @@ from sceneprint.geometry.validation.map_verification import (
     view_separations,
 )
 from sceneprint.geometry.validation.validation import preferred
-from sceneprint.pipeline import PairMatch
+from sceneprint.pipeline import PairMatch, answer_numbers
 from sceneprint.types import Floats, Geometry
 
 LocalizationStatus = Literal["found", "ambiguous", "not_found"]
-#: What decided: the votes of accepted matches; the map's frames, where these did not suffice; or
-#: what the robot believed before, where the map bears it out as well as any other pose.
+#: What decided: strong matches that vote for the pose; the map's frames, where no match is strong;
+#: or what the robot believed before, where the map bears that out as well as any other pose.
 Verifier = Literal["matches", "map", "prior"]
 
 
 @dataclass(frozen=True)
 class LocalizationParameters:
-    """The numbers of the answer; how they were chosen: docs/trust.md."""
+    """The numbers of the answer; docs/trust.md says how they were chosen."""
 
-    views: int = 5  #: votes that are averaged, at most
+    confidence: float = 0.99  #: least of a pose that is found; other places share the rest
+    worth: float = 0.02  #: least confidence of an alternative that is worth a look
+    views: int = 5  #: votes that are averaged, and alternatives, at most
     weak: float = 0.4  #: weight of a weak or ambiguous match; a strong one counts 1
-    outweigh: float = 2.0  #: times as much weight as any other place
-    sure_weight: float = 2.0  #: of a place, that two strong matches give it
-    planes: float = 6.0  #: distinct ones that must agree at any pose, where the map is asked
-    rival: float = 0.6  #: of its score, above which another pose makes it ambiguous
-    rival_unsure: float = 0.3  #: the same of a place with less weight, and without any
-    violations: float = 0.05  #: most, beyond the map's own, for each unit of weight, two at most
-    lone_views: int = 3  #: viewpoints of frames that agree with a pose that only one suggests
-    map_confirms: bool = True  #: whether the map's frames may decide without a strong match
-    map_score: float = 0.3  #: least score of a pose that the map confirms without a strong match
-    map_planes: float = 12.0  #: and least number of distinct planes that agree
-    map_violations: float = 0.03  #: and most violations, beyond the map's own
-    map_views: int = 8  #: and least number of frames of the map that agree
-    map_viewpoints: int = 2  #: from which candidates suggest it, where no match votes for it
-    prior_rival: float = 0.65  #: of its score that another pose near the prior may reach
-    prior_share: float = 0.9  #: least score of that pose, beside the best anywhere
+    outweigh: float = 2.0  #: times as much weight as any other place, where no map is asked
+    voted_only: bool = False  #: whether a pose needs the vote of a match
+    prior_share: float = 0.9  #: least score of a pose that a prior decides for, beside the best
     most_noise: float = 0.2  #: violations of the map's own that are believed
     rivals: int = 2  #: frames elsewhere that are compared before a pose is found, at most
     rival_distance: float = 1.2  #: times that of the farthest match for the pose, at most
     map: MapParameters = field(default_factory=MapParameters)
+    judgement: ConfidenceParameters = field(default_factory=ConfidenceParameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +85,6 @@ class QueryFrame:
     T: Floats = field(default_factory=lambda: np.eye(4))
 
 
-#: Metres between two cameras that still see the same surfaces.
-SAME_SURFACES_M = 8.0
-
-
 @dataclass(frozen=True, eq=False)
 class PosePrior:
     """What a robot believes of its pose before it asks.
@@ -107,14 +100,14 @@ class PosePrior:
     T: Floats
     covariance: Floats
 
-    def reaches(self, pose: Floats) -> bool:
-        """Whether a frame at T_parent_sensor (4, 4) may see what the robot sees.
+    def reaches(self, pose: Floats, p: MapParameters) -> bool:
+        """Return whether a frame at T_parent_sensor (4, 4) may see what the robot sees.
 
-        They stand at most `SAME_SURFACES_M` apart, and three deviations of the prior.
+        They stand at most `p.same_surfaces` apart, and three deviations of the prior.
         """
         deviation = math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
         apart = float(np.linalg.norm(pose[:3, 3] - self.T[:3, 3]))
-        return apart <= SAME_SURFACES_M + 3 * deviation
+        return apart <= p.same_surfaces + 3 * deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,15 +117,22 @@ class AlternativePose:
     Parameters
     ----------
     T : (4, 4) T_parent_query
-    weight : of its votes: 1 for a strong match, 0.4 for a weak or an ambiguous one
     support : matches from different viewpoints that vote for it
-    score : how far the map bears it out, 1 at most; None where it was not asked
+    weight : of these votes: 1 for a strong match, 0.4 for a weak or an ambiguous one
+    confidence : probability that it is right; None where the map was not asked
+    evidence : what that was computed from; None where the map was not asked
     """
 
     T: Floats
-    weight: float
     support: int
-    score: float | None
+    weight: float
+    confidence: float | None
+    evidence: PlaceEvidence | None
+
+    @property
+    def score(self) -> float | None:
+        """How well the map bears it out; None where it was not asked."""
+        return None if self.evidence is None else self.evidence.score
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,9 +148,7 @@ class PoseEstimate:
     covariance : (6, 6) of it, as `place_covariance` orders it; None where a vote has none
     strength : of the matches that vote for it; None unless found
     verified_by : what decided; None unless found
-    alternatives : the poses that the evidence supports, the answer among them, best first; more
-        than one only where the answer is ambiguous
-    rival_ratio : the next best place's score by that of the best; None where no map was asked
+    alternatives : the poses that are worth a look, best first; the answer alone where it is found
     votes : accepted matches that have a pose in the parent frame
     members : rows of the matches that vote for the answer
     guided : how many of these were guided by the others
@@ -164,10 +162,20 @@ class PoseEstimate:
     strength: Strength | None
     verified_by: Verifier | None
     alternatives: tuple[AlternativePose, ...]
-    rival_ratio: float | None
     votes: int = 0
     members: tuple[int, ...] = ()
     guided: int = 0
+
+    @property
+    def confidence(self) -> float | None:
+        """Probability that the best pose is right; None where the map was not asked."""
+        return self.alternatives[0].confidence if self.alternatives else None
+
+    @property
+    def rival_ratio(self) -> float | None:
+        """Score of the best other place, relative to that of the best pose; None likewise."""
+        best = self.alternatives[0].evidence if self.alternatives else None
+        return None if best is None else best.rival
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,40 +194,37 @@ class _Vote:
 
 
 @dataclass(frozen=True, eq=False)
-class _Place:
-    """The votes for one place, those to believe most first, and how the map bears it out.
+class Place:
+    """A place where the query may have been taken.
 
     Parameters
     ----------
-    weight, support : of the votes from different viewpoints
-    viewpoints : from which a candidate suggests it, voting or not
-    seen_from : viewpoints of the map's frames that agree with it
+    T : (4, 4) T_parent_query
+    votes : of matches, those to believe most first
+    support, weight : of the votes from different viewpoints, as in AlternativePose
+    evidence : for its pose; None where the map was not asked
     """
 
+    T: Floats
     votes: list[_Vote]
-    weight: float
     support: int
-    viewpoints: int
-    seen_from: int = 0
-    scored: ScoredPose | None = None
+    weight: float
+    evidence: PlaceEvidence | None
 
     @property
-    def accepted(self) -> bool:
-        return any(vote.accepted for vote in self.votes)
+    def accepted(self) -> list[_Vote]:
+        """The votes of accepted matches."""
+        return [vote for vote in self.votes if vote.accepted]
 
     @property
     def strong(self) -> bool:
+        """Whether a strong match votes for it."""
         return any(vote.match.validation.strength == "strong" for vote in self.votes)
 
     @property
-    def pose(self) -> Floats:
-        if self.scored is not None and not self.accepted:
-            return self.scored.T
-        return self.votes[0].T
-
-    @property
     def score(self) -> float:
-        return 0.0 if self.scored is None else self.scored.score
+        """How well the map bears it out."""
+        return 0.0 if self.evidence is None else self.evidence.score
 
 
 #: Gives the frames of a parent frame that may see what a query at poses (n, 4, 4) sees.
@@ -235,7 +240,7 @@ def localize(
     p: LocalizationParameters | None = None,
     overlap_p: OverlapParameters | None = None,
 ) -> PoseEstimate | None:
-    """Where a query was taken: the poses that its matches and the map support, compared.
+    """Return where a query was taken, by its matches and the frames of the map.
 
     Parameters
     ----------
@@ -245,13 +250,46 @@ def localize(
         parent frame only: that of the prior, or that of most of the matches
     views_of : see ViewsOf; None: pairs alone decide
     prior : what the robot believed before
-    p, overlap_p : see there
+    p : default: those of the model that made the artifacts
+    overlap_p : see there
 
     Returns
     -------
     estimate : or None where nothing suggests a pose
     """
-    p, overlap_p = p or LocalizationParameters(), overlap_p or OverlapParameters()
+    p = p or parameters_of(frames)
+    parent, prior, places = judged_places(
+        frames, poses, parents, views_of, prior, p, overlap_p or OverlapParameters()
+    )
+    if not places:
+        return None
+    blind = all(frame.geometry.surface.camera is None for frame in frames)
+    return estimate_of(parent, places, prior, p, blind=blind)
+
+
+def parameters_of(frames: Sequence[QueryFrame]) -> LocalizationParameters:
+    """Return the numbers of the model that made the artifacts of a query; see `answer_numbers`."""
+    answer = answer_numbers(frames[0].geometry)
+    return LocalizationParameters(map=answer.map, judgement=answer.confidence)
+
+
+def judged_places(
+    frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats],
+    parents: Sequence[str] | Mapping[int, str] | None, views_of: ViewsOf | None,
+    prior: PosePrior | None, p: LocalizationParameters, overlap_p: OverlapParameters,
+) -> tuple[str, PosePrior | None, list[Place]]:  # fmt: skip
+    """Return every place that a match, the map or the prior suggests, with its evidence.
+
+    Parameters
+    ----------
+    frames, poses, parents, views_of, prior, p, overlap_p : see `localize`
+
+    Returns
+    -------
+    parent : frame in which poses are compared
+    prior : the one given; None where it is of another parent frame
+    places : those with votes first, then by score
+    """
     parent = _parent(frames, parents)
     if prior is not None and prior.parent != parent:
         if _accepts(frames, parents, parent) and not _accepts(frames, parents, prior.parent):
@@ -265,19 +303,15 @@ def localize(
         for frame in frames
     ]  # fmt: skip
     suggested, viewpoints = _suggested(own, poses)
-    scored: list[ScoredPose] = []
-    views: MapViews | None = None
-    if views_of is not None and (len(suggested) or prior is not None):
-        ready = [map_frame(one.geometry, one.T, p.map, overlap_p) for one in frames]
-        starts = _NONE if prior is None else starts_about(prior.T, prior.covariance)
-        views = views_of(parent, np.concatenate([starts[:1], suggested]))
-        near = refined_starts(ready, starts, views, p.map, overlap_p)
-        scored = compare_poses(ready, np.concatenate([near, suggested]), views, p.map, overlap_p)
-    places = _places(_votes(own, poses, p), scored, suggested, viewpoints, views, p)
-    if not places:
-        return None
-    blind = all(frame.geometry.surface.camera is None for frame in frames)
-    return _estimate(parent, places, prior, bool(scored), blind, p)
+    votes = _votes(own, poses, p)
+    if views_of is None or (not len(suggested) and prior is None):
+        return parent, prior, [_place(group, None, p) for group in _grouped(votes, [], p)]
+    ready = [map_frame(one.geometry, one.T, p.map, overlap_p) for one in frames]
+    starts = _NONE if prior is None else starts_about(prior.T, prior.covariance, p.map)
+    views = views_of(parent, np.concatenate([starts[:1], suggested]))
+    near = refined_starts(ready, starts, views, p.map, overlap_p)
+    scored = compare_poses(ready, np.concatenate([near, suggested]), views, p.map, overlap_p)
+    return parent, prior, _places(votes, scored, suggested, viewpoints, views, p)
 
 
 def views_of_rows(
@@ -287,8 +321,9 @@ def views_of_rows(
     parents: Sequence[str] | None = None,
     p: MapParameters | None = None,
     overlap_p: OverlapParameters | None = None,
+    ahead: Sequence[bool] | None = None,
 ) -> ViewsOf:
-    """What `localize` asks the map with, where all poses of a database are at hand.
+    """Return what `localize` asks the map with, where all poses of a database are at hand.
 
     Parameters
     ----------
@@ -297,6 +332,7 @@ def views_of_rows(
     open_geometry : artifact of a row, or None
     parents : parent frame of every row; default: one for all
     p, overlap_p : see there
+    ahead : of every row, whether its sensor looks along z; default: all do
     """
 
     def views_of(parent: str, at: Floats) -> MapViews:  # noqa: ARG001
@@ -308,6 +344,7 @@ def views_of_rows(
             p or MapParameters(),
             overlap_p or OverlapParameters(),
             [k for k, i in enumerate(own) if i in tried],
+            None if ahead is None else [ahead[i] for i in own],
         )
 
     return views_of
@@ -460,154 +497,202 @@ def _votes(
     return votes
 
 
-def _places(
-    votes: Sequence[_Vote], scored: Sequence[ScoredPose], suggested: Floats, viewpoints: Floats,
-    views: MapViews | None, p: LocalizationParameters,
-) -> list[_Place]:  # fmt: skip
-    """Votes and scored poses by place: those with votes first, then by score."""
-    groups: list[list[_Vote]] = []
+def _grouped(
+    votes: Sequence[_Vote], scored: Sequence[ScoredPose], p: LocalizationParameters
+) -> list[list[_Vote]]:
+    """Group votes by place: of the scored poses, in their order, then by themselves."""
+    groups: list[list[_Vote]] = [[] for _ in scored]
+    others: list[list[_Vote]] = []
     for vote in votes:
-        for group in groups:
+        at = next((k for k, one in enumerate(scored) if one.is_of(vote.T, p.map)), None)
+        if at is not None:
+            groups[at].append(vote)
+            continue
+        for group in others:
             if same_place(group[0].T, vote.T, p.map):
                 group.append(vote)
                 break
         else:
-            groups.append([vote])
+            others.append([vote])
+    return groups + others
 
-    def suggesting(T: Floats) -> int:
-        return len(different_views(viewpoints[at_place(suggested, T, p.map)], p.map))
 
-    def seen_from(pose: ScoredPose | None) -> int:
-        if pose is None or views is None:
-            return 0
-        agreeing = np.unique([i for _, i in pose.views]).astype(np.intp)
-        return len(different_views(views.poses[agreeing], p.map))
-
-    left = list(scored)
+def _places(
+    votes: Sequence[_Vote], scored: Sequence[ScoredPose], suggested: Floats, viewpoints: Floats,
+    views: MapViews, p: LocalizationParameters,
+) -> list[Place]:  # fmt: skip
+    """Return the places of votes and scored poses, with the evidence for each."""
+    groups = _grouped(votes, scored, p)
+    weights = [_weight(group, p)[1] for group in groups]
+    scores = [one.score for one in scored]
     places = []
-    for group in groups:
-        own = next((one for one in left if same_place(group[0].T, one.T, p.map)), None)
-        left = [one for one in left if one is not own]
-        # neither a copy of a view nor what other matches gave is a vote of its own
-        voting = [vote for vote in group if not vote.match.validation.guided]
-        from_where = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)
-        different = different_views(from_where, p.map)
-        weight = sum(voting[i].weight for i in different)
-        suggested_by = suggesting(group[0].T)
-        places.append(_Place(group, weight, len(different), suggested_by, seen_from(own), own))
-    return places + [_Place([], 0.0, 0, suggesting(one.T), seen_from(one), one) for one in left]
+    for k, group in enumerate(groups):
+        pose = scored[k] if k < len(scored) else None
+        others = scores[:k] + scores[k + 1 :]
+        evidence = _evidence(
+            group, pose, suggested, viewpoints, views,
+            max(others, default=0.0), max(weights[:k] + weights[k + 1 :], default=0.0), p,
+        )  # fmt: skip
+        places.append(_place(group, pose, p, evidence))
+    return sorted(places, key=lambda place: not place.votes)
 
 
-def _estimate(
-    parent: str, places: Sequence[_Place], prior: PosePrior | None, mapped: bool, blind: bool,
-    p: LocalizationParameters,
+def _place(
+    group: list[_Vote], pose: ScoredPose | None, p: LocalizationParameters,
+    evidence: PlaceEvidence | None = None,
+) -> Place:  # fmt: skip
+    """Return the place of some votes, or of a scored pose, or of both."""
+    accepted = any(vote.accepted for vote in group)
+    T = group[0].T if pose is None or accepted else pose.T
+    support, weight = _weight(group, p)
+    return Place(T, group, support, weight, evidence)
+
+
+def _weight(group: Sequence[_Vote], p: LocalizationParameters) -> tuple[int, float]:
+    """Return how many viewpoints vote, and the weight of their first votes.
+
+    Neither a copy of a view nor what other matches gave is a vote of its own.
+    """
+    voting = [vote for vote in group if not vote.match.validation.guided]
+    viewpoints = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)
+    different = different_views(viewpoints, p.map)
+    return len(different), sum(voting[i].weight for i in different)
+
+
+def _evidence(
+    group: Sequence[_Vote], pose: ScoredPose | None, suggested: Floats, viewpoints: Floats,
+    views: MapViews, rival: float, rival_weight: float, p: LocalizationParameters,
+) -> PlaceEvidence:  # fmt: skip
+    """Return the evidence for a place: of its votes and of its pose on the map.
+
+    Parameters
+    ----------
+    group : votes
+    pose : None where none at the place was scored
+    suggested, viewpoints : see `_suggested`
+    views : the map's frames
+    rival, rival_weight : best score, and largest weight, of another place
+    p : see LocalizationParameters
+    """
+    weight = _weight(group, p)[1]
+    strong = _weight([v for v in group if v.match.validation.strength == "strong"], p)[0]
+    T = group[0].T if pose is None else pose.T
+    suggesting = len(different_views(viewpoints[at_place(suggested, T, p.map)], p.map))
+    if pose is None:
+        return PlaceEvidence(
+            0.0, 0.0, 0.0, 0, 0, 1.0, weight, strong, suggesting, 1.0, rival_weight
+        )
+    agreeing = np.unique([i for _, i in pose.views]).astype(np.intp)
+    seen_from = len(different_views(views.poses[agreeing], p.map))
+    excess = pose.violations + pose.hidden - min(pose.noise, p.most_noise)
+    ratio = max(rival, 0.0) / pose.score if pose.score > 0 else 1.0
+    return PlaceEvidence(
+        pose.score, pose.share, pose.planes, len(agreeing), seen_from, excess, weight, strong,
+        suggesting, ratio, rival_weight,
+    )  # fmt: skip
+
+
+def estimate_of(
+    parent: str, places: Sequence[Place], prior: PosePrior | None, p: LocalizationParameters, *,
+    blind: bool = False,
 ) -> PoseEstimate:  # fmt: skip
-    """The verdict on places, one or more."""
-    by_score = sorted(places, key=lambda place: -place.score)
-    best, ratio = by_score[0], None
-    if mapped:
-        next_best = by_score[1].score if len(by_score) > 1 else 0.0
-        ratio = min(max(next_best / best.score, 0.0), 1.0) if best.score > 0 else 1.0
-    voted = max(places, key=lambda place: (place.accepted, place.weight, place.score))
-    against = _against_votes(voted, places, mapped, blind, p)
-    if against is None:
-        return _found(parent, voted, places, "matches", ratio, p)
-    if mapped and _map_confirms(best, places, p):
-        return _found(parent, best, places, "map", ratio, p)
-    if prior is not None and mapped:
-        inside = _confirmed_by_prior(by_score, prior, p)
+    """Return the verdict on places.
+
+    Parameters
+    ----------
+    parent, prior, places : of `judged_places`; one place or more
+    p : see LocalizationParameters
+    blind : whether nothing is known of free space
+    """
+    if all(place.evidence is None for place in places):
+        return _estimate_by_votes(parent, places, blind, p)
+    judged = _confidences(places, p)
+    order = sorted(range(len(places)), key=lambda i: (-judged[i], -places[i].score))
+    others = max((judged[i] for i in order[1:]), default=0.0)
+    best = places[order[0]]
+    if judged[order[0]] >= p.confidence and others <= 1.0 - p.confidence:
+        verified_by: Verifier = "matches" if best.strong else "map"
+        return _found(parent, best, places, verified_by, judged[order[0]], p)
+    if prior is not None:
+        inside = _confirmed_by_prior(places, prior, p)
         if inside is not None:
-            return _found(parent, inside, places, "prior", ratio, p)
-    least = max(p.map_score, 0.5 * best.score)
-    told = [
-        place for place in sorted(places, key=lambda one: (-one.weight, -one.score))
-        # what a caller asks of a match, a pose that no match votes for does not meet
-        if place.votes or (p.map_confirms and place.score >= least)
-    ]  # fmt: skip
-    if not any(one.votes or _planes(one) >= p.map_planes for one in told):
-        told = []  # a few planes fit in many places
+            place, confidence = inside
+            return _found(parent, place, places, "prior", confidence, p)
+    worth = [i for i in order if judged[i] >= p.worth][: p.views]
     alternatives = tuple(
-        AlternativePose(one.pose, one.weight, one.support, one.score if mapped else None)
-        for one in told[: p.views]
+        AlternativePose(one.T, one.support, one.weight, judged[i], one.evidence)
+        for i in worth
+        for one in (places[i],)
     )
-    status: LocalizationStatus = "ambiguous" if told else "not_found"
-    votes = sum(vote.accepted for place in places for vote in place.votes)
-    return PoseEstimate(status, against, parent, None, None, None, None, alternatives, ratio, votes)
+    reason = weakest_evidence(_known(best.evidence), p.judgement)
+    votes = sum(len(place.accepted) for place in places)
+    status: LocalizationStatus = "ambiguous" if alternatives else "not_found"
+    return PoseEstimate(status, reason, parent, None, None, None, None, alternatives, votes)
 
 
-def _against_votes(
-    voted: _Place, places: Sequence[_Place], mapped: bool, blind: bool,
-    p: LocalizationParameters,
-) -> str | None:  # fmt: skip
-    """Why the place with most votes is not the answer; None where it is."""
-    others = [place for place in places if place is not voted]
-    if not voted.accepted:
-        return "no match is accepted, and the map's frames confirm none of the poses that fit"
-    heaviest = max((place.weight for place in others), default=0.0)
-    if heaviest * p.outweigh > voted.weight:
-        return "the matches disagree: none of their poses has twice the weight of the next"
-    if mapped:
-        score = max((place.score for place in others), default=0.0)
-        sure = voted.weight >= p.sure_weight
-        if score > (p.rival if sure else p.rival_unsure) * voted.score:
-            return (
-                "another pose explains the frame as well: the place repeats, or has a symmetry"
-                if score > p.rival * voted.score
-                else "too little speaks for the pose while another explains much of the frame"
-            )
-        if _planes(voted) < p.planes:
-            return (
-                f"only {_planes(voted):.0f} distinct planes agree, and a few planes fit in many "
-                "places"
-            )
-        excess = _excess(voted, p)
-        # more votes are no more evidence: in a room of two like ends all are for the wrong one
-        if excess > p.violations * min(max(voted.weight, 1.0), p.sure_weight):
-            return (
-                f"a pose fits, but {excess:.0%} of what should be in sight there is missing: "
-                "another place may look like this one, or this one has changed"
-            )
-        if voted.viewpoints == 1 and voted.seen_from >= p.lone_views:
-            return f"one view alone suggests this pose, of {voted.seen_from} that see the place"
-    if not voted.strong and not blind:
-        return "the accepted matches are weak, and the map's other frames do not confirm them"
-    return None
+def _known(evidence: PlaceEvidence | None) -> PlaceEvidence:
+    assert evidence is not None
+    return evidence
 
 
-def _map_confirms(best: _Place, places: Sequence[_Place], p: LocalizationParameters) -> bool:
-    """Whether the map alone decides for the place with the best score."""
-    if best.scored is None or not p.map_confirms:
-        return False
-    others = [place for place in places if place is not best]
-    frames = {i for _, i in best.scored.views}
-    return (
-        (bool(best.votes) or best.viewpoints >= p.map_viewpoints)
-        and best.score >= p.map_score
-        and max((place.score for place in others), default=0.0) <= p.rival_unsure * best.score
-        and best.scored.planes >= p.map_planes
-        and len(frames) >= p.map_views
-        and max((place.weight for place in others), default=0.0) < 1.0
-        and _excess(best, p) <= p.map_violations
-    )
+def _confidences(places: Sequence[Place], p: LocalizationParameters) -> list[float]:
+    """Return the confidence of each place; together they are at most 1, as one at most is right."""
+    judged = [
+        0.0
+        if p.voted_only and not place.votes
+        else confidence_of(_known(place.evidence), p.judgement)
+        for place in places
+    ]
+    whole = max(sum(judged), 1.0)
+    return [one / whole for one in judged]
 
 
 def _confirmed_by_prior(
-    by_score: Sequence[_Place], prior: PosePrior, p: LocalizationParameters
-) -> _Place | None:
-    """The one place near the prior that the map bears out as well as any other."""
-    inside = [place for place in by_score if is_expected(place.pose, prior)]
-    if not inside or inside[0].scored is None:
+    places: Sequence[Place], prior: PosePrior, p: LocalizationParameters
+) -> tuple[Place, float] | None:
+    """Return the place that the prior decides for, and its confidence; None where it does not.
+
+    Places that the prior does not expect are no rivals of those that it does, provided that they
+    fit the map no better.
+    """
+    inside = [place for place in places if is_expected(place.T, prior)]
+    most = max(place.score for place in places)
+    within = []
+    for place in inside:
+        others = [one for one in inside if one is not place]
+        rival = max((one.score for one in others), default=0.0)
+        evidence = replace(
+            _known(place.evidence), rival=rival / place.score if place.score > 0 else 1.0,
+            rival_weight=max((one.weight for one in others), default=0.0),
+        )  # fmt: skip
+        within.append(replace(place, evidence=evidence))
+    judged = _confidences(within, p)
+    best = max(range(len(within)), key=judged.__getitem__, default=None)
+    if best is None or judged[best] < p.confidence or within[best].score < p.prior_share * most:
         return None
-    best = inside[0]
-    next_best = inside[1].score if len(inside) > 1 else 0.0
-    sure = (
-        best.score >= p.map_score
-        and _planes(best) >= p.planes
-        and next_best <= p.prior_rival * best.score
-        and best.score >= p.prior_share * by_score[0].score
-        and _excess(best, p) <= p.violations
+    return within[best], judged[best]
+
+
+def _estimate_by_votes(
+    parent: str, places: Sequence[Place], blind: bool, p: LocalizationParameters
+) -> PoseEstimate:
+    """Return the verdict on places by their votes alone, where the map is not asked."""
+    order = sorted(places, key=lambda place: (not place.accepted, -place.weight))
+    best, heaviest = order[0], max((place.weight for place in order[1:]), default=0.0)
+    against = None
+    if not best.accepted:
+        against = "no match is accepted"
+    elif heaviest * p.outweigh > best.weight:
+        against = "the matches disagree: none of their poses has twice the weight of the next"
+    elif not best.strong and not blind:
+        against = "the accepted matches are weak"
+    if against is None:
+        return _found(parent, best, places, "matches", None, p)
+    alternatives = tuple(
+        AlternativePose(one.T, one.support, one.weight, None, None) for one in order[: p.views]
     )
-    return best if sure else None
+    votes = sum(len(place.accepted) for place in places)
+    return PoseEstimate("ambiguous", against, parent, None, None, None, None, alternatives, votes)
 
 
 def is_expected(T: Floats, prior: PosePrior) -> bool:
@@ -620,39 +705,27 @@ def is_expected(T: Floats, prior: PosePrior) -> bool:
 _CHI_SQUARE_6 = 22.458
 
 
-def _planes(place: _Place) -> float:
-    return 0.0 if place.scored is None else place.scored.planes
-
-
-def _excess(place: _Place, p: LocalizationParameters) -> float:
-    """Violations of both sides, less those that the map's own frames show."""
-    if place.scored is None:
-        return 1.0
-    one = place.scored
-    return one.violations + one.hidden - min(one.noise, p.most_noise)
-
-
 def _found(
-    parent: str, place: _Place, places: Sequence[_Place], verified_by: Verifier,
-    ratio: float | None, p: LocalizationParameters,
+    parent: str, place: Place, places: Sequence[Place], verified_by: Verifier,
+    confidence: float | None, p: LocalizationParameters,
 ) -> PoseEstimate:  # fmt: skip
-    accepted = [vote for vote in place.votes if vote.accepted]
+    """Return the answer that a query was taken at a place."""
+    accepted = place.accepted
     votes = accepted[: p.views]
-    told = [vote.covariance for vote in votes if vote.covariance is not None]
-    average = average_poses(np.stack([vote.T for vote in votes] or [place.pose]))
+    covariances = [vote.covariance for vote in votes if vote.covariance is not None]
+    average = average_poses(np.stack([vote.T for vote in votes] or [place.T]))
     covariance = None
-    if votes and len(told) == len(votes):
+    if votes and len(covariances) == len(votes):
         poses = np.stack([vote.T for vote in votes])
-        covariance = place_covariance(average, poses, np.stack(told))
-    total = sum(vote.accepted for one in places for vote in one.votes)
+        covariance = place_covariance(average, poses, np.stack(covariances))
+    total = sum(len(one.accepted) for one in places)
     guided = sum(vote.match.validation.guided for vote in accepted)
     reason = _found_reason(average, len(accepted), guided, total, place.support, verified_by)
     strength: Strength = "strong" if place.strong else "weak"
-    score = None if place.scored is None else place.score
-    itself = AlternativePose(average.T, place.weight, place.support, score)
+    itself = AlternativePose(average.T, place.support, place.weight, confidence, place.evidence)
     return PoseEstimate(
-        "found", reason, parent, average, covariance, strength, verified_by, (itself,), ratio,
-        total, tuple(vote.match.index for vote in accepted), guided,
+        "found", reason, parent, average, covariance, strength, verified_by, (itself,), total,
+        tuple(vote.match.index for vote in accepted), guided,
     )  # fmt: skip
 
 
@@ -660,19 +733,20 @@ def _found_reason(
     average: PoseAverage, agreeing: int, guided: int, accepted: int, support: int,
     verified_by: Verifier,
 ) -> str:  # fmt: skip
+    """Return a sentence on what the answer rests on."""
     if verified_by == "map":
         return "the map's frames confirm this pose, and no other comes near"
     if verified_by == "prior":
         return "several poses fit, and only this one lies where the prior expects the robot"
     if agreeing == 1:
-        told = "one match gives the pose; one view, unconfirmed"
-        return told if accepted == 1 else f"{told}, and {accepted - 1} weaker ones disagree"
+        reason = "one match gives the pose"
+        return reason if accepted == 1 else f"{reason}, and {accepted - 1} weaker ones disagree"
     spread = (
         f", within {average.spread_m:.2g} m and {math.degrees(average.spread_rad):.2g} deg"
         if average.support > 1
         else ""
     )
-    told = f"{agreeing} of {accepted} matches agree on the pose{spread}"
+    reason = f"{agreeing} of {accepted} matches agree on the pose{spread}"
     if guided:
-        told += f"; {guided} of them followed from the others"
-    return f"{told}, all from one viewpoint" if support == 1 else told
+        reason += f"; {guided} of them followed from the others"
+    return f"{reason}, all from one viewpoint" if support == 1 else reason

@@ -44,6 +44,7 @@ from sceneprint.geometry.validation.validation import validate as validate_geome
 from sceneprint.geometry.validation.validation import validate_guided as check_predicted
 from sceneprint.geometry.validation.validation import validate_without_up as check_up
 from sceneprint.models import PRESETS, Model, read_model
+from sceneprint.models.model import AnswerParameters
 from sceneprint.signing import (
     Signature,
     Signer,
@@ -111,7 +112,7 @@ def geometry_of(seen: Surface, model: Model) -> Geometry:
     model : whose parameters and compression are used
     """
     p = model.parameters
-    _NUMBERS[model.id] = p.validation
+    _NUMBERS[model.id] = p.validation, model.answer
     shown = seen
     if isinstance(seen, Voxels):
         shown = _scan(seen.cloud, p.cloud) if seen.cloud.has_viewpoint else seen.plain
@@ -257,20 +258,35 @@ def validate_without_up(
 
 
 #: Of models that this process has used, by id: an artifact names its model, and holds no more.
-_NUMBERS: dict[str, ValidationParameters] = {}
+_NUMBERS: dict[str, tuple[ValidationParameters, AnswerParameters]] = {}
 
 
-def _numbers_of(made: Geometry) -> ValidationParameters:
-    """What its own model validates with: rooms and halls are not judged by one number."""
-    if made.model_id not in _NUMBERS:
-        for model in map(read_model, PRESETS):
-            _NUMBERS[model.id] = model.parameters.validation
-    if made.model_id not in _NUMBERS:
+def _numbers_of(geometry: Geometry) -> ValidationParameters:
+    """Return what the model of an artifact validates with: rooms and halls differ."""
+    _learn_presets(geometry.model_id)
+    if geometry.model_id not in _NUMBERS:
         raise ModelMismatch(
-            f"The artifacts are of model {made.model_id[:12]}, which ships with no preset and has "
-            "not been used by this process. Give `p`, its `model.parameters.validation`."
+            f"The artifacts are of model {geometry.model_id[:12]}, which ships with no preset and "
+            "has not been used by this process. Give `p`, its `model.parameters.validation`."
         )
-    return _NUMBERS[made.model_id]
+    return _NUMBERS[geometry.model_id][0]
+
+
+def answer_numbers(geometry: Geometry) -> AnswerParameters:
+    """Return what the model of an artifact judges poses with.
+
+    Those of the default preset, where this process has not used the model.
+    """
+    _learn_presets(geometry.model_id)
+    known = _NUMBERS.get(geometry.model_id)
+    return AnswerParameters() if known is None else known[1]
+
+
+def _learn_presets(model_id: str) -> None:
+    """Note the numbers of the presets, unless those of a model are known."""
+    if model_id not in _NUMBERS:
+        for model in map(read_model, PRESETS):
+            _NUMBERS[model.id] = model.parameters.validation, model.answer
 
 
 def _stacked(signatures: Sequence[Signature]) -> Bytes:
@@ -376,7 +392,9 @@ def associate(
         if geometry is None:
             continue
         ups = up, up_of(index)
-        T = _predicted(tried, index, pose_of) if mode == "full" and validation is None else None
+        T = None
+        if mode == "full" and validation is None:
+            T = _predicted(tried, index, pose_of, answer_numbers(query).map)
         if T is not None:
             validation = validate_guided(query, geometry, T, seed, p, ups)
         if validation is None:
@@ -416,7 +434,9 @@ def searched(matches: Sequence[PairMatch]) -> dict[int, PairValidation] | None:
 _GUIDES = 2
 
 
-def _predicted(tried: Sequence[PairMatch], index: int, pose_of: PoseOf) -> Floats | None:
+def _predicted(
+    tried: Sequence[PairMatch], index: int, pose_of: PoseOf, p: MapParameters
+) -> Floats | None:
     """T_match_query of a candidate by its pose and the matches before; None where these leave it
     open: too few are strong, or one of them, accepted or ambiguous, is for another pose.
     """
@@ -436,7 +456,6 @@ def _predicted(tried: Sequence[PairMatch], index: int, pose_of: PoseOf) -> Float
             viewpoints.append(known[1])
     if len(strong) < _GUIDES:
         return None
-    p = MapParameters()
     different = different_views(np.stack(viewpoints), p)
     if len(different) < _GUIDES:
         return None

@@ -42,7 +42,7 @@ from sceneprint.geometry.signature.segmentation import HierarchyParameters, patc
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
 from sceneprint.lab.synth import synthesise_room, synthesise_survey
 from sceneprint.models import Model, ModelParameters
-from sceneprint.models.model import scaled
+from sceneprint.models.model import AnswerParameters, scaled
 from sceneprint.signing import (
     Signer,
     float_signature,
@@ -123,6 +123,8 @@ _SCAN_ACCEPTANCE = AcceptanceParameters(
 )
 #: The world of a scanner beside that of a depth camera.
 _FACTOR = 5.0
+#: How the noise of a laser changes what its refinements weigh.
+_SCAN_NOISE: dict[str, Any] = {"reference_depth": 10.0, "growth": 1, "weight_depth": 1e6}
 
 
 def _lidar() -> ModelParameters:
@@ -134,6 +136,7 @@ def _lidar() -> ModelParameters:
     distance from sample to sample.
     """
     p = scaled(ModelParameters(), _FACTOR)
+    noise = _SCAN_NOISE
     cloud = replace(
         p.cloud,
         minimum_range=0.6,
@@ -148,7 +151,6 @@ def _lidar() -> ModelParameters:
     )
     depth = replace(p.depth, minimum_depth=0.6, maximum_depth=60.0)
     v = p.validation
-    noise: dict[str, Any] = {"reference_depth": 10.0, "growth": 1, "weight_depth": 1e6}
     validation = replace(
         v,
         acceptance=_SCAN_ACCEPTANCE,
@@ -182,6 +184,20 @@ def _lidar() -> ModelParameters:
         cloud=cloud,
         validation=validation,
     )
+
+
+def preset_answer(preset: str) -> AnswerParameters:
+    """Return the numbers of a preset by which poses are judged, but for what is learnt.
+
+    Parameters
+    ----------
+    preset : one of PRESETS
+    """
+    if preset != "lidar":
+        return AnswerParameters()
+    answer = scaled(AnswerParameters(), _FACTOR)
+    refinement = replace(answer.map.refinement, **_SCAN_NOISE)
+    return replace(answer, map=replace(answer.map, refinement=refinement))
 
 
 #: Called with the stage's name, steps done and their total.

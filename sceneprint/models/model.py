@@ -40,6 +40,8 @@ from sceneprint.geometry.signature.segmentation import (
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters, NormalParameters
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, AmbiguityParameters
+from sceneprint.geometry.validation.confidence import ConfidenceParameters
+from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.types import Floats32
 
@@ -73,6 +75,14 @@ class ModelParameters:
     validation: ValidationParameters = field(default_factory=ValidationParameters)
 
 
+@dataclass(frozen=True)
+class AnswerParameters:
+    """The numbers by which poses are judged on a map; signatures and artifacts do without them."""
+
+    map: MapParameters = field(default_factory=MapParameters)
+    confidence: ConfidenceParameters = field(default_factory=ConfidenceParameters)
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """Projection, mixture, quantiser, compression, whitening, and the parameters of each stage.
@@ -90,6 +100,8 @@ class Model:
         of a byte
     provenance : what the model was trained on and with; not part of its identity
     whitening : see Whitening; None where psi itself is stored
+    answer : see AnswerParameters; not part of its identity, so that a better judgement of poses
+        needs no frame to be signed again
     """
 
     name: str
@@ -101,6 +113,7 @@ class Model:
     psi_unrelated_distance: float
     provenance: Mapping[str, Any]
     whitening: Whitening | None = None
+    answer: AnswerParameters = field(default_factory=AnswerParameters)
 
     @property
     def metric(self) -> Metric:
@@ -203,7 +216,7 @@ def to_mapping(parameters: ModelParameters) -> dict[str, Any]:
     }  # in the order of the stages
     for name in SPARSE:
         group = getattr(parameters, name)
-        different = _differences(group, type(group)())
+        different = differences(group)
         if different:
             whole[name] = different
     return whole
@@ -221,7 +234,7 @@ def parameters_of(values: Any) -> ModelParameters:
     given = {name: value for name, value in values.items() if name not in SPARSE}
     default = ModelParameters()
     groups = {
-        name: _changed(getattr(default, name), values.get(name, {}), f"parameters.{name}")
+        name: changed(getattr(default, name), values.get(name, {}), f"parameters.{name}")
         for name in SPARSE
     }
     return from_mapping(ModelParameters, given, "parameters", **groups)
@@ -258,20 +271,38 @@ def from_mapping(kind: type[T], values: Any, where: str, **groups: Any) -> T:
     return kind(**made, **groups)
 
 
-def _differences(record: Any, default: Any) -> dict[str, Any]:
-    """What of a record is not as in the default, group by group."""
+def differences(record: Any, default: Any = None) -> dict[str, Any]:
+    """Return the numbers of a record that differ from those of another, group by group.
+
+    Parameters
+    ----------
+    record : a frozen record of numbers and of other records
+    default : of the same kind; None: that of its kind
+    """
+    default = type(record)() if default is None else default
     different: dict[str, Any] = {}
     for one in fields(record):
         value, usual = getattr(record, one.name), getattr(default, one.name)
         if is_dataclass(value):
-            value, usual = _differences(value, usual), {}
+            value, usual = differences(value, usual), {}
         if value != usual:
             different[one.name] = value
     return different
 
 
-def _changed(default: T, values: Any, where: str) -> T:
-    """A record as the default is, but for the values given."""
+def changed(default: T, values: Any, where: str) -> T:
+    """Return a record as the default is, but for some values.
+
+    Parameters
+    ----------
+    default : a frozen record
+    values : parsed JSON, as of `differences`
+    where : it stood, for errors
+
+    Raises
+    ------
+    UnreadableModel : a field is unknown, or no number.
+    """
     hints = get_type_hints(type(default))
     unknown = sorted(set(values) - set(hints)) if isinstance(values, dict) else values
     if unknown or not isinstance(values, dict):
@@ -280,7 +311,7 @@ def _changed(default: T, values: Any, where: str) -> T:
             "Use the version that wrote it, or a later one."
         )
     made = {
-        name: _changed(getattr(default, name), value, f"{where}.{name}")
+        name: changed(getattr(default, name), value, f"{where}.{name}")
         if is_dataclass(hints[name])
         else _number(hints[name], value, f"{where}.{name}")
         for name, value in values.items()
@@ -338,6 +369,18 @@ POWERS: dict[type, dict[str, int]] = {
         "reach": 1,
     },
     AmbiguityParameters: {"shift": 1, "rival_m": 1},
+    ValidationParameters: {"guided_m": 1},
+    MapParameters: {
+        "look_ahead": 1,
+        "reach": 1,
+        "around_reach": 1,
+        "same_surfaces": 1,
+        "near": 1,
+        "cell": 1,
+        "start_shift": 1,
+        "same_m": 1,
+        "place_m": 1,
+    },
     SequenceParameters: {
         "opposite_distance": 1,
         "minimum_distance": 1,

@@ -35,8 +35,11 @@ from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.models.model import (
     PSI_SCHEMA_VERSION,
     SCHEMA_VERSION,
+    AnswerParameters,
     Model,
     ModelParameters,
+    changed,
+    differences,
     parameters_of,
 )
 from sceneprint.types import Floats32
@@ -75,6 +78,8 @@ BOUNDS = {
     "yaws of a plan": (1, 720),
     "heights of a plan": (1, 10_000),
     "hypotheses of plans": (1, 1000),
+    "views of a pose": (1, 100),
+    "poses that are compared": (1, 1000),
 }
 
 
@@ -157,9 +162,7 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
         "heights of a plan": round(plan.height_range / plan.height_step),
         "hypotheses of plans": max(plan.n_kept * plan.n_heights, plan.kept_yaws * plan.n_peaks),
     }
-    for what, (least, most) in BOUNDS.items():
-        if not least <= counts[what] <= most:
-            raise ValueError(f"{what}: {counts[what]} is not from {least} to {most}")
+    _check_counts(counts)
 
 
 def _check_cloud(p: CloudParameters) -> None:
@@ -190,6 +193,7 @@ def write_model(model: Model) -> bytes:
         "id": model.id,
         "name": model.name,
         "provenance": dict(model.provenance),
+        "answer": differences(model.answer),
     }
     return bytes(save(model.tensors, {"sceneprint": json.dumps(header, sort_keys=True)}))
 
@@ -326,7 +330,32 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
         psi_unrelated_distance=d0,
         provenance=dict(header["provenance"]),
         whitening=_whitening(header, tensors, 25 * g, parameters.hierarchy.n_levels),
+        answer=_answer(header.get("answer", {})),
     )
+
+
+def _answer(values: Any) -> AnswerParameters:
+    """Return the numbers of the answer, read back; UnreadableModel or ValueError."""
+    answer = changed(AnswerParameters(), values, "answer")
+    refinement, views = answer.map.refinement, answer.map
+    counts = {
+        "iterations of a refinement": refinement.iterations,
+        "stride": refinement.stride,
+        "views of a pose": max(views.n_views, views.n_refining, views.n_noise),
+        "poses that are compared": max(views.n_poses, views.n_places, views.n_refined),
+    }
+    _check_counts(counts)
+    if not (views.cell > 0 and views.reach > 0 and views.around_reach > 0):
+        raise ValueError("reaches and cells of the map should have a size")
+    return answer
+
+
+def _check_counts(counts: dict[str, int]) -> None:
+    """See that numbers are within their BOUNDS; ValueError where one is not."""
+    for what, count in counts.items():
+        least, most = BOUNDS[what]
+        if not least <= count <= most:
+            raise ValueError(f"{what}: {count} is not from {least} to {most}")
 
 
 def _whitening(

@@ -138,26 +138,27 @@ def answer(
     if before:
         clock.stage("earlier")
     last = _attempt(store, places, model, asked, query, deadline, prior, clock)
-    estimate, p = None, model.parameters.validation
+    estimate = None
     if asked.geometry is not None:
         attempts = [*before, last]
         poses = [*(one.T for one in earlier), np.eye(4)]
-        estimate, last = _decided(store, attempts, poses, prior, p, query, deadline)
+        estimate, last = _decided(store, attempts, poses, prior, model, query, deadline)
         clock.stage("locate")
     return _answer(store, places, model, last, estimate, query, deadline, clock, len(before))
 
 
 def _decided(
     store: Store, attempts: list[_Attempt], poses: Sequence[Floats], prior: PosePrior | None,
-    p: ValidationParameters, query: Query, deadline: Deadline,
+    model: Model, query: Query, deadline: Deadline,
 ) -> tuple[PoseEstimate | None, _Attempt]:  # fmt: skip
     """Where the last frame was taken, and it with all that was validated to decide that."""
 
     def decide() -> PoseEstimate | None:
-        return _placed(store, attempts, poses, prior, p, query)
+        return _placed(store, attempts, poses, prior, model, query)
 
     def search_for_guided() -> PoseEstimate | None:
         """Guided matches are no votes: what these would say may decide."""
+        p = model.parameters.validation
         again = [_searched(store, one, query, deadline, p) for one in attempts]
         if again == attempts:
             return estimate
@@ -167,7 +168,7 @@ def _decided(
     estimate = decide()
     if estimate is not None and estimate.status != "found":
         estimate = search_for_guided()
-    attempts[-1] = _with_rivals(store, attempts[-1], estimate, query, deadline, p)
+    attempts[-1] = _with_rivals(store, attempts[-1], estimate, query, deadline, model)
     if attempts[-1].rivals:
         estimate = decide()
         if estimate is not None and estimate.status != "found":
@@ -179,13 +180,13 @@ def _decided(
 
 def _with_rivals(
     store: Store, last: _Attempt, estimate: PoseEstimate | None, query: Query, deadline: Deadline,
-    p: ValidationParameters,
+    model: Model,
 ) -> _Attempt:  # fmt: skip
     """The last frame, with frames validated that look like it elsewhere."""
     if last.asked.geometry is None:
         return last
     more = validate_elsewhere(
-        store, last.searched, last.tried, estimate, last.asked.geometry, query, deadline, p,
+        store, last.searched, last.tried, estimate, last.asked.geometry, query, deadline, model,
         last.asked.up,
     )  # fmt: skip
     if more is None:
@@ -203,7 +204,7 @@ def _with_rivals(
 
 def _placed(
     store: Store, attempts: Sequence[_Attempt], poses: Sequence[Floats], prior: PosePrior | None,
-    p: ValidationParameters, query: Query,
+    model: Model, query: Query,
 ) -> PoseEstimate | None:  # fmt: skip
     """Where the last frame of a query was taken, by those at poses T_query_sensor."""
     frames = [
@@ -213,9 +214,7 @@ def _placed(
     ]
     rows = {number: row for one in attempts for number, row in one.rows.items()}
     geometries = {n: g for one in attempts for n, g in one.tried.geometries.items()}
-    return placed(
-        store, attempts[-1].searched, geometries, rows, frames, prior, p, query.validation
-    )  # fmt: skip
+    return placed(store, attempts[-1].searched, geometries, rows, frames, prior, model, query)
 
 
 def _searched(
@@ -251,7 +250,9 @@ def _attempt(
     among, selection, scales = _selection(searched, query, model, wanted)
     clock.stage("diversify")
     chosen = range(min(wanted, len(ranking))) if selection is None else selection.indices.tolist()
-    first = chosen if prior is None else nearest_first(store, ranking, chosen, prior)
+    first = chosen if prior is None else nearest_first(
+        store, ranking, chosen, prior, model.answer.map
+    )  # fmt: skip
     p = model.parameters.validation
     tried = validated(store, searched, first, asked.geometry, query, deadline, p, asked.up)
     clock.stage("validate")

@@ -21,10 +21,13 @@ from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, InvalidRequest, UnreadableGeometry
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
-from sceneprint.geometry.validation.map_verification import MapViews, looks_ahead
+from sceneprint.geometry.validation.map_verification import (
+    MapParameters,
+    MapViews,
+    looks_ahead,
+)
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.localization import (
-    SAME_SURFACES_M,
     LocalizationParameters,
     PosedFrame,
     PoseEstimate,
@@ -33,6 +36,7 @@ from sceneprint.localization import (
     localize,
     rival_rows,
 )
+from sceneprint.models import Model
 from sceneprint.pipeline import PairMatch, associate
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import has_parent_frame
@@ -167,15 +171,15 @@ def validated(
 
 def validate_elsewhere(
     store: Store, searched: Searched, tried: Validated, estimate: PoseEstimate | None,
-    geometry: Geometry, query: Query, deadline: Deadline, p: ValidationParameters,
-    up: Floats | None,
+    geometry: Geometry, query: Query, deadline: Deadline, model: Model, up: Floats | None,
 ) -> Validated | None:  # fmt: skip
     """Validate frames that look like the query and show another place than the one that is found.
 
     Parameters
     ----------
     estimate : of `placed`, with the matches of `tried`
-    store, searched, tried, geometry, query, deadline, p, up : see `validated`
+    model : of the maps
+    store, searched, tried, geometry, query, deadline, up : see `validated`
 
     Returns
     -------
@@ -192,34 +196,39 @@ def validate_elsewhere(
         }
 
     before = {match.index for match in tried.matches}
-    numbers = rival_rows(estimate, searched.ranking, before, posed, looks_ahead(geometry))
+    numbers = rival_rows(
+        estimate, searched.ranking, before, posed, looks_ahead(geometry), numbers_of(model, query)
+    )
     if not numbers:
         return None
     chosen = np.flatnonzero(np.isin(searched.ranking.indices, numbers)).tolist()
     return validated(
-        store, searched, chosen, geometry, query, deadline, p, up, known={}, retry=False
+        store, searched, chosen, geometry, query, deadline, model.parameters.validation, up,
+        known={}, retry=False,
     )  # fmt: skip
 
 
-#: Frames that are looked for about each pose that a candidate suggests, and how far off, metres:
-#: first close by, as a map may hold thousands, and farther off where that gives too few. Scans
-#: see farther than cameras.
+#: Frames that are looked for about each pose that a candidate suggests: first close by, as a map
+#: may hold thousands, and farther off where that gives too few.
 _NEAR_FRAMES = 48
-_NEAR_M = (2.0, SAME_SURFACES_M)
-_NEAR_SCANS_M = (*_NEAR_M, 15.0)
-#: Poses this near are looked about once, metres.
-_CELL_M = 1.0
 #: Places that are looked about, at most.
 _MOST_PLACES = 24
+
+
+def numbers_of(model: Model, query: Query) -> LocalizationParameters:
+    """Return the numbers of an answer: those of the model, and what a query asks of an answer."""
+    answer = model.answer
+    return LocalizationParameters(
+        map=answer.map, judgement=answer.confidence, voted_only=query.validation is not None
+    )
 
 
 def placed(
     store: Store, searched: Searched, geometries: Mapping[int, Geometry],
     rows: Mapping[int, FrameRow],
-    asked: Sequence[QueryFrame], prior: PosePrior | None, p: ValidationParameters,
-    options: ValidationOptions | None,
+    asked: Sequence[QueryFrame], prior: PosePrior | None, model: Model, query: Query,
 ) -> PoseEstimate | None:  # fmt: skip
-    """Where the query was taken, by its matches and the frames of the map about the poses.
+    """Return where the query was taken, by its matches and the frames of the map about the poses.
 
     Parameters
     ----------
@@ -228,9 +237,9 @@ def placed(
     rows : of the candidates, by number; those without a pose suggest none
     asked : the query's frames with their matches
     prior : what the robot believed before; its parent as `parent_key` writes it
-    p : of the model
-    options : what the query asks of a match: where it asks for anything, the map's frames tell
-        poses apart, but confirm none by themselves; in mode `paper` they are not asked
+    model : of the maps
+    query : where it asks for anything of a match, a pose needs the vote of one; in mode `paper` the
+        map's frames are not asked
 
     Returns
     -------
@@ -239,14 +248,11 @@ def placed(
     poses = {number: np.array(row.pose) for number, row in rows.items() if row.pose is not None}
     parents = {number: parent_key(rows[number]) for number in poses}
     frames = [replace(one, matches=[m for m in one.matches if m.index in poses]) for one in asked]
-    own_p = LocalizationParameters()
-    if options is not None:
-        own_p = replace(own_p, map_confirms=False)
-    reaches = _NEAR_M if all(looks_ahead(one.geometry) for one in asked) else _NEAR_SCANS_M
+    own_p, agreement = numbers_of(model, query), model.parameters.validation.agreement
 
     def views_of(parent: str, at: Floats) -> MapViews:
         known = [number for number in geometries if parents.get(number) == parent]
-        near = _near_frames(store, searched, parent, at, reaches)
+        near = _near_frames(store, searched, parent, at, own_p.map)
         numbers = [*known, *(number for number in near if number not in known)]
         at_poses = [poses[n] if n in known else near[n].pose for n in numbers]
         ahead = [rows[n].cloud is None if n in known else not near[n].is_cloud for n in numbers]
@@ -261,10 +267,10 @@ def placed(
                 return None  # one frame of many: the others tell the poses apart
 
         stack = np.array(at_poses).reshape(-1, 4, 4)
-        return MapViews(stack, open_view, own_p.map, p.agreement, range(len(known)), ahead)
+        return MapViews(stack, open_view, own_p.map, agreement, range(len(known)), ahead)
 
-    paper = options is not None and options.mode == "paper"
-    return localize(frames, poses, parents, None if paper else views_of, prior, own_p, p.agreement)
+    paper = query.validation is not None and query.validation.mode == "paper"
+    return localize(frames, poses, parents, None if paper else views_of, prior, own_p, agreement)
 
 
 def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PosePrior | None:
@@ -338,7 +344,7 @@ def _prior_covariance(given: Prior) -> Floats:
 
 
 def nearest_first(
-    store: Store, ranking: Ranking, chosen: Sequence[int], prior: PosePrior
+    store: Store, ranking: Ranking, chosen: Sequence[int], prior: PosePrior, p: MapParameters
 ) -> list[int]:
     """Candidates, positions in R, those that were taken near a prior first, else as they were."""
     with store.database.read() as connection:
@@ -347,7 +353,7 @@ def nearest_first(
 
     def far(position: int) -> bool:
         one = posed.get(int(ranking.indices[position]))
-        return one is None or parent_key(one) != prior.parent or not prior.reaches(one.pose)
+        return one is None or parent_key(one) != prior.parent or not prior.reaches(one.pose, p)
 
     return sorted(chosen, key=far)
 
@@ -358,16 +364,16 @@ def parent_key(row: FrameRow | FrameViewpoint) -> str:
 
 
 def _near_frames(
-    store: Store, searched: Searched, parent: str, at: Floats, reaches: Sequence[float]
+    store: Store, searched: Searched, parent: str, at: Floats, p: MapParameters
 ) -> dict[int, PlacedFrame]:
-    """Frames of a parent frame taken about poses (n, 4, 4) that the query may find, by number."""
+    """Return frames of a parent frame about poses (n, 4, 4) that the query may find, by number."""
     number, _, name = parent.partition(" ")
     part = next(one for one in searched.parts if one.place.row.number == int(number))
-    cells = np.unique(np.round(at[:, :3, 3] / _CELL_M), axis=0, return_index=True)[1]
+    cells = np.unique(np.round(at[:, :3, 3] / p.cell), axis=0, return_index=True)[1]
     found: dict[int, PlacedFrame] = {}
     with store.database.read() as connection:
         for centre in at[np.sort(cells)[:_MOST_PLACES], :3, 3].tolist():
-            for within in reaches:
+            for within in (p.near, p.same_surfaces):
                 near = placed_frames(
                     connection, int(number), name, part.place.row.model_id, centre, within,
                     _NEAR_FRAMES,

@@ -43,7 +43,11 @@ class MapParameters:
     n_views: int = 10  #: that a pose is scored on, at most
     look_ahead: float = 1.5  #: of a camera, to the middle of what it sees, metres
     reach: float = 3.5  #: between the middles of two views that may share surfaces, metres
-    around_reach: float = 15.0  #: the same where one of the sensors may look anywhere
+    around_reach: float = 4.0  #: the same where one of the sensors may look anywhere
+    same_surfaces: float = 8.0  #: between two sensors that may still see the same surfaces, metres
+    near: float = 2.0  #: within which frames of the map are looked for first, metres
+    cell: float = 1.0  #: poses this near are looked about once, metres
+    start_shift: float = 0.5  #: from a prior to the starts about it, at most, metres
     least_agreeing: float = 0.03  #: share of the query's points, below which a view has no say
     violation_weight: float = 2.0  #: of the violations of either side, in the score
     n_poses: int = 40  #: that are scored on the candidates
@@ -104,6 +108,7 @@ class ScoredPose:
     noise : violations that the map's frames about the pose show among themselves; 0 where it
         was not asked for
     views : frames of the query with positions of map frames that agree, most shared first
+    starts : (4, 4) poses that were refined to this one, or to its place
     """
 
     T: Floats
@@ -114,6 +119,11 @@ class ScoredPose:
     hidden: float
     views: tuple[tuple[int, int], ...]
     noise: float = 0.0
+    starts: tuple[Floats, ...] = ()
+
+    def is_of(self, T: Floats, p: MapParameters) -> bool:
+        """Return whether a pose (4, 4) is at this place, or at one that was refined to it."""
+        return bool(at_place(np.stack([self.T, *self.starts]), T, p).any())
 
 
 class MapViews:
@@ -300,17 +310,17 @@ def refined_pose(
     return average_poses(np.stack(found)).T if found else None
 
 
-def starts_about(T: Floats, covariance: Floats) -> Floats:
-    """A pose and six about it, a deviation away along each axis: (7, 4, 4).
+def starts_about(T: Floats, covariance: Floats, p: MapParameters) -> Floats:
+    """Return a pose and six about it, a deviation away along each axis: (7, 4, 4).
 
     Parameters
     ----------
     T : (4, 4) T_parent_sensor that is believed
-    covariance : (6, 6) of it, metres before radians; shifts are half a metre at most, as farther
-        off nothing is refined
+    covariance : (6, 6) of it, metres before radians
+    p : shifts are `p.start_shift` at most, as refinement bridges no more
     """
     starts = np.tile(T, (7, 1, 1))
-    deviations = np.minimum(np.sqrt(np.diag(covariance)[:3]), 0.5)
+    deviations = np.minimum(np.sqrt(np.diag(covariance)[:3]), p.start_shift)
     for axis in range(3):
         starts[1 + 2 * axis, axis, 3] += deviations[axis]
         starts[2 + 2 * axis, axis, 3] -= deviations[axis]
@@ -334,7 +344,7 @@ def compare_poses(
     frames: Sequence[MapFrame], poses: Floats, views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> list[ScoredPose]:  # fmt: skip
-    """Poses of the query, the best of each place, best first.
+    """Return poses of the query, the best of each place, best first.
 
     All are compared on the candidates first, and the best places on all frames that would see them.
     The first few places are refined on the map before they are compared, as a pose that is off
@@ -354,16 +364,40 @@ def compare_poses(
     scored = [score_pose(frames, poses[i], views, p, overlap_p, among) for i in chosen]
     places = _hopeful(best_of_places(scored, p), p)[: p.n_places]
     scored = [score_pose(frames, place.T, views, p, overlap_p) for place in places]
-    places = best_of_places(scored, p)
-    for pose in _hopeful(places, p)[: p.n_refined]:
-        T = refined_pose(frames, pose, views, p)
-        if T is not None:
-            scored.append(score_pose(frames, T, views, p, overlap_p))
-    places = best_of_places(scored, p)
+    places = _refined_places(frames, best_of_places(scored, p), views, p, overlap_p)
     for k, pose in enumerate(places[: p.n_refined]):
         if pose.violations + pose.hidden > p.least_noise:
             places[k] = replace(pose, noise=map_noise(pose, views, p, overlap_p))
     return places
+
+
+def _refined_places(
+    frames: Sequence[MapFrame], places: list[ScoredPose], views: MapViews, p: MapParameters,
+    overlap_p: OverlapParameters,
+) -> list[ScoredPose]:  # fmt: skip
+    """Refine places, best first, until `n_refined` different ones are left: best first.
+
+    A pose that refines to a better one is no other place: it started in the same basin, and would
+    pass for a rival of what it leads to.
+    """
+    hopeful = _hopeful(places, p)
+    settled: list[ScoredPose] = []
+    for pose in hopeful:
+        if len(settled) == p.n_refined:
+            break
+        T = refined_pose(frames, pose, views, p)
+        refined = pose if T is None else score_pose(frames, T, views, p, overlap_p)
+        near = [same_place(one.T, refined.T, p) for one in settled]
+        if any(near):
+            k = near.index(True)
+            best = max(settled[k], refined, key=lambda one: one.score)
+            settled[k] = replace(best, starts=(*settled[k].starts, pose.T))
+            continue
+        best = max(pose, refined, key=lambda one: one.score)
+        settled.append(replace(best, starts=(pose.T,)))
+    own = np.array([T for one in settled for T in (one.T, *one.starts)]).reshape(-1, 4, 4)
+    rest = [one for one in places if not at_place(own, one.T, p).any()]
+    return best_of_places([*settled, *rest], p)
 
 
 def _hopeful(places: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:

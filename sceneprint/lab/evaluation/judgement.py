@@ -25,6 +25,7 @@ from sceneprint.geometry.retrieval.ranking import (
 )
 from sceneprint.geometry.rigid import average_poses, inverse
 from sceneprint.geometry.validation.acceptance import Mode
+from sceneprint.geometry.validation.confidence import confidence_of
 from sceneprint.geometry.validation.map_verification import looks_ahead
 from sceneprint.geometry.validation.validation import ValidationParameters, refined_at
 from sceneprint.lab.evaluation.protocol import (
@@ -32,6 +33,7 @@ from sceneprint.lab.evaluation.protocol import (
     Error,
     FrameStore,
     JudgedAnswer,
+    JudgedPlace,
     SignedFrame,
     ValidatedPair,
     Watch,
@@ -40,14 +42,18 @@ from sceneprint.lab.evaluation.protocol import (
     unwatched,
 )
 from sceneprint.localization import (
+    LocalizationParameters,
+    Place,
     PosedFrame,
     PoseEstimate,
     PosePrior,
     QueryFrame,
-    localize,
+    estimate_of,
+    judged_places,
     rival_rows,
     views_of_rows,
 )
+from sceneprint.models.model import AnswerParameters
 from sceneprint.pipeline import PairMatch, associate, searched, validate
 from sceneprint.types import Bytes, Floats, Geometry
 
@@ -121,6 +127,8 @@ class Judge:
     p : of the model
     matching : see `validate`
     database : the frames of the map; empty where only pairs are validated
+    answer : of the model
+    confidence : least of a pose that is found
     """
 
     geometry: Callable[[int], Geometry]
@@ -129,6 +137,8 @@ class Judge:
     p: ValidationParameters = field(default_factory=ValidationParameters)
     matching: Matching = "histograms"
     database: Sequence[SignedFrame] = ()
+    answer: AnswerParameters = field(default_factory=AnswerParameters)
+    confidence: float = LocalizationParameters.confidence
 
 
 def open_judge(
@@ -138,10 +148,12 @@ def open_judge(
     p: ValidationParameters,
     matching: Matching = "histograms",
     database: Sequence[SignedFrame] = (),
+    answer: AnswerParameters | None = None,
 ) -> Judge:
     """Make ready to validate frames of a store."""
     # neighbouring queries have many candidates in common
-    return Judge(lru_cache(128)(store.geometry), mode, seed, p, matching, database)
+    geometry = lru_cache(128)(store.geometry)
+    return Judge(geometry, mode, seed, p, matching, database, answer or AnswerParameters())
 
 
 def voters(parents: Sequence[str], strong: Sequence[bool], most: int = 5) -> list[int]:
@@ -233,11 +245,16 @@ def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -
 
     start = time.perf_counter()
     poses = [frame.pose for frame in judging.database]
+    own_p = LocalizationParameters(
+        judging.confidence, map=judging.answer.map, judgement=judging.answer.confidence
+    )
     # what a query may not find must not tell poses apart either: a scene of its own
     scenes = [frame.scene if row in allowed else "" for row, frame in enumerate(judging.database)]
 
     def far(row: int) -> bool:
-        return prior is not None and not (scenes[row] == prior.parent and prior.reaches(poses[row]))
+        return prior is not None and not (
+            scenes[row] == prior.parent and prior.reaches(poses[row], own_p.map)
+        )
 
     n = len(task.selection)
     selected = Ranking(
@@ -249,14 +266,19 @@ def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -
         seed=judging.seed, p=judging.p, mode=judging.mode, matching=judging.matching,
     )  # fmt: skip
 
+    seen: list[Place] = []
+
     def located(matches: list[PairMatch]) -> PoseEstimate | None:
         views_of = views_of_rows(
-            matches, poses, open_geometry, scenes, overlap_p=judging.p.agreement
-        )
-        return localize(
-            [QueryFrame(query, matches)], poses, scenes,
-            views_of if judging.mode == "full" else None, prior, overlap_p=judging.p.agreement,
+            matches, poses, open_geometry, scenes, own_p.map, judging.p.agreement,
+            [looks_ahead(query)] * len(poses),  # a recording has one sensor
         )  # fmt: skip
+        parent, known_prior, seen[:] = judged_places(
+            [QueryFrame(query, matches)], poses, scenes,
+            views_of if judging.mode == "full" else None, prior, own_p, judging.p.agreement,
+        )  # fmt: skip
+        blind = query.surface.camera is None
+        return estimate_of(parent, seen, known_prior, own_p, blind=blind) if seen else None
 
     matches = validating(selected, range(n), pose_of=lambda row: (scenes[row], poses[row]))
     told = located(matches)
@@ -275,15 +297,25 @@ def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -
     rivals: list[int] = []
     if task.retrieved is not None and judging.mode == "full":
         tried = {match.index for match in matches}
-        rivals = rival_rows(told, task.retrieved, tried, posed, looks_ahead(query))
+        rivals = rival_rows(told, task.retrieved, tried, posed, looks_ahead(query), own_p)
     if rivals:
         others = Ranking(np.array(rivals), np.zeros(len(rivals), np.int64), np.zeros(len(rivals)))
         told = located([*matches, *validating(others, range(len(rivals)), retry=False)])
     spent = 1e3 * (time.perf_counter() - start)
-    if told is None or told.average is None:
-        return JudgedAnswer("not_found" if told is None else told.status, milliseconds=spent)
-    error = pose_error(told.average.T, task.pose) if told.parent == task.scene else Error()
-    return JudgedAnswer(told.status, told.strength, error, spent)
+    if told is None:
+        return JudgedAnswer(milliseconds=spent)
+
+    def error_of(T: Floats) -> Error:
+        return pose_error(T, task.pose) if told.parent == task.scene else Error()
+
+    places = tuple(
+        JudgedPlace(one.evidence, confidence_of(one.evidence, own_p.judgement), error_of(one.T))
+        for one in sorted(seen, key=lambda place: -place.score)
+        if one.evidence is not None
+    )
+    if told.average is None:
+        return JudgedAnswer(told.status, milliseconds=spent, places=places)
+    return JudgedAnswer(told.status, told.strength, error_of(told.average.T), spent, places)
 
 
 def true_transform(task: QueryTask, candidate: Candidate) -> Floats:

@@ -28,12 +28,14 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.geometry.rigid import difference, moved
 from sceneprint.geometry.validation.acceptance import Strength
+from sceneprint.geometry.validation.confidence import PlaceEvidence
 from sceneprint.geometry.validation.validation import (
     PairValidation,
     ValidationParameters,
     preferred,
 )
 from sceneprint.models import Model
+from sceneprint.models.model import AnswerParameters
 from sceneprint.pipeline import Signer, open_signer, prepare
 from sceneprint.types import (
     AnyFrame,
@@ -133,6 +135,22 @@ class ValidatedPair:
 
 
 @dataclass(frozen=True, eq=False)
+class JudgedPlace:
+    """A candidate pose of a query, and how far off it is.
+
+    Parameters
+    ----------
+    evidence : for the pose
+    confidence : computed from it
+    error : of the pose; infinite in another parent frame
+    """
+
+    evidence: PlaceEvidence
+    confidence: float
+    error: Error
+
+
+@dataclass(frozen=True, eq=False)
 class JudgedAnswer:
     """What a robot is told of a query, and how far off that is.
 
@@ -142,12 +160,14 @@ class JudgedAnswer:
     strength : "strong" or "weak"; None unless found
     error : of the pose in the map; infinite without one, and in another parent frame
     milliseconds : that the answer took, from R on
+    places : that the answer was chosen from, the likeliest first
     """
 
     status: AnswerStatus = "not_found"
     strength: Strength | None = None
     error: Error = Error()
     milliseconds: float = 0.0
+    places: tuple[JudgedPlace, ...] = ()
 
     @property
     def right(self) -> bool:
@@ -810,7 +830,7 @@ class Prepared:
     queries, database : in the order of the protocol
     left_out : (name, reason) of the others
     milliseconds : median time to sign a frame and work out its geometry; None without frames
-    validation, metric : of the model
+    validation, metric, answer : of the model
     """
 
     queries: list[SignedFrame]
@@ -819,6 +839,7 @@ class Prepared:
     milliseconds: float | None
     validation: ValidationParameters = field(default_factory=ValidationParameters)
     metric: Metric = "l2"
+    answer: AnswerParameters = field(default_factory=AnswerParameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -881,7 +902,7 @@ def prepare_all(
     model = signer.model
     return Prepared(
         by_use["query"], by_use["database"], left_out, median, model.parameters.validation,
-        model.metric,
+        model.metric, model.answer,
     )  # fmt: skip
 
 

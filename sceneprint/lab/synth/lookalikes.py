@@ -10,6 +10,10 @@ unmapped  the map: all rooms of such a row but one; queries: views of that one
 kitchens  the map: one kitchen; queries: another with the same furniture, arranged alike
 opposite  the map: furniture in a room, from one side; queries: from the other side
 absent    the map: rooms and an object; queries: other rooms and another object
+
+and ordinary places, to compare with:
+
+rooms     the map: a few different rooms; queries: other views of them
 """
 
 from __future__ import annotations
@@ -61,6 +65,8 @@ from sceneprint.lab.synth.trajectories import orbit, scattered_poses
 from sceneprint.types import AnyFrame, DepthFrame, Floats, Intrinsics
 
 KINDS = ("object", "offices", "unmapped", "kitchens", "opposite", "absent")
+#: Kinds of which no two places look alike.
+ORDINARY = ("rooms",)
 #: kinds of which nothing in the map is the query's place
 ELSEWHERE = ("unmapped", "kitchens", "absent")
 #: of those, kinds whose queries have a parent frame of their own
@@ -133,11 +139,12 @@ def synthesise_lookalike(
     MissingDependency : Embree cannot be imported.
     ValueError : there is no such kind.
     """
-    if kind not in KINDS:
+    kinds = KINDS + ORDINARY
+    if kind not in kinds:
         raise ValueError(
-            f"There is no kind {kind!r} of look-alikes. Choose from {', '.join(KINDS)}."
+            f"There is no kind {kind!r} of look-alikes. Choose from {', '.join(kinds)}."
         )
-    rng = np.random.default_rng(np.random.SeedSequence((seed, index, 16 + KINDS.index(kind))))
+    rng = np.random.default_rng(np.random.SeedSequence((seed, index, 16 + kinds.index(kind))))
     shoot = _SHOOTS[kind](rng, index, queries)
     sensor = own_sensor(noise, intrinsics, rng) if noise else None
     if sensor is not None and kind == "object":
@@ -627,6 +634,20 @@ def _absent_places(rng: np.random.Generator, index: int, queries: int) -> Shoot:
     return Shoot(views(4, 10, 20), views(rooms, each, alone)[-queries:])
 
 
+def _ordinary_rooms(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
+    """Different rooms side by side, seen from few places or from many."""
+    rooms = [make_room(rng) for _ in range(3)]
+    each = int(rng.integers(6, 22))
+    map_of = [(room, T) for room in rooms for T in scattered_poses(room, each, rng)]
+    asked = [rooms[k % len(rooms)] for k in range(queries)]
+    starts = np.cumsum([0.0, *(room.size[0] + 0.2 for room in rooms)])
+
+    def shift(room: Room) -> Floats:
+        return np.array([starts[next(i for i, one in enumerate(rooms) if one is room)], 0.0, 0.0])
+
+    return Shoot(map_of, [(r, scattered_poses(r, 1, rng)[0]) for r in asked], shift)
+
+
 _SHOOTS: dict[str, Callable[[np.random.Generator, int, int], Shoot]] = {
     "object": _circled_object,
     "offices": _row,
@@ -634,4 +655,5 @@ _SHOOTS: dict[str, Callable[[np.random.Generator, int, int], Shoot]] = {
     "kitchens": _second_kitchen,
     "opposite": _opposite_sides,
     "absent": _absent_places,
+    "rooms": _ordinary_rooms,
 }

@@ -1,0 +1,143 @@
+"""Confidence: the probability that a candidate pose is right, from what speaks for and against it.
+
+    PlaceEvidence  --confidence_of-->  P(right), 0 to 1
+    PlaceEvidence  --weakest_evidence-->  a sentence on what keeps it from being more
+
+The logit of the probability is what a pose with the best evidence has, less one penalty for each
+kind of evidence. A penalty is a piecewise linear function of its evidence that never rises with
+better evidence, so more support never lowers a confidence, and a better rival never raises one.
+`sceneprint.lab.confidence` learns the penalties on synthetic places; docs/trust.md shows how well
+the confidences are calibrated on recordings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class PlaceEvidence:
+    """What speaks for and against a pose of the query.
+
+    Parameters
+    ----------
+    score : how well the map's frames bear the pose out, see ScoredPose; at most 1
+    share : share of the query's surface that the map shows there, every plane counting the same
+    planes : distinct planes of the query that agree with the map
+    frames : frames of the map that agree
+    viewpoints : different viewpoints of these frames
+    excess : free-space violations of both sides, less those that the map's own frames show among
+        themselves; a share
+    weight : of the matches that vote for the pose, one for each viewpoint: 1 of a strong match,
+        less of a weak or an ambiguous one
+    strong : different viewpoints of strong matches that vote for it
+    suggested : different viewpoints of candidates that suggest it, whether accepted or not
+    rival : score of the best other place, relative to this one's; 0 where there is none
+    rival_weight : largest weight of the votes for another place
+    """
+
+    score: float
+    share: float
+    planes: float
+    frames: int
+    viewpoints: int
+    excess: float
+    weight: float
+    strong: int
+    suggested: int
+    rival: float
+    rival_weight: float
+
+
+@dataclass(frozen=True)
+class Penalty:
+    """What one kind of evidence takes from the logit, at three of its four knots; 0 at the best.
+
+    Parameters
+    ----------
+    worst, poor, fair : at the first, second and third knot; none below the next
+    """
+
+    worst: float = 0.0
+    poor: float = 0.0
+    fair: float = 0.0
+
+    @property
+    def values(self) -> tuple[float, float, float, float]:
+        """The penalties at the four knots."""
+        return self.worst, self.poor, self.fair, 0.0
+
+
+#: The four values of each kind of evidence between which its penalty is linear, the worst first.
+KNOTS: Mapping[str, tuple[float, float, float, float]] = {
+    "score": (0.05, 0.15, 0.3, 0.6),
+    "planes": (3.0, 6.0, 12.0, 24.0),
+    "frames": (1.0, 3.0, 6.0, 10.0),
+    "excess": (0.25, 0.12, 0.05, 0.0),
+    "weight": (0.0, 0.4, 1.0, 3.0),
+    "strong": (0.0, 1.0, 2.0, 4.0),
+    "suggested": (0.0, 1.0, 2.0, 4.0),
+    "rival": (1.0, 0.8, 0.5, 0.2),
+    "rival_weight": (2.0, 1.0, 0.4, 0.0),
+}
+
+
+@dataclass(frozen=True)
+class ConfidenceParameters:
+    """The numbers of the confidence, learnt on synthetic places.
+
+    Parameters
+    ----------
+    best : logit of a pose with the best evidence of every kind
+    score, planes, ... : penalty of each kind of evidence
+    """
+
+    best: float = 8.0
+    score: Penalty = Penalty(4.0, 2.0, 0.5)
+    planes: Penalty = Penalty(6.0, 3.0, 0.5)
+    frames: Penalty = Penalty(1.0, 0.5, 0.2)
+    excess: Penalty = Penalty(9.0, 5.0, 1.5)
+    weight: Penalty = Penalty(2.0, 1.5, 1.0)
+    strong: Penalty = Penalty(1.5, 0.5, 0.0)
+    suggested: Penalty = Penalty(1.0, 1.0, 0.0)
+    rival: Penalty = Penalty(9.0, 5.0, 2.0)
+    rival_weight: Penalty = Penalty(4.0, 2.0, 1.0)
+
+
+def penalties_of(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, float]:
+    """Return what each kind of evidence takes from the logit: >= 0, by name."""
+    found = {}
+    for name, knots in KNOTS.items():
+        values = getattr(p, name).values
+        rising = knots[0] < knots[-1]
+        xs, ys = (knots, values) if rising else (knots[::-1], values[::-1])
+        found[name] = float(np.interp(getattr(e, name), xs, ys))
+    return found
+
+
+def confidence_of(e: PlaceEvidence, p: ConfidenceParameters) -> float:
+    """Return the probability that a pose with some evidence is right, 0 to 1."""
+    logit = p.best - sum(penalties_of(e, p).values())
+    return 1.0 / (1.0 + math.exp(-logit))
+
+
+def weakest_evidence(e: PlaceEvidence, p: ConfidenceParameters) -> str:
+    """Return a sentence on the evidence that lowers the confidence of a pose most."""
+    penalties = penalties_of(e, p)
+    name = max(penalties, key=penalties.__getitem__)
+    return {
+        "score": f"the map shows only {e.share:.0%} of what the frame sees",
+        "planes": f"only {e.planes:.0f} distinct planes agree, and a few planes fit in many places",
+        "frames": f"only {e.frames} frames of the map see this place",
+        "excess": f"a pose fits, but {max(e.excess, 0.0):.0%} of what should be in sight there is "
+        "missing: another place may look like this one, or this one has changed",
+        "weight": "too few matches vote for the pose",
+        "strong": "no strong match votes for the pose",
+        "suggested": f"one view alone suggests this pose, of {e.viewpoints} that see the place",
+        "rival": "another pose explains the frame as well: the place repeats, or has a symmetry",
+        "rival_weight": "the matches disagree: some vote for another pose",
+    }[name]

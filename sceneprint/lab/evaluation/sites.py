@@ -1,0 +1,195 @@
+"""Synthetic places asked as a robot would: a site is built, signed, and all its queries answered.
+
+kind, seed, index  --ask_site-->  SiteAnswer, ...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sceneprint.errors import UselessFrame
+from sceneprint.geometry.rigid import turned
+from sceneprint.lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
+from sceneprint.lab.evaluation.protocol import JudgedAnswer, SignedFrame, overlaps, view_of
+from sceneprint.lab.synth.lookalikes import (
+    KINDS,
+    ORDINARY,
+    LookalikeSite,
+    synthesise_lookalike,
+)
+from sceneprint.localization import PosePrior
+from sceneprint.pipeline import Signer, prepare
+from sceneprint.types import DepthFrame, Floats, Geometry
+from sceneprint_client.poses import rotation_of
+
+#: From this overlap, smaller direction, a frame of the map is enough to answer a query.
+ANSWERABLE = 0.3
+#: Deviations that a robot states with its prior, and how far that is turned at most, degrees.
+PRIOR_M, PRIOR_DEG = 0.3, 10.0
+
+
+@dataclass(frozen=True)
+class SiteAnswer:
+    """The answer to one query at a site.
+
+    Parameters
+    ----------
+    site, kind, query : where the query was taken, and its number there
+    answerable : whether a frame of the map overlaps it enough
+    answer : see JudgedAnswer
+    """
+
+    site: str
+    kind: str
+    query: int
+    answerable: bool
+    answer: JudgedAnswer
+
+
+@dataclass(frozen=True)
+class MapFlaws:
+    """What a map may lack of a perfect one.
+
+    Parameters
+    ----------
+    missing : largest share of the frames that are left out
+    drift_m, drift_rad : deviation of the error of a pose from that of the pose before, in each
+        direction; poses drift back to the truth, so that they stay within about twice as much
+    """
+
+    missing: float = 0.5
+    drift_m: float = 0.01
+    drift_rad: float = 0.003
+
+
+def with_flaws(
+    frames: Sequence[DepthFrame], flaws: MapFlaws, rng: np.random.Generator
+) -> list[DepthFrame]:
+    """Return some of a map's frames, in their order, with poses that drift.
+
+    Parameters
+    ----------
+    frames : of the map, with poses
+    flaws : of every site, a share from 0 to each of these is drawn
+    rng : decides which frames are missing, and how the poses drift
+    """
+    share = rng.uniform(0.0, 1.0, 3) * (flaws.missing, flaws.drift_m, flaws.drift_rad)
+    in_map = rng.uniform(size=len(frames)) >= share[0]
+    drift, flawed = np.zeros(6), []
+    for frame, has_it in zip(frames, in_map, strict=True):
+        drift = 0.9 * drift + rng.standard_normal(6) * np.repeat(share[1:], 3)
+        if has_it and frame.pose is not None:
+            T = frame.pose.copy()
+            turned(frame.pose[:3, :3], drift[3:], T[:3, :3])
+            T[:3, 3] += drift[:3]
+            flawed.append(replace(frame, pose=T))
+    return flawed
+
+
+def signed(
+    frames: Sequence[DepthFrame], scene: str, signer: Signer, first: int
+) -> tuple[list[DepthFrame], list[SignedFrame], list[Geometry]]:
+    """Return those frames that show anything, as an evaluation has them, and their geometry."""
+    usable: list[DepthFrame] = []
+    members: list[SignedFrame] = []
+    geometries: list[Geometry] = []
+    for frame in frames:
+        try:
+            signature, geometry = prepare(frame, signer)
+        except UselessFrame:
+            continue
+        pose = np.eye(4) if frame.pose is None else frame.pose
+        number = first + len(members)
+        members.append(SignedFrame(number, frame.name, scene, pose, signature.vector))
+        geometries.append(geometry)
+        usable.append(frame)
+    return usable, members, geometries
+
+
+def prior_about(
+    pose: Floats, parent: str, least: float, most: float, rng: np.random.Generator
+) -> PosePrior:
+    """Return a prior that is off by `least` to `most` metres, any way, and up to 10 degrees.
+
+    It states deviations of 30 cm and 10 degrees, however far off it is.
+    """
+    directions = rng.standard_normal((2, 3))
+    shift, axis = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    T = np.eye(4)
+    half = np.deg2rad(rng.uniform(0.0, PRIOR_DEG)) / 2
+    T[:3, :3] = rotation_of(np.array([*(np.sin(half) * axis), np.cos(half)])) @ pose[:3, :3]
+    T[:3, 3] = pose[:3, 3] + shift * rng.uniform(least, most)
+    deviations = [PRIOR_M] * 3 + [np.deg2rad(PRIOR_DEG)] * 3
+    return PosePrior(parent, T, np.diag(np.square(deviations)))
+
+
+def ask_site(
+    signer: Signer,
+    work: tuple[str, int, int],
+    *,
+    seed: int,
+    candidates: int = 10,
+    prior: tuple[float, float] | None = None,
+    flaws: MapFlaws | None = None,
+    confidence: float | None = None,
+) -> list[SiteAnswer]:
+    """Build one site and ask all its queries.
+
+    Parameters
+    ----------
+    signer : see `open_signer`
+    work : kind, index and number of queries
+    seed : of the collection
+    candidates : size of C
+    prior : least and most metres that the robot's prior is off; None: it has none
+    flaws : of the map; None: it has all frames, and true poses
+    confidence : least of a pose that is found; default: that of LocalizationParameters
+    """
+    kind, index, queries = work
+    rng = np.random.default_rng([seed, index, (KINDS + ORDINARY).index(kind)])
+    site = synthesise_lookalike(kind, seed, index, queries=queries)
+    frames = site.map if flaws is None else with_flaws(site.map, flaws, rng)
+    shown, database, of_map = signed(frames, site.name, signer, 0)
+    # of another place: a pose in its own frame is a pose in no map
+    scene = site.name if site.same_frame else f"{site.name}, elsewhere"
+    sent, asked, of_queries = signed(site.queries, scene, signer, len(database))
+    geometries = [*of_map, *of_queries]
+    model = signer.model
+    judge = Judge(
+        geometries.__getitem__, "full", 0, model.parameters.validation, database=database,
+        answer=model.answer,
+    )  # fmt: skip
+    if confidence is not None:
+        judge = replace(judge, confidence=confidence)
+    ranked = rank(
+        np.stack([q.signature for q in asked]), np.stack([d.signature for d in database]),
+        np.ones((len(asked), len(database)), np.bool_), metric=model.metric,
+        candidates=candidates,
+    )  # fmt: skip
+    able = _answerable(site, shown, sent)
+    answers = []
+    for number, (query, one) in enumerate(zip(asked, ranked, strict=True)):
+        among = tuple(
+            Candidate(j, j, database[j].scene, database[j].pose, 0.0, 0.0) for j in one.selection
+        )
+        rows = np.arange(len(database))
+        task = QueryTask(
+            query.number, scene, query.pose, [], one.selection, among, rows, one.retrieved
+        )  # fmt: skip
+        believed = None if prior is None else prior_about(query.pose, site.name, *prior, rng)
+        answer = answer_of(judge, task, believed)
+        answers.append(SiteAnswer(site.name, kind, number, able[number], answer))
+    return answers
+
+
+def _answerable(
+    site: LookalikeSite, shown: Sequence[DepthFrame], sent: Sequence[DepthFrame]
+) -> list[bool]:
+    """Return, for each query, whether a frame of the map overlaps it enough."""
+    if not site.present:
+        return [False] * len(sent)
+    seen = overlaps([view_of(q) for q in sent], [view_of(d) for d in shown])
+    return [bool(most >= ANSWERABLE) for most in seen.least.max(axis=1)]

@@ -1,0 +1,53 @@
+"""The confidence of a pose: by hand, monotone, and with a reason."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from sceneprint.geometry.validation.confidence import (
+    KNOTS,
+    ConfidenceParameters,
+    Penalty,
+    PlaceEvidence,
+    confidence_of,
+    penalties_of,
+    weakest_evidence,
+)
+
+BEST = PlaceEvidence(0.9, 0.95, 40.0, 12, 12, 0.0, 5.0, 5, 8, 0.0, 0.0)
+P = ConfidenceParameters(
+    best=6.0,
+    **{name: Penalty(3.0, 2.0, 1.0) for name in KNOTS},
+)
+
+
+def test_the_best_evidence_costs_nothing() -> None:
+    assert set(penalties_of(BEST, P).values()) == {0.0}
+    assert confidence_of(BEST, P) == pytest.approx(1 / (1 + math.exp(-6.0)))
+
+
+def test_a_penalty_is_linear_between_its_knots() -> None:
+    """Planes: 3 at 3 planes, 2 at 6, 1 at 12, 0 from 24 on."""
+    for planes, penalty in ((1.0, 3.0), (3.0, 3.0), (4.5, 2.5), (12.0, 1.0), (18.0, 0.5)):
+        assert penalties_of(replace(BEST, planes=planes), P)["planes"] == pytest.approx(penalty)
+    for rival, penalty in ((1.5, 3.0), (0.9, 2.5), (0.5, 1.0), (0.35, 0.5), (0.2, 0.0)):
+        assert penalties_of(replace(BEST, rival=rival), P)["rival"] == pytest.approx(penalty)
+    two = replace(BEST, planes=12.0, rival=0.8)
+    assert confidence_of(two, P) == pytest.approx(1 / (1 + math.exp(-3.0)))
+
+
+@pytest.mark.parametrize("name", KNOTS)
+def test_better_evidence_never_lowers_a_confidence(name: str) -> None:
+    worst, *_, best = KNOTS[name]
+    steps = [worst + (best - worst) * k / 20 for k in range(-3, 24)]
+    found = [confidence_of(replace(BEST, **{name: x}), ConfidenceParameters()) for x in steps]
+    assert found == sorted(found)
+
+
+def test_the_reason_names_what_costs_most() -> None:
+    assert "only 5 distinct planes" in weakest_evidence(replace(BEST, planes=5.0), P)
+    assert "another pose" in weakest_evidence(replace(BEST, planes=12.0, rival=0.9), P)
+    assert "14%" in weakest_evidence(replace(BEST, excess=0.14), P)
