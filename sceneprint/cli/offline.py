@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
@@ -36,7 +36,10 @@ from sceneprint.formats.export import write_ply
 from sceneprint.models import PRESETS, ModelParameters, save_model
 from sceneprint.pipeline import Signature, Signer, sign
 from sceneprint.settings import Settings
-from sceneprint.types import DepthFrame
+from sceneprint.types import AnyFrame, Cloud, DepthFrame
+
+if TYPE_CHECKING:
+    from sceneprint.lab.synth import LookalikeSite
 
 
 def add_sign(commands: Any) -> None:
@@ -377,8 +380,11 @@ class _Bars:
 
 #: Stored units per metre.
 DEPTH_SCALE = 1000.0
-#: Kinds of look-alike sites, as `sceneprint.lab.synth.lookalikes` has them.
-LOOKALIKES = ("object", "offices", "unmapped", "kitchens", "opposite", "absent")
+#: Kinds of look-alike sites of a sensor, as `lookalikes` and `lookalike_surveys` have them.
+LOOKALIKES = {
+    "kinect": ("object", "offices", "unmapped", "kitchens", "opposite", "absent"),
+    "lidar": ("bays", "streets", "halls", "unmapped", "absent", "sites"),
+}
 
 
 def add_synth(commands: Any) -> None:
@@ -390,7 +396,7 @@ def add_synth(commands: Any) -> None:
         "OUT/room-000/seq-01/frame-000000.depth.png and .pose.txt. With --sensor lidar: halls, "
         "storeys and blocks as a spinning laser would see them, OUT/site-000/scan-000000.ply "
         "and .pose.txt. With --lookalikes: sites that look like themselves or like another, as "
-        "7-Scenes scenes whose TrainSplit.txt and TestSplit.txt say what is the map and what the "
+        "scenes whose TrainSplit.txt and TestSplit.txt say what is the map and what the "
         "queries, so that `sceneprint evaluate OUT` measures wrong answers.",
     )
     command.add_argument("out", type=Path, metavar="OUT", help="output folder, new or empty")
@@ -399,13 +405,16 @@ def add_synth(commands: Any) -> None:
     )
     command.add_argument(
         "--lookalikes",
-        choices=LOOKALIKES,
+        choices=sorted({kind for kinds in LOOKALIKES.values() for kind in kinds}),
         metavar="KIND",
         help="object: a symmetric object circled on a bare floor; offices: a row of equal rooms, "
         "or a hall of equal bays; unmapped: such a row, the queries from a room that the map "
         "lacks; kitchens: the queries from another kitchen with the same furniture; opposite: "
         "furniture in a room, the queries from its other side; absent: the queries from other "
-        "rooms",
+        "rooms. With --sensor lidar: bays: a hall of equal bays; streets: a street of equal "
+        "blocks; halls: a hall that is the same after half a turn; unmapped: equal halls or "
+        "streets, the queries from one that the map lacks; absent: the queries from other halls "
+        "and streets; sites: ordinary halls, storeys and blocks, which do not repeat",
     )
     command.add_argument(
         "--rooms",
@@ -437,11 +446,15 @@ def add_synth(commands: Any) -> None:
 
 def run_synth(options: argparse.Namespace) -> int:
     """Make the rooms."""
-    if options.lookalikes and (options.path or options.sensor == "lidar"):
-        given = "--path" if options.path else "--sensor lidar"
+    if options.lookalikes and options.path:
         raise DatasetError(
-            f"--lookalikes and {given}: look-alike sites have camera paths of their own. "
-            f"Leave {given} out."
+            "--lookalikes and --path: look-alike sites have paths of their own. Leave --path out."
+        )
+    kinds = LOOKALIKES[options.sensor]
+    if options.lookalikes and options.lookalikes not in kinds:
+        raise DatasetError(
+            f"--lookalikes {options.lookalikes}: there is no such kind for --sensor "
+            f"{options.sensor}. Choose from {', '.join(kinds)}."
         )
     if options.out.exists() and any(options.out.iterdir()):
         raise DatasetError(
@@ -462,7 +475,8 @@ def _rooms(options: argparse.Namespace) -> Iterator[None]:
     where = options.out, options.seed, options.views
     make: Callable[[int], None]
     if options.lookalikes:
-        make = partial(_write_lookalike, *where, kind=options.lookalikes, perfect=options.perfect)
+        look = _write_lookalike_survey if options.sensor == "lidar" else _write_lookalike
+        make = partial(look, *where, kind=options.lookalikes, perfect=options.perfect)
     else:
         write = _write_site if options.sensor == "lidar" else _write_room
         make = partial(write, *where, along_path=options.path, perfect=options.perfect)
@@ -502,15 +516,35 @@ def _write_lookalike(
 
     noise = None if perfect else KinectNoise()
     site = synthesise_lookalike(kind, seed, index, queries=queries, noise=noise)
+    of_map, of_queries = _split_scenes(out, site)
+    _write_sequence(of_map / "seq-01", site.map)
+    _write_sequence(of_queries / "seq-02", site.queries)
+    for folder in {of_map, of_queries}:
+        write_intrinsics(folder, Camera(site.map[0].intrinsics, DEPTH_SCALE, along_ray=False))
+
+
+def _write_lookalike_survey(
+    out: Path, seed: int, queries: int, index: int, *, kind: str, perfect: bool
+) -> None:
+    """As `_write_lookalike`, of scans."""
+    from sceneprint.lab.synth import synthesise_lookalike_survey
+
+    site = synthesise_lookalike_survey(kind, seed, index, queries=queries, perfect=perfect)
+    of_map, of_queries = _split_scenes(out, site)
+    _write_scans(of_map / "seq-01", site.map)
+    _write_scans(of_queries / "seq-02", site.queries)
+
+
+def _split_scenes(out: Path, site: LookalikeSite[AnyFrame]) -> tuple[Path, Path]:
+    """Folders of the scenes of a site's map and of its queries, with the files of their splits."""
     of_map = of_queries = out / site.name
     if not site.same_frame:
         of_queries = out / f"{site.name}-elsewhere"
-    _write_sequence(of_map / "seq-01", site.map)
-    _write_sequence(of_queries / "seq-02", site.queries)
+    for folder in (of_map, of_queries):
+        folder.mkdir(parents=True, exist_ok=True)
     (of_map / "TrainSplit.txt").write_text("sequence1\n")
     (of_queries / "TestSplit.txt").write_text("sequence2\n")
-    for folder in {of_map, of_queries}:
-        write_intrinsics(folder, Camera(site.map[0].intrinsics, DEPTH_SCALE, along_ray=False))
+    return of_map, of_queries
 
 
 def _write_site(
@@ -519,9 +553,12 @@ def _write_site(
     from sceneprint.lab.synth import synthesise_survey
 
     survey = synthesise_survey(seed, index, views, along_path=along_path, perfect=perfect)
-    folder = out / survey.name
+    _write_scans(out / survey.name, survey.clouds)
+
+
+def _write_scans(folder: Path, clouds: Sequence[Cloud]) -> None:
     folder.mkdir(parents=True)
-    for number, cloud in enumerate(survey.clouds):
+    for number, cloud in enumerate(clouds):
         (folder / f"scan-{number:06d}.ply").write_bytes(write_ply(cloud.points))
         if cloud.pose is not None:
             write_pose(folder / f"scan-{number:06d}.pose.txt", cloud.pose)

@@ -270,7 +270,8 @@ def find_sequences(
     Understood are a 7-Scenes sequence or scene (with TrainSplit.txt, TestSplit.txt), a TUM
     RGB-D folder, a folder of depth images (PNG or NPY; `*.color.png` and `*rgb*` are left
     out), a folder of point clouds (PLY, PCD, KITTI .bin, LAS, LAZ; NPY beside a clouds.json),
-    one depth image or cloud, and folders of these. A sequence is named by its place below
+    one depth image or cloud, and folders of these. Clouds in a folder seq-01 that such a split
+    file names are a sequence of a 7-Scenes scene as well. A sequence is named by its place below
     the path, or by its own folder where that is the path. A recording of ROS (.mcap, .db3, .bag,
     a rosbag2 folder) is one sequence, named after it; so is each of a folder of recordings.
 
@@ -489,9 +490,11 @@ def _sequence(
 def _sequence_of(
     folder: Path, layout: Layout, name: str, frames: tuple[FrameReference, ...]
 ) -> FrameSequence:
-    if layout is Layout.SEVEN_SCENES and _SEQUENCE_FOLDER.fullmatch(folder.name):
-        scene = folder.parent
-        return FrameSequence(name, folder, layout, scene.name, _split(folder), frames)
+    seven, clouds = layout is Layout.SEVEN_SCENES, layout is Layout.CLOUDS
+    split = _split(folder) if seven or clouds else None
+    # clouds are a sequence of a scene only where a split file of the scene says so
+    if split or (seven and _SEQUENCE_FOLDER.fullmatch(folder.name)):
+        return FrameSequence(name, folder, layout, folder.parent.name, split, frames)
     return FrameSequence(name, folder, layout, name, None, frames)
 
 

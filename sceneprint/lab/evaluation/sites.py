@@ -22,7 +22,7 @@ from sceneprint.lab.synth.lookalikes import (
 )
 from sceneprint.localization import PosePrior
 from sceneprint.pipeline import Signer, prepare
-from sceneprint.types import DepthFrame, Floats, Geometry
+from sceneprint.types import AnyFrame, Floats, Geometry
 from sceneprint_client.poses import rotation_of
 
 #: From this overlap, smaller direction, a frame of the map is enough to answer a query.
@@ -66,8 +66,8 @@ class MapFlaws:
 
 
 def with_flaws(
-    frames: Sequence[DepthFrame], flaws: MapFlaws, rng: np.random.Generator
-) -> list[DepthFrame]:
+    frames: Sequence[AnyFrame], flaws: MapFlaws, rng: np.random.Generator
+) -> list[AnyFrame]:
     """Return some of a map's frames, in their order, with poses that drift.
 
     Parameters
@@ -78,7 +78,8 @@ def with_flaws(
     """
     share = rng.uniform(0.0, 1.0, 3) * (flaws.missing, flaws.drift_m, flaws.drift_rad)
     in_map = rng.uniform(size=len(frames)) >= share[0]
-    drift, flawed = np.zeros(6), []
+    drift = np.zeros(6)
+    flawed: list[AnyFrame] = []
     for frame, has_it in zip(frames, in_map, strict=True):
         drift = 0.9 * drift + rng.standard_normal(6) * np.repeat(share[1:], 3)
         if has_it and frame.pose is not None:
@@ -90,10 +91,10 @@ def with_flaws(
 
 
 def signed(
-    frames: Sequence[DepthFrame], scene: str, signer: Signer, first: int
-) -> tuple[list[DepthFrame], list[SignedFrame], list[Geometry]]:
+    frames: Sequence[AnyFrame], scene: str, signer: Signer, first: int
+) -> tuple[list[AnyFrame], list[SignedFrame], list[Geometry]]:
     """Return those frames that show anything, as an evaluation has them, and their geometry."""
-    usable: list[DepthFrame] = []
+    usable: list[AnyFrame] = []
     members: list[SignedFrame] = []
     geometries: list[Geometry] = []
     for frame in frames:
@@ -186,7 +187,7 @@ def ask_site(
 
 
 def _answerable(
-    site: LookalikeSite, shown: Sequence[DepthFrame], sent: Sequence[DepthFrame]
+    site: LookalikeSite[AnyFrame], shown: Sequence[AnyFrame], sent: Sequence[AnyFrame]
 ) -> list[bool]:
     """Return, for each query, whether a frame of the map overlaps it enough."""
     if not site.present:

@@ -2,6 +2,7 @@
 
     seed, index  --synthesise_room-->  frames        seed, index  --synthesise_survey-->  clouds
     kind, seed, index  --synthesise_lookalike-->  frames of a map, and queries
+    kind, seed, index  --synthesise_lookalike_survey-->  clouds of a map, and queries
 
 Nothing here reads or writes files.
 """
@@ -16,6 +17,7 @@ from sceneprint.lab.synth.dataset import (
     take,
 )
 from sceneprint.lab.synth.large_scenes import corridor, symmetric_box
+from sceneprint.lab.synth.lookalike_surveys import synthesise_lookalike_survey
 from sceneprint.lab.synth.lookalikes import LookalikeSite, synthesise_lookalike
 from sceneprint.lab.synth.rooms import Room, make_room
 from sceneprint.lab.synth.sensors import (
@@ -48,6 +50,7 @@ __all__ = [
     "scattered_poses",
     "symmetric_box",
     "synthesise_lookalike",
+    "synthesise_lookalike_survey",
     "synthesise_room",
     "synthesise_survey",
     "take",

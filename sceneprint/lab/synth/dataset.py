@@ -210,7 +210,7 @@ def synthesise_survey(
     drawn = own_scanner(rng)
     sensor = sensor or drawn
     if perfect:
-        sensor = replace(sensor, sigma=0.0, ring_sigma=0.0, loss=0.0, grazing=0.0, blind_width=0.0)
+        sensor = sensor.perfect()
     name, clouds = f"site-{index:03d}", []
     poses = walk(premises, views, rng) if along_path else scattered(premises, views, rng)
     for number, first in enumerate(poses):

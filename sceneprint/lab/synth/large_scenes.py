@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -124,7 +124,7 @@ def make_hall(rng: np.random.Generator) -> Premises:
     """A hall with columns, girders, galleries, doors and what stands about in it."""
     outline = floor_plan(rng) * rng.uniform(4.5, 9.0)
     top = Ceiling(float(rng.uniform(3.5, 12.0)), np.zeros(2))
-    walls = [_pierced(wall, top, rng) for wall in walls_of(outline)]
+    walls = [hall_wall(wall, top, rng) for wall in walls_of(outline)]
     site = Site(walls, top, Floor(outline, CELL), rng)
     keep_doors_free(site)
     parts = [shell(outline, walls, top)]
@@ -141,7 +141,7 @@ def make_hall(rng: np.random.Generator) -> Premises:
     return Premises("hall", join(parts), site.floor)
 
 
-def _pierced(wall: Wall, top: Ceiling, rng: np.random.Generator) -> Wall:
+def hall_wall(wall: Wall, top: Ceiling, rng: np.random.Generator) -> Wall:
     """The wall with gates, doors and a row of windows, nothing above anything else."""
     openings, u = [], float(rng.uniform(0.5, 4.0))
     high = min(top.height - 0.5, rng.uniform(3.0, 4.5))
@@ -412,8 +412,8 @@ def _building(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
     corners = np.array([(-w, -d), (-w, d), (w, d), (w, -d)]) / 2  # clockwise: walls face outward
     top = Ceiling(h, np.zeros(2))
     rise, deep = float(rng.uniform(2.7, 3.8)), float(rng.uniform(0.1, 0.4))
-    walls = [wall_mesh(_facade(wall, h, rise, deep, rng), top) for wall in walls_of(corners)]
-    parts = [*walls, _roof(w, d, h, rng)]
+    walls = [wall_mesh(facade(wall, h, rise, deep, rng), top) for wall in walls_of(corners)]
+    parts = [*walls, roof(w, d, h, rng)]
     for _ in range(int(rng.integers(0, 5))):  # porches, bays, boxes on the wall
         a, b, c = rng.uniform((0.8, 0.5, 0.8), (4.0, 2.0, 3.5))
         side = float(rng.choice((-1, 1)))
@@ -427,7 +427,7 @@ def _building(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
     return [join(parts).moved((place.x, place.y, -0.3), yaw)]
 
 
-def _facade(wall: Wall, h: float, rise: float, deep: float, rng: np.random.Generator) -> Wall:
+def facade(wall: Wall, h: float, rise: float, deep: float, rng: np.random.Generator) -> Wall:
     """The wall with windows in rows, some missing, and doors below."""
     wide, gap = rng.uniform(0.8, 2.2), rng.uniform(0.6, 3.0)
     high, share = rng.uniform(1.0, 1.8), rng.uniform(0.3, 1.0)
@@ -446,7 +446,7 @@ def _facade(wall: Wall, h: float, rise: float, deep: float, rng: np.random.Gener
     return Wall(wall.corner, wall.along, wall.length, tuple(openings))
 
 
-def _roof(w: float, d: float, h: float, rng: np.random.Generator) -> SyntheticMesh:
+def roof(w: float, d: float, h: float, rng: np.random.Generator) -> SyntheticMesh:
     """A flat roof with eaves, or a gable along x."""
     if rng.random() < 0.5:
         return box(w + 0.6, d + 0.6, 0.3, (0, 0, h))
@@ -469,7 +469,7 @@ def _garden_wall(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
 
 # Scenes made to be hard: the same from several sides, or the same again and again.
 #
-# symmetric_box()  -->  Room        corridor(doors)  -->  Room
+# symmetric_box()  -->  Room      corridor(doors)  -->  Room      rng  --symmetric_hall-->  Premises
 
 
 def symmetric_box(side: float = 0.6, hall: float = 12.0) -> Room:
@@ -487,6 +487,39 @@ def symmetric_box(side: float = 0.6, hall: float = 12.0) -> Room:
     outline = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
     top = Ceiling(4.0, np.zeros(2))
     return Room(join([shell(outline, walls_of(outline), top), box(side, side, side)]), outline, top)
+
+
+def symmetric_hall(rng: np.random.Generator) -> Premises:
+    """A hall about the origin that half a turn about z maps onto itself, with all that is in it.
+
+    The half with x > 0 is built as `make_hall` builds a hall; the other is that half, turned.
+    """
+    # whole cells of the floor's grid, less what rounding could add
+    a, b = (CELL * np.round(rng.uniform((8.0, 5.0), (20.0, 13.0)) / CELL) - 1e-9).tolist()
+    outline = _rectangle(-a, a, -b, b)
+    top = Ceiling(float(rng.uniform(3.5, 10.0)), np.zeros(2))
+    walls = walls_of(outline)
+    walls[:2] = [hall_wall(wall, top, rng) for wall in walls[:2]]
+    walls[2:] = [
+        replace(wall, openings=like.openings)
+        for wall, like in zip(walls[2:], walls[:2], strict=True)
+    ]
+    right = _rectangle(0.0, a, -b, b)
+    site = Site(walls, top, Floor(right, CELL), rng)
+    keep_doors_free(site)
+    parts = [*_columns(site, right), *_girders(site, right)]
+    at_walls, free = _KINDS[int(rng.integers(0, len(_KINDS)))]
+    lower, upper = replace(walls[0], corner=np.array([0.0, -b]), length=a), walls[2]
+    for wall in (lower, walls[1], replace(upper, length=a)):
+        parts += along_wall(wall, at_walls, site)
+    parts += in_the_open(free, site)
+    half = join(parts)
+    floor = Floor(outline, CELL)
+    claimed = site.floor.claimed
+    floor.claimed[:] = np.concatenate([claimed[::-1, ::-1], claimed])
+    return Premises(
+        "hall", join([shell(outline, walls, top), half, half.moved(yaw=math.pi)]), floor
+    )
 
 
 def corridor(doors: int, pitch: float = 2.0, width: float = 1.8, height: float = 2.5) -> Room:

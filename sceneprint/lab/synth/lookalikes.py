@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -61,7 +62,7 @@ from sceneprint.lab.synth.mesh import (
 from sceneprint.lab.synth.rooms import Floor, Maker, PiecePose, Room, make_room
 from sceneprint.lab.synth.sensors import KINECT_V1, KinectNoise
 from sceneprint.lab.synth.trajectories import orbit, scattered_poses
-from sceneprint.types import DepthFrame, Floats, Intrinsics
+from sceneprint.types import AnyFrame, DepthFrame, Floats, Intrinsics
 
 KINDS = ("object", "offices", "unmapped", "kitchens", "opposite", "absent")
 #: Kinds of which no two places look alike.
@@ -72,16 +73,20 @@ ELSEWHERE = ("unmapped", "kitchens", "absent")
 APART = ("kitchens", "absent")
 
 
+#: DepthFrame or Cloud
+F_co = TypeVar("F_co", bound=AnyFrame, covariant=True)
+
+
 @dataclass(frozen=True, eq=False)
-class LookalikeSite:
+class LookalikeSite(Generic[F_co]):
     """A map and queries that it may be mistaken about.
 
     Parameters
     ----------
     name : "object-000" and so on
-    kind : one of KINDS
+    kind : one of KINDS, or of `lookalike_surveys.SURVEYED_KINDS`
     seed, index : what it was made from
-    map, queries : depth in whole millimetres where noisy; pose is T_world_camera
+    map, queries : depth in whole millimetres where noisy, and T_world_camera; or clouds
     present : whether the queries were taken at a place of the map
     """
 
@@ -89,8 +94,8 @@ class LookalikeSite:
     kind: str
     seed: int
     index: int
-    map: tuple[DepthFrame, ...]
-    queries: tuple[DepthFrame, ...]
+    map: tuple[F_co, ...]
+    queries: tuple[F_co, ...]
     present: bool
 
     @property
@@ -116,7 +121,7 @@ def synthesise_lookalike(
     queries: int = 12,
     noise: KinectNoise | None = KINECT_V1,
     intrinsics: Intrinsics = KINECT,
-) -> LookalikeSite:
+) -> LookalikeSite[DepthFrame]:
     """Build a site that looks like itself or like another, and take depth frames of it.
 
     The outcome depends on the arguments only.
@@ -366,12 +371,14 @@ class Likeness:
     shift, turn : standard deviation by which pieces stand elsewhere, metres and radians
     loose_shift : of chairs and boxes, metres
     same_load : chance that the same things lie on a piece
+    missing : chance that a piece is not there
     """
 
     shift: float = 0.0
     turn: float = 0.0
     loose_shift: float = 0.2
     same_load: float = 0.6
+    missing: float = 0.0
 
 
 _OFFICE: tuple[Maker, ...] = (desk, desk, shelf, cupboard)
@@ -436,6 +443,8 @@ def furnish(
     """
     parts = []
     for number, one in enumerate(placed):
+        if likeness.missing and rng.random() < likeness.missing:
+            continue
         shift = likeness.loose_shift if one.loose else likeness.shift
         turn = 2 * likeness.loose_shift if one.loose else likeness.turn
         dx, dy = rng.normal(0, 1, 2) * shift

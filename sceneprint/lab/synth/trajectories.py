@@ -301,7 +301,7 @@ def scattered(premises: Premises, n: int, rng: np.random.Generator) -> list[Floa
     spots = premises.floor.points[premises.walkable]
     height = float(rng.uniform(0.5, 1.9))
     chosen = spots[rng.integers(0, len(spots), n)]
-    return [_pose(x, y, height, rng.uniform(-math.pi, math.pi), rng) for x, y in chosen]
+    return [scanner_pose(x, y, height, rng.uniform(-math.pi, math.pi), rng) for x, y in chosen]
 
 
 def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STEP) -> list[Floats]:
@@ -339,12 +339,13 @@ def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STE
     height = float(rng.uniform(0.5, 1.9))
     mounted = float(rng.uniform(-math.pi, math.pi))
     return [
-        _pose(x, y, height, mounted + math.atan2(dy, dx), rng)
+        scanner_pose(x, y, height, mounted + math.atan2(dy, dx), rng)
         for (x, y), (dx, dy) in zip(xy, ahead, strict=True)
     ]
 
 
-def _pose(x: float, y: float, z: float, yaw: float, rng: np.random.Generator) -> Floats:
+def scanner_pose(x: float, y: float, z: float, yaw: float, rng: np.random.Generator) -> Floats:
+    """T_world_sensor (4, 4) of a scanner that is carried nearly upright, about 2 cm off z."""
     roll, pitch = rng.normal(0, math.radians(1.5), 2)
     T = np.eye(4)
     across = rotation_z(math.pi / 2) @ rotation_x(float(pitch)) @ rotation_z(-math.pi / 2)
