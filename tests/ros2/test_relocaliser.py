@@ -313,11 +313,11 @@ def test_up_is_sent_while_the_robot_is_at_rest(ros: SimpleNamespace) -> None:
         writer.transforms(1.0, {("odom", "base_link"): np.eye(4)})
         with scripted() as (core, client):
             run(core, writer.written)
-        told = client.asked[0]["up"]
+        up = client.asked[0]["meta"].up
         if expected is None:
-            assert told is None
+            assert up is None
         else:
-            np.testing.assert_allclose(told, expected, atol=1e-9)
+            np.testing.assert_allclose((up.x, up.y, up.z), expected, atol=1e-9)
 
 
 def test_what_cannot_be_used_is_told_and_the_robot_goes_on(ros: SimpleNamespace) -> None:
