@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from benchmarks.lookalikes import ask_site
+from sceneprint.lab.evaluation.protocol import Error, JudgedAnswer
+from sceneprint.lab.evaluation.sites import RIGHT_SCAN, kinds_of
+from sceneprint.lab.synth.lookalike_surveys import SURVEYED_KINDS
+from sceneprint.lab.synth.lookalikes import KINDS, ORDINARY
 from sceneprint.models import read_model
 from sceneprint.pipeline import Signer, open_signer
 
@@ -34,3 +40,29 @@ def test_a_prior_decides_between_places_that_look_alike() -> None:
     told_where = ask_site(signer, ("object", 0, 2), seed=5, prior=(0.0, 0.3))
     assert [one.answer.status for one in told_where] == ["found", "found"]
     assert max(one.answer.error.metres for one in told_where) < 0.1
+
+
+def test_a_model_is_asked_at_places_of_its_sensor() -> None:
+    assert kinds_of(read_model("depth")) == KINDS + ORDINARY
+    assert kinds_of(read_model("lidar")) == SURVEYED_KINDS
+
+
+def test_the_answer_of_a_scanner_may_be_five_times_as_far_off() -> None:
+    for metres, right, gross in ((0.45, True, False), (0.55, False, False), (2.6, False, True)):
+        scanned, seen = (
+            JudgedAnswer("found", "strong", Error(share * metres, 0.1), limits=limits)
+            for share, limits in ((1.0, RIGHT_SCAN), (0.2, (0.10, 10.0)))
+        )
+        assert (scanned.right, scanned.grossly_wrong) == (right, gross)
+        assert (seen.right, seen.grossly_wrong) == (right, gross)
+    turned = JudgedAnswer("found", "weak", Error(0.0, math.radians(16)), limits=RIGHT_SCAN)
+    assert (turned.right, turned.grossly_wrong) == (False, True)
+
+
+@pytest.mark.thorough
+def test_a_scanned_site_is_asked() -> None:
+    signer = open_signer(read_model("lidar"))
+    (answer,) = ask_site(signer, ("bays", 0, 1), seed=1)
+    assert (answer.site, answer.answerable) == ("bays-000", True)
+    assert answer.answer.limits == RIGHT_SCAN
+    assert answer.answer.status == "not_found" or answer.answer.error.metres < 100.0

@@ -161,6 +161,7 @@ class JudgedAnswer:
     error : of the pose in the map; infinite without one, and in another parent frame
     milliseconds : that the answer took, from R on
     places : that the answer was chosen from, the likeliest first
+    limits : metres and degrees to which a pose is to be right; those of a depth camera by default
     """
 
     status: AnswerStatus = "not_found"
@@ -168,16 +169,18 @@ class JudgedAnswer:
     error: Error = Error()
     milliseconds: float = 0.0
     places: tuple[JudgedPlace, ...] = ()
+    limits: tuple[float, float] = RIGHT
 
     @property
     def right(self) -> bool:
-        """Whether it is found within 10 cm and 10 degrees."""
-        return self.status == "found" and self.error.within(*RIGHT)
+        """Whether it is found within its limits, 10 cm and 10 degrees by default."""
+        return self.status == "found" and self.error.within(*self.limits)
 
     @property
     def grossly_wrong(self) -> bool:
-        """Whether it is found, but beyond 50 cm or 15 degrees."""
-        return self.status == "found" and not self.error.within(*GROSS)
+        """Whether it is found, but beyond 50 cm or 15 degrees; with other limits in proportion."""
+        gross = [g * limit / r for g, limit, r in zip(GROSS, self.limits, RIGHT, strict=True)]
+        return self.status == "found" and not self.error.within(*gross)
 
 
 @dataclass(frozen=True, eq=False)

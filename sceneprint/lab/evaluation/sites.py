@@ -14,19 +14,21 @@ from sceneprint.errors import UselessFrame
 from sceneprint.geometry.rigid import turned
 from sceneprint.lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
 from sceneprint.lab.evaluation.protocol import JudgedAnswer, SignedFrame, overlaps, view_of
-from sceneprint.lab.synth.lookalikes import (
-    KINDS,
-    ORDINARY,
-    LookalikeSite,
-    synthesise_lookalike,
-)
+from sceneprint.lab.synth import synthesise_lookalike, synthesise_lookalike_survey
+from sceneprint.lab.synth.lookalike_surveys import SURVEYED_KINDS
+from sceneprint.lab.synth.lookalikes import KINDS, ORDINARY, LookalikeSite
 from sceneprint.localization import PosePrior
+from sceneprint.models import Model
 from sceneprint.pipeline import Signer, prepare
-from sceneprint.types import AnyFrame, Floats, Geometry
+from sceneprint.types import AnyFrame, Cloud, Floats, Geometry
 from sceneprint_client.poses import rotation_of
 
 #: From this overlap, smaller direction, a frame of the map is enough to answer a query.
 ANSWERABLE = 0.3
+#: So near, in metres, a scan of the map is near enough to answer a query of a scanner.
+ANSWERABLE_M = 10.0
+#: Metres and degrees to which the pose of a scanner is to be right: half of what is one place.
+RIGHT_SCAN = (0.5, 10.0)
 #: Deviations that a robot states with its prior, and how far that is turned at most, degrees.
 PRIOR_M, PRIOR_DEG = 0.3, 10.0
 
@@ -38,7 +40,7 @@ class SiteAnswer:
     Parameters
     ----------
     site, kind, query : where the query was taken, and its number there
-    answerable : whether a frame of the map overlaps it enough
+    answerable : whether a frame of the map overlaps it enough, or a scan of the map is near
     answer : see JudgedAnswer
     """
 
@@ -127,6 +129,15 @@ def prior_about(
     return PosePrior(parent, T, np.diag(np.square(deviations)))
 
 
+def kinds_of(model: Model) -> tuple[str, ...]:
+    """Return the kinds of sites of the sensor that a model was trained for."""
+    return SURVEYED_KINDS if _is_of_scans(model) else KINDS + ORDINARY
+
+
+def _is_of_scans(model: Model) -> bool:
+    return bool(model.provenance.get("training", {}).get("scenes") == "sites")
+
+
 def ask_site(
     signer: Signer,
     work: tuple[str, int, int],
@@ -141,8 +152,9 @@ def ask_site(
 
     Parameters
     ----------
-    signer : see `open_signer`
-    work : kind, index and number of queries
+    signer : see `open_signer`; its model decides whether sites are seen by a depth camera or
+        scanned by a laser
+    work : kind, of `kinds_of`, index and number of queries
     seed : of the collection
     candidates : size of C
     prior : least and most metres that the robot's prior is off; None: it has none
@@ -150,15 +162,19 @@ def ask_site(
     confidence : least of a pose that is found; default: that of LocalizationParameters
     """
     kind, index, queries = work
-    rng = np.random.default_rng([seed, index, (KINDS + ORDINARY).index(kind)])
-    site = synthesise_lookalike(kind, seed, index, queries=queries)
+    model, of_scans = signer.model, _is_of_scans(signer.model)
+    rng = np.random.default_rng([seed, index, kinds_of(model).index(kind)])
+    site: LookalikeSite[AnyFrame] = (
+        synthesise_lookalike_survey(kind, seed, index, queries=queries)
+        if of_scans
+        else synthesise_lookalike(kind, seed, index, queries=queries)
+    )
     frames = site.map if flaws is None else with_flaws(site.map, flaws, rng)
     shown, database, of_map = signed(frames, site.name, signer, 0)
     # of another place: a pose in its own frame is a pose in no map
     scene = site.name if site.same_frame else f"{site.name}, elsewhere"
     sent, asked, of_queries = signed(site.queries, scene, signer, len(database))
     geometries = [*of_map, *of_queries]
-    model = signer.model
     judge = Judge(
         geometries.__getitem__, "full", 0, model.parameters.validation, database=database,
         answer=model.answer,
@@ -182,6 +198,8 @@ def ask_site(
         )  # fmt: skip
         believed = None if prior is None else prior_about(query.pose, site.name, *prior, rng)
         answer = answer_of(judge, task, believed)
+        if of_scans:
+            answer = replace(answer, limits=RIGHT_SCAN)
         answers.append(SiteAnswer(site.name, kind, number, able[number], answer))
     return answers
 
@@ -189,8 +207,13 @@ def ask_site(
 def _answerable(
     site: LookalikeSite[AnyFrame], shown: Sequence[AnyFrame], sent: Sequence[AnyFrame]
 ) -> list[bool]:
-    """Return, for each query, whether a frame of the map overlaps it enough."""
+    """Return, for each query, whether a frame of the map overlaps it enough, or a scan is near."""
     if not site.present:
         return [False] * len(sent)
+    if isinstance(sent[0], Cloud):
+        here, there = (np.array([f.pose[:3, 3] for f in frames if f.pose is not None])
+                       for frames in (sent, shown))  # fmt: skip
+        apart = np.linalg.norm(here[:, None] - there, axis=2)
+        return [bool(least < ANSWERABLE_M) for least in apart.min(axis=1)]
     seen = overlaps([view_of(q) for q in sent], [view_of(d) for d in shown])
     return [bool(most >= ANSWERABLE) for most in seen.least.max(axis=1)]
