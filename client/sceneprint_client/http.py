@@ -199,6 +199,7 @@ class QueryOptions(TypedDict, total=False):
     diversity: Diversity | dict[str, float] | None
     validation: ValidationOptions | dict[str, Any] | None
     prior: Prior | dict[str, Any] | None
+    confidence: float
     deadline_ms: int | None
     explain: bool
     explain_frame: str | None

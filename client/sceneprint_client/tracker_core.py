@@ -54,7 +54,7 @@ class TrackerParameters:
     gate_m, gate_deg : two poses that differ by less are one place, beside what drift explains
     apart_m, apart_deg : two views that differ by more, in either, are independent
     strong_weight, weak_weight : of an answer `found`: with strong matches from two viewpoints or
-        more and no rival near, and any other
+        more, and any other
     alternative_weight : of all alternatives of an ambiguous answer together
     need : weight by which a place must lead for a first fix
     ratio : of the weight of answers `found` there to those anywhere else, for a first fix
@@ -110,7 +110,7 @@ class PoseEvidence:
     ----------
     parent_frame : of the map
     T_map_sensor : (4, 4)
-    weight : of an alternative, as the service says it
+    weight : of an alternative, beside the others: its confidence
     covariance : (6, 6) of errors (x, y, z, rx, ry, rz), metres and radians, or None
     """
 
@@ -128,7 +128,7 @@ class Observation:
     ----------
     status : of the answer; `unanswered` where none came
     poses : the pose that was found, or the alternatives of an ambiguous answer
-    strong : `found` by strong matches from two viewpoints or more, and no rival near
+    strong : `found` by strong matches from two viewpoints or more
     by_prior : `found` because the prior decided
     reason : of the answer
     earlier : (4, 4) T_odom_sensor of each earlier frame that the question was asked with
@@ -150,15 +150,14 @@ def observation_of(answer: Localization) -> Observation:
         pose = PoseEvidence(
             answer.pose.parent_frame, rigid_transform(np.array(answer.pose.matrix)), 1.0, covariance
         )
-        near = answer.rival_ratio is not None and answer.rival_ratio > 0.5
-        strong = answer.strength == "strong" and answer.support >= 2 and not near
+        strong = answer.strength == "strong" and answer.support >= 2
         return Observation("found", (pose,), strong, answer.verified_by == "prior", answer.reason)
     if answer.status == "found":
         return Observation("not_found", reason="No frame that matched has a pose in the map.")
     poses = tuple(
         PoseEvidence(
             one.pose.parent_frame, rigid_transform(np.array(one.pose.matrix)),
-            max(one.weight, one.score or 0.0, 1e-3),
+            max(one.confidence or 0.0, 1e-3),
         )
         for one in answer.alternatives
     )  # fmt: skip

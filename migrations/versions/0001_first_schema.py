@@ -334,6 +334,7 @@ def _create_queries() -> None:
         sa.Column("reason", TEXT, nullable=False),
         sa.Column("pose_parent", _string(128)),
         sa.Column("pose", sa.JSON()),
+        sa.Column("confidence", sa.Float()),
         sa.Column("support", WHOLE),
         sa.Column("rival_ratio", sa.Float()),
         sa.Column("alternatives", WHOLE, nullable=False),

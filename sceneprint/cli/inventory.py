@@ -22,6 +22,7 @@ from sceneprint.cli.options import (
     one_line,
     open_client,
     open_scene,
+    percent,
     up_of,
 )
 from sceneprint.errors import InvalidRequest
@@ -344,7 +345,8 @@ def _where_or_why(one: QueryRecord) -> str:
     t = one.pose.translation
     place = f"{t.x:.2f} {t.y:.2f} {t.z:.2f} m in {one_line(one.pose.parent_frame)}"
     views = "1 view" if one.support == 1 else f"{one.support} views"
-    return f"{place}, {views}"
+    sure = "" if one.confidence is None else f", {percent(one.confidence)}"
+    return f"{place}, {views}{sure}"
 
 
 # `sceneprint jobs`: the jobs of a service, given up or tried again.

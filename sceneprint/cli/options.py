@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import math
 import os
 import signal
 import sys
@@ -293,6 +294,11 @@ def one_line(text: str) -> str:
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
+def percent(confidence: float) -> str:
+    """A confidence for people, rounded down, so that none looks better than it is."""
+    return f"{math.floor(1000 * min(confidence, 0.999)) / 10:.1f} %"
+
+
 def add_seed_option(command: argparse.ArgumentParser) -> None:
     """Add --seed, of the random choices of a validation."""
     command.add_argument(
@@ -336,6 +342,13 @@ def add_asking_options(command: argparse.ArgumentParser) -> None:
         help="set a validation option, such as mode=paper or residual_m=0.05; repeatable",
     )
     command.add_argument(
+        "--confidence",
+        type=float,
+        default=0.99,
+        metavar="P",
+        help="least probability of a pose that is found, 0.5 to 0.999 (default: 0.99)",
+    )
+    command.add_argument(
         "--deadline-ms",
         type=positive,
         metavar="MS",
@@ -364,6 +377,7 @@ def options_of(options: argparse.Namespace) -> dict[str, Any]:
         "candidates": options.candidates,
         "diversity": settings_of(options.diversity),
         "validation": settings_of(options.validation),
+        "confidence": options.confidence,
         "deadline_ms": options.deadline_ms,
         "explain": options.explain,
         "explain_frame": options.explain_frame,

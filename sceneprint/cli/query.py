@@ -27,6 +27,7 @@ from sceneprint.cli.options import (
     open_client,
     open_scene,
     options_of,
+    percent,
     stamps_of,
 )
 from sceneprint.errors import (
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
         Localization,
         Location,
         Match,
+        PlaceEvidence,
         Transform,
     )
 
@@ -269,9 +271,11 @@ def answer_lines(name: str, answer: Answer) -> list[str]:
     of = f"{counts.map}"
     if counts.passed != counts.map:
         of = f"{counts.passed} that pass the filter, of {counts.map}"
+    there = answer.location or next(iter(answer.alternatives), None)
+    sure = "" if there is None else _percent(there.confidence)
     lines = [
-        f"{one_line(name)}: {answer.status.replace('_', ' ')} ({tried}{counts.ranked} ranked of "
-        f"{of} frames, {answer.milliseconds.get('total', 0.0):.0f} ms)"
+        f"{one_line(name)}: {answer.status.replace('_', ' ')}{sure} ({tried}{counts.ranked} "
+        f"ranked of {of} frames, {answer.milliseconds.get('total', 0.0):.0f} ms)"
     ]
     if answer.matches:
         several = len(answer.maps) > 1
@@ -314,7 +318,7 @@ _DECIDED = {
 
 
 def _grounds(there: Location | Localization) -> str:
-    """What a pose that is found rests on, and how near another place comes."""
+    """What a pose that is found rests on, and what the map says of it and of other places."""
     if there.support == 0:
         voted = "no match votes for it"
     elif there.support == 1:
@@ -324,10 +328,26 @@ def _grounds(there: Location | Localization) -> str:
         voted = f"{there.support} of {there.votes} accepted matches vote for it ({there.strength})"
         if there.spread_m is not None and there.spread_deg is not None:
             voted += f", spread {100 * there.spread_m:.1f} cm, {there.spread_deg:.1f} deg"
-    rival = "not compared with other places"
-    if there.rival_ratio is not None:
-        rival = f"the next best place fits {there.rival_ratio:.0%} as well"
-    return f"{voted}; {_DECIDED[there.verified_by or 'matches']}; {rival}"
+    why = _evidence(there.evidence)
+    return f"{voted}; {_DECIDED[there.verified_by or 'matches']}; {why}"
+
+
+def _evidence(e: PlaceEvidence | None) -> str:
+    """The evidence that a confidence was computed from, in a line."""
+    if e is None:
+        return "not compared with other places"
+    rival = "no other place fits"
+    if e.rival >= 0.05:
+        rival = f"the next best place fits {e.rival:.0%} as well"
+    return (
+        f"{e.planes:.0f} planes and {e.frames} frames of the map agree, "
+        f"{max(e.excess, 0.0):.0%} is missing, {rival}"
+    )
+
+
+def _percent(confidence: float | None) -> str:
+    """A confidence behind a status; nothing where there is none."""
+    return "" if confidence is None else f" {percent(confidence)}"
 
 
 def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
@@ -337,14 +357,13 @@ def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
     head = f"  {len(alternatives)} poses are supported; at most one is right:"
     if len(alternatives) == 1:
         head = "  one pose is supported, and not confirmed:"
-    lines = [head]
-    for one in alternatives:
-        score = "not compared with the map" if one.score is None else f"score {one.score:.2f}"
-        lines.append(
-            f"    {metres(one.pose)} m in {one_line(one.pose.parent_frame)}, weight "
-            f"{one.weight:.1f}, support {one.support}, {score}"
-        )
-    return lines
+    places = [
+        f"  {_percent(one.confidence):>7}  {metres(one.pose)} m in "
+        f"{one_line(one.pose.parent_frame)}, weight {one.weight:.1f}, support {one.support}; "
+        f"{_evidence(one.evidence)}"
+        for one in alternatives
+    ]
+    return [head, *places]
 
 
 def _label(match: Match, several: bool) -> str:
@@ -516,7 +535,8 @@ def localization_lines(name: str, there: Localization) -> list[str]:
     sure = f" ({there.strength})" if there.strength else ""
     several = f"{there.frames} frames, " if there.frames > 1 else ""
     lines = [
-        f"{one_line(name)}: {there.status.replace('_', ' ')}{sure}; {one_line(there.reason)} "
+        f"{one_line(name)}: {there.status.replace('_', ' ')}{_percent(there.confidence)}{sure}; "
+        f"{one_line(there.reason)} "
         f"({several}{there.milliseconds.get('total', 0.0):.0f} ms)"
     ]
     if there.cause is not None:

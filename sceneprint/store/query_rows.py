@@ -55,6 +55,7 @@ class _Query:
     reason: str
     pose_parent: str | None
     pose: Sequence[float] | None
+    confidence: float | None
     support: int | None
     rival_ratio: float | None
     alternatives: int
@@ -77,7 +78,8 @@ class NewQuery(_Query):
     robot, session : who sent it, and in which run, as far as is known
     status, cause, reason : of the answer; or `failed`, the type of the error, and its text
     pose_parent, pose : x, y, z, qx, qy, qz, qw of T_parent_query where it was found
-    support, rival_ratio : of that pose
+    confidence : of that pose, or of the best alternative
+    support, rival_ratio : of the pose that was found
     alternatives : number of poses that the evidence supports as well
     milliseconds : duration
     kind : of the frame, if it was read

@@ -420,6 +420,7 @@ queries = Table(
     Column("reason", TEXT, nullable=False),
     Column("pose_parent", _string(128)),
     Column("pose", JSON(none_as_null=True)),  # T_parent_query: x, y, z, qx, qy, qz, qw
+    Column("confidence", Float),
     Column("support", WHOLE),
     Column("rival_ratio", Float),
     Column("alternatives", WHOLE, nullable=False),

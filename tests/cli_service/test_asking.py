@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -86,10 +87,11 @@ def test_a_query_says_where_frames_were_lost(
 def test_a_frame_is_localized(sceneprint: Run, maps: dict[str, list[str]], rooms: Path) -> None:
     frame = rooms / "room-0" / "seq-01" / "frame-000001.depth.png"
     lines = sceneprint("localize", "near", frame).stdout.splitlines()
-    assert ": found (strong); " in lines[0]
+    assert re.search(r": found 99\.\d % \(strong\); ", lines[0])
     assert lines[1].startswith("  at ")
     assert " m in room-0/seq-01, rotation " in lines[1]
-    told = sceneprint("localize", "near", rooms / "room-0", "--json", expect=1).stdout.splitlines()
+    alone = ("localize", "near", rooms / "room-0", "--last", 1, "--json")
+    told = sceneprint(*alone, expect=1).stdout.splitlines()
     there = [json.loads(line) for line in told]
     assert [one["status"] for one in there] == ["found", "found", "not_found"]
     assert [one["matches"][0] for one in there[:2]] == maps["near"]
@@ -125,7 +127,8 @@ def test_an_ambiguous_place_is_told_with_its_alternatives(
     told = json.loads(sceneprint("localize", "sides", file, "--json", expect=1).stdout)
     assert (told["status"], told["pose"], len(told["alternatives"])) == ("ambiguous", None, 4)
     located = sceneprint("localize", "sides", file, expect=1).stdout.splitlines()
-    assert f"/view: ambiguous; {told['reason']} (" in located[0]
+    sure = floored(told["confidence"])
+    assert f"/view: ambiguous {sure} %; {told['reason']} (" in located[0]
     queried = sceneprint("query", "sides", file).stdout.splitlines()
     assert queried[-6] == f"  {told['reason']}"
     assert located[1:] == queried[-5:]
@@ -133,13 +136,20 @@ def test_an_ambiguous_place_is_told_with_its_alternatives(
     places = []
     for line, one in zip(located[2:], told["alternatives"], strict=True):
         place = re.fullmatch(
-            r"    (\S+) (\S+) (\S+) m in hall, weight 0\.4, support 1, score (\S+)", line
+            r" +(\S+) %  (\S+) (\S+) (\S+) m in hall, weight 0\.4, support 1; (\d+) planes and "
+            r"(\d+) frames of the map agree, (\d+)% is missing, .*",
+            line,
         )
         assert place is not None, line
-        *xyz, score = map(float, place.groups())
+        sure, *xyz = map(float, place.groups()[:4])
+        assert sure == floored(one["confidence"])
+        evidence = one["evidence"]
+        planes, frames, missing = map(int, place.groups()[4:])
+        assert (planes, frames) == (round(evidence["planes"]), evidence["frames"])
+        assert missing == round(100 * max(evidence["excess"], 0))
         places.append(complex(*xyz[:2]))
         t = one["pose"]["translation"]
-        assert [*xyz, score] == pytest.approx([t["x"], t["y"], t["z"], one["score"]], abs=6e-3)
+        assert xyz == pytest.approx([t["x"], t["y"], t["z"]], abs=6e-3)
     # the true place turned about the cube by 0, 90, 180 and 270 degrees
     true = complex(truth[0][3], truth[1][3])
     turned = sorted((true * 1j**i for i in range(4)), key=lambda z: (z.real, z.imag))
@@ -147,6 +157,11 @@ def test_an_ambiguous_place_is_told_with_its_alternatives(
     assert [abs(a - b) for a, b in zip(turned, found, strict=True)] == pytest.approx(
         [0] * 4, abs=0.1
     )
+
+
+def floored(confidence: float) -> float:
+    """Per cent, as printed: rounded down to a tenth."""
+    return math.floor(1000 * min(confidence, 0.999)) / 10
 
 
 def test_frames_of_a_folder_are_asked_with_those_before_them(
@@ -223,7 +238,7 @@ def test_queries_that_came_are_listed(sceneprint: Run, service_url: str, rooms: 
     assert " ".join(head.split()) == "query came status ms map robot/session where or why"
     assert found.pose is not None
     t = found.pose.translation
-    place = f"{t.x:.2f} {t.y:.2f} {t.z:.2f} m in room-0, 1 view"
+    place = f"{t.x:.2f} {t.y:.2f} {t.z:.2f} m in room-0, 1 view, {floored(found.confidence)} %"
     assert re.fullmatch(
         rf"{found.query_id}  \S+ \S+  found +\d+  asked  spot\S*/seq-01  {place}", first
     ), first

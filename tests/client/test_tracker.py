@@ -21,11 +21,16 @@ from sceneprint.lab.synth import KINECT, SynthRoom, corridor, render, synthesise
 from sceneprint.lab.synth.trajectories import pose as camera_pose
 from sceneprint.types import DepthFrame, Floats, Intrinsics
 from sceneprint_client import AsyncTracker, Client, Tracker, errors
-from sceneprint_client.api import FrameMeta, GivenPose, Localization
+from sceneprint_client.api import Alternative, FrameMeta, GivenPose, Localization
 from sceneprint_client.api.base import GivenDirection
 from sceneprint_client.frame_files import camera_of
 from sceneprint_client.tracker import State, TrackerParameters, replay
-from sceneprint_client.tracker_core import difference, inverse, rotation_matrix
+from sceneprint_client.tracker_core import (
+    difference,
+    inverse,
+    observation_of,
+    rotation_matrix,
+)
 
 DEPTH = np.ones((3, 4), np.float32)
 K = (5.0, 5.0, 1.5, 1.0)
@@ -48,7 +53,7 @@ def answer(status: str, x: float = 0.0, **fields: Any) -> Localization:
         "verified_by": "matches" if found else None, "rival_ratio": 0.0 if found else None,
         "best": None, "matches": [], "query_id": "q", "seed": 0, "model": "depth",
         "milliseconds": {},
-        "alternatives": [{"pose": pose, "weight": 1, "support": 1, "score": 0.5}]
+        "alternatives": [{"pose": pose, "confidence": 0.5, "weight": 1, "support": 1, "score": 0.5}]
         if status == "ambiguous" else [],
         **fields,
     }  # fmt: skip
@@ -131,8 +136,8 @@ def test_its_state_is_the_prior_of_the_next_question() -> None:
     assert tracker.update(DEPTH, ahead(2), stamp=2.0).age == 1.0
 
 
-def test_weak_and_rivalled_answers_are_no_fix_alone() -> None:
-    for fields in ({"support": 1}, {"strength": "weak"}, {"rival_ratio": 0.6}):
+def test_weak_answers_are_no_fix_alone() -> None:
+    for fields in ({"support": 1}, {"strength": "weak"}):
         tracker = Tracker(fake(answer("found", 5.0, **fields)), "m", camera=K)
         assert tracker.update(DEPTH, ahead(0), stamp=0.0).status == "lost"
     told = answer("found", 5.0, verified_by="prior")
@@ -215,6 +220,17 @@ def test_what_the_thread_meets_is_raised_by_the_next_submit() -> None:
         assert tracker.wait(PATIENCE_S)
         with pytest.raises(errors.UnknownMap):
             tracker.submit(DEPTH, ahead(1), stamp=1.0)
+
+
+def test_alternatives_weigh_by_their_confidence() -> None:
+    pose = answer("found", 5.0).pose
+    alternatives = [
+        Alternative(pose=pose, confidence=p, weight=2, support=1, score=0.9)
+        for p in (0.6, 0.3, 0.0, None)
+    ]
+    unsure = answer("ambiguous").model_copy(update={"alternatives": alternatives})
+    weights = [one.weight for one in observation_of(unsure).poses]
+    assert weights == [0.6, 0.3, 0.001, 0.001]
 
 
 # Several frames in one question, while no place is tracked.

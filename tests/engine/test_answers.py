@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -92,6 +93,9 @@ def test_an_answer_has_the_numbers_of_the_library(
     assert place is not None
     assert np.array(answer.location.pose.matrix).tobytes() == place.average.T.tobytes()
     assert answer.location.spread_m == place.average.spread_m
+    assert answer.location.confidence == place.confidence
+    evidence = asdict(place.alternatives[0].evidence)
+    assert answer.location.evidence.model_dump() == pytest.approx(evidence, abs=5e-4)
     ranks = {m.frame_id: (m.rank, m.diversity_gain) for m in answer.matches}
     assert ranks == {
         names[others[ranking.indices[i]]]: (i + 1, gain)

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from sceneprint.engine import Engine
 from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.engine.search.answer import Outcome, answer_status
 from sceneprint.engine.search.query import localization_of
-from sceneprint.engine.search.verification import Validated
+from sceneprint.engine.search.verification import Validated, numbers_of
 from sceneprint.errors import InvalidPose, InvalidRequest
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
@@ -26,6 +27,7 @@ from sceneprint.localization import (
     localize,
     views_of_rows,
 )
+from sceneprint.models import read_model
 from sceneprint.pipeline import PairMatch, Signature, Signer, associate, diversify, retrieve
 from sceneprint.store.maps import placed_frames
 from sceneprint.types import Geometry, Patches
@@ -151,6 +153,24 @@ def test_the_paper_s_test_asks_no_other_frames(full: Engine, uploads: Any) -> No
         there = localized(full, uploads[8], validation={"mode": mode})
         assert (there.status, there.verified_by) == ("found", "matches")
         assert (there.rival_ratio is not None) is told
+        assert (there.confidence is not None) is told
+        assert (there.evidence is not None) is told
+
+
+def test_a_query_says_how_sure_a_pose_must_be(full: Engine, uploads: Any) -> None:
+    sure = localized(full, uploads[8], confidence=0.5)
+    assert (sure.status, sure.evidence.rival) == ("found", sure.rival_ratio)
+    asked = full.queries.upload(
+        ["hall"], uploads[8].data, uploads[8].meta, Query(confidence=0.5, keep=False)
+    )
+    assert asked.location.confidence == sure.confidence
+    model = read_model("depth")
+    for wanted in (0.5, 0.99, 0.999):
+        assert numbers_of(model, Query(confidence=wanted)).confidence == wanted
+    assert numbers_of(model, Query()).confidence == 0.99
+    for wrong in (0.49, 1.0):
+        with pytest.raises(ValidationError, match="confidence"):
+            Query(confidence=wrong)
 
 
 def test_candidates_near_a_prior_are_tried_first(full: Engine, uploads: Any, ids: Ids) -> None:

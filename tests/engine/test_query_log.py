@@ -36,7 +36,15 @@ from sceneprint.store.events import Wanted, list_events
 from sceneprint.store.frame_queries import QueryOrigin
 from sceneprint.store.query_rows import NewQuery, WantedQueries, drop_answers, keep_answer
 from sceneprint.store.tables import queries
-from sceneprint_client.api import Answer, Counts, NamedFrame, NewMap, Query, SeveralQuery
+from sceneprint_client.api import (
+    Alternative,
+    Answer,
+    Counts,
+    NamedFrame,
+    NewMap,
+    Query,
+    SeveralQuery,
+)
 
 COUNTS = Counts(map=0, passed=0, compared=0, ranked=0, selected=0, validated=0, accepted=0)
 EVERY = WantedQueries()
@@ -56,8 +64,8 @@ def row(number: int, **more: object) -> NewQuery:
     one = NewQuery(
         id=f"{number:032x}", at=time.time() + number, map="hall", maps=None, robot=None,
         session=None, status="not_found", cause="nothing_alike", reason="why", pose_parent=None,
-        pose=None, support=None, rival_ratio=None, alternatives=0, milliseconds=12.5, kind="depth",
-        frame_map=None, frame_id=None, key_id=None, listed=True,
+        pose=None, confidence=None, support=None, rival_ratio=None, alternatives=0,
+        milliseconds=12.5, kind="depth", frame_map=None, frame_id=None, key_id=None, listed=True,
     )  # fmt: skip
     return replace(one, **more)
 
@@ -122,12 +130,22 @@ def test_answers_and_failures_become_rows(full, uploads):
     assert found == NewQuery(
         id=answer.query_id, at=7.0, map="hall", maps=None, robot="spot", session="monday",
         key_id=None, status="found", cause=None, reason=answer.reason, pose_parent=one.room,
-        pose=(t.x, t.y, t.z, r.x, r.y, r.z, r.w), support=answer.location.support,
-        rival_ratio=answer.location.rival_ratio, alternatives=0, milliseconds=250.0, kind="depth",
-        frame_map=None, frame_id=None, listed=True,
+        pose=(t.x, t.y, t.z, r.x, r.y, r.z, r.w), confidence=answer.location.confidence,
+        support=answer.location.support, rival_ratio=answer.location.rival_ratio,
+        alternatives=0, milliseconds=250.0, kind="depth", frame_map=None, frame_id=None,
+        listed=True,
     )  # fmt: skip
     # the pose is where the frame was taken, not only what the answer says
     assert found.pose[:3] == pytest.approx(one.pose[:3, 3], abs=0.03)
+    assert found.confidence >= 0.99
+    pose = answer.location.pose
+    alternatives = [Alternative(pose=pose, confidence=p, weight=1, support=1, score=0.5)
+                    for p in (0.7, 0.2)]  # fmt: skip
+    unsure = answer.model_copy(
+        update={"status": "ambiguous", "location": None, "alternatives": alternatives}
+    )
+    unsure_row = query_row(SentQuery(["hall"], query), unsure, 0.25)
+    assert (unsure_row.pose, unsure_row.confidence, unsure_row.alternatives) == (None, 0.7, 2)
     failed = query_row(SentQuery(["hall"], Query(), at=8.0), FrameError("no samples"), 0.002)
     assert (failed.status, failed.cause, failed.reason) == ("failed", "frame-error", "no samples")
     assert (failed.pose, failed.milliseconds) == (None, 2.0)

@@ -234,10 +234,52 @@ class Match(ApiRecord):
 Verifier = Literal["matches", "map", "prior"]
 
 
+class PlaceEvidence(ApiRecord):
+    """What speaks for and against a pose; its `confidence` is computed from these numbers."""
+
+    score: float = Field(
+        description="How well the map's frames bear the pose out: `share`, less for what they saw "
+        "through; at most 1."
+    )
+    share: float = Field(
+        description="Share of the query's surface that the map shows there, every plane counting "
+        "the same."
+    )
+    planes: float = Field(description="Distinct planes of the query that agree with the map.")
+    frames: int = Field(description="Frames of the map that agree.")
+    viewpoints: int = Field(description="Different viewpoints of these frames.")
+    excess: float = Field(
+        description="Share of what should be in sight and is missing, in the query or in the map, "
+        "beyond what the map's own frames miss among themselves."
+    )
+    weight: float = Field(
+        description="Of the matches that vote for the pose, one for each viewpoint: 1 of a strong "
+        "match, 0.4 of a weak or an ambiguous one."
+    )
+    strong: int = Field(description="Different viewpoints of strong matches that vote for it.")
+    suggested: int = Field(
+        description="Different viewpoints of candidates that suggest it, accepted or not."
+    )
+    rival: float = Field(
+        description="Score of the best pose at another place, as a share of `score`; 0 where there "
+        "is none."
+    )
+    rival_weight: float = Field(
+        description="Largest weight of the matches that vote for another place."
+    )
+
+
+_CONFIDENCE = "Probability that the pose is right, 0 to 1. Null where the map was not asked."
+
+
 class Alternative(ApiRecord):
     """A pose of the query that the evidence supports; of several, one is right at most."""
 
     pose: Transform
+    confidence: float | None = Field(default=None, description=_CONFIDENCE)
+    evidence: PlaceEvidence | None = Field(
+        default=None, description="What `confidence` was computed from; null likewise."
+    )
     map: str | None = Field(default=None, description="Whose parent frame it is given in.")
     weight: float = Field(
         description="Of its votes, one for each viewpoint: 1 of a strong match, 0.4 of a weak or "
@@ -255,6 +297,10 @@ class Location(ApiRecord):
     """The query's pose averaged over the accepted matches that agree on it."""
 
     pose: Transform
+    confidence: float | None = Field(default=None, description=_CONFIDENCE)
+    evidence: PlaceEvidence | None = Field(
+        default=None, description="What `confidence` was computed from; null likewise."
+    )
     map: str | None = Field(default=None, description="Whose frames it is averaged over.")
     support: int = Field(
         description="Matches that agree on it; 0 where the map alone confirms it, and 1 is one "
@@ -442,6 +488,13 @@ class Query(Given):
         "it is refined on the map beside the search over all; it decides only between poses that "
         "the map bears out alike.",
     )
+    confidence: float = Field(
+        default=0.99,
+        ge=0.5,
+        le=0.999,
+        description="Least confidence of a pose that is `found`. All other places together have "
+        "at most the rest.",
+    )
     deadline_ms: int | None = Field(
         default=None,
         ge=1,
@@ -542,9 +595,10 @@ class Answer(ApiRecord):
 
     query_id: str
     status: AnswerStatus = Field(
-        description="`found`: one pose is supported, and no other comes near; where no accepted "
-        "match has a pose, a match is accepted. `ambiguous`: the evidence supports several poses, "
-        "or one that it does not confirm: never drive on it. `not_found`: nothing is supported, "
+        description="`found`: the confidence of one pose reaches that of the query; where no "
+        "accepted match has a pose, a match is accepted. `ambiguous`: the evidence supports one "
+        "pose or several, and none with that confidence: never drive on it. `not_found`: nothing "
+        "is supported, "
         "see `cause`. `unvalidated`: validation was not asked for, or the deadline came before a "
         "match was accepted."
     )
@@ -615,9 +669,9 @@ class Localization(ApiRecord):
     """Where the query was taken, if that is known."""
 
     status: LocalizationStatus = Field(
-        description="`found`: one pose is supported, and no other comes near. `ambiguous`: several "
-        "are, see `alternatives`, or one that is not confirmed: move on and ask again. "
-        "`not_found`: none is, see `cause`, or the deadline came before."
+        description="`found`: the confidence of one pose reaches that of the query. `ambiguous`: "
+        "none does, see `alternatives`: move on and ask again. `not_found`: no pose is supported, "
+        "see `cause`, or the deadline came before."
     )
     reason: str
     cause: Cause | None = Field(default=None, description="The likeliest of `not_found`.")
@@ -625,6 +679,14 @@ class Localization(ApiRecord):
     pose: Transform | None = Field(
         description="T_parent_query: the query's camera in the parent frame of its matches' "
         "poses. Null unless `found`, and where no accepted match has a pose: see `best`."
+    )
+    confidence: float | None = Field(
+        default=None,
+        description="Probability that `pose` is right, 0 to 1; of `ambiguous`, that the first of "
+        "`alternatives` is. Null where there is no pose, or the map was not asked.",
+    )
+    evidence: PlaceEvidence | None = Field(
+        default=None, description="What `confidence` was computed from; null likewise."
     )
     support: int = Field(
         description="Matches that agree on the pose; 1 is one view, which nothing confirms."

@@ -73,6 +73,10 @@ class QueryRecord(ApiRecord):
     )
     reason: str
     pose: RecordedPose | None = Field(description="Of `found`, where the matches have poses.")
+    confidence: float | None = Field(
+        description="Probability that `pose` is right, or of `ambiguous` the best alternative; "
+        "null where the map was not asked."
+    )
     support: int | None = Field(description="Number of matches that agree on `pose`.")
     rival_ratio: float | None = Field(description="How near another place comes, 0 to 1.")
     alternatives: int = Field(

@@ -530,6 +530,7 @@ def localization_of(answer: Answer) -> Localization:
     if answer.status in ("found", "ambiguous"):
         status = answer.status
     there = answer.location
+    judged = there if there is not None else next(iter(answer.alternatives), None)
     strength = there.strength if there is not None else None
     if there is None and status == "found":  # of matches without a pose
         strength = accepted[0].validation.strength
@@ -539,6 +540,8 @@ def localization_of(answer: Answer) -> Localization:
         cause=answer.cause,
         map=answer.maps[0],
         pose=None if there is None else there.pose,
+        confidence=None if judged is None else judged.confidence,
+        evidence=None if judged is None else judged.evidence,
         support=0 if there is None else there.support,
         votes=0 if there is None else there.votes,
         spread_m=None if there is None else there.spread_m,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -35,6 +35,7 @@ from sceneprint.geometry.retrieval.ranking import (
     similarity,
 )
 from sceneprint.geometry.rigid import inverse
+from sceneprint.geometry.validation.confidence import PlaceEvidence
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.localization import PoseEstimate
 from sceneprint.models import Model
@@ -57,6 +58,7 @@ from sceneprint_client.api import Match as ToldMatch
 from sceneprint_client.api import Validation as ToldValidation
 from sceneprint_client.api.base import Vector
 from sceneprint_client.api.query import FreeDirection, Lost, Outcome, Stage, Uncertainty
+from sceneprint_client.api.query import PlaceEvidence as ToldEvidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +132,8 @@ def location_record(found: Candidates, estimate: PoseEstimate | None) -> ToldLoc
     return ToldLocation(
         pose=transform(average.T, parent, found.query_frame),
         map=found.maps[int(number)],
+        confidence=estimate.confidence,
+        evidence=evidence_record(estimate.alternatives[0].evidence),
         support=len(estimate.members),
         guided=estimate.guided,
         votes=estimate.votes,
@@ -152,12 +156,22 @@ def alternative_records(found: Candidates, estimate: PoseEstimate | None) -> lis
         ToldAlternative(
             pose=transform(one.T, parent, found.query_frame),
             map=found.maps[int(number)],
+            confidence=one.confidence,
+            evidence=evidence_record(one.evidence),
             weight=one.weight,
             support=one.support,
             score=one.score,
         )
         for one in estimate.alternatives
     ]
+
+
+def evidence_record(evidence: PlaceEvidence | None) -> ToldEvidence | None:
+    """Return as JSON what speaks for and against a pose; shares are rounded to a tenth of 1 %."""
+    if evidence is None:
+        return None
+    rounded = {name: round(value, 3) for name, value in asdict(evidence).items()}
+    return ToldEvidence.model_validate(rounded)
 
 
 def _match(

@@ -219,7 +219,10 @@ def numbers_of(model: Model, query: Query) -> LocalizationParameters:
     """Return the numbers of an answer: those of the model, and what a query asks of an answer."""
     answer = model.answer
     return LocalizationParameters(
-        map=answer.map, judgement=answer.confidence, voted_only=query.validation is not None
+        confidence=query.confidence,
+        map=answer.map,
+        judgement=answer.confidence,
+        voted_only=query.validation is not None,
     )
 
 
