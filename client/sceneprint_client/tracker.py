@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import json
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from threading import Condition, RLock, Thread
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
@@ -24,14 +25,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint_client import errors
-from sceneprint_client.api import GivenPose, Prior
+from sceneprint_client.api import FrameMeta, GivenPose, Localization, Prior
+from sceneprint_client.http import frame_bytes
+from sceneprint_client.poses import rigid_transform
 from sceneprint_client.tracker_core import (
     Observation,
     PoseEvidence,
     State,
     TrackerCore,
     TrackerParameters,
+    inverse,
+    is_new_view,
     observation_of,
+    spaced_views,
 )
 
 if TYPE_CHECKING:
@@ -44,14 +50,27 @@ __all__ = ["AsyncTracker", "Observation", "State", "Tracker", "TrackerParameters
 
 #: Why no answer came, and may come the next time.
 _AWAY = (errors.Unreachable, errors.Busy, errors.RateLimited, errors.StoreAway, errors.StoreLocked)
+#: Age of a frame from which on later questions are not asked with it, seconds.
+_OLDEST_S = 30.0
 #: Statuses of HTTP from here on are faults of the service, or of what stands before it.
 _FIRST_FAULT = 500
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A frame as it is sent: alone, or again with later ones."""
+
+    stamp: float
+    T_odom_sensor: NDArray[np.float64]
+    data: bytes
+    meta: FrameMeta
 
 
 class Tracker:
     """Where a robot is in a map: `lost`, `ambiguous` or `tracking`, with T_map_odom.
 
-    Each update asks the service once, and waits for the answer: see AsyncTracker.
+    Each update asks the service once, and waits for the answer: see AsyncTracker. Unless it is
+    tracking, the service gets the latest frames together (`TrackerParameters.frames`).
 
     Parameters
     ----------
@@ -72,6 +91,7 @@ class Tracker:
     ) -> None:  # fmt: skip
         self._client, self._map, self._camera = client, map_name, camera
         self._core = TrackerCore(parameters)
+        self._views: deque[_View] = deque(maxlen=self._core.parameters.frames)
         self._lock = RLock()
         self.epoch = 0  #: how often it was reset
         self._log = log
@@ -119,6 +139,7 @@ class Tracker:
         """
         with self._lock:
             self.epoch += 1
+            self._views.clear()
             self._write({"reset": reason})
             return self._core.reset(reason)
 
@@ -127,37 +148,77 @@ class Tracker:
         stamp: float, meta: MetaInput | None, epoch: int,
     ) -> State:  # fmt: skip
         """As `update`; an answer to a frame of an `epoch` before the last reset is not used."""
-        T_odom_sensor = np.asarray(odom_pose, np.float64)
+        T_odom_sensor = rigid_transform(np.asarray(odom_pose, np.float64))
+        camera = self._camera if meta is None else meta
+        view = _View(stamp, T_odom_sensor, *frame_bytes(frame, camera, with_pose=False, up=up))
         with self._lock:
             prior = self._core.prior(T_odom_sensor)
-        observation = self._observe(frame, up, meta, prior)
+            earlier = self._earlier(view)
+        observation, is_readable = self._observe(view, earlier, prior)
         with self._lock:
             if epoch != self.epoch:
                 return self._core.state()
             state = self._core.update(stamp, T_odom_sensor, observation)
+            if state.status == "tracking":
+                self._views.clear()
+            elif is_readable:
+                self._remember(view)
             line = {"stamp": stamp, "odometry": _listed(odom_pose)}
             self._write({**line, "observation": _observation_json(observation)})
             return state
 
+    def _earlier(self, view: _View) -> list[_View]:
+        """Return the earlier frames that a question is asked with; none while tracking."""
+        views = [one for one in self._views if 0 <= view.stamp - one.stamp <= _OLDEST_S]
+        poses = [one.T_odom_sensor for one in (*views, view)]
+        places = spaced_views(poses, self._core.parameters.frames)
+        return [views[place] for place in places[:-1]]
+
+    def _remember(self, view: _View) -> None:
+        """Keep a frame for later questions; a robot that stands still keeps what it saw before."""
+        if not self._views or is_new_view(self._views[-1].T_odom_sensor, view.T_odom_sensor):
+            self._views.append(view)
+
     def _observe(
-        self, frame: FrameInput, up: Sequence[float] | None, meta: MetaInput | None,
-        prior: PoseEvidence | None,
-    ) -> Observation:  # fmt: skip
-        """What the service says of a frame."""
+        self, view: _View, earlier: list[_View], prior: PoseEvidence | None
+    ) -> tuple[Observation, bool]:
+        """Return what the service says of a frame, and whether it answered with the frame."""
         try:
-            answer = self._client.localize(
-                self._map, frame, self._camera if meta is None else meta, up=up, keep=False,
-                prior=None if prior is None else _given_prior(prior),
-            )  # fmt: skip
+            answer, used = self._localize(view, earlier, prior)
         except errors.UselessFrame as error:
-            return Observation("not_found", reason=str(error))
+            return Observation("not_found", reason=str(error)), False
         except _AWAY as error:
-            return Observation("unanswered", reason=f"no answer: {error}")
+            return Observation("unanswered", reason=f"no answer: {error}"), False
         except errors.Refused as error:
             if error.status < _FIRST_FAULT:
                 raise
-            return Observation("unanswered", reason=f"no answer: {error}")
-        return observation_of(answer)
+            return Observation("unanswered", reason=f"no answer: {error}"), False
+        poses = tuple(one.T_odom_sensor for one in used)
+        return replace(observation_of(answer), earlier=poses), True
+
+    def _localize(
+        self, view: _View, earlier: list[_View], prior: PoseEvidence | None
+    ) -> tuple[Localization, list[_View]]:
+        """Ask the service; returns its answer, and the earlier frames that it rests on."""
+        given = None if prior is None else _given_prior(prior)
+        if earlier:
+            back = inverse(view.T_odom_sensor)  # only what lies between the frames counts
+            sent = [*earlier, view]
+            metas = [_with_odometry(one.meta, back @ one.T_odom_sensor) for one in sent]
+            frames = [one.data for one in sent]
+            try:
+                answer = self._client.localize_sequence(
+                    self._map, frames, metas, keep=False, prior=given
+                )
+            except (errors.FrameError, errors.TooLarge):
+                pass  # asking with the frame alone tells whether the earlier ones are at fault
+            else:
+                return answer, earlier
+        answer = self._client.localize(self._map, view.data, view.meta, keep=False, prior=given)
+        if earlier:
+            with self._lock:
+                self._views.clear()
+        return answer, []
 
     def _write(self, line: dict[str, Any]) -> None:
         if self._log is not None:
@@ -300,6 +361,7 @@ def _observation_json(observation: Observation) -> dict[str, Any]:
     return {
         "status": observation.status, "poses": poses, "strong": observation.strong,
         "by_prior": observation.by_prior, "reason": observation.reason,
+        "earlier": [_listed(one) for one in observation.earlier],
     }  # fmt: skip
 
 
@@ -311,7 +373,10 @@ def _observation_from(line: dict[str, Any]) -> Observation:
         )
         for one in line["poses"]
     )  # fmt: skip
-    return Observation(line["status"], poses, line["strong"], line["by_prior"], line["reason"])
+    earlier = tuple(map(_matrix, line["earlier"]))
+    return Observation(
+        line["status"], poses, line["strong"], line["by_prior"], line["reason"], earlier
+    )
 
 
 def _given_prior(pose: PoseEvidence) -> Prior:
@@ -319,3 +384,8 @@ def _given_prior(pose: PoseEvidence) -> Prior:
         raise AssertionError("the tracker knows how sure it is")
     given = GivenPose(parent_frame=pose.parent_frame, matrix=pose.T_map_sensor.tolist())
     return Prior(pose=given, covariance=_listed(pose.covariance))
+
+
+def _with_odometry(meta: FrameMeta, T_odom_sensor: NDArray[np.float64]) -> FrameMeta:
+    pose = GivenPose(parent_frame="odom", matrix=T_odom_sensor.tolist())
+    return meta.model_copy(update={"pose": pose})

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Literal
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint_client.api import Localization
+from sceneprint_client.api.query import MOST_OF_SEQUENCE
 from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.poses import rigid_transform
 
@@ -34,6 +35,11 @@ _ANSWER_M, _ANSWER_RAD = 0.03, math.radians(1.0)
 _PRIOR_FACTOR = 2.0
 #: Moves of odometry whose distance is remembered: answers come late by fewer.
 _MOST_MARKS = 4096
+#: Views of one question differ by at least one of these, so that each shows something new.
+_SPACING_M, _SPACING_RAD = 0.1, math.radians(6.0)
+#: Views farther back on the way are not used: by then odometry may be off by centimetres, and what
+#: is farther still is a jump.
+_LONGEST_WAY_M, _LONGEST_TURN_RAD = 3.0, math.radians(120.0)
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,8 @@ class TrackerParameters:
     most_undecided_m : distance that answers may stay undecided between places, or rest on the
         prior, before the state is ambiguous
     alone_every : every so many questions one is asked without a prior
+    frames : with how many of the latest frames a question is asked while the robot is lost or
+        ambiguous, 1 to 10; 1 asks with each frame alone
     """
 
     drift: float = 0.01
@@ -83,6 +91,15 @@ class TrackerParameters:
     most_deviation_m: float = 0.3
     most_undecided_m: float = 10.0
     alone_every: int = 4
+    frames: int = 3
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.frames <= MOST_OF_SEQUENCE:
+            raise InvalidRequest(
+                f"A question cannot be asked with {self.frames} frames. Set `frames` to 1 to "
+                f"{MOST_OF_SEQUENCE}.",
+                (("frames", f"not from 1 to {MOST_OF_SEQUENCE}"),),
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +131,7 @@ class Observation:
     strong : `found` by strong matches from two viewpoints or more, and no rival near
     by_prior : `found` because the prior decided
     reason : of the answer
+    earlier : (4, 4) T_odom_sensor of each earlier frame that the question was asked with
     """
 
     status: Literal["found", "ambiguous", "not_found", "unanswered"]
@@ -121,6 +139,7 @@ class Observation:
     strong: bool = False
     by_prior: bool = False
     reason: str = ""
+    earlier: tuple[Array, ...] = ()
 
 
 def observation_of(answer: Localization) -> Observation:
@@ -175,12 +194,16 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """A place of the odometry: pose, and the way until there in metres and radians."""
+    """A place of the odometry: pose, and the way until there in metres and radians.
+
+    `earlier` are the poses of the earlier frames that an answer rests on as well.
+    """
 
     stamp: float
     T_odom_sensor: Array
     distance: float
     angle: float
+    earlier: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +274,7 @@ class TrackerCore:
             self._verdict = self._tracked(self._marks[-1]) if self._belief else (status, reason)
             return self.state()
         self._answers += 1
+        mark = replace(mark, earlier=observation.earlier)
         self._vote(mark, observation)
         if self._belief is None:
             self._verdict = self._fixed(mark, observation)
@@ -322,8 +346,15 @@ class TrackerCore:
         return p.drift * way, turned
 
     def _apart(self, a: _Mark, b: _Mark) -> bool:
-        step, turn = difference(a.T_odom_sensor, b.T_odom_sensor)
-        return step > self.parameters.apart_m or turn > math.radians(self.parameters.apart_deg)
+        """Return whether two answers are independent: each view of one differs from each of the
+        other.
+        """
+        A, B = (np.stack([one.T_odom_sensor, *one.earlier]) for one in (a, b))
+        steps = np.linalg.norm(A[:, None, :3, 3] - B[None, :, :3, 3], axis=2)
+        # the trace of a rotation is 1 + 2 cos(angle)
+        cosines = (np.einsum("aij,bij->ab", A[:, :3, :3], B[:, :3, :3]) - 1) / 2
+        turned = cosines < math.cos(math.radians(self.parameters.apart_deg))
+        return bool(np.all((steps > self.parameters.apart_m) | turned))
 
     # Votes, and the first fix.
 
@@ -554,6 +585,37 @@ def difference(a: Array, b: Array) -> tuple[float, float]:
     """Metres and radians between two poses (4, 4)."""
     angle = float(np.linalg.norm(rotation_vector(a[:3, :3].T @ b[:3, :3])))
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), angle
+
+
+def spaced_views(poses: Sequence[Array], most: int) -> list[int]:
+    """Return which of the last views of a way a question is asked with.
+
+    Parameters
+    ----------
+    poses : (4, 4) T_odom_sensor of each view, in the order they were taken
+    most : views, the last one included
+
+    Returns
+    -------
+    places : of the views, in order; the last one is that of `poses`. Any two differ by 0.1 m or 6
+        degrees, and the way from each to the last is at most 3 m long and turns by 120 degrees.
+    """
+    last = len(poses) - 1
+    chosen, way, turned = [last], 0.0, 0.0
+    for place in range(last - 1, -1, -1):
+        step, turn = difference(poses[place], poses[place + 1])
+        way, turned = way + step, turned + turn
+        if len(chosen) >= most or way > _LONGEST_WAY_M or turned > _LONGEST_TURN_RAD:
+            break
+        if all(is_new_view(poses[place], poses[one]) for one in chosen):
+            chosen.append(place)
+    return chosen[::-1]
+
+
+def is_new_view(a: Array, b: Array) -> bool:
+    """Return whether two poses (4, 4) are 0.1 m or 6 degrees apart."""
+    step, turn = difference(a, b)
+    return step >= _SPACING_M or turn >= _SPACING_RAD
 
 
 def rotation_vector(R: Array) -> Array:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.atomic_files import check_writable, write_whole
-from sceneprint.cli import whole_number
+from sceneprint.cli import positive
 from sceneprint.cli.bag import add_recording_options, sequences_at
 from sceneprint.cli.options import (
     add_asking_options,
@@ -29,14 +29,23 @@ from sceneprint.cli.options import (
     options_of,
     stamps_of,
 )
-from sceneprint.errors import DatasetError, FrameError, MissingDependency, TooLarge, UnknownFrame
+from sceneprint.errors import (
+    DatasetError,
+    FrameError,
+    InvalidPose,
+    MissingDependency,
+    TooLarge,
+    UnknownFrame,
+)
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client.api.base import CameraIntrinsics
 from sceneprint_client.api.query import MOST_OF_SEQUENCE
 from sceneprint_client.api.results import COLOURS, TRANSFORMS
+from sceneprint_client.tracker_core import spaced_views
 
 if TYPE_CHECKING:
     from sceneprint.scenes.scene import SceneStream
+    from sceneprint.types import Floats
     from sceneprint_client import Client
     from sceneprint_client.api import (
         Alternative,
@@ -362,6 +371,9 @@ def _degrees(transform: Transform | None) -> str:
 
 # `sceneprint localize`: where in a map was this frame taken? One pose, or why there is none.
 
+#: With how many frames each is looked up by default, and how many before it these may be.
+_LAST, _FARTHEST_BACK = 3, 200
+
 
 def add_localize(commands: Any) -> None:
     """Describe the command to the parser."""
@@ -379,9 +391,10 @@ def add_localize(commands: Any) -> None:
         "--frame", metavar="N|FILE", help="frame of a folder: index from 0, or name (default: all)"
     )
     command.add_argument(
-        "--last", type=whole_number, default=1, metavar="K",
-        help="ask with the K last frames up to --frame (default: the last), 2 to 10, whose poses "
-        "in the folder are the odometry (default: 1, each frame alone)",
+        "--last", type=positive, metavar="K",
+        help="look each frame up together with the frames before it, K in all, 1 to 10: those "
+        "that were taken 0.1 m or 6 degrees apart. Their poses in the folder are used as odometry "
+        "(default: 3 where frames have poses and --up is not given; 1: each frame alone)",
     )  # fmt: skip
     command.add_argument("--json", action="store_true", help="print JSON")
     add_up_option(command)
@@ -404,12 +417,8 @@ def run_localize(options: argparse.Namespace) -> int:
     with open_client(options) as client, open_scene(options) as stream:
         scene = _answer_scene(client, stream, chosen, options)
         for reference in chosen:
-            before = _frames_before(options, every, reference)
             try:
-                if before:
-                    there = client.localize_sequence(options.map, [*before, reference], **how)
-                else:
-                    there = client.localize(options.map, reference, up=options.up, **how)
+                there = _localize(client, options, every, reference, how)
             except (FrameError, MissingDependency, TooLarge) as error:  # of this file alone
                 if len(chosen) == 1:
                     raise
@@ -431,16 +440,21 @@ def run_localize(options: argparse.Namespace) -> int:
 def _frames_to_localize(
     options: argparse.Namespace, every: list[FrameReference]
 ) -> list[FrameReference]:
-    """All frames; that of `--frame`; or, of a sequence that ends anywhere, the last one.
+    """Return all frames, or that of `--frame`.
 
     Raises
     ------
-    DatasetError : no such frame, or a prior of several.
+    DatasetError : no such frame, a prior of several, or --last that cannot be used.
     """
+    if options.last is not None and options.last > MOST_OF_SEQUENCE:
+        raise DatasetError(f"--last {options.last}: choose from 1 to {MOST_OF_SEQUENCE}.")
+    if options.up is not None and (options.last or 1) > 1:
+        raise DatasetError(
+            "--up is of one frame. Leave --last out, or have `up` in the intrinsics.json beside "
+            "the frames."
+        )
     if options.frame is not None:
         return _wanted_frame(options.path, options.frame, every)
-    if options.last > 1:
-        return every[-1:]
     if options.prior is not None and len(every) > 1:
         raise DatasetError(
             f"{options.path} has {len(every)} frames, and --prior is of one. Name it with --frame."
@@ -448,37 +462,62 @@ def _frames_to_localize(
     return every
 
 
+def _localize(
+    client: Client, options: argparse.Namespace, every: list[FrameReference],
+    reference: FrameReference, how: dict[str, Any],
+) -> Localization:  # fmt: skip
+    """Look a frame up with those before it; alone where the service refuses one of these."""
+    before = _frames_before(options, every, reference)
+    if before:
+        try:
+            return client.localize_sequence(options.map, [*before, reference], **how)
+        except (FrameError, TooLarge):
+            pass  # asking with the frame alone tells whether the earlier ones are at fault
+    return client.localize(options.map, reference, up=options.up, **how)
+
+
 def _frames_before(
     options: argparse.Namespace, every: list[FrameReference], reference: FrameReference
 ) -> list[FrameReference]:
-    """The frames of a sequence before its last one; DatasetError where it cannot be asked so."""
-    if options.last == 1:
+    """Return the frames of its sequence that a frame is looked up with.
+
+    Raises
+    ------
+    DatasetError : --last asks for some, and the frame has no pose.
+    """
+    most = options.last or (_LAST if options.up is None else 1)
+    if most == 1:
         return []
-    if not 2 <= options.last <= MOST_OF_SEQUENCE:
-        raise DatasetError(f"--last {options.last}: choose from 1 to {MOST_OF_SEQUENCE}.")
-    if options.up is not None:
+    if reference.pose is None:
+        if options.last is None:
+            return []
         raise DatasetError(
-            "--up is of one frame. Leave --last out, or have `up` in the intrinsics.json beside "
-            "the frames."
+            f"{reference.name} has no pose, and --last {options.last} needs odometry. Leave --last "
+            "out, or put the poses beside the frames."
         )
     run = reference.name.rpartition("/")[0]
     frames = [frame for frame in every if frame.name.rpartition("/")[0] == run]
-    place = [f.path for f in frames].index(reference.path)
-    before = frames[max(place - options.last + 1, 0) : place]
-    if len(before) < options.last - 1:
-        raise DatasetError(
-            f"{reference.name}: {len(before)} frames come before it, and --last {options.last} "
-            f"needs {options.last - 1}. Choose a later --frame, or a smaller --last."
-        )
-    return before
+    place = [frame.path for frame in frames].index(reference.path)
+    posed = [(one, pose) for one in frames[max(place - _FARTHEST_BACK, 0) : place + 1]
+             if (pose := _pose_or_none(one)) is not None]  # fmt: skip
+    return [posed[i][0] for i in spaced_views([pose for _, pose in posed], most)[:-1]]
+
+
+def _pose_or_none(reference: FrameReference) -> Floats | None:
+    """Its pose; None where it has none, or its file holds none, as where tracking was lost."""
+    try:
+        return reference.pose
+    except InvalidPose:
+        return None
 
 
 def localization_lines(name: str, there: Localization) -> list[str]:
     """A localization for people."""
     sure = f" ({there.strength})" if there.strength else ""
+    several = f"{there.frames} frames, " if there.frames > 1 else ""
     lines = [
         f"{one_line(name)}: {there.status.replace('_', ' ')}{sure}; {one_line(there.reason)} "
-        f"({there.milliseconds.get('total', 0.0):.0f} ms)"
+        f"({several}{there.milliseconds.get('total', 0.0):.0f} ms)"
     ]
     if there.cause is not None:
         lines.append(f"  cause: {there.cause}")

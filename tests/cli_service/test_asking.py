@@ -149,22 +149,35 @@ def test_an_ambiguous_place_is_told_with_its_alternatives(
     )
 
 
-def test_the_last_frames_of_a_folder_are_asked_together(
-    sceneprint: Run, maps: dict[str, list[str]], rooms: Path, capsys: Any
+def test_frames_of_a_folder_are_asked_with_those_before_them(
+    sceneprint: Run, maps: dict[str, list[str]], rooms: Path, tmp_path: Path
 ) -> None:
-    asked = ("localize", "near", rooms / "room-0", "--frame", 1, "--json")
-    alone = json.loads(sceneprint(*asked).stdout)
-    both = json.loads(sceneprint(*asked, "--last", 2).stdout)
-    assert (alone["status"], both["status"]) == ("found", "found")
+    asked = ("localize", "near", rooms / "room-0")
+    first, both = map(json.loads, sceneprint(*asked, "--json").stdout.splitlines())
+    alone = json.loads(sceneprint(*asked, "--frame", 1, "--json", "--last", 1).stdout)
+    assert [one["frames"] for one in (first, both, alone)] == [1, 2, 1]
     assert both["votes"] > alone["votes"]  # the frame before votes too
     here, there = (np.array(one["pose"]["matrix"]) for one in (alone, both))
     assert np.linalg.norm(here[:3, 3] - there[:3, 3]) < 0.05
+    assert " (2 frames, " in sceneprint(*asked, "--frame", 1).stdout
+    up = json.loads(
+        sceneprint(*asked, "--frame", 1, "--up", "0,-1,0", "--json", expect=None).stdout
+    )
+    assert up["frames"] == 1
+    # without poses beside them each frame is alone
+    for file in (rooms / "room-0").rglob("*"):
+        if file.is_file() and not file.name.endswith("pose.txt"):
+            bare = tmp_path / file.relative_to(rooms)
+            bare.parent.mkdir(parents=True, exist_ok=True)
+            bare.write_bytes(file.read_bytes())
+    one = ("localize", "near", tmp_path / "room-0", "--frame", 1)
+    assert json.loads(sceneprint(*one, "--json").stdout)["frames"] == 1
     for wrong, text in (
-        (("--last", 3), "1 frames come before it, and --last 3 needs 2"),
-        (("--last", 11), "--last 11: choose from 1 to 10"),
-        (("--last", 2, "--up", "0,-1,0"), "--up is of one frame"),
+        ((*asked, "--last", 11), "--last 11: choose from 1 to 10"),
+        ((*asked, "--last", 2, "--up", "0,-1,0"), "--up is of one frame"),
+        ((*one, "--last", 2), "has no pose, and --last 2 needs odometry"),
     ):
-        assert text in sceneprint(*asked, *wrong, expect=2).stderr
+        assert text in sceneprint(*wrong, expect=2).stderr
 
 
 def test_a_prior_is_a_file_or_json(

@@ -5,7 +5,7 @@ through synthetic buildings, kidnapped and beside what looks alike.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +22,7 @@ from sceneprint.lab.synth.trajectories import pose as camera_pose
 from sceneprint.types import DepthFrame, Floats, Intrinsics
 from sceneprint_client import AsyncTracker, Client, Tracker, errors
 from sceneprint_client.api import FrameMeta, GivenPose, Localization
+from sceneprint_client.api.base import GivenDirection
 from sceneprint_client.frame_files import camera_of
 from sceneprint_client.tracker import State, TrackerParameters, replay
 from sceneprint_client.tracker_core import difference, inverse, rotation_matrix
@@ -67,13 +68,31 @@ class FakeClient:
         self.may_answer.set()
 
     def localize(self, map_name: str, frame: Any, meta: Any = None, **how: Any) -> Localization:
-        self.asked.append({"map": map_name, "frame": frame, "meta": meta, **how})
+        return self.answer({"map": map_name, "frames": [depth_of(frame)], "metas": [meta], **how})
+
+    def localize_sequence(self, map_name: str, frames: Any, metas: Any, **how: Any) -> Localization:
+        seen = [depth_of(one) for one in frames]
+        return self.answer({"map": map_name, "frames": seen, "metas": metas, **how})
+
+    def answer(self, asked: dict[str, Any]) -> Localization:
+        self.asked.append(asked)
         self.begun.set()
         assert self.may_answer.wait(PATIENCE_S)
         told = self.answers[min(len(self.asked), len(self.answers)) - 1]
         if isinstance(told, Exception):
             raise told
         return told
+
+
+def depth(metres: float) -> np.ndarray:
+    return np.full((3, 4), metres, np.float32)
+
+
+def depth_of(data: bytes) -> float:
+    """The depth of a frame of `depth`, as it was sent."""
+    sent = np.load(io.BytesIO(data))
+    assert (sent.shape, sent.min()) == ((3, 4), sent.max())
+    return float(sent[0, 0])
 
 
 def ahead(x: float) -> np.ndarray:
@@ -98,10 +117,13 @@ def test_its_state_is_the_prior_of_the_next_question() -> None:
     tracker = Tracker(client, "m", camera=K)
     state = tracker.update(DEPTH, ahead(0), stamp=0.0, up=(0, -1, 0))
     assert (state.status, state.parent_frame) == ("tracking", "map")
-    tracker.update(DEPTH, ahead(1), stamp=1.0, meta=FrameMeta())
+    tracker.update(DEPTH, ahead(1), stamp=1.0, meta=camera_of(K, (4, 3)))
     first, second = client.asked
-    assert (first["map"], first["meta"], first["up"], first["prior"]) == ("m", K, (0, -1, 0), None)
-    assert second["meta"] == FrameMeta()
+    (meta,) = first["metas"]
+    up = GivenDirection(x=0, y=-1, z=0)
+    assert (first["map"], first["frames"], first["prior"]) == ("m", [1.0], None)
+    assert (meta.intrinsics, meta.up) == (camera_of(K, (4, 3)), up)
+    assert second["metas"] == [FrameMeta(intrinsics=camera_of(K, (4, 3)))]
     assert second["prior"].pose.parent_frame == "map"
     np.testing.assert_allclose(second["prior"].pose.matrix, ahead(6), atol=1e-9)
     covariance = np.reshape(second["prior"].covariance, (6, 6))
@@ -155,16 +177,16 @@ def test_a_thread_asks_for_the_latest_frame_alone() -> None:
     client.may_answer.clear()
     log = io.StringIO()
     with AsyncTracker(Tracker(client, "m", camera=K, log=log)) as tracker:
-        assert tracker.submit("0", ahead(0), stamp=0.0).status == "lost"
+        assert tracker.submit(depth(0), ahead(0), stamp=0.0).status == "lost"
         assert client.begun.wait(PATIENCE_S)
         for i in (1, 2, 3):
-            assert tracker.submit(str(i), ahead(i), stamp=float(i)).status == "lost"
+            assert tracker.submit(depth(i), ahead(i), stamp=float(i)).status == "lost"
         assert not tracker.wait(0)
         client.may_answer.set()
         assert tracker.wait(PATIENCE_S)
-        assert [one["frame"] for one in client.asked] == ["0", "3"]
+        assert [one["frames"] for one in client.asked] == [[0.0], [3.0]]
         assert tracker.dropped == 2
-        state = tracker.submit("4", ahead(4), stamp=4.0)
+        state = tracker.submit(depth(4), ahead(4), stamp=4.0)
         assert (state.status, state.age) == ("tracking", 1.0)
         np.testing.assert_allclose(state.T_map_sensor, ahead(9), atol=1e-9)
         assert tracker.wait(PATIENCE_S)
@@ -176,15 +198,15 @@ def test_an_answer_to_a_frame_from_before_a_reset_is_not_used() -> None:
     client.may_answer.clear()
     inner = Tracker(client, "m", camera=K)
     with AsyncTracker(inner) as tracker:
-        tracker.submit("0", ahead(0), stamp=0.0)
+        tracker.submit(DEPTH, ahead(0), stamp=0.0)
         assert client.begun.wait(PATIENCE_S)
-        tracker.submit("1", ahead(1), stamp=1.0)
+        tracker.submit(DEPTH, ahead(1), stamp=1.0)
         assert inner.reset("a lift").reason == "a lift"
         client.may_answer.set()
         assert tracker.wait(PATIENCE_S)
-        assert tracker.submit("2", ahead(0), stamp=0.5).status == "lost"  # the clock began anew
+        assert tracker.submit(DEPTH, ahead(0), stamp=0.5).status == "lost"  # the clock began anew
         assert tracker.wait(PATIENCE_S)
-        assert tracker.submit("3", ahead(0), stamp=0.6).status == "tracking"
+        assert tracker.submit(DEPTH, ahead(0), stamp=0.6).status == "tracking"
 
 
 def test_what_the_thread_meets_is_raised_by_the_next_submit() -> None:
@@ -193,6 +215,93 @@ def test_what_the_thread_meets_is_raised_by_the_next_submit() -> None:
         assert tracker.wait(PATIENCE_S)
         with pytest.raises(errors.UnknownMap):
             tracker.submit(DEPTH, ahead(1), stamp=1.0)
+
+
+# Several frames in one question, while no place is tracked.
+
+
+def asked_with(tracker: Tracker, xs: Sequence[float], client: FakeClient) -> list[list[float]]:
+    """Depths of the frames of each question; the depth of a frame is its place on the way."""
+    for i, x in enumerate(xs):
+        tracker.update(depth(x), ahead(x), stamp=float(i))
+    return [one["frames"] for one in client.asked]
+
+
+def test_while_it_is_lost_it_asks_with_the_latest_frames_that_differ() -> None:
+    client = fake(answer("not_found"), answer("ambiguous"))
+    tracker = Tracker(client, "m", camera=K)
+    told = asked_with(tracker, [5, 5.05, 5.2, 5.4, 5.41, 5.8, 8.75], client)
+    # 5.05 is too near to 5, and 5.41 to 5.4; only 5.8 is within 3 m of 8.75
+    expected = [
+        [5], [5.05], [5, 5.2], [5, 5.2, 5.4], [5, 5.2, 5.41], [5.2, 5.4, 5.8], [5.8, 8.75],
+    ]  # fmt: skip
+    assert [[round(one, 2) for one in frames] for frames in told] == expected
+    third = client.asked[3]
+    # odometry from the last frame: 40 cm and 20 cm behind it
+    for meta, x in zip(third["metas"], (-0.4, -0.2, 0.0), strict=True):
+        assert meta.pose.parent_frame == "odom"
+        np.testing.assert_allclose(meta.pose.matrix, ahead(x), atol=1e-12)
+        assert meta.intrinsics == camera_of(K, (4, 3))
+    assert third["keep"] is False
+
+
+def test_it_asks_with_one_frame_while_it_tracks_or_where_only_one_is_wanted() -> None:
+    client = fake(answer("not_found"), answer("found", 6.0), answer("not_found"))
+    assert asked_with(Tracker(client, "m", camera=K), [5, 6, 7, 8], client) == [
+        [5.0], [5.0, 6.0], [7.0], [8.0]
+    ]  # fmt: skip
+    client = fake(answer("not_found"))
+    alone = Tracker(client, "m", camera=K, parameters=TrackerParameters(frames=1))
+    assert asked_with(alone, [5, 6, 7], client) == [[5.0], [6.0], [7.0]]
+    for wrong in (0, 11):
+        with pytest.raises(errors.InvalidRequest, match="Set `frames` to 1 to 10"):
+            TrackerParameters(frames=wrong)
+
+
+def test_after_a_kidnapping_no_frame_from_before_is_sent() -> None:
+    # at 2 it is carried away: both answers there contradict the tracked place
+    told = [answer("found", 0.0), answer("found", 1.0), answer("found", 40.0)]
+    client = fake(*told, answer("found", 41.0), answer("not_found"))
+    tracker = Tracker(client, "m", camera=K)
+    assert asked_with(tracker, [0, 1, 2, 3, 4], client)[2:] == [[2.0], [3.0], [3.0, 4.0]]
+    assert tracker.state().status == "lost"
+    tracker.reset("a lift")
+    tracker.update(depth(5), ahead(5), stamp=5.0)
+    assert client.asked[-1]["frames"] == [5.0]
+
+
+def test_frames_that_were_not_answered_or_are_old_are_not_sent_again() -> None:
+    not_found = answer("not_found")
+    client = fake(not_found, errors.Busy("busy"), errors.UselessFrame("blank"), not_found)
+    tracker = Tracker(client, "m", camera=K)
+    # the blank frame is refused with the one before it, then alone
+    assert asked_with(tracker, [1, 2], client) == [[1.0], [1.0, 2.0]]
+    client.answers[3:] = [errors.UselessFrame("blank"), not_found]
+    assert tracker.update(depth(2.5), ahead(2.5), stamp=2.0).reason == "blank"
+    assert [one["frames"] for one in client.asked[2:]] == [[1.0, 2.5], [2.5]]
+    tracker.update(depth(3), ahead(3), stamp=3.0)
+    tracker.update(depth(3.5), ahead(3.5), stamp=32.0)  # 32 s after the first
+    assert [one["frames"] for one in client.asked[4:]] == [[1.0, 3.0], [3.0, 3.5]]
+
+
+@pytest.mark.parametrize("error", [errors.UselessFrame("blank"), errors.TooLarge("3 MB")])
+def test_where_earlier_frames_are_refused_it_asks_with_the_last_alone(error: Exception) -> None:
+    client = fake(answer("not_found"), error, answer("not_found"))
+    tracker = Tracker(client, "m", camera=K)
+    told = asked_with(tracker, [1, 2, 3], client)
+    assert told == [[1.0], [1.0, 2.0], [2.0], [2.0, 3.0]]
+
+
+def test_answers_that_share_frames_or_nearly_are_one_view() -> None:
+    # weak answers are a fix where their frames lie more than 0.3 m apart, each from each
+    way = (1.0, 1.2, 1.4, 1.6, 1.8)
+    for frames, tracks_from in ((1, 1.4), (2, 1.6), (3, 1.8)):
+        client, log = fake(*(answer("found", x, support=1) for x in way)), io.StringIO()
+        parameters = TrackerParameters(frames=frames)
+        tracker = Tracker(client, "m", camera=K, parameters=parameters, log=log)
+        states = [tracker.update(depth(x), ahead(x), stamp=x) for x in way]
+        assert [one.status == "tracking" for one in states] == [x >= tracks_from for x in way]
+        assert all(map(equal, replay(log.getvalue().splitlines()), states))
 
 
 # Runs through synthetic buildings, against a service in this process.

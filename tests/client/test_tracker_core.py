@@ -19,6 +19,7 @@ from sceneprint_client.tracker_core import (
     inverse,
     rotation_matrix,
     rotation_vector,
+    spaced_views,
 )
 
 #: Covariance of the answers of these tests: 4 cm and 0 about each axis; 3 cm and 1 deg are added.
@@ -63,6 +64,20 @@ def tracking(parameters: TrackerParameters | None = None) -> TrackerCore:
 
 def step(core: TrackerCore, stamp: float, x: float, observation: Observation) -> State:
     return core.update(stamp, at(x), observation)
+
+
+def test_views_of_a_question_differ_and_lie_close_behind_the_last() -> None:
+    assert spaced_views([at(0)], 3) == [0]
+    assert spaced_views([at(0), at(1), at(2), at(2.9)], 3) == [1, 2, 3]
+    assert spaced_views([at(0), at(1), at(1.95), at(2)], 3) == [0, 1, 3]
+    assert spaced_views([at(0), at(1.95), at(2)], 1) == [2]
+    # it turns: 5 degrees are too few, and 7 are enough; 121 degrees of way are too many
+    turns = [at(0, yaw_deg=a) for a in (-114, -107, 0, 5, 7)]
+    assert spaced_views(turns, 5) == [1, 2, 4]
+    # 3.1 m of way, to and fro
+    assert spaced_views([at(0), at(1.6), at(0.1)], 3) == [1, 2]
+    # a jump of the odometry
+    assert spaced_views([at(0), at(50), at(50.5), at(51)], 4) == [1, 2, 3]
 
 
 def test_a_strong_answer_is_a_fix() -> None:

@@ -39,6 +39,13 @@ class ScriptedLocalizer:
 
     def localize(self, map_name: str, frame: Any, meta: Any = None, **how: Any) -> Localization:
         self.asked.append({"frame": frame, "meta": meta, **how})
+        return self._answer()
+
+    def localize_sequence(self, map_name: str, frames: Any, metas: Any, **how: Any) -> Localization:
+        self.asked.append({"frame": frames[-1], "meta": metas[-1], **how})
+        return self._answer()
+
+    def _answer(self) -> Localization:
         matrix = self.found_at(len(self.asked) - 1)
         pose = None
         if matrix is not None:
@@ -306,11 +313,11 @@ def test_up_is_sent_while_the_robot_is_at_rest(ros: SimpleNamespace) -> None:
         writer.transforms(1.0, {("odom", "base_link"): np.eye(4)})
         with scripted() as (core, client):
             run(core, writer.written)
-        told = client.asked[0]["up"]
+        up = client.asked[0]["meta"].up
         if expected is None:
-            assert told is None
+            assert up is None
         else:
-            np.testing.assert_allclose(told, expected, atol=1e-9)
+            np.testing.assert_allclose((up.x, up.y, up.z), expected, atol=1e-9)
 
 
 def test_what_cannot_be_used_is_told_and_the_robot_goes_on(ros: SimpleNamespace) -> None:

@@ -656,6 +656,7 @@ class Localization(ApiRecord):
         description="The accepted match to believe first, with the transform to it."
     )
     matches: list[str] = Field(description="Ids of the accepted matches, in the order of belief.")
+    frames: int = Field(default=1, description="Of the query, those of a sequence together.")
     query_id: str
     seed: int
     model: str

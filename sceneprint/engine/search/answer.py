@@ -134,10 +134,11 @@ def answer(
     """
     clock = _Clock({"prepare": round(asked.prepare_ms, 2)})
     prior = prior_of(store, query, places)
+    # the last frame first: a deadline costs votes of the earlier ones, and not its own
+    last = _attempt(store, places, model, asked, query, deadline, prior, clock)
     before = [_attempt(store, places, model, one.asked, query, deadline, prior) for one in earlier]
     if before:
         clock.stage("earlier")
-    last = _attempt(store, places, model, asked, query, deadline, prior, clock)
     estimate = None
     if asked.geometry is not None:
         attempts = [*before, last]

@@ -551,6 +551,7 @@ def localization_of(answer: Answer) -> Localization:
         alternatives=answer.alternatives,
         best=accepted[0] if accepted and status == "found" else None,
         matches=[one.frame_id for one in accepted],
+        frames=answer.frames,
         query_id=answer.query_id,
         seed=answer.seed,
         model=answer.model,
