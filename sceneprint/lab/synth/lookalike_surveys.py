@@ -408,11 +408,15 @@ def _likeness(rng: np.random.Generator) -> Likeness:
 class _Carrier:
     """Whoever carries the scanner along a row: how high, and how it is mounted."""
 
-    def __init__(self, unit: Unit, count: int, rng: np.random.Generator) -> None:
+    def __init__(self, unit: Unit, count: int, sensor: Scanner, rng: np.random.Generator) -> None:
         self.length, self.rng = unit.pitch * count, rng
         self.reach = unit.half_way - 0.5  # to either side of the middle of the way
         self.height = float(rng.uniform(0.5, 1.9))
-        self.mounted = float(rng.uniform(-math.pi, math.pi))
+        self.sees_back = not isinstance(sensor, Rosette)
+        # what sees around may be turned anyhow, what does not looks ahead
+        self.mounted = float(
+            rng.uniform(-math.pi, math.pi) if self.sees_back else rng.normal(0, 0.3)
+        )
 
     def along(self, n: int) -> list[Floats]:
         """n poses from end to end, winding a little."""
@@ -425,13 +429,13 @@ class _Carrier:
             for at_x, at_y, turn in np.column_stack([x, y, yaw]).tolist()
         ]
 
-    def anywhere(self, n: int, sensor: Scanner) -> list[Floats]:
+    def anywhere(self, n: int) -> list[Floats]:
         """n poses on all of the way; some of them face back, where the scanner sees all around."""
         rng = self.rng
         x = rng.uniform(1.5, self.length - 1.5, n)
         y = rng.uniform(-self.reach, self.reach, n)
         yaw = self.mounted + rng.normal(0, 0.12, n)
-        if not isinstance(sensor, Rosette):
+        if self.sees_back:
             yaw = yaw + math.pi * (rng.random(n) < 0.3)
         z = self.height + rng.normal(0, 0.1, n)
         return [
@@ -446,9 +450,9 @@ def _row(
 ) -> Round:  # fmt: skip
     unit, count = make(rng), int(rng.integers(*counts))
     row = row_of(unit, count, _likeness(rng), rng)
-    carrier = _Carrier(unit, count, rng)
+    carrier = _Carrier(unit, count, sensor, rng)
     stops = [Stop(row, T) for T in carrier.along(MAP_SCANS)]
-    return Round(stops, [Stop(row, T) for T in carrier.anywhere(queries, sensor)])
+    return Round(stops, [Stop(row, T) for T in carrier.anywhere(queries)])
 
 
 def _bays(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:  # noqa: ARG001
@@ -471,7 +475,7 @@ def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanne
     rows, count = (2, int(rng.integers(4, 7))) if street else (3, int(rng.integers(2, 4)))
     likeness = replace(_likeness(rng), missing=float(rng.uniform(0.1, 0.35)))
     *mapped, last = (row_of(unit, count, likeness, rng) for _ in range(rows))
-    carrier = _Carrier(unit, count, rng)
+    carrier = _Carrier(unit, count, sensor, rng)
     origins = [(0.0, 120.0 * k, 0.0) for k in range(rows)]
     each = MAP_SCANS // len(mapped)
     stops = [
@@ -489,7 +493,7 @@ def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanne
                 found += [(row, T) for row in mapped]
         return found
 
-    asked = [Stop(last, T, origins[-1]) for T in carrier.anywhere(3 * queries, sensor)]
+    asked = [Stop(last, T, origins[-1]) for T in carrier.anywhere(3 * queries)]
     return Round(stops, _most_different(asked, rivals, queries, sensor))
 
 
@@ -498,15 +502,19 @@ def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
     whole = symmetric_hall(rng)
     things = stand_about({pile: 2, person: 1, cabin: 1, screen: 2, tank: 1}, whole.floor, rng, 3)
     details = furnish(things, 0, Likeness(), rng)
+    # whoever can walk somewhere can walk there after half a turn
+    whole.floor.claimed[:] |= whole.floor.claimed[::-1, ::-1]
     hall = Premises("hall", join([whole.mesh, details]), whole.floor)
     if not _another(index):
         return _walked(hall, rng, queries)
-    T = walk(hall, 4 * MAP_SCANS, rng)
-    near, far = ([one for one in T if s * one[0, 3] > 0.5] for s in (1, -1))
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    asked = [Stop(hall, one) for one in far]
+
+    def in_half(poses: list[Floats], side: int) -> list[Stop]:
+        return [Stop(hall, T if T[0, 3] * side > 0 else half_turn @ T) for T in poses]
+
+    asked = in_half(walk(hall, 3 * queries, rng), -1)
     return Round(
-        [Stop(hall, one) for one in near[:MAP_SCANS]],
+        in_half(walk(hall, MAP_SCANS, rng), 1),
         _most_different(asked, lambda stop: [(hall, half_turn @ stop.T)], queries, sensor),
     )
 
