@@ -63,11 +63,12 @@ class Robot:
                 print(f"  not a place of the map ({found.cause}): explore, and map it")
                 self.remember(seen, session="afternoon")
                 return None
-            elif found.pose is None or (found.support == 1 and found.verified_by == "matches"):
-                print("  one view, unconfirmed: look again before trusting it")
+            elif found.pose is None or found.confidence is None:
+                print("  a place of the map, but its pose is not known: look again")
             else:
                 votes = f"{found.support} of {found.votes} views vote for one pose"
-                print(f"  found, {votes}, decided by {found.verified_by}: go on from there")
+                sure = f"{100 * found.confidence:.1f} % sure, decided by {found.verified_by}"
+                print(f"  found, {votes}, {sure}: go on from there")
                 return seen, np.array(found.pose.matrix)
         return None
 
@@ -75,8 +76,8 @@ class Robot:
 def tell_alternatives(found: Localization) -> None:
     """The poses that the evidence supports: one of them is right at most."""
     for one in found.alternatives:
-        t = one.pose.translation
-        print(f"    x {t.x:.2f}, y {t.y:.2f} m: weight {one.weight:.1f}, support {one.support}")
+        t, sure = one.pose.translation, 100 * (one.confidence or 0.0)
+        print(f"    {sure:.0f} %: x {t.x:.2f}, y {t.y:.2f} m, support {one.support}")
 
 
 def depth_of(seen: DepthFrame) -> bytes:

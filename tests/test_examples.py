@@ -32,13 +32,15 @@ def test_the_robot_maps_a_room_and_finds_itself(tmp_path: Path) -> None:
     assert "driving: 12 frames are uploaded" in told
     room, _, cabinet = told.partition("beside a cabinet that looks the same from behind:")
     assert "  do not drive: " in room
-    assert re.search(r"found, [2-9] of \d views vote for one pose, decided by matches", room)
+    assert re.search(
+        r"found, [2-9] of \d views vote for one pose, [\d.]+ % sure, decided by matches", room
+    )
     assert room.count("not a place of the map (nothing_alike): explore") == 1
     # both sides are told of each view, half a turn about the cabinet apart, and none is driven on
     alone, _, believed = cabinet.partition("asked again, and odometry says where it is")
     assert alone.count("do not drive: ") == 2
     assert "found" not in alone
-    sides = [complex(*map(float, one)) for one in re.findall(r"x (\S+), y (\S+) m: weight", alone)]
+    sides = [complex(*map(float, one)) for one in re.findall(r"x (\S+), y (\S+) m, support", alone)]
     assert len(sides) == 4
     assert max(abs(sides[i] + sides[i + 1]) for i in (0, 2)) < 0.2
     assert "decided by prior" in believed

@@ -323,7 +323,6 @@ def _grounds(there: Location | Localization) -> str:
         voted = "no match votes for it"
     elif there.support == 1:
         voted = f"one view ({there.strength})"
-        voted += ", unconfirmed" if there.verified_by == "matches" else ""
     else:
         voted = f"{there.support} of {there.votes} accepted matches vote for it ({there.strength})"
         if there.spread_m is not None and there.spread_deg is not None:
@@ -339,10 +338,12 @@ def _evidence(e: PlaceEvidence | None) -> str:
     rival = "no other place fits"
     if e.rival >= 0.05:
         rival = f"the next best place fits {e.rival:.0%} as well"
-    return (
-        f"{e.planes:.0f} planes and {e.frames} frames of the map agree, "
-        f"{max(e.excess, 0.0):.0%} is missing, {rival}"
-    )
+    planes, frames = _things(round(e.planes), "plane"), _things(e.frames, "frame")
+    return f"{planes} and {frames} of the map agree, {max(e.excess, 0.0):.0%} is missing, {rival}"
+
+
+def _things(number: int, name: str) -> str:
+    return f"{number} {name}{'' if number == 1 else 's'}"
 
 
 def _percent(confidence: float | None) -> str:

@@ -238,8 +238,8 @@ class _Drawing:
         for number, one in enumerate(self._answer.alternatives, start=1):
             path = (self._space(one.map, one.pose.parent_frame), "alternatives", f"{number}")
             child = f"{one.pose.child_frame} alternative {number}"
-            score = "" if one.score is None else f", score {one.score:.2f}"
-            label = f"alternative {number}: weight {one.weight:.1f}{score}"
+            sure = "" if one.confidence is None else f", confidence {one.confidence:.2f}"
+            label = f"alternative {number}: support {one.support}{sure}"
             found.append(SceneEntity(path, Placement(np.array(one.pose.matrix), child)))
             found += _sensor(path, some, self._camera, UNSURE, label)
         return found

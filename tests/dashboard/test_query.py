@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from typing import Any
 
@@ -124,8 +125,8 @@ def test_the_rows_are_the_answer(station, page, ask, axe):
 @pytest.mark.parametrize(
     ("search", "status", "title"),
     [
-        ("", "found", "Found."),
-        ("&ambiguous=0", "ambiguous", "Ambiguous."),
+        ("", "found", "Found, 99."),
+        ("&ambiguous=0&confidence=0.999", "ambiguous", "Ambiguous, "),
         ("&residual_m=0.00001&candidates=3", "not_found", "Not found."),
         ("&stages=retrieve", "unvalidated", "Not validated."),
         ("&session=nobody", "not_found", "Not found."),
@@ -176,9 +177,9 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
             figures: [...one.querySelectorAll("dd")].map((each) => each.textContent),
             bars: [...one.querySelectorAll(".alternatives-bar > span")].map(
                 (each) => each.style.width),
+            why: one.querySelector(".alternatives-why").textContent,
         }))"""
     )
-    heaviest = max(one["weight"] for one in several)
     for i, (item, told) in enumerate(zip(items, several, strict=True)):
         assert item["letter"] == "ABCDE"[i]
         p = told["pose"]["translation"]
@@ -187,11 +188,12 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
         assert item["place"].endswith(" from A") == (i > 0)
         support = told["support"]
         supported = f"{support} match{'es' if support > 1 else ''}" if support else "the map alone"
-        figures = [f"{round(told['weight'], 2):g}", supported, f"{round(told['score'], 2):g}"]
-        assert item["figures"] == figures
-        widths = [float(one.removesuffix("%")) for one in item["bars"]]
-        share = told["weight"] / heaviest
-        assert widths == pytest.approx([100 * share, 100 * told["score"]], abs=0.1)
+        sure = told["confidence"]
+        assert item["figures"] == [f"{math.floor(1000 * sure) / 10:.1f} %", supported]
+        assert [float(one.removesuffix("%")) for one in item["bars"]] == [
+            pytest.approx(100 * sure, abs=0.1)
+        ]
+        assert " of the map agree, " in item["why"]
     # each match stands with the pose that it votes for
     votes = page.locator("[data-row=VDR] .query-vote").all_inner_texts()
     support = {f"for pose {'ABCDE'[i]}": one["support"] for i, one in enumerate(several)}
@@ -281,7 +283,8 @@ def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
         pose = {"parent_frame": "hall", "translation": {"x": 1, "y": 2, "z": 0.5}}
         location = {
             "map": "house", "pose": pose, "support": 3, "guided": 0, "votes": 3,
-            "strength": "strong", "verified_by": "matches", "rival_ratio": 0.42,
+            "strength": "strong", "verified_by": "matches", "confidence": 0.99676,
+            "evidence": {"planes": 19.6, "frames": 9, "excess": 0.012, "rival": 0.42},
             "spread_m": 0.02, "spread_deg": 0.5, "uncertainty": None, **change,
         }  # fmt: skip
         answer = {
@@ -292,31 +295,35 @@ def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
         assert one["text"] == "In map house, at x 1, y 2, z 0.5 m in hall."
         return one["details"], one["kind"], one["title"]
 
-    near = "the next best place fits 42 % as well"
+    seen = "20 planes and 9 frames of the map agree, 1.2 % is missing, "
+    near = f"{seen}the next best place fits 42 % as well"
     firm = "3 of 3 accepted matches agree on this pose, within 20 mm, 0.5°"
-    assert told() == ([firm, "strong matches", near], "good", "Found")
+    title = "Found, 99.6 % sure"  # rounded down
+    assert told() == ([near, firm, "strong matches"], "good", title)
     apart = firm.replace("of 3", "of 5")
     assert told(votes=5) == (
-        [apart, "strong matches", "2 accepted matches vote for another pose", near], "good", "Found"
+        [near, apart, "strong matches", "2 accepted matches vote for another pose"], "good", title
     )  # fmt: skip
-    lone = ["one view, unconfirmed", "strong match", "1 accepted match votes for another pose"]
-    assert told(support=1, votes=2, rival_ratio=0.0) == (
-        [*lone, "no other place fits"], "warn", "Found"
+    alone = {"planes": 1.2, "frames": 1, "excess": -0.01, "rival": 0.04}
+    assert told(support=1, votes=1, evidence=alone, confidence=0.99996) == (
+        ["1 plane and 1 frame of the map agree, 0.0 % is missing, no other place fits", "one view",
+         "strong match"], "good", "Found, 99.9 % sure"
     )  # fmt: skip
     assert told(support=0, votes=0, verified_by="map", strength="weak")[:2] == (
-        ["confirmed by the map’s frames", "no accepted match", near], "warn"
+        [near, "confirmed by the map’s frames", "no accepted match"], "good"
     )  # fmt: skip
-    assert told(verified_by="map")[1] == "good"
+    details = told(support=5, votes=5, guided=3)[0]
     followed = "5 of 5 accepted matches agree on this pose, 3 of them guided by the others, within"
-    for guided, kind in ((3, "good"), (4, "warn")):  # what was guided confirms nothing
-        details, shown_as, _ = told(support=5, votes=5, guided=guided)
-        assert details[0].startswith(followed.replace("3", str(guided)))
-        assert shown_as == kind
-    assert told(support=1, votes=1, verified_by="prior", strength="weak", rival_ratio=None)[:2] == (
-        ["several poses fit, and the prior decided", "one view", "weak match",
-         "not compared with other places"], "warn"
+    assert details[1].startswith(followed)
+    # found with less confidence than the default, or without one
+    assert told(confidence=0.9)[1:] == ("warn", "Found, 90.0 % sure")
+    unknown = told(
+        support=1, votes=1, verified_by="prior", strength="weak", confidence=None, evidence=None
+    )
+    assert unknown == (
+        ["not compared with other places", "several poses fit, and the prior decided", "one view",
+         "weak match"], "warn", "Found"
     )  # fmt: skip
-    assert told(strength="weak")[1] == "warn"
 
     gravity = "tilted by 3.5 deg against `up`. Check `up`"
     assert run("m.parts(given[0])", gravity) == {

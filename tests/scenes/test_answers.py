@@ -119,8 +119,8 @@ def test_alternatives_are_told_from_the_answer(
     shifted[:3, 3] += (1.0, 2.0, 0.5)
     other = pose.model_copy(update={"matrix": shifted.tolist()})
     rivals = [
-        Alternative(pose=one, map=MAP, weight=1.4, support=2, score=score)
-        for one, score in ((pose, 0.5), (other, None))
+        Alternative(pose=one, map=MAP, confidence=sure, weight=1.4, support=2, score=0.9)
+        for one, sure in ((pose, 0.5), (other, None))
     ]
     unsure = answer.model_copy(
         update={"status": "ambiguous", "location": None, "alternatives": rivals}
@@ -132,8 +132,10 @@ def test_alternatives_are_told_from_the_answer(
     np.testing.assert_array_equal(there[f"{space}/alternatives/2"].T_parent_child, shifted)
     one, two = (there[f"{space}/alternatives/{n}"].child for n in (1, 2))
     assert one != two
-    assert there[f"{space}/alternatives/1/label"].text == "alternative 1: weight 1.4, score 0.50"
-    assert there[f"{space}/alternatives/2/label"].text == "alternative 2: weight 1.4"
+    assert (
+        there[f"{space}/alternatives/1/label"].text == "alternative 1: support 2, confidence 0.50"
+    )
+    assert there[f"{space}/alternatives/2/label"].text == "alternative 2: support 2"
     points = there[f"{space}/alternatives/1/points"]
     assert set(map(tuple, points.colours.tolist())) == {UNSURE}
     assert 1000 < len(points.points) <= 2 * ONE.match

@@ -304,7 +304,7 @@ class Location(ApiRecord):
     map: str | None = Field(default=None, description="Whose frames it is averaged over.")
     support: int = Field(
         description="Matches that agree on it; 0 where the map alone confirms it, and 1 is one "
-        "view, unconfirmed."
+        "view."
     )
     guided: int = Field(
         default=0,
@@ -317,15 +317,15 @@ class Location(ApiRecord):
     )
     verified_by: Verifier = Field(
         default="matches",
-        description="`matches`: accepted matches agree, and no other pose comes near. `map`: the "
-        "map's frames confirm it, where matches did not suffice. `prior`: they bear several poses "
-        "out, and this is the one that the prior expects.",
+        description="`matches`: a strong match votes for the pose. `map`: no strong one does, and "
+        "the map's frames bear it out. `prior`: they bear several poses out, and this is the one "
+        "that the prior expects.",
     )
     rival_ratio: float | None = Field(
         default=None,
         description="How far the map bears out the best pose of another place, as a share of the "
-        "best of all: 0 where nothing comes near, 1 where it is as good. Null where the map's "
-        "frames were not asked.",
+        "best of all, as `evidence.rival`: 0 where nothing comes near, 1 where it is as good. Null "
+        "where the map's frames were not asked.",
     )
     spread_m: float
     spread_deg: float
@@ -689,7 +689,7 @@ class Localization(ApiRecord):
         default=None, description="What `confidence` was computed from; null likewise."
     )
     support: int = Field(
-        description="Matches that agree on the pose; 1 is one view, which nothing confirms."
+        description="Matches that agree on the pose; 1 is one view, and 0 the map alone."
     )
     votes: int = Field(description="Accepted matches, whatever pose they vote for.")
     spread_m: float | None = Field(description="Of the votes; null without a pose.")

@@ -2,7 +2,7 @@
 // again.
 import { get, watch } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { count, ms, percent, shortId, time } from "../lib/format.js";
+import { confidence, count, ms, shortId, time } from "../lib/format.js";
 import { coded, sentence } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { empty, soon } from "../lib/states.js";
@@ -115,7 +115,8 @@ function row(one) {
     cell("when", time(one.at)),
     h("th", { class: "queries-who", scope: "row", role: "rowheader" }, one.robot ?? h("span", { class: "muted", title: "The query did not say who asked." }, one.key ? `key ${one.key}` : "not named"),
       one.session && h("span", { class: "queries-more muted" }, one.session)),
-    cell("outcome", h("span", { class: "badge", dataset: { kind } }, text)),
+    cell("outcome", h("span", { class: "badge", dataset: { kind } }, text),
+      one.confidence !== null && h("span", { class: "queries-more muted number", title: "Confidence of its best pose" }, confidence(one.confidence))),
     cell("pose", pose(one)),
     cell("views number", one.pose ? count(one.support) : "–"),
     cell("took number", ms(one.milliseconds)),
@@ -124,12 +125,11 @@ function row(one) {
 }
 
 /** Where it was found. */
-function pose({ pose: found, alternatives, rival_ratio: rival }) {
+function pose({ pose: found, alternatives }) {
   if (!found) return alternatives ? `${count(alternatives)} possible` : "–";
   const { x, y, z } = found.translation;
   const told = [x, y, z].map((one) => one.toFixed(2)).join(", ");
-  const near = typeof rival === "number" && rival > 0 ? `, next best place ${percent(rival)} as good` : "";
-  return h("span", { title: `In ${found.parent_frame}${near}` }, h("span", { class: "number" }, told), h("span", { class: "queries-more muted" }, `m in ${found.parent_frame}`));
+  return h("span", { title: `In ${found.parent_frame}` }, h("span", { class: "number" }, told), h("span", { class: "queries-more muted" }, `m in ${found.parent_frame}`));
 }
 
 function why({ reason, frame }) {

@@ -41,6 +41,11 @@ export function percent(x) {
   return `${share.toFixed(share !== 0 && Math.abs(share) < 1 ? 2 : Math.abs(share) < 10 ? 1 : 0)} %`;
 }
 
+/** A probability: "99.6 %", rounded down, so that none looks better than it is. @param {number | null | undefined} x of 1 */
+export function confidence(x) {
+  return isNumber(x) ? `${(Math.floor(1000 * Math.min(x, 0.999)) / 10).toFixed(1)} %` : NONE;
+}
+
 /** A span: "0.4 s", "12 s", "3 min 20 s", "2 h 5 min", "3 d 4 h". @param {number | null | undefined} s */
 export function seconds(s) {
   if (!isNumber(s)) return NONE;

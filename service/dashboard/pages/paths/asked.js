@@ -2,11 +2,11 @@
 
 import { at, get } from "../lib/api.js";
 import { h } from "../lib/dom.js";
-import { count, metres, shortId } from "../lib/format.js";
+import { confidence, count, metres, shortId } from "../lib/format.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { alternativesList } from "../query/alternatives.js";
-import { grounds, mapOf, rivalOf, verdict } from "../query/words.js";
+import { evidenceOf, grounds, mapOf, verdict } from "../query/words.js";
 import { inverseRigid, multiply, ofRows } from "../viewer/matrix.js";
 import { axesOf, SIGMAS } from "./shapes.js";
 
@@ -81,8 +81,9 @@ function foundFacts({ location, parent, axes }) {
   const sure = axes?.map((one) => metres(one.deviation * SIGMAS)).join(" × ");
   return h("dl", { class: "paths-facts" },
     fact("In frame", h("span", { class: "mono" }, parent)),
+    fact("Confidence", confidence(location.confidence)),
+    fact("Evidence", evidenceOf(location)),
     fact("Rests on", grounds(location).join("; ")),
-    fact("Other places", rivalOf(location)),
     sure && fact("95 % ellipsoid", `± ${sure}`));
 }
 

@@ -1,8 +1,8 @@
 // The poses of an ambiguous answer: of one rank, each with what speaks for it; none is the answer.
 import { h } from "../lib/dom.js";
-import { count, degrees, metres } from "../lib/format.js";
+import { confidence, count, degrees, metres } from "../lib/format.js";
 import { apart } from "../overlay/words.js";
-import { number } from "./words.js";
+import { evidenceOf, number } from "./words.js";
 
 /** What an alternative is called, in lists and on the map: A, B, C. @param {number} i from 0 */
 export const letterOf = (i) => String.fromCharCode(65 + i);
@@ -32,24 +32,24 @@ export function voteOf({ location, alternatives }, { pose_in_map: own, validatio
  * @returns {HTMLElement}
  */
 export function alternativesList(alternatives) {
-  const heaviest = Math.max(...alternatives.map((one) => one.weight), 1);
   const [first] = alternatives;
   return h("div", { class: "alternatives" },
     h("p", { class: "muted" }, "In ", h("span", { class: "mono" }, first.pose.parent_frame), ", metres. At most one is right."),
-    h("ol", { "aria-label": "Alternatives" }, alternatives.map((one, i) => alternative(one, i, first, heaviest))));
+    h("ol", { "aria-label": "Alternatives" }, alternatives.map((one, i) => alternative(one, i, first))));
 }
 
-/** @param {Object<string, any>} one @param {number} i @param {Object<string, any>} first @param {number} heaviest */
-function alternative({ pose, weight, support, score }, i, first, heaviest) {
+/** @param {Object<string, any>} one @param {number} i @param {Object<string, any>} first */
+function alternative(one, i, first) {
+  const { pose, confidence: sure, support } = one;
   const { x, y, z } = pose.translation, away = apart(pose, first.pose);
   return h("li", {},
     h("span", { class: "alternatives-letter" }, letterOf(i)),
     h("span", { class: "alternatives-place number" }, `x ${number(x)}, y ${number(y)}, z ${number(z)}`,
       i > 0 && h("span", { class: "muted" }, ` · ${metres(away.metres)}, ${degrees(away.degrees)} from A`)),
     h("dl", {},
-      figure("Weight", number(weight), weight / heaviest),
-      figure("Support", support === 0 ? "the map alone" : `${count(support)} ${support === 1 ? "match" : "matches"}`),
-      figure("Score", score === null ? "not compared" : number(score), score)));
+      figure("Confidence", confidence(sure), sure),
+      figure("Support", support === 0 ? "the map alone" : `${count(support)} ${support === 1 ? "match" : "matches"}`)),
+    h("p", { class: "alternatives-why muted" }, evidenceOf(one)));
 }
 
 /** A figure with a bar. @param {number | null} [share] none: without */

@@ -29,6 +29,8 @@ export const FIELDS = [
     hint: "Makes a difference only in very large maps and with PostgreSQL search, which skip some frames otherwise." },
   { name: "seed", group: "search", label: "Seed", kind: "number", min: 0, max: 4294967295, step: 1, default: 0,
     hint: "Random seed of validation." },
+  { name: "confidence", group: "search", label: "Confidence", kind: "number", min: 0.5, max: 0.999, step: 0.001, default: 0.99,
+    hint: "Minimum probability of a pose that is found; below it the answer is ambiguous." },
   { name: "deadline_ms", group: "search", label: "Deadline", kind: "number", min: 1, max: 600000, step: 1, unit: "ms", default: null,
     hint: "Skips candidates that would finish later." },
   { name: "sigma", group: "diversity", within: "diversity", label: "Sigma", kind: "range", min: 0.05, max: 10, step: 0.05, default: 1,
@@ -125,7 +127,7 @@ export function fromOptions(options) {
  * @returns {Object<string, any>}
  */
 export function toOptions(said, rest = {}) {
-  const told = { k: null, candidates: null, stages: null, exact: null, seed: null, deadline_ms: null,
+  const told = { k: null, candidates: null, stages: null, exact: null, seed: null, confidence: null, deadline_ms: null,
     diversity: null, validation: null, filter: Object.keys(rest).length ? { ...rest } : null };
   for (const { name, within } of FIELDS) {
     let value = said[name];

@@ -1,5 +1,5 @@
 // What an answer says, in one line a lost person understands, and in figures.
-import { count, degrees, frameLabel, metres, percent, shortId } from "../lib/format.js";
+import { confidence, count, degrees, frameLabel, metres, percent, shortId } from "../lib/format.js";
 import { sentence } from "../lib/prose.js";
 
 const STATUS = {
@@ -16,6 +16,9 @@ export function statusOf(validation) {
   const weak = validation.strength === "weak";
   return { kind: weak ? "warn" : "good", text: `accepted, ${validation.strength ?? "strong"}` };
 }
+
+/** Confidence of a pose that is `found` by default. */
+const SURE = 0.99;
 
 /** A frame of one of several maps, as the rows know it. */
 export function keyOf(one) {
@@ -51,16 +54,21 @@ export function mapOf({ location, alternatives, maps }) {
 export function verdict(answer) {
   const { why, next } = parts(answer.reason);
   const told = { cause: null, next, details: [] };
-  if (answer.status === "found") return { ...told, ...found(answer), title: "Found", next: null };
+  if (answer.status === "found") return { ...told, ...found(answer), title: titled("Found", answer.location), next: null };
   if (answer.status === "ambiguous") {
-    const { length } = answer.alternatives;
+    const { length, 0: best } = answer.alternatives;
     const these = length === 0 ? "" : length === 1 ? "Do not act on this pose. " : "Do not act on any of these poses. ";
-    return { ...told, kind: "warn", title: "Ambiguous", text: why,
+    return { ...told, kind: "warn", title: titled("Ambiguous", best, length > 1 ? "best pose " : ""), text: why,
       next: `${these}Move on and query again, or query with a prior.`,
       details: [`${count(answer.counts.accepted)} of ${count(answer.counts.validated)} validated frames accepted`] };
   }
   if (answer.status === "unvalidated") return { ...told, ...unvalidated(answer), kind: "neutral", title: "Not validated" };
   return { ...told, kind: "bad", title: "Not found", cause: CAUSES[answer.cause] ?? null, text: why, details: reasons(answer.matches) };
+}
+
+/** A verdict with the confidence of a pose. @param {string} word @param {Object<string, any> | null | undefined} place */
+function titled(word, place, which = "") {
+  return typeof place?.confidence === "number" ? `${word}, ${which}${confidence(place.confidence)} sure` : word;
 }
 
 /** @param {Object<string, any>} answer */
@@ -74,7 +82,7 @@ function found({ matches, counts, location, maps }) {
   const p = location.pose.translation, spread = deviation(location.uncertainty?.covariance);
   return { kind: sureness(location),
     text: `In map ${location.map ?? maps[0]}, at x ${number(p.x)}, y ${number(p.y)}, z ${number(p.z)} m in ${location.pose.parent_frame}.`,
-    details: [...grounds(location), rivalOf(location),
+    details: [evidenceOf(location), ...grounds(location),
       ...(spread ? [`± ${metres(spread.m)}, ± ${degrees(spread.deg)} (one standard deviation, worst axis)`] : [])] };
 }
 
@@ -89,9 +97,9 @@ function unvalidated({ matches, counts, deadline_reached: late }) {
   };
 }
 
-/** Kind of badge of a pose that is found: an unconfirmed one is to be looked at twice. @param {Object<string, any>} location */
-function sureness({ support, guided, strength, verified_by: by }) {
-  return strength === "strong" && (by === "map" || (by === "matches" && support - guided > 1)) ? "good" : "warn";
+/** Kind of badge of a pose that is found: look twice at one found with less confidence than the default. @param {Object<string, any>} location */
+function sureness({ confidence: sure }) {
+  return sure !== null && sure >= SURE ? "good" : "warn";
 }
 
 /**
@@ -104,7 +112,6 @@ export function grounds({ support, guided, votes, strength, verified_by: by, spr
   if (by === "map") told.push("confirmed by the map’s frames");
   if (by === "prior") told.push("several poses fit, and the prior decided");
   if (support === 0) told.push("no accepted match");
-  else if (support === 1 && by === "matches") told.push("one view, unconfirmed");
   else told.push(support === 1 ? "one view" : `${count(support)} of ${count(votes)} accepted matches agree on this pose${guided > 0 ? `, ${count(guided)} of them guided by the others` : ""}, within ${metres(shift)}, ${degrees(turn)}`);
   if (support > 0) told.push(`${strength} match${support === 1 ? "" : "es"}`);
   const apart = votes - support;
@@ -112,10 +119,16 @@ export function grounds({ support, guided, votes, strength, verified_by: by, spr
   return told;
 }
 
-/** How near another place comes. @param {Object<string, any>} location of an answer */
-export function rivalOf({ rival_ratio: ratio }) {
-  if (ratio === null) return "not compared with other places";
-  return ratio < 0.05 ? "no other place fits" : `the next best place fits ${percent(ratio)} as well`;
+/** What the confidence of a pose was computed from. @param {Object<string, any>} place location or alternative of an answer */
+export function evidenceOf({ evidence }) {
+  if (evidence === null) return "not compared with other places";
+  const { planes, frames, excess, rival } = evidence;
+  const next = rival < 0.05 ? "no other place fits" : `the next best place fits ${percent(rival)} as well`;
+  return `${things(Math.round(planes), "plane")} and ${things(frames, "frame")} of the map agree, ${percent(Math.max(excess, 0))} is missing, ${next}`;
+}
+
+function things(n, name) {
+  return `${count(n)} ${name}${n === 1 ? "" : "s"}`;
 }
 
 /**
