@@ -4,8 +4,9 @@ kind, seed, index  --synthesise_lookalike_survey-->  LookalikeSite: scans of a m
 
 bays      the map: scans along a hall of equal bays; queries: others from its aisle
 streets   the map: scans along a street of equal blocks; queries: others from its carriageway
-halls     the map: a walk in a hall that half a turn maps onto itself but for one to three things
-          (of four sites two: in one half of it); queries: others (from the other half)
+halls     the map: a walk in a hall that half a turn maps onto itself but for one to three things;
+          queries: other scans (of four sites two: the map is of one half, the queries of the other,
+          and as many things differ as tell them apart)
 unmapped  the map: all halls but one of a row of equal ones (of four sites two: one of two equal
           streets); queries: scans of the one that is left out
 absent    the map: an ordinary hall and ordinary blocks; queries: other halls, storeys and blocks
@@ -229,13 +230,19 @@ def told_apart(here: Stop, other: Premises, T: Floats, sensor: Scanner) -> float
 def _most_different(
     stops: Sequence[Stop], rivals: Callable[[Stop], list[tuple[Premises, Floats]]], n: int,
     sensor: Scanner,
-) -> list[Stop]:  # fmt: skip
-    """n stops that differ from each rival by TOLD_SHARE, or the n that differ most."""
+) -> tuple[list[Stop], float]:  # fmt: skip
+    """n stops that differ from each rival by TOLD_SHARE, or the n that differ most.
+
+    Returns
+    -------
+    stops : n
+    least : of their shares
+    """
     shares = [min(told_apart(stop, *rival, sensor) for rival in rivals(stop)) for stop in stops]
     fair = [k for k, share in enumerate(shares) if share >= TOLD_SHARE]
     if len(fair) < n:
         fair = sorted(range(len(stops)), key=lambda k: -shares[k])
-    return [stops[k] for k in sorted(fair[:n])]
+    return [stops[k] for k in sorted(fair[:n])], min(shares[k] for k in fair[:n])
 
 
 # What is repeated: a bay of a hall, a block of a street.
@@ -473,7 +480,7 @@ def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanne
     street = _another(index)
     unit = block(rng) if street else bay(rng)
     rows, count = (2, int(rng.integers(4, 7))) if street else (3, int(rng.integers(2, 4)))
-    likeness = replace(_likeness(rng), missing=float(rng.uniform(0.1, 0.35)))
+    likeness = replace(_likeness(rng), missing=float(rng.uniform(0.15, 0.5)))
     *mapped, last = (row_of(unit, count, likeness, rng) for _ in range(rows))
     carrier = _Carrier(unit, count, sensor, rng)
     origins = [(0.0, 120.0 * k, 0.0) for k in range(rows)]
@@ -494,17 +501,12 @@ def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanne
         return found
 
     asked = [Stop(last, T, origins[-1]) for T in carrier.anywhere(3 * queries)]
-    return Round(stops, _most_different(asked, rivals, queries, sensor))
+    return Round(stops, _most_different(asked, rivals, queries, sensor)[0])
 
 
 def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:
-    """All of a hall, or what is seen from its one half."""
-    whole = symmetric_hall(rng)
-    things = stand_about({pile: 2, person: 1, cabin: 1, screen: 2, tank: 1}, whole.floor, rng, 3)
-    details = furnish(things, 0, Likeness(), rng)
-    # whoever can walk somewhere can walk there after half a turn
-    whole.floor.claimed[:] |= whole.floor.claimed[::-1, ::-1]
-    hall = Premises("hall", join([whole.mesh, details]), whole.floor)
+    """All of a hall with one to three details; or one half of it, with as many as tell it apart."""
+    hall = _with_details(symmetric_hall(rng), rng)
     if not _another(index):
         return _walked(hall, rng, queries)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -512,11 +514,26 @@ def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
     def in_half(poses: list[Floats], side: int) -> list[Stop]:
         return [Stop(hall, T if T[0, 3] * side > 0 else half_turn @ T) for T in poses]
 
-    asked = in_half(walk(hall, 3 * queries, rng), -1)
-    return Round(
-        in_half(walk(hall, MAP_SCANS, rng), 1),
-        _most_different(asked, lambda stop: [(hall, half_turn @ stop.T)], queries, sensor),
-    )
+    def rivals(stop: Stop) -> list[tuple[Premises, Floats]]:
+        return [(hall, half_turn @ stop.T)]
+
+    for _ in range(10):
+        asked, least = _most_different(
+            in_half(walk(hall, 3 * queries, rng), -1), rivals, queries, sensor
+        )
+        if least >= TOLD_SHARE:
+            break
+        hall = _with_details(hall, rng)
+    return Round(in_half(walk(hall, MAP_SCANS, rng), 1), asked)
+
+
+def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
+    """The hall with up to three things more; their places are taken on both sides of it."""
+    menu: Menu = {pile: 2, person: 1, cabin: 2, screen: 2, tank: 1, machine: 1}
+    things = furnish(stand_about(menu, hall.floor, rng, 3), 0, Likeness(), rng)
+    # whoever can walk somewhere can walk there after half a turn
+    hall.floor.claimed[:] |= hall.floor.claimed[::-1, ::-1]
+    return Premises("hall", join([hall.mesh, things]), hall.floor)
 
 
 def _walked(premises: Premises, rng: np.random.Generator, queries: int) -> Round:
