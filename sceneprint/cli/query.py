@@ -51,10 +51,10 @@ if TYPE_CHECKING:
     from sceneprint_client.api import (
         Alternative,
         Answer,
+        EvidenceRecord,
         Localization,
         Location,
         Match,
-        PlaceEvidence,
         Transform,
     )
 
@@ -331,7 +331,7 @@ def _grounds(there: Location | Localization) -> str:
     return f"{voted}; {_DECIDED[there.verified_by or 'matches']}; {why}"
 
 
-def _evidence(e: PlaceEvidence | None) -> str:
+def _evidence(e: EvidenceRecord | None) -> str:
     """The evidence that a confidence was computed from, in a line."""
     if e is None:
         return "not compared with other places"

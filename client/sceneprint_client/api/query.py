@@ -234,7 +234,7 @@ class Match(ApiRecord):
 Verifier = Literal["matches", "map", "prior"]
 
 
-class PlaceEvidence(ApiRecord):
+class EvidenceRecord(ApiRecord):
     """What speaks for and against a pose; its `confidence` is computed from these numbers."""
 
     score: float = Field(
@@ -277,7 +277,7 @@ class Alternative(ApiRecord):
 
     pose: Transform
     confidence: float | None = Field(default=None, description=_CONFIDENCE)
-    evidence: PlaceEvidence | None = Field(
+    evidence: EvidenceRecord | None = Field(
         default=None, description="What `confidence` was computed from; null likewise."
     )
     map: str | None = Field(default=None, description="Whose parent frame it is given in.")
@@ -298,7 +298,7 @@ class Location(ApiRecord):
 
     pose: Transform
     confidence: float | None = Field(default=None, description=_CONFIDENCE)
-    evidence: PlaceEvidence | None = Field(
+    evidence: EvidenceRecord | None = Field(
         default=None, description="What `confidence` was computed from; null likewise."
     )
     map: str | None = Field(default=None, description="Whose frames it is averaged over.")
@@ -685,7 +685,7 @@ class Localization(ApiRecord):
         description="Probability that `pose` is right, 0 to 1; of `ambiguous`, that the first of "
         "`alternatives` is. Null where there is no pose, or the map was not asked.",
     )
-    evidence: PlaceEvidence | None = Field(
+    evidence: EvidenceRecord | None = Field(
         default=None, description="What `confidence` was computed from; null likewise."
     )
     support: int = Field(

@@ -46,6 +46,7 @@ from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats
 from sceneprint_client.api import Alternative as ToldAlternative
 from sceneprint_client.api import (
+    EvidenceRecord,
     ExplainedFrame,
     Explanation,
     FrameState,
@@ -58,7 +59,6 @@ from sceneprint_client.api import Match as ToldMatch
 from sceneprint_client.api import Validation as ToldValidation
 from sceneprint_client.api.base import Vector
 from sceneprint_client.api.query import FreeDirection, Lost, Outcome, Stage, Uncertainty
-from sceneprint_client.api.query import PlaceEvidence as ToldEvidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,12 +166,12 @@ def alternative_records(found: Candidates, estimate: PoseEstimate | None) -> lis
     ]
 
 
-def evidence_record(evidence: PlaceEvidence | None) -> ToldEvidence | None:
+def evidence_record(evidence: PlaceEvidence | None) -> EvidenceRecord | None:
     """Return as JSON what speaks for and against a pose; shares are rounded to a tenth of 1 %."""
     if evidence is None:
         return None
     rounded = {name: round(value, 3) for name, value in asdict(evidence).items()}
-    return ToldEvidence.model_validate(rounded)
+    return EvidenceRecord.model_validate(rounded)
 
 
 def _match(
