@@ -342,7 +342,7 @@ POWERS: dict[type, dict[str, int]] = {
     },
     PropertyParameters: {"radius": 1},
     PatchDescriptorParameters: {"near_radius": 1, "middle_radius": 1, "far_radius": 1},
-    AcceptanceParameters: {"residual_m": 1},
+    AcceptanceParameters: {"residual_m": 1, "sparse_deviation_m": 1, "apart_m": 1},
     OverlapParameters: {
         "surface_tolerance": 1,
         "point_tolerance": 1,

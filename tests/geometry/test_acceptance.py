@@ -15,6 +15,7 @@ from sceneprint.geometry.validation.acceptance import (
     Evidence,
     belief,
     objection,
+    sparse_evidence_suffices,
 )
 from sceneprint.lab.training import preset_parameters
 from sceneprint.types import Floats32, Geometry, Intrinsics, Patches, Surface
@@ -107,6 +108,76 @@ def test_scans_may_share_little_but_not_against_free_space() -> None:
     assert found == (
         "rejected", "16% agrees by planes, and 2.5% lies where the other frame saw through"
     )  # fmt: skip
+
+
+SPARSE = Evidence(0.01, 0.01, 0.15, 0.2, 0.004, 1e-3, planes=8.0, worst_violations=0.01)
+
+
+@pytest.mark.parametrize(
+    ("worse", "just"),
+    [
+        ({"residual_m": 0.081}, {"residual_m": 0.079}),
+        ({"residual_rad": math.radians(5.1)}, {"residual_rad": math.radians(4.9)}),
+        # overlap less five times the violations: .119 - .02 and .121 - .02
+        ({"overlap": 0.119}, {"overlap": 0.121}),
+        (
+            {"plane_overlap": 0.099, "violations": 0.0},
+            {"plane_overlap": 0.101, "violations": 0.0},
+        ),
+        # plane overlap less three times the violations: .13 - .0303 and .13 - .0297
+        (
+            {"plane_overlap": 0.13, "violations": 0.0101, "overlap": 0.2},
+            {"plane_overlap": 0.13, "violations": 0.0099, "overlap": 0.2},
+        ),
+        ({"planes": 4.9}, {"planes": 5.1}),
+        ({"plane_violations": 0.061}, {"plane_violations": 0.059}),
+        ({"worst_violations": 0.031}, {"worst_violations": 0.029}),
+        ({"stiffness": 9e-6}, {"stiffness": 1.1e-5}),
+        ({"one_sided": True}, {"one_sided": False}),
+        ({"violations": None}, {"violations": 0.0}),
+    ],
+)
+def test_little_evidence_must_be_good_in_every_respect(
+    worse: dict[str, float], just: dict[str, float]
+) -> None:
+    assert sparse_evidence_suffices(SPARSE, 0.02, P)
+    # the evidence that a match usually needs, it has not
+    assert objection(SPARSE, P, "full") == ("rejected", "only 15% of the surfaces agree")
+    assert not sparse_evidence_suffices(replace(SPARSE, **worse), 0.02, P)
+    assert sparse_evidence_suffices(replace(SPARSE, **just), 0.02, P)
+
+
+def test_one_search_alone_needs_another_plane() -> None:
+    assert sparse_evidence_suffices(replace(SPARSE, planes=6.1), 0.02, P, alone=True)
+    assert not sparse_evidence_suffices(replace(SPARSE, planes=5.9), 0.02, P, alone=True)
+
+
+APART = replace(SPARSE, residual_m=0.15, plane_overlap=0.25, planes=13.0)
+
+
+@pytest.mark.parametrize(
+    ("worse", "just"),
+    [
+        ({"residual_m": 0.21}, {"residual_m": 0.19}),
+        ({"residual_rad": math.radians(4.1)}, {"residual_rad": math.radians(3.9)}),
+        ({"planes": 11.9}, {"planes": 12.1}),
+        ({"plane_overlap": 0.19}, {"plane_overlap": 0.21}),
+        ({"worst_violations": 0.051}, {"worst_violations": 0.049}),
+        ({"plane_violations": 0.061}, {"plane_violations": 0.059}),
+    ],
+)
+def test_refinements_that_settle_apart_need_many_planes(
+    worse: dict[str, float], just: dict[str, float]
+) -> None:
+    assert sparse_evidence_suffices(replace(APART, **just), 0.1, P, alone=True)
+    assert not sparse_evidence_suffices(replace(APART, **worse), 0.1, P, alone=True)
+    # two searches that disagree by as much have found two places
+    assert not sparse_evidence_suffices(replace(APART, **just), 0.1, P)
+
+
+def test_little_evidence_must_fix_the_transform() -> None:
+    assert sparse_evidence_suffices(SPARSE, 0.044, P)
+    assert not sparse_evidence_suffices(SPARSE, 0.046, P)
 
 
 def test_one_direction_alone_is_not_believed() -> None:

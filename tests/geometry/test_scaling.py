@@ -32,7 +32,9 @@ BARE = {
         "residual_rad", "violation_weight", "evidence", "plane_overlap", "strong", "weak",
         "ambiguous", "ambiguous_share", "stiffness", "blind_ambiguous_share",
         "blind_evidence", "blind_plane_overlap", "net_weight", "net", "net_strong", "planes",
-        "plane_violations", "worst_violations",
+        "plane_violations", "worst_violations", "sparse_evidence", "sparse_plane_overlap",
+        "sparse_planes", "sparse_plane_violations", "sparse_worst_violations", "alone_planes",
+        "apart_rad", "apart_planes", "apart_plane_overlap",
     },
     "AmbiguityParameters": {
         "same_direction", "least_crossing", "hopeful_share", "hopeful_violations", "refuted",
@@ -47,7 +49,7 @@ BARE = {
     "SequenceParameters": {"angle_scale", "gap_cost", "swap_cost"},
     "OverlapParameters": {"normal_cosine"},
     "CovarianceParameters": {"independent", "free"},
-    "ValidationParameters": {"guided_m", "guided_rad"},  # how far the poses of a map drift
+    "ValidationParameters": {"guided_rad"},
 }  # fmt: skip
 
 

@@ -15,13 +15,14 @@ from scipy.spatial.transform import Rotation
 from sceneprint import pipeline
 from sceneprint.errors import ModelMismatch
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.registration.alignment import align, samples_of
+from sceneprint.geometry.registration.alignment import Alignment, align, samples_of
 from sceneprint.geometry.registration.overlap import explained, overlap_counts, sampled
 from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
 from sceneprint.geometry.validation.validation import (
     PairValidation,
     ValidationParameters,
+    _decided,
     middle,
     refined_at,
     validate,
@@ -308,7 +309,7 @@ def test_the_papers_test_is_the_residual_alone(
     pairs: list[tuple[Geometry, Geometry, Floats]], model: Model
 ) -> None:
     query, match, _ = pairs[0]
-    hard = AcceptanceParameters(evidence=2.0)
+    hard = AcceptanceParameters(evidence=2.0, sparse_evidence=2.0)
 
     def judged(p: AcceptanceParameters, mode: Mode) -> PairValidation:
         return sane(validate(query, match, 0, ValidationParameters(acceptance=p), mode))
@@ -381,6 +382,70 @@ def test_where_the_directions_disagree_the_better_one_is_told(rooms: list[Views]
         assert found.status == "rejected"
     assert apart >= 1
     assert met >= 1
+
+
+def elsewhere(found: Alignment) -> Alignment:
+    """The same search, had it found a place a metre off and half a turn round."""
+    T = np.diag([-1.0, 1.0, -1.0, 1.0])
+    T[0, 3] = 1.0
+    return replace(found, T=T @ found.T, others=found.others[:0])
+
+
+def test_what_one_search_alone_finds_is_judged_by_the_evidence(
+    pairs: list[tuple[Geometry, Geometry, Floats]],
+) -> None:
+    p, accepted = ValidationParameters(), 0
+    for query, match, T in pairs:
+        a, b = (samples_of(one, p.agreement.stride, p.rivals.planes) for one in (query, match))
+        there = align(a, b, np.random.default_rng((0, 0)), p.alignment, p.agreement)
+        back = align(b, a, np.random.default_rng((0, 1)), p.alignment, p.agreement)
+        assert there is not None
+        assert back is not None
+        for one, other, who in (
+            (there, elsewhere(back), "query_to_match"),
+            (elsewhere(there), back, "match_to_query"),
+        ):
+            found = sane(_decided(a, b, one, other, 0, p, "full"))
+            # the residual alone cannot tell the two apart
+            assert _decided(a, b, one, other, 0, p, "paper").status == "rejected"
+            assert found.directions == (who,)
+            assert found.T_other is not None
+            if found.status != "accepted":
+                assert "the two directions disagree" in found.reason
+                continue
+            accepted += 1
+            metres, degrees = off(found, T)
+            assert metres < 0.05
+            assert degrees < 5.0
+            assert found.strength == "weak"
+            assert found.residual_m <= p.acceptance.residual_m
+            assert found.covariance is not None
+            assert found.reason.endswith("planes, but one direction alone found it")
+    assert accepted >= len(pairs)
+
+
+def test_of_two_places_that_both_explain_the_frames_neither_is_believed(model: Model) -> None:
+    """Each search finds another side of a cube: neither refutes what the other one found."""
+    scene, rng = symmetric_box(), np.random.default_rng(0)
+    # a cube on a floor does not fix a transform firmly: all but rivals is to speak for it
+    p = ValidationParameters(acceptance=AcceptanceParameters(sparse_deviation_m=1.0))
+    seen = []
+    for turn in (0.4, 0.4 + math.pi / 2):
+        T = looking((2.2 * math.sin(turn), -2.2 * math.cos(turn), 1.3), (0.0, 0.0, 0.3))
+        seen.append(geometry(model, take(scene, T, KINECT, rng)))
+    a, b = (samples_of(one, p.agreement.stride, p.rivals.planes) for one in seen)
+    v = validate(*seen)
+    assert v.T_rival is not None
+    there = align(a, b, np.random.default_rng((0, 0)), p.alignment, p.agreement)
+    back = align(b, a, np.random.default_rng((0, 1)), p.alignment, p.agreement)
+    assert there is not None
+    assert back is not None
+    apart = replace(there, T=v.T_match_query), replace(back, T=inverse(v.T_rival))
+    found = sane(_decided(a, b, *apart, 0, p, "full"))
+    assert found.status == "rejected"
+    assert "the two directions disagree" in found.reason
+    free = replace(p.acceptance, ambiguous=9.0, ambiguous_share=9.0)
+    assert _decided(a, b, *apart, 0, replace(p, acceptance=free), "full").status == "accepted"
 
 
 def test_a_free_direction_is_seen_without_rivals(model: Model) -> None:

@@ -75,7 +75,8 @@ class ValidationOptions(Given):
     residual_deg: float = Field(default=5.0, gt=0, le=45.0, description="The same, of the turn.")
     evidence: Share = Field(
         default=0.2,
-        description="Least `overlap` - `violation_weight` x `free_space_violations`.",
+        description="Least `overlap` - `violation_weight` x `free_space_violations`. The default "
+        "lets half of it pass, as a weak match, where little is shared and all of it agrees.",
     )
     violation_weight: float = Field(default=5.0, ge=0.0, le=100.0)
     plane_overlap: Share = Field(default=0.15, description="Least, every plane counting alike.")
@@ -149,7 +150,8 @@ class Validation(ApiRecord):
     )
     directions: list[Literal["query_to_match", "match_to_query"]] = Field(
         default=[],
-        description="In which directions it was found; of an accepted match, both.",
+        description="Directions of the search in which it was found. One alone makes an accepted "
+        "match weak.",
     )
     tilt_deg: float | None = Field(
         default=None,

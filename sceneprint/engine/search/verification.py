@@ -54,12 +54,15 @@ from sceneprint_client.api.query import FARTHEST_PRIOR, LEAST_DEVIATION, MOST_DE
 
 #: Candidates that are selected and validated, unless more matches are wanted: more cost time.
 CANDIDATES = 10
-#: What stands in the place of a limit where nothing is known of free space: what a caller says of
-#: the one is meant of the other too.
-_BLIND = {
-    "evidence": "blind_evidence", "plane_overlap": "blind_plane_overlap",
-    "ambiguous_share": "blind_ambiguous_share",
-}  # fmt: skip
+#: Limits that take the place of another one where nothing is known of free space, or where the
+#: frames share little: a limit that the caller sets holds in each of its places.
+_ALSO_SET = {
+    "residual_m": ("apart_m",),
+    "residual_rad": ("apart_rad",),
+    "evidence": ("blind_evidence", "sparse_evidence"),
+    "plane_overlap": ("blind_plane_overlap", "sparse_plane_overlap", "apart_plane_overlap"),
+    "ambiguous_share": ("blind_ambiguous_share",),
+}
 #: Why no candidate was tried where validation was not asked for.
 NOT_ASKED = "not requested"
 
@@ -104,7 +107,7 @@ def thresholds(
     own = given.model_dump(exclude={"mode", "residual_deg"}, exclude_unset=True)
     if "residual_deg" in given.model_fields_set:
         own["residual_rad"] = math.radians(given.residual_deg)
-    own |= {blind: own[name] for name, blind in _BLIND.items() if name in own}
+    own |= {also: own[name] for name in _ALSO_SET if name in own for also in _ALSO_SET[name]}
     return replace(p, acceptance=replace(p.acceptance, **own)), given.mode
 
 

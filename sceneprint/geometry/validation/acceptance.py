@@ -1,6 +1,7 @@
 """Sec. III-E, acceptance: what is known of a transform to whether it is believed, and its rivals.
 
     Evidence  --objection-->  why not        Evidence, ambiguity  --belief-->  how far
+    Evidence, deviation  --sparse_evidence_suffices-->  whether little is enough
     T, hypotheses, planes  --best_alternative-->  ambiguity, T_alternative
 
 A lone box looks the same from its four sides, a corridor the same at every door. Two frames of
@@ -61,6 +62,17 @@ class AcceptanceParameters:
     blind_evidence: float = 0.4  #: least where nothing is known of free space
     blind_plane_overlap: float = 0.3  #: and least of `plane_overlap`
     blind_ambiguous_share: float = 0.75  #: of which, in the place of both above: fewer rivals fall
+    sparse_evidence: float = 0.1  #: least where little is shared, or one search alone found it
+    sparse_plane_overlap: float = 0.1  #: and least of `plane_overlap`
+    sparse_planes: float = 5.0  #: and least number of distinct planes
+    alone_planes: float = 6.0  #: the same of what one search alone found
+    sparse_plane_violations: float = 0.06  #: and most of `plane_violations`
+    sparse_worst_violations: float = 0.03  #: and most of `worst_violations`
+    sparse_deviation_m: float = 0.045  #: and most of the deviation of the translation, metres
+    apart_m: float = 0.2  #: most of the residual, where one search found it and both refine it
+    apart_rad: float = math.radians(4.0)
+    apart_planes: float = 12.0  #: then least number of distinct planes, beyond `residual_m`
+    apart_plane_overlap: float = 0.2  #: and least of `plane_overlap`
 
 
 @dataclass(frozen=True)
@@ -140,6 +152,51 @@ def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status,
     if e.stiffness < p.stiffness:
         return "ambiguous", "what the frames share leaves a direction free, as a plane does"
     return None
+
+
+def sparse_evidence_suffices(
+    e: Evidence, deviation_m: float, p: AcceptanceParameters, *, alone: bool = False
+) -> bool:
+    """Return whether little evidence is enough, because all of it speaks for the transform.
+
+    Two frames that share a tenth of what they see cannot show the overlap that `objection` asks
+    for, and the search from one of them may miss what the search from the other finds. Such a
+    transform must be refined to the same place in both directions, several planes must agree,
+    next to nothing may lie in free space of either frame, and the surfaces must fix it firmly.
+    Depth that a sensor distorts lets the two refinements of a right transform settle some
+    centimetres apart: there many planes must agree.
+
+    Parameters
+    ----------
+    e : of the transform, with the residual of its two refinements
+    deviation_m : standard deviation of its translation, metres
+    p : see AcceptanceParameters
+    alone : whether only one of the two searches found it
+    """
+    if e.violations is None or e.one_sided:
+        return False
+    if (
+        e.net(p) < p.net
+        or e.plane_violations > min(p.plane_violations, p.sparse_plane_violations)
+        or e.stiffness < p.stiffness
+    ):
+        return False
+    if e.residual_m <= p.residual_m and e.residual_rad <= p.residual_rad:
+        return (
+            e.total(p) >= p.sparse_evidence
+            and e.plane_overlap >= p.sparse_plane_overlap
+            and e.planes >= max(p.planes, p.alone_planes if alone else p.sparse_planes)
+            and e.worst_violations <= min(p.worst_violations, p.sparse_worst_violations)
+            and deviation_m <= p.sparse_deviation_m
+        )
+    return (
+        alone
+        and e.residual_m <= p.apart_m
+        and e.residual_rad <= p.apart_rad
+        and e.plane_overlap >= p.apart_plane_overlap
+        and e.planes >= max(p.planes, p.apart_planes)
+        and e.worst_violations <= p.worst_violations
+    )
 
 
 def belief(

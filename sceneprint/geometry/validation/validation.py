@@ -7,6 +7,12 @@ The transform is estimated both ways, independently. That both agree is the pape
 itself it believes too much: two estimates from the same two frames may fall into the same wrong
 place, where plane lies on plane. So the transform must also explain what both sensors saw: enough
 of both surfaces agrees, and next to nothing lies where the other frame saw through.
+
+By itself it also believes too little: of two depth images that share a tenth of what they see, one
+search may miss what the other one finds. Such a transform is refined in both directions, and little
+that agrees is enough for a weak match if several planes are among it and nothing contradicts it.
+What the other search found is then a rival like any other hypothesis. The searches themselves stay
+independent.
 """
 
 from __future__ import annotations
@@ -14,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -67,6 +73,7 @@ from sceneprint.geometry.validation.acceptance import (
     belief,
     best_alternative,
     objection,
+    sparse_evidence_suffices,
 )
 from sceneprint.types import Floats, Geometry, Sphere, kind_of
 
@@ -111,7 +118,8 @@ class PairValidation:
         is, whatever the status: halfway between the two directions, or where these disagree, the
         one that more speaks for; None where the frames gave no hypothesis at all
     residual_m, residual_rad : of the two directions composed, T_match_query T_query_match;
-        infinite where there is none
+        infinite where there is none. Of an accepted match with `T_other`, or with one direction
+        only, those of its two refinements
     overlap : share of both frames' points that agree under the transform, 0 to 1
     plane_overlap : the same with every plane counting as much as another, however large, 0 to 1:
         low where only a floor or a wall agrees
@@ -129,7 +137,7 @@ class PairValidation:
     plane_violations : `violations` with every plane counting the same
     search : what proposed the transform: correspondences of patches, the plans of two scans, or
         the map's poses
-    directions : of the search, in which the transform was found: of an accepted one, both
+    directions : of the search, in which the transform was found: both, or the one that found it
     T_other : (4, 4) where the two directions disagree, what the other one found; else None
     hypotheses : (n, 4, 4) T_match_query of the best that either direction refined, and of
         `T_rival`: what the frames may stand to each other, for the map to decide between
@@ -362,52 +370,177 @@ def _nothing(reason: str, seed: int, query: Geometry, match: Geometry, ups: Ups)
     )  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class _Proposal:
+    """A transform that is judged.
+
+    Parameters
+    ----------
+    T : (4, 4) T_match_query
+    directions : of the search, in which it was found
+    refined_by : the alignments that it is the middle of, or the one that it is of
+    evidence, inliers : see Evidence and PairValidation
+    """
+
+    T: Floats
+    directions: tuple[Direction, ...]
+    refined_by: tuple[Alignment, ...]
+    evidence: Evidence
+    inliers: int
+
+    def covariance(self, p: ValidationParameters) -> Floats | None:
+        """Return the covariance (6, 6) of T, or None where it was not refined both ways.
+
+        Where the two refinements settle apart, what they differ by is part of the error.
+        """
+        refined = [one.refined for one in self.refined_by]
+        if len(refined) < 2 or refined[0] is None or refined[1] is None:
+            return None
+        covariance = pair_covariance(refined[0], refined[1], self.T, p.covariance)
+        e, limits = self.evidence, p.acceptance
+        if covariance is None:
+            return None
+        if e.residual_m > limits.residual_m or e.residual_rad > limits.residual_rad:
+            off = _small_difference(refined[0].T, self.T)
+            covariance = covariance + np.outer(off, off)
+        return covariance
+
+
+def _small_difference(a: Floats, b: Floats) -> Floats:
+    """Return what must be added to b to give a: metres, then radians about the axes, (6,)."""
+    D = a[:3, :3] @ b[:3, :3].T
+    turn = [D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]]
+    return np.concatenate([a[:3, 3] - b[:3, 3], np.array(turn) / 2])
+
+
+class _Verdict(NamedTuple):
+    """Status, strength and reason of a validation, and the rival that was found."""
+
+    status: Status
+    strength: Strength | None
+    reason: str
+    rival: Rival = Rival(0.0, None)
+
+
 def _decided(
     query: FrameSamples, match: FrameSamples, there: Alignment | None, back: Alignment | None,
     seed: int, p: ValidationParameters, mode: Mode,
 ) -> PairValidation:  # fmt: skip
     residual, found = _estimates(there, back, p.acceptance)
-    found_by = [one for one in (there, back) if one is not None]
-    views = query.planes, match.planes
+    found_by = tuple(one for one in (there, back) if one is not None)
     transforms = list(found.values())
-    seen = explained(*views, np.stack(transforms), p.agreement)
+    seen = explained(query.planes, match.planes, np.stack(transforms), p.agreement)
     best = int(np.argmax(seen.share - p.alignment.rank_violations * seen.violations))
     (directions, T), *others = sorted(found.items(), key=lambda one: one[1] is not transforms[best])
-    e, inliers = _evidence(query, match, found_by, T, residual, seen, best, p)
-    T_other = others[0][1] if others else None
-    rival, ups = Rival(0.0, None), (query.up, match.up)
-    tilt = tilt_of(T, ups)
-    strength: Strength | None = None
-    against = objection(e, p.acceptance, mode) or _tilted(tilt, p)
-    if against is not None:
-        status, reason = against
-    elif mode == "paper":
-        strength = "weak" if e.violations is None or e.one_sided else "strong"
-        status, reason = "accepted", "the two directions agree"
-    elif found_by[0].search == "guided":
-        status, strength, reason = belief(e, rival.share, p.acceptance)
-    else:
-        voted = np.concatenate(
-            [there.others if there else _NONE, inverses(back.others) if back else _NONE]
-        )
-        proposed = there.proposed if there else _NONE
-        rival = best_alternative(
-            *views, T, e.plane_violations, voted, proposed, p.rivals, p.agreement,
-            ups, p.alignment.gravity.rival_tilt,
-        )  # fmt: skip
-        status, strength, reason = belief(e, rival.share, p.acceptance)
-        if status == "accepted" and rival.tilted > e.plane_overlap:
-            status, strength, reason = "ambiguous", None, _MORE_TILTED
-    covariance = None
-    if status == "accepted" and there is not None and back is not None:
-        covariance = pair_covariance(there.refined, back.refined, T, p.covariance)
+    evidence = _evidence(query, match, found_by, T, residual, seen, best, p)
+    one = _Proposal(T, directions, found_by, *evidence)
+    verdict = _verdict(query, match, one, there, back, p, mode)
+    if verdict.status == "rejected" and mode == "full":
+        sparse = _sparse(query, match, one, there, back, p)
+        one, verdict = sparse or (one, verdict)
+    e, rival, ups = one.evidence, verdict.rival, (query.up, match.up)
+    covariance = one.covariance(p) if verdict.status == "accepted" else None
     return PairValidation(
-        status, strength, reason, T, e.residual_m, e.residual_rad, e.overlap, e.plane_overlap,
-        e.violations, inliers, rival.share, rival.T, seed, covariance,
-        _sees_around(query.geometry) and _sees_around(match.geometry),
-        e.planes, e.plane_violations, found_by[0].search, directions, T_other,
-        _hypotheses(there, back, transforms, rival.T, p.n_hypotheses), ups, tilt,
+        verdict.status, verdict.strength, verdict.reason, one.T, e.residual_m, e.residual_rad,
+        e.overlap, e.plane_overlap, e.violations, one.inliers, rival.share, rival.T, seed,
+        covariance, _sees_around(query.geometry) and _sees_around(match.geometry), e.planes,
+        e.plane_violations, found_by[0].search, one.directions, others[0][1] if others else None,
+        _hypotheses(there, back, transforms, rival.T, p.n_hypotheses), ups, tilt_of(one.T, ups),
     )  # fmt: skip
+
+
+def _verdict(
+    query: FrameSamples, match: FrameSamples, one: _Proposal,
+    there: Alignment | None, back: Alignment | None, p: ValidationParameters, mode: Mode,
+) -> _Verdict:  # fmt: skip
+    """Judge a transform by the agreement of both directions, the evidence and its rivals."""
+    e = one.evidence
+    against = objection(e, p.acceptance, mode) or _tilted(tilt_of(one.T, (query.up, match.up)), p)
+    if against is not None:
+        return _Verdict(against[0], None, against[1])
+    if mode == "paper":
+        one_view = e.violations is None or e.one_sided
+        return _Verdict("accepted", "weak" if one_view else "strong", "the two directions agree")
+    if one.refined_by[0].search == "guided":
+        return _Verdict(*belief(e, 0.0, p.acceptance))
+    rival = _rival(query, match, one, there, back, p)
+    status, strength, reason = belief(e, rival.share, p.acceptance)
+    if status == "accepted" and rival.tilted > e.plane_overlap:
+        return _Verdict("ambiguous", None, _MORE_TILTED, rival)
+    return _Verdict(status, strength, reason, rival)
+
+
+def _rival(
+    query: FrameSamples, match: FrameSamples, one: _Proposal,
+    there: Alignment | None, back: Alignment | None, p: ValidationParameters,
+) -> Rival:  # fmt: skip
+    """Return the best rival of a transform, among all that either direction refined."""
+    voted = [_NONE]
+    if there is not None:
+        voted += [there.T[None], there.others]
+    if back is not None:
+        voted += [inverse(back.T)[None], inverses(back.others)]
+    return best_alternative(
+        query.planes, match.planes, one.T, one.evidence.plane_violations, np.concatenate(voted),
+        there.proposed if there else _NONE, p.rivals, p.agreement,
+        (query.up, match.up), p.alignment.gravity.rival_tilt,
+    )  # fmt: skip
+
+
+def _sparse(
+    query: FrameSamples, match: FrameSamples, one: _Proposal,
+    there: Alignment | None, back: Alignment | None, p: ValidationParameters,
+) -> tuple[_Proposal, _Verdict] | None:  # fmt: skip
+    """Accept a transform of depth images as weak, if the little that it shows speaks for it.
+
+    What one search alone found is refined in both directions first. What the other search found
+    is a rival then, as all other hypotheses are.
+
+    Returns
+    -------
+    the transform and its verdict, or None where the rejection stands
+    """
+    if one.refined_by[0].search != "correspondences" or are_scans(query.geometry, match.geometry):
+        return None
+    alone = len(one.directions) < 2
+    if alone:
+        refined = _refined_both_ways(query, match, one, p)
+        if refined is None:
+            return None
+        one = refined
+    e, covariance = one.evidence, one.covariance(p)
+    if covariance is None or _tilted(tilt_of(one.T, (query.up, match.up)), p) is not None:
+        return None
+    deviation = math.sqrt(max(float(np.trace(covariance[:3, :3])), 0.0))
+    if not sparse_evidence_suffices(e, deviation, p.acceptance, alone=alone):
+        return None
+    rival = _rival(query, match, one, there, back, p)
+    status, _, _ = belief(e, rival.share, p.acceptance)
+    if status != "accepted" or rival.tilted > e.plane_overlap:
+        return None
+    reason = f"{e.overlap:.0%} of the surfaces agree, in {e.planes:.0f} planes"
+    if alone:
+        reason += ", but one direction alone found it"
+    return one, _Verdict("accepted", "weak", reason, rival)
+
+
+def _refined_both_ways(
+    query: FrameSamples, match: FrameSamples, one: _Proposal, p: ValidationParameters
+) -> _Proposal | None:
+    """Refine in both directions what one search found, where it explains enough to be worth it."""
+    e = one.evidence
+    half = p.acceptance.sparse_plane_overlap / 2
+    if e.plane_overlap - e.plane_violations < half or e.plane_violations > 2 * half:
+        return None
+    there = align_guided(query, match, one.T, p.alignment)
+    back = align_guided(match, query, inverse(one.T), p.alignment)
+    if there is None or back is None:
+        return None
+    residual, _ = _estimates(there, back, p.acceptance)
+    T = middle(there.T, inverse(back.T))
+    seen = explained(query.planes, match.planes, T[None], p.agreement)
+    evidence = _evidence(query, match, (there, back), T, residual, seen, 0, p)
+    return _Proposal(T, one.directions, (there, back), *evidence)
 
 
 def _hypotheses(
