@@ -339,7 +339,8 @@ def _evidence(e: EvidenceRecord | None) -> str:
     if e.rival >= 0.05:
         rival = f"the next best place fits {e.rival:.0%} as well"
     planes, frames = _things(round(e.planes), "plane"), _things(e.frames, "frame")
-    return f"{planes} and {frames} of the map agree, {max(e.excess, 0.0):.0%} is missing, {rival}"
+    missing = "nothing" if e.excess < 0.005 else f"{e.excess:.0%}"
+    return f"{planes} and {frames} of the map agree, {missing} is missing, {rival}"
 
 
 def _things(number: int, name: str) -> str:

@@ -137,16 +137,17 @@ def test_an_ambiguous_place_is_told_with_its_alternatives(
     for line, one in zip(located[2:], told["alternatives"], strict=True):
         place = re.fullmatch(
             r" +(\S+) %  (\S+) (\S+) (\S+) m in hall, weight 0\.4, support 1; (\d+) planes? and "
-            r"(\d+) frames? of the map agree, (\d+)% is missing, .*",
+            r"(\d+) frames? of the map agree, (nothing|\d+%) is missing, .*",
             line,
         )
         assert place is not None, line
         sure, *xyz = map(float, place.groups()[:4])
         assert sure == floored(one["confidence"])
         evidence = one["evidence"]
-        planes, frames, missing = map(int, place.groups()[4:])
-        assert (planes, frames) == (round(evidence["planes"]), evidence["frames"])
-        assert missing == round(100 * max(evidence["excess"], 0))
+        planes, frames, missing = place.groups()[4:]
+        assert (int(planes), int(frames)) == (round(evidence["planes"]), evidence["frames"])
+        excess = evidence["excess"]
+        assert missing == ("nothing" if excess < 0.005 else f"{excess:.0%}")
         places.append(complex(*xyz[:2]))
         t = one["pose"]["translation"]
         assert xyz == pytest.approx([t["x"], t["y"], t["z"]], abs=6e-3)

@@ -116,7 +116,7 @@ function row(one) {
     h("th", { class: "queries-who", scope: "row", role: "rowheader" }, one.robot ?? h("span", { class: "muted", title: "The query did not say who asked." }, one.key ? `key ${one.key}` : "not named"),
       one.session && h("span", { class: "queries-more muted" }, one.session)),
     cell("outcome", h("span", { class: "badge", dataset: { kind } }, text),
-      one.confidence !== null && h("span", { class: "queries-more muted number", title: "Confidence of its best pose" }, confidence(one.confidence))),
+      one.confidence !== null && h("span", { class: "queries-more muted", title: "Confidence of its best pose" }, confidence(one.confidence))),
     cell("pose", pose(one)),
     cell("views number", one.pose ? count(one.support) : "–"),
     cell("took number", ms(one.milliseconds)),

@@ -123,8 +123,9 @@ export function grounds({ support, guided, votes, strength, verified_by: by, spr
 export function evidenceOf({ evidence }) {
   if (evidence === null) return "not compared with other places";
   const { planes, frames, excess, rival } = evidence;
+  const missing = excess < 0.005 ? "nothing" : percent(excess);
   const next = rival < 0.05 ? "no other place fits" : `the next best place fits ${percent(rival)} as well`;
-  return `${things(Math.round(planes), "plane")} and ${things(frames, "frame")} of the map agree, ${percent(Math.max(excess, 0))} is missing, ${next}`;
+  return `${things(Math.round(planes), "plane")} and ${things(frames, "frame")} of the map agree, ${missing} is missing, ${next}`;
 }
 
 function things(n, name) {
