@@ -306,8 +306,8 @@ def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
     )  # fmt: skip
     alone = {"planes": 1.2, "frames": 1, "excess": -0.01, "rival": 0.04}
     assert told(support=1, votes=1, evidence=alone, confidence=0.99996) == (
-        ["1 plane and 1 frame of the map agree, nothing is missing, no other place fits", "one view",
-         "strong match"], "good", "Found, 99.9 % sure"
+        ["1 plane and 1 frame of the map agree, nothing is missing, no other place fits",
+         "one view", "strong match"], "good", "Found, 99.9 % sure"
     )  # fmt: skip
     assert told(support=0, votes=0, verified_by="map", strength="weak")[:2] == (
         [near, "confirmed by the map’s frames", "no accepted match"], "good"
