@@ -327,17 +327,24 @@ def _grounds(there: Location | Localization) -> str:
         voted = f"{there.support} of {there.votes} accepted matches vote for it ({there.strength})"
         if there.spread_m is not None and there.spread_deg is not None:
             voted += f", spread {100 * there.spread_m:.1f} cm, {there.spread_deg:.1f} deg"
-    why = _evidence(there.evidence)
+    why = _evidence(there.evidence, expected=there.verified_by == "prior")
     return f"{voted}; {_DECIDED[there.verified_by or 'matches']}; {why}"
 
 
-def _evidence(e: EvidenceRecord | None) -> str:
-    """The evidence that a confidence was computed from, in a line."""
+def _evidence(e: EvidenceRecord | None, *, expected: bool = False) -> str:
+    """The evidence that a confidence was computed from, in a line.
+
+    Parameters
+    ----------
+    e : of a pose
+    expected : whether it was compared only with places that the prior expects
+    """
     if e is None:
         return "not compared with other places"
-    rival = "no other place fits"
+    place = "place that the prior expects" if expected else "place"
+    rival = f"no other {place} fits"
     if e.rival >= 0.05:
-        rival = f"the next best place fits {e.rival:.0%} as well"
+        rival = f"the next best {place} fits {e.rival:.0%} as well"
     planes, frames = _things(round(e.planes), "plane"), _things(e.frames, "frame")
     missing = "nothing" if e.excess < 0.005 else f"{e.excess:.0%}"
     return f"{planes} and {frames} of the map agree, {missing} is missing, {rival}"

@@ -315,6 +315,9 @@ def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
     details = told(support=5, votes=5, guided=3)[0]
     followed = "5 of 5 accepted matches agree on this pose, 3 of them guided by the others, within"
     assert details[1].startswith(followed)
+    assert told(verified_by="prior", evidence=alone)[0][0].endswith(
+        ", no other place that the prior expects fits"
+    )
     # found with less confidence than the default, or without one
     assert told(confidence=0.9)[1:] == ("warn", "Found, 90.0 % sure")
     unknown = told(

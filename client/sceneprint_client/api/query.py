@@ -264,7 +264,7 @@ class EvidenceRecord(ApiRecord):
     )
     rival: float = Field(
         description="Score of the best pose at another place, as a share of `score`; 0 where there "
-        "is none."
+        "is none. Where the prior decided, of the places that it expects."
     )
     rival_weight: float = Field(
         description="Largest weight of the matches that vote for another place."

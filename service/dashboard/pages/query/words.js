@@ -120,11 +120,12 @@ export function grounds({ support, guided, votes, strength, verified_by: by, spr
 }
 
 /** What the confidence of a pose was computed from. @param {Object<string, any>} place location or alternative of an answer */
-export function evidenceOf({ evidence }) {
+export function evidenceOf({ evidence, verified_by: by }) {
   if (evidence === null) return "not compared with other places";
   const { planes, frames, excess, rival } = evidence;
   const missing = excess < 0.005 ? "nothing" : percent(excess);
-  const next = rival < 0.05 ? "no other place fits" : `the next best place fits ${percent(rival)} as well`;
+  const place = by === "prior" ? "place that the prior expects" : "place";
+  const next = rival < 0.05 ? `no other ${place} fits` : `the next best ${place} fits ${percent(rival)} as well`;
   return `${things(Math.round(planes), "plane")} and ${things(frames, "frame")} of the map agree, ${missing} is missing, ${next}`;
 }
 
