@@ -327,7 +327,8 @@ class JobMethods(ServiceConnection):
         ----------
         map_name, association_id : of the association
         min_overlap : least overlap
-        consistent : only edges that loops confirm (True) or contradict (False); default: all
+        consistent : only edges that a second edge or a join supports (True), or that were outvoted
+            (False); default: all
 
         Raises
         ------
@@ -342,7 +343,7 @@ class JobMethods(ServiceConnection):
 
     def graph(
         self, map_name: str, association_id: str, kind: GraphFormat = "g2o", *,
-        min_overlap: float = 0.0, odometry: bool = False, consistent: bool = False,
+        min_overlap: float = 0.0, odometry: bool = False, consistent: bool = True,
     ) -> str:  # fmt: skip
         """The pose graph of an association that has succeeded, as a file.
 
@@ -352,7 +353,8 @@ class JobMethods(ServiceConnection):
         kind : g2o, tum or json
         min_overlap : least overlap of an edge
         odometry : add an edge between consecutive frames, from their poses
-        consistent : only edges that loops confirm; else all that loops do not contradict
+        consistent : only edges that a second edge of another viewpoint or a join supports; False
+            adds those that nothing checks, such as all edges of frames without poses
 
         Raises
         ------

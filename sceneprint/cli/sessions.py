@@ -301,8 +301,8 @@ def association_lines(told: Association) -> list[str]:
     r = told.result
     lines = [
         f"{name}: {r.edges} edges from {r.frames} frames ({r.validated} pairs validated)",
-        f"edges: {r.consistent} confirmed by loops, {r.inconsistent} outvoted, {r.unchecked} "
-        "unchecked",
+        f"edges: {r.consistent} supported by others, {r.inconsistent} outvoted, {r.unchecked} "
+        "unsupported",
     ]
     lines += [line for one in r.joins for line in _join(one)]
     if len(told.asked.sessions) == 2 and not r.joins:

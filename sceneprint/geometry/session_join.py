@@ -10,6 +10,13 @@ first run. Where it does not close, one of the edges is wrong. Odometry is belie
 only, so poses that drift do no harm, and no run need know where the other began (pairwise
 consistency: Mangelson et al., ICRA 2018, with odometry's doubt as a tolerance).
 
+Two edges of one viewpoint share their mistakes: what looks like another place from there looks like
+it in every frame that a robot takes while it stands still. So an edge counts as supported only
+where a loop closes with an edge whose frame was taken from elsewhere, on either run. Nor do all
+edges together tell the sides of a symmetric object apart, since all are mistaken by the same turn.
+The run itself does: an edge within one run that lies farther from its odometry than any odometry
+drifts is not supported.
+
 Each association of a frame of run b with a frame of run a is a vote for the transform between
 their parent frames. Votes are compared where their frames are, never at the origin of b: a degree
 is nothing there, and metres at an origin far away.
@@ -18,14 +25,14 @@ is nothing there, and metres at an origin far away.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.rigid import nearest_rotation, rotation_angle
+from sceneprint.geometry.rigid import distinct, nearest_rotation, rotation_angle
 from sceneprint.types import Floats
 
 
@@ -36,16 +43,22 @@ class Votes:
     Parameters
     ----------
     transforms : (n, 4, 4) T_a_b
-    places : (n, 3) metres, where the frame of each was, in b
+    views : (n, 4, 4) T_b_source, where the frame of each was
     source, target : (n,) its frames in b and in a
     weights : (n,) positive
     """
 
     transforms: Floats
-    places: Floats
+    views: Floats
     source: NDArray[np.int64]
     target: NDArray[np.int64]
     weights: Floats
+
+    @property
+    def places(self) -> Floats:
+        """Where the frame of each was, (n, 3) metres in b."""
+        places: Floats = self.views[:, :3, 3]
+        return places
 
 
 def votes_of(
@@ -67,7 +80,7 @@ def votes_of(
     places = source_poses[:, :3, 3]
     whole[:, :3, 3] = there[:, :3, 3] - np.einsum("nij,nj->ni", whole[:, :3, :3], places)
     whole[:, 3, 3] = 1.0
-    return Votes(whole, places, source, target, weights)
+    return Votes(whole, source_poses, source, target, weights)
 
 
 # Runs: where a robot was, frame by frame, and how far it went from one to the next.
@@ -123,9 +136,17 @@ class CycleParameters:
     close_m: float = 0.07  #: what may be left of a loop without a way, metres
     close_rad: float = math.radians(4.0)
     drift: float = 0.05  #: of a way: metres a metre, and radians a radian
+    most_drift: float = 0.2  #: of a way of any length, beyond which its edge is not supported
     reach_m: float = 1.0  #: longest way along either run, metres; past it odometry says nothing
     reach_rad: float = math.radians(60.0)
+    view_m: float = 0.1  #: frames of a run that are nearer than this were taken from one viewpoint
+    view_rad: float = math.radians(6.0)  #: unless they are turned by more than this
     most_loops: int = 4_000_000  #: that are held; the reach is shortened until there are no more
+
+    def scaled(self, scale: float) -> CycleParameters:
+        """Return these numbers with all lengths multiplied by `scale`."""
+        lengths = {name: scale * getattr(self, name) for name in ("close_m", "reach_m", "view_m")}
+        return replace(self, **lengths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,16 +178,20 @@ class Verdicts:
     kept : (n,) not outvoted
     loops : (n,) loops with edges that were kept
     closed : (n,) how many of them close; an edge without any was checked by nothing
+    supported : (n,) kept, one of those that close has an edge of another viewpoint, and the
+        odometry of one run does not contradict it
     """
 
     kept: NDArray[np.bool_]
     loops: Ints64
     closed: Ints64
+    supported: NDArray[np.bool_]
 
 
 def verdicts(
-    edges: LoopEdges, source: RobotPath, target: RobotPath, p: CycleParameters | None = None
-) -> Verdicts:
+    edges: LoopEdges, source: RobotPath, target: RobotPath, p: CycleParameters | None = None,
+    *, within_run: bool = False,
+) -> Verdicts:  # fmt: skip
     """Take edges out, the most outvoted first, until none is outvoted.
 
     Parameters
@@ -174,9 +199,10 @@ def verdicts(
     edges : see Edges
     source, target : the runs of their frames; the same one twice for loop closures
     p : see CycleParameters
+    within_run : whether both are the same run
     """
     p = p or CycleParameters()
-    firsts, seconds, closing = _loops(edges, source, target, p)
+    firsts, seconds, closing, elsewhere = _loops(edges, source, target, p)
     n = len(edges)
     both = np.concatenate([firsts, seconds])
     others = np.concatenate([seconds, firsts])
@@ -187,13 +213,36 @@ def verdicts(
     _outvote(starts, others[order], twice[order], edges.weights, kept)
     loops = np.bincount(both, kept[others], n).astype(np.int64)
     closed = np.bincount(both, kept[others] & twice, n).astype(np.int64)
-    return Verdicts(kept, loops, closed)
+    telling = np.concatenate([closing & elsewhere] * 2)
+    supported = kept & (np.bincount(both, kept[others] & telling, n) > 0)
+    if within_run:
+        supported &= _drifted_so_far(edges, source, p)
+    return Verdicts(kept, loops, closed, supported)
+
+
+def _drifted_so_far(edges: LoopEdges, run: RobotPath, p: CycleParameters) -> NDArray[np.bool_]:
+    """Which edges of a run lie no farther from its odometry than the way between their frames
+    allows.
+    """
+    here, there = run.poses[edges.source], run.poses[edges.target]
+    # where the run has the source, and where the edge puts it, in the run's frame
+    put = there @ edges.transforms
+    metres = np.linalg.norm(put[:, :3, 3] - here[:, :3, 3], axis=1)
+    cosines = (np.einsum("nij,nij->n", put[:, :3, :3], here[:, :3, :3]) - 1.0) / 2.0
+    way = np.abs(run.metres[edges.source] - run.metres[edges.target])
+    turn = np.abs(run.radians[edges.source] - run.radians[edges.target])
+    most = np.minimum(p.close_rad + p.most_drift * turn, math.pi)
+    near = (metres <= p.close_m + p.most_drift * way) & (cosines >= np.cos(most))
+    allowed: NDArray[np.bool_] = near | (way >= _BROKEN)
+    return allowed
 
 
 def _loops(
     edges: LoopEdges, source: RobotPath, target: RobotPath, p: CycleParameters
-) -> tuple[Ints64, Ints64, NDArray[np.bool_]]:
-    """Pairs of edges near each other on both runs, and which of them close."""
+) -> tuple[Ints64, Ints64, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pairs of edges near each other on both runs, which of them close, and which are of two
+    viewpoints on either run.
+    """
     ways = np.stack(
         [
             source.metres[edges.source], source.radians[edges.source],
@@ -217,7 +266,19 @@ def _loops(
         ways, limits, here, there, np.ascontiguousarray(edges.transforms), numbers,
         firsts, seconds, closing,
     )  # fmt: skip
-    return firsts, seconds, closing
+    elsewhere = _are_elsewhere(here, firsts, seconds, p) | _are_elsewhere(there, firsts, seconds, p)
+    return firsts, seconds, closing, elsewhere
+
+
+def _are_elsewhere(
+    poses: Floats, firsts: Ints64, seconds: Ints64, p: CycleParameters
+) -> NDArray[np.bool_]:
+    """Which pairs of poses (n, 4, 4) are two viewpoints."""
+    a, b = poses[firsts], poses[seconds]
+    metres = np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
+    cosines = (np.einsum("nij,nij->n", a[:, :3, :3], b[:, :3, :3]) - 1.0) / 2.0
+    apart: NDArray[np.bool_] = (metres > p.view_m) | (cosines < math.cos(p.view_rad))
+    return apart
 
 
 @kernel
@@ -340,6 +401,8 @@ class JoiningParameters:
     rounds: int = 8  #: of fitting again to the votes that agree
     least_votes: int = 3  #: that agree
     least_frames: int = 2  #: of either run, that these are of
+    view_m: float = 0.1  #: and they were not all taken within this of one another, metres
+    view_rad: float = math.radians(6.0)  #: or they are turned by more than this
     rival: float = 0.5  #: share of the support from which on another transform leaves it open
     strong_votes: int = 10
     strong_frames: int = 5
@@ -430,6 +493,8 @@ def _belief(
             f"{told}, of {frames} frames: {p.least_votes} of {p.least_frames} frames of either "
             "are needed"
         )
+    if len(distinct(votes.views[agree], np.zeros(support), p.view_m, p.view_rad, 2)) < 2:
+        return None, f"{told}, all of one viewpoint: nothing from elsewhere supports them"
     if weights[rivals].sum() >= p.rival * weights[agree].sum():
         return None, f"{told}, and {int(rivals.sum())} on another transform"
     if frames < p.strong_frames or support < max(p.strong_votes, p.strong_share * n):

@@ -208,7 +208,10 @@ def list_edges(
     min_overlap: _Overlap = 0.0,
     consistent: Annotated[
         bool | None,
-        Query(description="`true`: those that loops confirm. `false`: those that were outvoted."),
+        Query(
+            description="`true`: those that a second edge or a join supports. `false`: those that "
+            "were outvoted."
+        ),
     ] = None,
 ) -> Page[Edge]:
     """Edges in the order in which they were found, also while more are."""
@@ -241,14 +244,19 @@ async def get_graph(
         Query(description="With an edge between each two consecutive frames, from their poses."),
     ] = False,
     consistent: Annotated[
-        bool, Query(description="Only edges that loops confirm; else all not outvoted.")
-    ] = False,
+        bool,
+        Query(
+            description="Only edges that a second edge of another viewpoint or a join supports. "
+            "`false`: also those that nothing checks, such as all edges of frames without poses."
+        ),
+    ] = True,
 ) -> Response:
     """The pose graph of an association that has succeeded, for an optimiser.
 
     Vertices are all frames of the sessions, run after run in the order of time, numbered from 0;
-    their poses are in one frame where the sessions are joined. Edges that were outvoted are left
-    out. `format=json` tells which vertex is which frame.
+    their poses are in one frame where the sessions are joined. One pair of frames that look alike
+    is no evidence of one place, so edges that no other supports are left out. `format=json` tells
+    which vertex is which frame.
     """
     kinds = {media: name for name, media in MEDIA_TYPES.items()}
     wanted: Any = kind or kinds[preferred_media_type(request, list(kinds))]

@@ -34,9 +34,9 @@ class Sent:
 def sent(
     tmp_path_factory: pytest.TempPathFactory, room_views: Callable[..., SynthRoom]
 ) -> list[Sent]:
-    """Six frames along a path, one to each of two runs in turn."""
+    """Six frames along a path, some two degrees apart, one to each of two runs in turn."""
     path, found = tmp_path_factory.mktemp("sent") / "depth.png", []
-    for i, frame in enumerate(room_views(21, 0, 6, along_path=True).frames):
+    for i, frame in enumerate(room_views(21, 0, 12, along_path=True, step=2).frames):
         write_depth_png(path, frame.depth, 1000.0)
         k = frame.intrinsics
         assert frame.pose is not None

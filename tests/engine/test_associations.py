@@ -18,12 +18,13 @@ from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import list_jobs
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.sessions import associations
-from sceneprint.engine.sessions.association_job import Associating
+from sceneprint.engine.sessions.association_job import Associating, finish_association
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.lab.synth import SynthRoom
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
+from sceneprint.store.frame_queries import PathFrame
 from sceneprint.store.tables import events, frames, job_items, jobs
 from sceneprint.types import Floats
 from sceneprint_client.api import Filter, JobState, NewMap
@@ -195,6 +196,61 @@ def test_a_slice_that_was_lost_is_done_again_with_the_same_edges(
     assert slices == 7  # the last concludes
     assert told.result == whole.result
     assert stored(engine, told.association_id) == stored(engine, whole.association_id)
+
+
+def concluded(
+    here: list[float], there: list[float], off: dict[int, float], scale: float = 1.0
+) -> tuple[list[bool | None], dict[str, int], list[dict[str, Any]]]:
+    """Edges of the frames of two runs at some metres along a line, in their order; `off` by so
+    many metres.
+    """
+    stops: dict[int, PathFrame] = {}
+    runs: tuple[list[int], list[int]] = [], []
+    for run, places in enumerate((here, there)):
+        for x in places:
+            pose = np.eye(4)
+            pose[0, 3] = x
+            name, number = "ab"[run], len(stops)
+            runs[run].append(number)
+            stops[number] = PathFrame(
+                number, f"{number}", None, name, float(number), name, pose.tolist(), is_cloud=False
+            )
+    found = []
+    for i, (a, b) in enumerate(zip(here, there, strict=True)):
+        T = np.eye(4)
+        T[0, 3] = a - b + off.get(i, 0.0)
+        found.append({"from": runs[0][i], "to": runs[1][i], "T": T.ravel(), "strength": "strong"})
+    told, counts, joins = finish_association(
+        found, *runs, stops, NewAssociation(sessions=["a", "b"]), scale
+    )
+    return [one["consistent"] for one in told], counts, joins
+
+
+def test_an_edge_needs_a_second_one_from_elsewhere() -> None:
+    # a robot that stands still: all agree, and nothing supports them
+    told, counts, (join,) = concluded([0.0, 0.02, 0.04], [0.0, 0.01, 0.02], {})
+    assert told == [None, None, None]
+    assert counts == {"consistent": 0, "inconsistent": 0, "unchecked": 3}
+    assert join["transform"] is None
+    assert "one viewpoint" in join["reason"]
+    # 20 cm on, the same two frames are supported
+    told, _, _ = concluded([0.0, 0.2], [0.0, 0.2], {})
+    assert told == [True, True]
+    # and where they contradict each other, neither is
+    told, counts, _ = concluded([0.0, 0.2], [0.0, 0.2], {1: 0.5})
+    assert set(told) == {None, False}
+    assert counts == {"consistent": 0, "inconsistent": 1, "unchecked": 1}
+
+
+def test_the_join_supports_edges_that_no_loop_reaches() -> None:
+    far = [0.0, 3.0, 6.0, 9.0, 12.0]
+    told, counts, (join,) = concluded(far, far, {3: 2.0})
+    assert join["support"] == 4
+    assert told == [True, True, True, None, True]
+    assert counts == {"consistent": 4, "inconsistent": 0, "unchecked": 1}
+    # two alone join nothing: of rooms they are too far apart for a loop, of halls they are not
+    assert concluded(far[:2], far[:2], {})[0] == [None, None]
+    assert concluded(far[:2], far[:2], {}, 5.0)[0] == [True, True]
 
 
 def test_loop_closures_are_with_frames_long_before(

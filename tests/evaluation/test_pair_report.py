@@ -18,10 +18,13 @@ from sceneprint.lab.evaluation.pair_report import (
     pair_figures,
     pair_table,
     residual,
+    second_pairs,
+    support,
 )
 from sceneprint.lab.evaluation.pair_run import BINS, Drawn, Other, PairEvaluation, Tried
 from sceneprint.lab.evaluation.protocol import RIGHT, Error, SignedFrame, ValidatedPair
 from sceneprint.lab.evaluation.report import to_json
+from sceneprint.types import Floats
 
 ACCEPTANCE = AcceptanceParameters()
 CM3, CM7, CM15, AWAY = Error(0.03, 0.0), Error(0.07, 0.0), Error(0.15, 0.0), Error(2.0, 1.0)
@@ -185,3 +188,43 @@ def test_the_json_is_one_and_the_table_says_it(found: dict[str, Any]) -> None:
     assert "1 wrongly accepted, 1 not believed, 1 near, 1 not found" in lines
     assert "here | there" in lines
     assert f"{1 - math.sqrt(0.05):.5f}" in lines
+
+
+def at(x: float) -> Floats:
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
+def test_a_second_pair_from_another_viewpoint_supports(
+    make_pair: Callable[..., ValidatedPair],
+) -> None:
+    """Matches stand at 0, 1 and .05 m; what a pair says of its query is where it puts it."""
+    members = [replace(member(i, "here"), pose=at(x)) for i, x in enumerate((0.0, 1.0, 0.05))]
+    members += [member(i, "here") for i in (3, 4, 5)]
+
+    def pair(query: int, match: int, says: float, status: str = "accepted") -> Tried:
+        one = make_pair(match, status, off=CM3)
+        T = at(says - float(members[match].pose[0, 3]))
+        drawn = Drawn(query, match, "overlapping", "30-50", 0.4, 0.4, planar=False)
+        return Tried(
+            drawn, replace(one, validation=replace(one.validation, T_match_query=T)), None, None
+        )
+
+    tried = [
+        # one place, to 10 cm, from two viewpoints and a third that is nearly the first
+        pair(3, 0, 5.0), pair(3, 1, 5.1), pair(3, 2, 5.0),
+        # two places, and one that nothing was said of
+        pair(4, 0, 2.0), pair(4, 1, 7.0), pair(4, 2, 7.0, "rejected"),
+        # one place, but from one viewpoint only
+        pair(5, 0, 2.0), pair(5, 2, 2.0),
+    ]  # fmt: skip
+    seconds = second_pairs(replace(evaluation(tried), members=members))
+    assert seconds == [
+        *["supported"] * 3, "contradicted", "contradicted", None, "alone", "alone",
+    ]  # fmt: skip
+    wrong = [*tried[:3], *(replace(one, pair=replace(one.pair, error=AWAY)) for one in tried[3:])]
+    assert support(wrong, seconds) == {
+        "supported": 3, "precision": 1.0, "contradicted": 2, "precision_contradicted": 0.0,
+        "alone": 2, "precision_alone": 0.0,
+    }  # fmt: skip

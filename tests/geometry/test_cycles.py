@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.rigid import difference, inverse
+from sceneprint.geometry.rigid import difference, inverse, inverses
 from sceneprint.geometry.session_join import (
     CycleParameters,
     LoopEdges,
@@ -138,9 +138,10 @@ def test_odometry_that_drifts_does_no_harm() -> None:
     target = source - 150
     exact = np.array([inverse(true[j]) @ true[i] for i, j in zip(source, target, strict=True)])
     run = a_run(drifted)
-    found = verdicts(LoopEdges(source, target, exact, np.ones(150)), run, run)
+    found = verdicts(LoopEdges(source, target, exact, np.ones(150)), run, run, within_run=True)
     assert found.kept.all()
     assert (found.loops > 0).all()
+    assert found.supported.all()
     blind = CycleParameters(reach_m=1e3, reach_rad=1e3, drift=0.0)
     assert not verdicts(LoopEdges(source, target, exact, np.ones(150)), run, run, blind).kept.all()
 
@@ -163,6 +164,82 @@ def test_by_hand() -> None:
     assert verdicts(edges, a_run(poses), a_run(poses)).closed.tolist() == [2, 1, 1]
     transforms[2, 1, 3] = 0.07 + 0.05 * 0.4 + 1e-6
     assert verdicts(edges, a_run(poses), a_run(poses)).kept.tolist() == [True, True, False]
+
+
+def line(*x: float) -> Floats:
+    poses = np.tile(np.eye(4), (len(x), 1, 1))
+    poses[:, 0, 3] = x
+    return poses
+
+
+def test_an_edge_of_the_same_viewpoint_supports_nothing() -> None:
+    """Frames at 0 and 5 cm are one viewpoint, that at 20 cm is another one; all edges agree."""
+    here = line(0.0, 0.05, 0.2)
+
+    def found(chosen: list[int], target: list[int], there: Floats) -> list[bool]:
+        source, onto = np.array(chosen), np.array(target)
+        transforms = inverses(there[onto]) @ here[source]
+        edges = LoopEdges(source, onto, transforms, np.ones(len(source)))
+        told = verdicts(edges, a_run(here), a_run(there))
+        assert told.kept.all()
+        assert (told.closed == len(source) - 1).all()
+        return told.supported.tolist()
+
+    still = line(0.0, 0.01, 0.02)
+    assert found([0, 1], [0, 1], still) == [False, False]
+    assert found([0, 1, 2], [0, 1, 2], still) == [True, True, True]
+    # on either run: one frame that was found at two places of the other one
+    assert found([0, 0], [0, 2], here) == [True, True]
+    assert found([0], [0], here) == [False]
+    # or turned by 7 degrees where it stood
+    turned = still.copy()
+    turned[1, :3, :3] = Rotation.from_euler("y", 7.0, degrees=True).as_matrix()
+    assert found([0, 1], [0, 1], turned) == [True, True]
+
+
+def test_no_odometry_drifts_from_one_side_of_an_object_to_the_other() -> None:
+    """Half a circle of 2 m radius about an object: each frame looks like that half a turn later."""
+    angles = np.linspace(0.0, 2 * np.pi, 41)[:-1]
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("z", angles[:, None]).as_matrix()
+    poses[:, :2, 3] = 2.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    source, run = np.arange(20, 40), a_run(poses)
+    alike = LoopEdges(source, source - 20, np.tile(np.eye(4), (20, 1, 1)), np.ones(20))
+    # all edges are turned alike, so that they agree with each other and with nothing else
+    found = verdicts(alike, run, run)
+    assert found.kept.all()
+    assert found.supported.all()
+    within = verdicts(alike, run, run, within_run=True)
+    assert within.kept.all()
+    assert not within.supported.any()
+    # right ones are 4 m apart, over a way of 6.3 m that may be wrong by a fifth
+    true = inverses(poses[source - 20]) @ poses[source]
+    for metres, supported in ((0.0, True), (1.2, True), (1.5, False)):
+        transforms = true.copy()
+        transforms[:, 2, 3] += metres
+        edges = LoopEdges(source, source - 20, transforms, np.ones(20))
+        found = verdicts(edges, run, run, within_run=True)
+        assert found.supported.tolist() == [supported] * 20
+    # a gap in the odometry allows everything
+    gap = a_run(poses, [0] * 20 + [1] * 20)
+    assert verdicts(alike, gap, gap, within_run=True).supported.all()
+
+
+def test_what_disagrees_supports_nothing() -> None:
+    here = line(0.0, 0.2)
+    transforms = np.tile(np.eye(4), (2, 1, 1))
+    transforms[1, 1, 3] = 0.5
+    every = np.arange(2)
+    found = verdicts(LoopEdges(every, every, transforms, np.ones(2)), a_run(here), a_run(here))
+    assert found.kept.sum() == 1
+    assert not found.supported.any()
+
+
+def test_lengths_are_multiples_of_the_scale() -> None:
+    p, large = CycleParameters(), CycleParameters().scaled(5.0)
+    lengths = [(p.close_m, large.close_m), (p.reach_m, large.reach_m), (p.view_m, large.view_m)]
+    assert [b / a for a, b in lengths] == pytest.approx([5.0] * 3)
+    assert (large.drift, large.close_rad) == (p.drift, p.close_rad)
 
 
 def test_nothing_checks_where_there_are_no_poses_or_odometry_is_broken() -> None:

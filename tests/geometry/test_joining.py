@@ -144,19 +144,31 @@ def test_too_few_votes_or_too_few_frames_are_none() -> None:
         join(votes_of(T[:0], b[:0], a[:0], n[:0], n[:0], np.ones(0)))
 
 
-def test_many_frames_of_one_place_are_weak() -> None:
+def test_many_frames_of_one_place_join_nothing() -> None:
     """A robot that stands still takes one view many times, and all are mistaken alike."""
     rng = np.random.default_rng(6)
     true, n = rigid(rng, 3.0), np.arange(30)
     still = np.array([rigid(rng, 5.0)] * 30)
-    moving = np.array([rigid(rng, 0.0, 0.0) @ still[0] for _ in range(30)])
-    moving[:, 0, 3] += np.linspace(0.0, 1.1, 30)
-    for b, strength in ((still, "weak"), (moving, "strong")):
+    reaching = {"": still}
+    for metres, said in ((0.09, "one viewpoint"), (0.11, "within 0.11 m"), (1.1, "agree")):
+        reaching[said] = still.copy()
+        reaching[said][:, 0, 3] += np.linspace(0.0, metres, 30)
+    turning = [still[0] @ turned_by(degrees) for degrees in np.linspace(0.0, 7.0, 30)]
+    reaching["within 0.00 m"] = np.array(turning)
+    expected = {"": None, "one viewpoint": None, "within 0.11 m": "weak", "agree": "strong",
+                "within 0.00 m": "weak"}  # fmt: skip
+    for said, b in reaching.items():
         T = np.array([rigid(rng, 0.01, 0.4) for _ in range(30)])
         found = join(votes_of(T, b, true @ b, n, n, np.ones(30)))
-        assert (found.support, found.strength) == (30, strength)
-        assert ("all within 0.00 m" in found.reason) is (strength == "weak")
-        assert found.T is not None
+        assert (found.support, found.strength) == (30, expected[said])
+        assert said in found.reason
+        assert (found.T is None) is (expected[said] is None)
+
+
+def turned_by(degrees: float) -> Floats:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    return T
 
 
 def test_a_frame_that_was_found_often_counts_once() -> None:

@@ -78,7 +78,11 @@ class NewAssociation(Given):
 
 
 class Edge(ApiRecord):
-    """Two frames that see one place, and how they lie to each other."""
+    """Two frames that seem to see one place, and how they lie to each other.
+
+    An edge alone is evidence that two places look alike, not that they are one: take it only where
+    `consistent` is true.
+    """
 
     number: int = Field(description="From 0, in the order in which edges were found.")
     from_frame: str = Field(description="The frame that was looked up.")
@@ -107,9 +111,10 @@ class Edge(ApiRecord):
     from_name: str | None = Field(default=None, description="What the file was called.")
     to_name: str | None = None
     consistent: bool | None = Field(
-        description="Whether loops with edges near by close. `false`: it was outvoted, and is "
-        "left out of graphs and joins. null: there is nothing near by to compare it with, or no "
-        "poses, or the association is not over."
+        description="Whether a second edge supports it. `true`: a loop with an edge near by of "
+        "another viewpoint closes, or it agrees with the join. `false`: it was outvoted, and is "
+        "left out of graphs and joins. null: nothing from another viewpoint checks it, or there "
+        "are no poses, or the association is not over."
     )
     loops: int | None = Field(description="Edges near by that it was compared with.")
     closed: int | None = Field(description="Of them those that agree with it.")
@@ -148,8 +153,13 @@ class AssociationResult(ApiRecord):
     frames: int = Field(description="Frames that were looked up.")
     skipped: int = Field(description="Frames that could not be, as they were deleted meanwhile.")
     validated: int = Field(description="Pairs of frames that were validated.")
-    edges: int = Field(description="Of them accepted.")
-    consistent: int = Field(description="Edges that loops with others confirm.")
+    edges: int = Field(
+        description="Of them accepted: places that look alike, of which those that are "
+        "`consistent` may be taken for one."
+    )
+    consistent: int = Field(
+        description="Edges that another one of another viewpoint, or a join, supports."
+    )
     inconsistent: int = Field(description="Edges that were outvoted.")
     unchecked: int = Field(description="Edges that nothing near by confirms or denies.")
     joins: list[Join] = Field(

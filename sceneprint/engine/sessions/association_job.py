@@ -30,6 +30,8 @@ from sceneprint.geometry.retrieval.ranking import (
     similarity,
 )
 from sceneprint.geometry.session_join import (
+    CycleParameters,
+    JoiningParameters,
     LoopEdges,
     RobotPath,
     Verdicts,
@@ -38,6 +40,7 @@ from sceneprint.geometry.session_join import (
     verdicts,
     votes_of,
 )
+from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.models import Model
 from sceneprint.pipeline import PairMatch, associate
 from sceneprint.store import Store
@@ -59,9 +62,12 @@ _WEAK = 0.5
 
 def finish_association(
     found: list[dict[str, Any]], source: list[int], target: list[int], stops: dict[int, PathFrame],
-    asked: NewAssociation,
+    asked: NewAssociation, scale: float = 1.0,
 ) -> tuple[list[dict[str, Any]], dict[str, int], list[dict[str, Any]]]:  # fmt: skip
     """Check edges against each other, and let those that stand vote.
+
+    An edge is consistent if a loop with an edge of another viewpoint closes, or if it agrees with
+    the join of the two parent frames that it leads between.
 
     Parameters
     ----------
@@ -69,6 +75,7 @@ def finish_association(
     source, target : numbers of the frames of both runs, in the order of time
     stops : what is known of them; deleted ones are missing
     asked : see NewAssociation
+    scale : by which lengths of the model are longer than those for rooms
 
     Returns
     -------
@@ -86,19 +93,23 @@ def finish_association(
         np.array([item["T"] for item in found], float).reshape(-1, 4, 4),
         np.array([1.0 if item["strength"] == "strong" else _WEAK for item in found]),
     )
-    judged = verdicts(edges, *runs)
-    confirmed = judged.kept & (judged.loops > 0)
+    cycles = CycleParameters().scaled(scale)
+    judged = verdicts(edges, *runs, cycles, within_run=len(asked.sessions) == 1)
+    numbers = JoiningParameters(view_m=cycles.view_m)
+    joins, agree = _joins(found, edges, runs, judged, stops, asked, numbers)
+    confirmed = judged.supported | agree
     counts = {
         "consistent": int(confirmed.sum()), "inconsistent": int((~judged.kept).sum()),
         "unchecked": int((judged.kept & ~confirmed).sum()),
     }  # fmt: skip
     told = [
-        {"consistent": bool(kept) if loops or not kept else None, "loops": loops, "closed": closed}
-        for kept, loops, closed in zip(
-            judged.kept.tolist(), judged.loops.tolist(), judged.closed.tolist(), strict=True
+        {"consistent": True if sure else None if kept else False, "loops": loops, "closed": closed}
+        for sure, kept, loops, closed in zip(
+            confirmed.tolist(), judged.kept.tolist(), judged.loops.tolist(),
+            judged.closed.tolist(), strict=True,
         )
-    ]
-    return told, counts, _joins(found, edges, runs, judged, stops, asked)
+    ]  # fmt: skip
+    return told, counts, joins
 
 
 def _run(numbers: list[int], stops: dict[int, PathFrame], parents: dict[str, int]) -> RobotPath:
@@ -111,11 +122,11 @@ def _run(numbers: list[int], stops: dict[int, PathFrame], parents: dict[str, int
 
 
 def _joins(
-    found: list[dict[str, Any]], edges: LoopEdges, runs: tuple[RobotPath, RobotPath], judged:
-Verdicts,
-    stops: dict[int, PathFrame], asked: NewAssociation,
-) -> list[dict[str, Any]]:  # fmt: skip
-    """A consensus of each two parent frames that edges lead between."""
+    found: list[dict[str, Any]], edges: LoopEdges, runs: tuple[RobotPath, RobotPath],
+    judged: Verdicts, stops: dict[int, PathFrame], asked: NewAssociation,
+    numbers: JoiningParameters,
+) -> tuple[list[dict[str, Any]], NDArray[np.bool_]]:  # fmt: skip
+    """A consensus of each two parent frames that edges lead between, and the edges that agree."""
     between: dict[tuple[str, str], list[int]] = {}
     for i in np.flatnonzero(judged.kept).tolist():
         ends = [stops.get(found[i][side]) for side in ("from", "to")]
@@ -123,13 +134,14 @@ Verdicts,
         # loop closures within one frame correct its drift, and join nothing
         if here is not None and there is not None and (len(asked.sessions) == 2 or here != there):
             between.setdefault((here, there), []).append(i)
-    told = []
+    told, agree = [], np.zeros(len(found), np.bool_)
     for (here, there), chosen in sorted(between.items()):
         own: NDArray[np.intp] = np.array(chosen)
         source, target = edges.source[own], edges.target[own]
         poses: tuple[Floats, Floats] = (runs[0].poses[source], runs[1].poses[target])
         votes = votes_of(edges.transforms[own], *poses, source, target, edges.weights[own])
-        one = join(votes, asked.seed)
+        one = join(votes, asked.seed, numbers)
+        agree[own] = one.agree & (one.T is not None)
         first, second = (stops[found[chosen[0]][side]] for side in ("from", "to"))
         told.append(
             Join(
@@ -142,7 +154,7 @@ Verdicts,
                 reason=one.reason,
             ).model_dump(mode="json")
         )  # fmt: skip
-    return told
+    return told, agree
 
 
 class Associating:
@@ -168,7 +180,10 @@ class Associating:
         with self._store.database.read() as connection:
             found = items_of(connection, task.job.number) + items
             stops = stops_of(connection, {*plan.source, *plan.target})
-        judged, counts, joins = finish_association(found, plan.source, plan.target, stops, asked)
+        scale = self._signers(task.of_map.model_id).model.answer.map.same_m / MapParameters().same_m
+        judged, counts, joins = finish_association(
+            found, plan.source, plan.target, stops, asked, scale
+        )
         result = {
             "frames": len(plan.source), "skipped": progress["skipped"],
             "validated": progress["validated"], "edges": len(found), **counts,

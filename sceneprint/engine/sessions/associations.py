@@ -190,12 +190,13 @@ class AssociationJobs(MapJobs[Association]):
 
     def graph(
         self, map_name: str, job_id: str, kind: GraphFormat = "g2o", min_overlap: float = 0.0,
-        *, odometry: bool = False, consistent: bool = False,
+        *, odometry: bool = False, consistent: bool = True,
     ) -> str:  # fmt: skip
-        """The pose graph of an association that is over, as a file of a kind.
+        """Return the pose graph of an association that is over, as a file of a kind.
 
-        It has the edges of at least `min_overlap` that were not outvoted, or those alone that
-        loops confirm (`consistent`); and with `odometry` one between each two consecutive frames.
+        It has the edges of at least `min_overlap` that a second edge or a join supports, or, unless
+        `consistent`, all that were not outvoted; and with `odometry` one between each two
+        consecutive frames.
 
         Raises
         ------

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Evidence
+from sceneprint.geometry.validation.map_verification import at_place, different_views
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.lab.evaluation.measures import (
     CONFIDENCE,
@@ -25,6 +26,7 @@ from sceneprint.lab.evaluation.pair_run import BINS, METHODS, PairEvaluation, Tr
 from sceneprint.lab.evaluation.protocol import Error, ValidatedPair
 from sceneprint.lab.evaluation.report import without_infinities
 from sceneprint.lab.evaluation.run import PLANAR
+from sceneprint.types import Floats
 
 _COLUMNS = ("within_5cm_5deg", "right")
 _LIMITS = "within 5 cm / right"
@@ -48,6 +50,13 @@ def pair_table(found: dict[str, Any]) -> list[str]:
         f"overlap is 30 % {_number(v['recall_overlap_30'])}; {v['accepted']} of {v['pairs']} pairs "
         f"accepted, {v['accepted_strong']} strong"
     )
+    s = found["support"]
+    lines.append(
+        f"second pair   {s['supported']} accepted pairs have one that agrees: precision "
+        f"{_number(s['precision'])}; {s['contradicted']} have only others that disagree: "
+        f"{_number(s['precision_contradicted'])}; {s['alone']} have no other: "
+        f"{_number(s['precision_alone'])}"
+    )
     kinds = [one["what"] for one in found["failures"]]
     counts = [f"{kinds.count(kind)} {kind.replace('_', ' ')}" for kind in dict.fromkeys(kinds)]
     lines.append(f"failures      {', '.join(counts) or 'none'}")
@@ -68,6 +77,8 @@ def _bins(found: dict[str, Any]) -> list[str]:
         ("accepted", lambda one: str(one["validation"]["accepted"])),
         ("  precision", lambda one: _number(one["validation"]["precision"])),
         ("  recall", lambda one: _number(one["validation"]["recall"])),
+        ("with a second pair", lambda one: str(one["support"]["supported"])),
+        ("  precision", lambda one: _number(one["support"]["precision"])),
     ]
     lines = [_HEAD]
     for name, cell in rows:
@@ -238,13 +249,18 @@ def pair_figures(evaluation: PairEvaluation, settings: dict[str, Any]) -> dict[s
     }
     found["left_out"] = [{"name": n, "reason": why} for n, why in evaluation.left_out]
     limits = evaluation.limits
-    found["bins"] = bins(tried, limits)
+    seconds = second_pairs(evaluation)
+    found["bins"] = bins(tried, seconds, limits)
     found["negatives"] = negatives(evaluation)
     found["validation"] = validation_of([one.pair for one in tried])
+    found["support"] = support(tried, seconds)
+
+    def within(scene: str) -> list[int]:
+        return [i for i, one in enumerate(tried) if _within(one, scene, scene_of)]
+
     if len(scenes) > 1:
         found["scenes"] = {
-            scene: _of_scene([one for one in tried if _within(one, scene, scene_of)], limits)
-            for scene in scenes
+            scene: _of_scene(within(scene), tried, seconds, limits) for scene in scenes
         }
     found["roc"] = curves([one.pair for one in tried], evaluation.acceptance)
     found["milliseconds"] = {
@@ -262,30 +278,87 @@ def _within(one: Tried, scene: str, scene_of: Sequence[str]) -> bool:
     return scene_of[one.drawn.query] == scene_of[one.drawn.match] == scene
 
 
-def _of_scene(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, Any]:
+def _of_scene(
+    own: Sequence[int], tried: Sequence[Tried], seconds: Sequence[Second | None],
+    limits: tuple[float, float],
+) -> dict[str, Any]:  # fmt: skip
     """Figures of the pairs of one scene, its negatives among them."""
+    pairs, theirs = [tried[i] for i in own], [seconds[i] for i in own]
     return {
-        "bins": bins(tried, limits),
-        "same_scene": rate([one for one in tried if one.drawn.kind == "same_scene"]),
-        "validation": validation_of([one.pair for one in tried]),
+        "bins": bins(pairs, theirs, limits),
+        "same_scene": rate([one for one in pairs if one.drawn.kind == "same_scene"]),
+        "validation": validation_of([one.pair for one in pairs]),
+        "support": support(pairs, theirs),
     }
 
 
-def bins(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, dict[str, Any]]:
+#: What other accepted pairs of the same query say of an accepted pair.
+Second = Literal["supported", "contradicted", "alone"]
+
+
+def second_pairs(evaluation: PairEvaluation) -> list[Second | None]:
+    """Return whether a second pair agrees with each accepted one, None for others.
+
+    Each accepted pair places its query by the true pose of its match, as the pose of a frame of
+    a map would. A pair is supported if another accepted pair of the same query, whose match was
+    taken from a different viewpoint, places it there too, to what a map takes for one place;
+    contradicted if all others place it elsewhere.
+    """
+    members, p = evaluation.members, evaluation.map
+    of_query: dict[int, list[int]] = {}
+    poses: dict[int, Floats] = {}
+    for i, one in enumerate(evaluation.tried):
+        T = one.pair.validation.T_match_query
+        if one.pair.accepted and T is not None:
+            of_query.setdefault(one.drawn.query, []).append(i)
+            poses[i] = members[one.drawn.match].pose @ T
+    said: list[Second | None] = [None] * len(evaluation.tried)
+    for own in of_query.values():
+        for i in own:
+            match = members[evaluation.tried[i].drawn.match]
+            agree = []
+            for j in own:
+                other = members[evaluation.tried[j].drawn.match]
+                views = np.stack([match.pose, other.pose])
+                if match.scene != other.scene:
+                    agree.append(False)
+                elif len(different_views(views, p)) > 1:
+                    agree.append(bool(at_place(poses[j][None], poses[i], p)[0]))
+            said[i] = "supported" if any(agree) else "contradicted" if agree else "alone"
+    return said
+
+
+def support(tried: Sequence[Tried], seconds: Sequence[Second | None]) -> dict[str, Any]:
+    """How many accepted pairs a second one supports, and how many of each kind are right."""
+    found: dict[str, Any] = {}
+    kinds: tuple[Second, ...] = get_args(Second)
+    for kind in kinds:
+        right = [t.pair.right for t, said in zip(tried, seconds, strict=True) if said == kind]
+        found[kind] = len(right)
+        name = "precision" if kind == "supported" else f"precision_{kind}"
+        found[name] = sum(right) / len(right) if right else None
+    return found
+
+
+def bins(
+    tried: Sequence[Tried], seconds: Sequence[Second | None], limits: tuple[float, float]
+) -> dict[str, dict[str, Any]]:
     """By true overlap: how often the transform is right, accepted or not, and whether believed.
 
     `success`: of the transform that validation found; `right`: to the limits of the evaluation.
     `bound`: of refinement started at the true pose. Without a transform a pair is a failure.
-    `validation`: see `measures.validation`.
+    `validation`: see `measures.validation`. `support`: see `support`.
     """
     found = {}
     for name in BINS:
-        own = [one.pair for one in tried if one.drawn.bin == name]
+        chosen = [i for i, one in enumerate(tried) if one.drawn.bin == name]
+        own = [tried[i].pair for i in chosen]
         found[name] = {
             "pairs": len(own),
             "success": _shares([pair.error for pair in own], limits),
             "bound": _shares([pair.bound or Error() for pair in own], limits),
             "validation": validation_of(own),
+            "support": support([tried[i] for i in chosen], [seconds[i] for i in chosen]),
         }
     return found
 

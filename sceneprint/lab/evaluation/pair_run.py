@@ -24,6 +24,7 @@ from sceneprint.geometry.registration.icp import refined_all
 from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.signature.pair_features import PropertyParameters
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
+from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.geometry.validation.validation import refined_at
 from sceneprint.lab.evaluation.judgement import (
     Candidate,
@@ -550,7 +551,7 @@ class PairEvaluation:
     ----------
     members : N frames that can be used, without their signatures
     limits : metres and degrees to which a transform was to be right
-    acceptance : the numbers of the model's
+    acceptance, map : the numbers of the model's
     planes : (N,) share of each one's samples in its largest plane
     tried : in the order drawn
     left_out : (name, reason) of other frames
@@ -564,6 +565,7 @@ class PairEvaluation:
     tried: list[Tried]
     left_out: list[tuple[str, str]]
     prepare_ms: float | None
+    map: MapParameters = field(default_factory=MapParameters)
 
 
 def evaluate_pairs(
@@ -636,6 +638,7 @@ def evaluate_pairs(
         list(watch(tried, "validate", len(tasks))),
         prepared.left_out,
         prepared.milliseconds,
+        signer.model.answer.map,
     )
 
 
