@@ -45,7 +45,7 @@ def test_each_query_leaves_a_record_of_what_came_of_it(house, shots, refused):
     mine = {"robot": "spot", "session": "monday"}
     found = house.ask("robot", "POST", f"{ALPHA}/queries", **shots[0].form(**mine))
     assert found.json()["status"] == "found", found.text
-    lost = house.ask("robot", "POST", f"{ALPHA}/localize", **shots[3].form(robot="cart"))
+    lost = house.ask("robot", "POST", f"{ALPHA}/localize", **shots[2].form(robot="cart"))
     assert lost.json()["status"] == "not_found", lost.text
     odometry = {"parent_frame": "odom", "matrix": shots[0].pose}
     meta = {"intrinsics": shots[0].camera, "pose": odometry, **mine}
