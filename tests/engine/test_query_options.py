@@ -16,6 +16,7 @@ from sqlalchemy import update
 from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index, retrieval
 from sceneprint.engine.search.retrieval import FIRST_S, Deadline
+from sceneprint.engine.search.verification import thresholds
 from sceneprint.errors import UnknownFrame
 from sceneprint.geometry.retrieval.ranking import (
     DiversityParameters,
@@ -23,12 +24,14 @@ from sceneprint.geometry.retrieval.ranking import (
     diversify,
     pairwise_distances,
 )
+from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.index import SearchHits
 from sceneprint.pipeline import Signature, Signer, retrieve, validate
 from sceneprint.store.maps import find_frame, find_map
 from sceneprint.store.tables import frames
 from sceneprint.types import Geometry
 from sceneprint_client.api import Answer, Query
+from sceneprint_client.api.query import ValidationOptions
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]
@@ -111,6 +114,20 @@ def test_thresholds_decide_what_is_accepted(full: Engine, ids: Ids) -> None:
             and one.validation.residual.rotation_deg <= 5.0
         )
         assert (one.validation.status == "accepted") is small
+
+
+def test_a_limit_of_the_caller_holds_however_little_the_frames_share() -> None:
+    p = ValidationParameters()
+    asked = ValidationOptions(evidence=0.4, plane_overlap=0.3, residual_m=0.05, residual_deg=3.0)
+    a = thresholds(asked, p)[0].acceptance
+    assert (a.evidence, a.sparse_evidence, a.blind_evidence) == (0.4, 0.4, 0.4)
+    assert (a.plane_overlap, a.sparse_plane_overlap, a.apart_plane_overlap) == (0.3, 0.3, 0.3)
+    assert (a.residual_m, a.apart_m) == (0.05, 0.05)
+    assert (a.residual_rad, a.apart_rad) == (math.radians(3.0), math.radians(3.0))
+    # what is left out is as the model has it
+    assert thresholds(ValidationOptions(weak=0.1), p)[0].acceptance == replace(
+        p.acceptance, weak=0.1
+    )
 
 
 def test_a_deadline_stops_validation_and_says_so(

@@ -110,7 +110,11 @@ class Residual(ApiRecord):
 
 
 class Validation(ApiRecord):
-    """What came of aligning the query with a match."""
+    """What came of aligning the query with a match.
+
+    An accepted pair is evidence that two frames look alike, not that they are of one place: the
+    answer's `status` weighs it against the map.
+    """
 
     status: ValidationStatus = Field(
         description="`skipped`: it was not tried, and `reason` says why."

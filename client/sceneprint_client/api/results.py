@@ -286,7 +286,8 @@ class Similarity(ApiRecord):
     b: FrameName | None
     validation: Validation | None = Field(description="Null where it was not asked for.")
     transform: Transform | None = Field(
-        description="x_a = matrix @ x_b; believe it where the validation accepts it."
+        description="x_a = matrix @ x_b. Where the validation accepts it, it is right if the two "
+        "frames are of one place, which a pair alone cannot show."
     )
     uncertainty: Uncertainty | None = Field(
         default=None, description="Of `transform`, where the validation accepts it."

@@ -162,7 +162,7 @@ class AssociationJobs(MapJobs[Association]):
         map_name, job_id : of the association
         cursor, limit : of the page
         min_overlap : least overlap
-        consistent : those that loops confirm, or those that were outvoted; default: all
+        consistent : those that others support, or those that were outvoted; default: all
 
         Raises
         ------
