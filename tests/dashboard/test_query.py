@@ -160,7 +160,8 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
     verdict = page.locator(".query-verdict")
     said = verdict.inner_text()
     reason = four_sides["reason"]
-    assert f"Ambiguous. {reason[0].upper()}{reason[1:]}." in said
+    sure = f"{math.floor(1000 * four_sides['alternatives'][0]['confidence']) / 10:.1f} %"
+    assert f"Ambiguous, best pose {sure} sure. {reason[0].upper()}{reason[1:]}." in said
     assert "Do not act on any of these poses. Move on and query again" in said
     assert "found" not in said.lower()
     assert "agree" not in said.lower()
