@@ -132,13 +132,14 @@ def test_frames_can_be_looked_at_and_edited(outputs: dict[str, list[str]]) -> No
 
 @pytest.mark.thorough
 def test_queries_answer_as_the_page_says(outputs: dict[str, list[str]]) -> None:
-    asked, of_map, listed = outputs["Where was this taken?"]
+    asked, of_map, less, listed = outputs["Where was this taken?"]
     answer = documents(asked)[0]
     assert answer["status"] == "found"
     assert answer["matches"][0]["validation"]["status"] == "accepted"
     assert answer["counts"]["map"] == 14
     again = documents(of_map)[0]
     assert (again["status"], again["seed"]) == ("found", 7)
+    assert documents(less)[0]["location"]["confidence"] == answer["location"]["confidence"] >= 0.99
     unvalidated = documents(listed)[0]
     assert (unvalidated["status"], unvalidated["counts"]["selected"]) == ("unvalidated", 5)
     explained = one(outputs, "Why not that one?")[0]
