@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.encode import Clock
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.formats.dataset import FrameReference
-from sceneprint.localization import PoseEstimate, QueryFrame, localize, views_of_rows
+from sceneprint.localization import PoseEstimate, localize, views_of_rows
 from sceneprint.pipeline import (
     PairMatch,
     Signature,
@@ -21,6 +21,7 @@ from sceneprint.pipeline import (
     retrieve,
     searched,
 )
+from sceneprint.places import QueryFrame
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Answer
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sceneprint.formats.dataset import find_sequences, make_frame, read_frame
     from sceneprint.formats.points import decode_cloud
     from sceneprint.geometry.validation.validation import PairValidation
-    from sceneprint.localization import PoseEstimate, QueryFrame, localize, views_of_rows
+    from sceneprint.localization import PoseEstimate, localize, views_of_rows
     from sceneprint.models import Model, read_model
     from sceneprint.pipeline import (
         PairMatch,
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         sign,
         validate,
     )
+    from sceneprint.places import QueryFrame
     from sceneprint.types import Cloud, DepthFrame, Geometry, Intrinsics
     from sceneprint_client import Client
 
@@ -82,7 +83,7 @@ _HOME = {
     "Geometry": "types",
     "Intrinsics": "types",
     "PoseEstimate": "localization",
-    "QueryFrame": "localization",
+    "QueryFrame": "places",
     "PairMatch": "pipeline",
     "Model": "models",
     "Signature": "pipeline",

@@ -5,109 +5,49 @@ matches, poses, MapViews  --localize-->  PoseEstimate
 Accepted matches vote with their poses. These poses, and all others that candidates suggest, are
 judged on the frames of the map that would see the same surfaces. What speaks for and against each
 of them gives its confidence: the probability that it is right. The best one is `found` where its
-confidence reaches the one that the query asks for, and no other place has more than the rest.
+confidence reaches the one that the query asks for: all others together have no more than the rest.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from sceneprint.geometry.registration.icp import error_of, place_covariance, transported
+from sceneprint.geometry.registration.icp import place_covariance
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.retrieval.ranking import Ranking
-from sceneprint.geometry.rigid import PoseAverage, average_poses, inverse
+from sceneprint.geometry.rigid import PoseAverage, average_poses
 from sceneprint.geometry.validation.acceptance import Strength
 from sceneprint.geometry.validation.confidence import (
-    ConfidenceParameters,
     PlaceEvidence,
-    confidence_of,
+    confidences_of,
     weakest_evidence,
 )
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
     MapViews,
-    ScoredPose,
-    at_place,
-    compare_poses,
-    different_views,
-    map_frame,
-    refined_starts,
-    same_place,
-    starts_about,
     view_separations,
 )
-from sceneprint.geometry.validation.validation import preferred
-from sceneprint.pipeline import PairMatch, answer_numbers
+from sceneprint.pipeline import PairMatch
+from sceneprint.places import (
+    LocalizationParameters,
+    Place,
+    PosePrior,
+    QueryFrame,
+    ViewsOf,
+    judged_places,
+    parameters_of,
+)
 from sceneprint.types import Floats, Geometry
 
 LocalizationStatus = Literal["found", "ambiguous", "not_found"]
 #: What decided: strong matches that vote for the pose; the map's frames, where no match is strong;
 #: or what the robot believed before, where the map bears that out as well as any other pose.
 Verifier = Literal["matches", "map", "prior"]
-
-
-@dataclass(frozen=True)
-class LocalizationParameters:
-    """The numbers of the answer; docs/trust.md says how they were chosen."""
-
-    confidence: float = 0.99  #: least of a pose that is found; other places share the rest
-    worth: float = 0.02  #: least confidence of an alternative that is worth a look
-    views: int = 5  #: votes that are averaged, and alternatives, at most
-    weak: float = 0.4  #: weight of a weak or ambiguous match; a strong one counts 1
-    outweigh: float = 2.0  #: times as much weight as any other place, where no map is asked
-    voted_only: bool = False  #: whether a pose needs the vote of a match
-    prior_share: float = 0.9  #: least score of a pose that a prior decides for, beside the best
-    most_noise: float = 0.2  #: violations of the map's own that are believed
-    rivals: int = 2  #: frames elsewhere that are compared before a pose is found, at most
-    rival_distance: float = 1.2  #: times that of the farthest match for the pose, at most
-    map: MapParameters = field(default_factory=MapParameters)
-    judgement: ConfidenceParameters = field(default_factory=ConfidenceParameters)
-
-
-@dataclass(frozen=True, eq=False)
-class QueryFrame:
-    """A frame of a query, and what came of its candidates.
-
-    Parameters
-    ----------
-    geometry : artifact of the frame
-    matches : of `associate`, accepted or not
-    T : (4, 4) T_query_sensor, by odometry; the identity for the frame that is to be placed
-    """
-
-    geometry: Geometry
-    matches: Sequence[PairMatch]
-    T: Floats = field(default_factory=lambda: np.eye(4))
-
-
-@dataclass(frozen=True, eq=False)
-class PosePrior:
-    """What a robot believes of its pose before it asks.
-
-    Parameters
-    ----------
-    parent : frame in which it is given
-    T : (4, 4) T_parent_query
-    covariance : (6, 6) of errors (x, y, z, rx, ry, rz) in the parent's axes: metres, radians
-    """
-
-    parent: str
-    T: Floats
-    covariance: Floats
-
-    def reaches(self, pose: Floats, p: MapParameters) -> bool:
-        """Return whether a frame at T_parent_sensor (4, 4) may see what the robot sees.
-
-        They stand at most `p.same_surfaces` apart, and three deviations of the prior.
-        """
-        deviation = math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
-        apart = float(np.linalg.norm(pose[:3, 3] - self.T[:3, 3]))
-        return apart <= p.same_surfaces + 3 * deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,59 +118,6 @@ class PoseEstimate:
         return None if best is None else best.rival
 
 
-@dataclass(frozen=True, eq=False)
-class _Vote:
-    """A pose that a match speaks for, and from where: both (4, 4) in the parent frame."""
-
-    match: PairMatch
-    T: Floats
-    covariance: Floats | None
-    viewpoint: Floats
-    weight: float
-
-    @property
-    def accepted(self) -> bool:
-        return self.match.validation.status == "accepted"
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """A place where the query may have been taken.
-
-    Parameters
-    ----------
-    T : (4, 4) T_parent_query
-    votes : of matches, those to believe most first
-    support, weight : of the votes from different viewpoints, as in AlternativePose
-    evidence : for its pose; None where the map was not asked
-    """
-
-    T: Floats
-    votes: list[_Vote]
-    support: int
-    weight: float
-    evidence: PlaceEvidence | None
-
-    @property
-    def accepted(self) -> list[_Vote]:
-        """The votes of accepted matches."""
-        return [vote for vote in self.votes if vote.accepted]
-
-    @property
-    def strong(self) -> bool:
-        """Whether a strong match votes for it."""
-        return any(vote.match.validation.strength == "strong" for vote in self.votes)
-
-    @property
-    def score(self) -> float:
-        """How well the map bears it out."""
-        return 0.0 if self.evidence is None else self.evidence.score
-
-
-#: Gives the frames of a parent frame that may see what a query at poses (n, 4, 4) sees.
-ViewsOf = Callable[[str, Floats], MapViews]
-
-
 def localize(
     frames: Sequence[QueryFrame],
     poses: Sequence[Floats] | Mapping[int, Floats],
@@ -265,53 +152,6 @@ def localize(
         return None
     blind = all(frame.geometry.surface.camera is None for frame in frames)
     return estimate_of(parent, places, prior, p, blind=blind)
-
-
-def parameters_of(frames: Sequence[QueryFrame]) -> LocalizationParameters:
-    """Return the numbers of the model that made the artifacts of a query; see `answer_numbers`."""
-    answer = answer_numbers(frames[0].geometry)
-    return LocalizationParameters(map=answer.map, judgement=answer.confidence)
-
-
-def judged_places(
-    frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats],
-    parents: Sequence[str] | Mapping[int, str] | None, views_of: ViewsOf | None,
-    prior: PosePrior | None, p: LocalizationParameters, overlap_p: OverlapParameters,
-) -> tuple[str, PosePrior | None, list[Place]]:  # fmt: skip
-    """Return every place that a match, the map or the prior suggests, with its evidence.
-
-    Parameters
-    ----------
-    frames, poses, parents, views_of, prior, p, overlap_p : see `localize`
-
-    Returns
-    -------
-    parent : frame in which poses are compared
-    prior : the one given; None where it is of another parent frame
-    places : those with votes first, then by score
-    """
-    parent = _parent(frames, parents)
-    if prior is not None and prior.parent != parent:
-        if _accepts(frames, parents, parent) and not _accepts(frames, parents, prior.parent):
-            prior = None  # what it says of one parent frame tells nothing of another
-        else:
-            parent = prior.parent
-    own = [
-        replace(frame, matches=[
-            m for m in frame.matches if parents is None or parents[m.index] == parent
-        ])
-        for frame in frames
-    ]  # fmt: skip
-    suggested, viewpoints = _suggested(own, poses)
-    votes = _votes(own, poses, p)
-    if views_of is None or (not len(suggested) and prior is None):
-        return parent, prior, [_place(group, None, p) for group in _grouped(votes, [], p)]
-    ready = [map_frame(one.geometry, one.T, p.map, overlap_p) for one in frames]
-    starts = _NONE if prior is None else starts_about(prior.T, prior.covariance, p.map)
-    views = views_of(parent, np.concatenate([starts[:1], suggested]))
-    near = refined_starts(ready, starts, views, p.map, overlap_p)
-    scored = compare_poses(ready, np.concatenate([near, suggested]), views, p.map, overlap_p)
-    return parent, prior, _places(votes, scored, suggested, viewpoints, views, p)
 
 
 def views_of_rows(
@@ -417,181 +257,6 @@ def unconfirmed(estimate: PoseEstimate) -> PoseEstimate:
     )  # fmt: skip
 
 
-_NONE = np.empty((0, 4, 4))
-
-
-def _parent(frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None) -> str:
-    """The parent frame with most strong matches, of equals with most accepted, with most at all."""
-    counts: dict[str, tuple[int, int, int]] = {}
-    for frame in frames:
-        for match in frame.matches:
-            name = "" if parents is None else parents[match.index]
-            strong, accepted, tried = counts.get(name, (0, 0, 0))
-            v = match.validation
-            counts[name] = (
-                strong + (v.strength == "strong"), accepted + (v.status == "accepted"), tried + 1
-            )  # fmt: skip
-    # the first of equals: dicts keep the order in which parents came
-    return max(counts, key=counts.__getitem__, default="")
-
-
-def _accepts(
-    frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None, parent: str
-) -> bool:
-    """Whether a match of a parent frame is accepted."""
-    return any(
-        match.validation.status == "accepted"
-        and ("" if parents is None else parents[match.index]) == parent
-        for frame in frames
-        for match in frame.matches
-    )
-
-
-def _suggested(
-    frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats]
-) -> tuple[Floats, Floats]:
-    """Every pose (n, 4, 4) that a candidate suggests, and the pose of each one's candidate.
-
-    The best of each candidate come first, then the next best.
-    """
-    of_each = [
-        (poses[match.index], poses[match.index] @ match.validation.hypotheses @ inverse(frame.T))
-        for frame in frames
-        for match in frame.matches
-        # of a sensor that cannot have stood so
-        if len(match.validation.hypotheses) and not match.validation.contradicts_up
-    ]
-    most = max((len(told) for _, told in of_each), default=0)
-    pairs = [
-        (told[rank], viewpoint)
-        for rank in range(most)
-        for viewpoint, told in of_each
-        if rank < len(told)
-    ]
-    both = np.array(pairs).reshape(-1, 2, 4, 4)
-    return both[:, 0], both[:, 1]
-
-
-def _votes(
-    frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats],
-    p: LocalizationParameters,
-) -> list[_Vote]:  # fmt: skip
-    """Votes of accepted matches in the order of belief, then those of ambiguous ones."""
-    votes: list[_Vote] = []
-    for frame in frames:
-        first = preferred([match.validation for match in frame.matches])
-        unsure = [i for i, m in enumerate(frame.matches) if m.validation.status == "ambiguous"]
-        for match in [frame.matches[i] for i in [*first, *unsure]]:
-            v, viewpoint = match.validation, poses[match.index]
-            if v.T_match_query is None:
-                continue
-            covariance = v.covariance
-            if covariance is not None:
-                covariance = transported(covariance, viewpoint[:3, :3], np.zeros(3))
-            weight = 1.0 if v.strength == "strong" else p.weak
-            T = viewpoint @ v.T_match_query @ inverse(frame.T)
-            votes.append(_Vote(match, T, covariance, viewpoint, weight))
-    if len(frames) > 1:
-        order = preferred([vote.match.validation for vote in votes])
-        votes = [votes[i] for i in order] + [vote for vote in votes if not vote.accepted]
-    return votes
-
-
-def _grouped(
-    votes: Sequence[_Vote], scored: Sequence[ScoredPose], p: LocalizationParameters
-) -> list[list[_Vote]]:
-    """Group votes by place: of the scored poses, in their order, then by themselves."""
-    groups: list[list[_Vote]] = [[] for _ in scored]
-    others: list[list[_Vote]] = []
-    for vote in votes:
-        at = next((k for k, one in enumerate(scored) if one.is_of(vote.T, p.map)), None)
-        if at is not None:
-            groups[at].append(vote)
-            continue
-        for group in others:
-            if same_place(group[0].T, vote.T, p.map):
-                group.append(vote)
-                break
-        else:
-            others.append([vote])
-    return groups + others
-
-
-def _places(
-    votes: Sequence[_Vote], scored: Sequence[ScoredPose], suggested: Floats, viewpoints: Floats,
-    views: MapViews, p: LocalizationParameters,
-) -> list[Place]:  # fmt: skip
-    """Return the places of votes and scored poses, with the evidence for each."""
-    groups = _grouped(votes, scored, p)
-    weights = [_weight(group, p)[1] for group in groups]
-    scores = [one.score for one in scored]
-    places = []
-    for k, group in enumerate(groups):
-        pose = scored[k] if k < len(scored) else None
-        others = scores[:k] + scores[k + 1 :]
-        evidence = _evidence(
-            group, pose, suggested, viewpoints, views,
-            max(others, default=0.0), max(weights[:k] + weights[k + 1 :], default=0.0), p,
-        )  # fmt: skip
-        places.append(_place(group, pose, p, evidence))
-    return sorted(places, key=lambda place: not place.votes)
-
-
-def _place(
-    group: list[_Vote], pose: ScoredPose | None, p: LocalizationParameters,
-    evidence: PlaceEvidence | None = None,
-) -> Place:  # fmt: skip
-    """Return the place of some votes, or of a scored pose, or of both."""
-    accepted = any(vote.accepted for vote in group)
-    T = group[0].T if pose is None or accepted else pose.T
-    support, weight = _weight(group, p)
-    return Place(T, group, support, weight, evidence)
-
-
-def _weight(group: Sequence[_Vote], p: LocalizationParameters) -> tuple[int, float]:
-    """Return how many viewpoints vote, and the weight of their first votes.
-
-    Neither a copy of a view nor what other matches gave is a vote of its own.
-    """
-    voting = [vote for vote in group if not vote.match.validation.guided]
-    viewpoints = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)
-    different = different_views(viewpoints, p.map)
-    return len(different), sum(voting[i].weight for i in different)
-
-
-def _evidence(
-    group: Sequence[_Vote], pose: ScoredPose | None, suggested: Floats, viewpoints: Floats,
-    views: MapViews, rival: float, rival_weight: float, p: LocalizationParameters,
-) -> PlaceEvidence:  # fmt: skip
-    """Return the evidence for a place: of its votes and of its pose on the map.
-
-    Parameters
-    ----------
-    group : votes
-    pose : None where none at the place was scored
-    suggested, viewpoints : see `_suggested`
-    views : the map's frames
-    rival, rival_weight : best score, and largest weight, of another place
-    p : see LocalizationParameters
-    """
-    weight = _weight(group, p)[1]
-    strong = _weight([v for v in group if v.match.validation.strength == "strong"], p)[0]
-    T = group[0].T if pose is None else pose.T
-    suggesting = len(different_views(viewpoints[at_place(suggested, T, p.map)], p.map))
-    if pose is None:
-        return PlaceEvidence(
-            0.0, 0.0, 0.0, 0, 0, 1.0, weight, strong, suggesting, 1.0, rival_weight
-        )
-    agreeing = np.unique([i for _, i in pose.views]).astype(np.intp)
-    seen_from = len(different_views(views.poses[agreeing], p.map))
-    excess = pose.violations + pose.hidden - min(pose.noise, p.most_noise)
-    ratio = max(rival, 0.0) / pose.score if pose.score > 0 else 1.0
-    return PlaceEvidence(
-        pose.score, pose.share, pose.planes, len(agreeing), seen_from, excess, weight, strong,
-        suggesting, ratio, rival_weight,
-    )  # fmt: skip
-
-
 def estimate_of(
     parent: str, places: Sequence[Place], prior: PosePrior | None, p: LocalizationParameters, *,
     blind: bool = False,
@@ -608,9 +273,8 @@ def estimate_of(
         return _estimate_by_votes(parent, places, blind, p)
     judged = _confidences(places, p)
     order = sorted(range(len(places)), key=lambda i: (-judged[i], -places[i].score))
-    others = max((judged[i] for i in order[1:]), default=0.0)
     best = places[order[0]]
-    if judged[order[0]] >= p.confidence and others <= 1.0 - p.confidence:
+    if judged[order[0]] >= p.confidence:
         verified_by: Verifier = "matches" if best.strong else "map"
         return _found(parent, best, places, verified_by, judged[order[0]], p)
     if prior is not None:
@@ -636,15 +300,16 @@ def _known(evidence: PlaceEvidence | None) -> PlaceEvidence:
 
 
 def _confidences(places: Sequence[Place], p: LocalizationParameters) -> list[float]:
-    """Return the confidence of each place; together they are at most 1, as one at most is right."""
-    judged = [
-        0.0
-        if p.voted_only and not place.votes
-        else confidence_of(_known(place.evidence), p.judgement)
-        for place in places
+    """Return the confidence of each place; 0 of those that need votes and have none."""
+    judged = confidences_of([_known(place.evidence) for place in places], p.judgement)
+    return [
+        0.0 if p.voted_only and not place.votes else one
+        for place, one in zip(places, judged, strict=True)
     ]
-    whole = max(sum(judged), 1.0)
-    return [one / whole for one in judged]
+
+
+#: Viewpoints of candidates that a prior is worth: it suggests a pose by itself.
+_SUGGESTED_BY_PRIOR = 2
 
 
 def _confirmed_by_prior(
@@ -655,7 +320,7 @@ def _confirmed_by_prior(
     Places that the prior does not expect are no rivals of those that it does, provided that they
     fit the map no better.
     """
-    inside = [place for place in places if is_expected(place.T, prior)]
+    inside = [place for place in places if prior.expects(place.T)]
     most = max(place.score for place in places)
     within = []
     for place in inside:
@@ -664,13 +329,16 @@ def _confirmed_by_prior(
         evidence = replace(
             _known(place.evidence), rival=rival / place.score if place.score > 0 else 1.0,
             rival_weight=max((one.weight for one in others), default=0.0),
+            suggested=max(_known(place.evidence).suggested, _SUGGESTED_BY_PRIOR),
         )  # fmt: skip
         within.append(replace(place, evidence=evidence))
     judged = _confidences(within, p)
     best = max(range(len(within)), key=judged.__getitem__, default=None)
-    if best is None or judged[best] < p.confidence or within[best].score < p.prior_share * most:
+    if best is None or within[best].score < p.prior_share * most:
         return None
-    return within[best], judged[best]
+    none = max(1.0 - sum(judged), 0.0)
+    confidence = p.prior_odds * judged[best] / (p.prior_odds * sum(judged) + none)
+    return (within[best], confidence) if confidence >= p.confidence else None
 
 
 def _estimate_by_votes(
@@ -693,16 +361,6 @@ def _estimate_by_votes(
     )
     votes = sum(len(place.accepted) for place in places)
     return PoseEstimate("ambiguous", against, parent, None, None, None, None, alternatives, votes)
-
-
-def is_expected(T: Floats, prior: PosePrior) -> bool:
-    """Whether a pose lies where the prior has 99.9 % of its mass."""
-    off = error_of(prior.T, T)
-    return float(off @ np.linalg.solve(prior.covariance, off)) <= _CHI_SQUARE_6
-
-
-#: 99.9 % of a chi-square of six degrees of freedom.
-_CHI_SQUARE_6 = 22.458
 
 
 def _found(

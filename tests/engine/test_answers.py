@@ -14,8 +14,9 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
-from sceneprint.localization import QueryFrame, localize, views_of_rows
+from sceneprint.localization import localize, views_of_rows
 from sceneprint.pipeline import Signature, Signer, associate, diversify, retrieve
+from sceneprint.places import QueryFrame
 from sceneprint.types import Geometry
 from sceneprint_client.api import Answer, NewMap, Query
 

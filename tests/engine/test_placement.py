@@ -23,13 +23,12 @@ from sceneprint.localization import (
     AlternativePose,
     LocalizationStatus,
     PoseEstimate,
-    QueryFrame,
     localize,
-    parameters_of,
     views_of_rows,
 )
 from sceneprint.models import read_model
 from sceneprint.pipeline import PairMatch, Signature, Signer, associate, diversify, retrieve
+from sceneprint.places import QueryFrame, parameters_of
 from sceneprint.store.maps import placed_frames
 from sceneprint.types import Geometry, Patches
 from sceneprint_client.api import Counts, Localization, Prior, Query

@@ -12,12 +12,12 @@ from sceneprint.geometry.validation.confidence import (
     ConfidenceParameters,
     Penalty,
     PlaceEvidence,
-    confidence_of,
+    confidences_of,
     penalties_of,
     weakest_evidence,
 )
 
-BEST = PlaceEvidence(0.9, 0.95, 40.0, 12, 12, 0.0, 5.0, 5, 8, 0.0, 0.0)
+BEST = PlaceEvidence(0.9, 0.95, 40.0, 12, 12, 0.0, 5.0, 5, 5, 8, 0.9, 0.0, 0.0)
 P = ConfidenceParameters(
     best=6.0,
     **{name: Penalty(3.0, 2.0, 1.0) for name in KNOTS},
@@ -26,7 +26,7 @@ P = ConfidenceParameters(
 
 def test_the_best_evidence_costs_nothing() -> None:
     assert set(penalties_of(BEST, P).values()) == {0.0}
-    assert confidence_of(BEST, P) == pytest.approx(1 / (1 + math.exp(-6.0)))
+    assert confidences_of([BEST], P) == pytest.approx([1 / (1 + math.exp(-6.0))])
 
 
 def test_a_penalty_is_linear_between_its_knots() -> None:
@@ -36,14 +36,22 @@ def test_a_penalty_is_linear_between_its_knots() -> None:
     for rival, penalty in ((1.5, 3.0), (0.9, 2.5), (0.5, 1.0), (0.35, 0.5), (0.2, 0.0)):
         assert penalties_of(replace(BEST, rival=rival), P)["rival"] == pytest.approx(penalty)
     two = replace(BEST, planes=12.0, rival=0.8)
-    assert confidence_of(two, P) == pytest.approx(1 / (1 + math.exp(-3.0)))
+    assert confidences_of([two], P) == pytest.approx([1 / (1 + math.exp(-3.0))])
+
+
+def test_candidates_share_what_one_of_them_has() -> None:
+    """Odds of e^6 and e^5 against 1 that none is right."""
+    whole = 1 + math.exp(6.0) + math.exp(5.0)
+    found = confidences_of([BEST, replace(BEST, planes=12.0)], P)
+    assert found == pytest.approx([math.exp(6.0) / whole, math.exp(5.0) / whole])
+    assert confidences_of([], P) == []
 
 
 @pytest.mark.parametrize("name", KNOTS)
 def test_better_evidence_never_lowers_a_confidence(name: str) -> None:
     worst, *_, best = KNOTS[name]
     steps = [worst + (best - worst) * k / 20 for k in range(-3, 24)]
-    found = [confidence_of(replace(BEST, **{name: x}), ConfidenceParameters()) for x in steps]
+    found = [confidences_of([replace(BEST, **{name: x})], ConfidenceParameters())[0] for x in steps]
     assert found == sorted(found)
 
 

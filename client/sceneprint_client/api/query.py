@@ -263,8 +263,14 @@ class EvidenceRecord(ApiRecord):
         "match, 0.4 of a weak or an ambiguous one."
     )
     strong: int = Field(description="Different viewpoints of strong matches that vote for it.")
+    accepted: int = Field(
+        description="Different viewpoints of accepted matches that lead to it, guided or not."
+    )
     suggested: int = Field(
         description="Different viewpoints of candidates that suggest it, accepted or not."
+    )
+    similarity: float = Field(
+        description="Of the signatures of the query and of the nearest of these candidates, 0 to 1."
     )
     rival: float = Field(
         description="Score of the best pose at another place, as a share of `score`; 0 where there "

@@ -49,9 +49,10 @@ from sceneprint.geometry.retrieval.ranking import (
     pairwise_distances,
 )
 from sceneprint.geometry.validation.validation import ValidationParameters
-from sceneprint.localization import PoseEstimate, PosePrior, QueryFrame, unconfirmed
+from sceneprint.localization import PoseEstimate, unconfirmed
 from sceneprint.models import Model
 from sceneprint.pipeline import PairMatch, searched
+from sceneprint.places import PosePrior, QueryFrame
 from sceneprint.store import Store
 from sceneprint.store.maps import frames_of
 from sceneprint.store.tables import FrameRow

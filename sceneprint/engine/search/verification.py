@@ -27,17 +27,10 @@ from sceneprint.geometry.validation.map_verification import (
     looks_ahead,
 )
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
-from sceneprint.localization import (
-    LocalizationParameters,
-    PosedFrame,
-    PoseEstimate,
-    PosePrior,
-    QueryFrame,
-    localize,
-    rival_rows,
-)
+from sceneprint.localization import PosedFrame, PoseEstimate, localize, rival_rows
 from sceneprint.models import Model
 from sceneprint.pipeline import PairMatch, associate
+from sceneprint.places import LocalizationParameters, PosePrior, QueryFrame
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import has_parent_frame
 from sceneprint.store.maps import (

@@ -1,19 +1,20 @@
 """Confidence: the probability that a candidate pose is right, from what speaks for and against it.
 
-    PlaceEvidence  --confidence_of-->  P(right), 0 to 1
+    PlaceEvidence of every candidate  --confidences_of-->  P(right) of each, 1 at most together
     PlaceEvidence  --weakest_evidence-->  a sentence on what keeps it from being more
 
-The logit of the probability is what a pose with the best evidence has, less one penalty for each
-kind of evidence. A penalty is a piecewise linear function of its evidence that never rises with
-better evidence, so more support never lowers a confidence, and a better rival never raises one.
-`sceneprint.lab.confidence` learns the penalties on synthetic places; docs/trust.md shows how well
-the confidences are calibrated on recordings.
+One of the candidates is right, or none. The logarithm of the odds of each, against none, is what a
+pose with the best evidence has, less one penalty for each kind of evidence. A penalty is a
+piecewise linear function of its evidence that never rises with better evidence, so more support
+never lowers a confidence, and a better rival never raises one. `sceneprint.lab.confidence` learns
+the penalties on synthetic places; docs/trust.md shows how well the confidences are calibrated on
+recordings.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +36,10 @@ class PlaceEvidence:
     weight : of the matches that vote for the pose, one for each viewpoint: 1 of a strong match,
         less of a weak or an ambiguous one
     strong : different viewpoints of strong matches that vote for it
+    accepted : different viewpoints of accepted matches that lead to it, those that were guided by
+        others among them
     suggested : different viewpoints of candidates that suggest it, whether accepted or not
+    similarity : of the signatures of the query and the nearest of these candidates, 0 to 1
     rival : score of the best other place, relative to this one's; 0 where there is none
     rival_weight : largest weight of the votes for another place
     """
@@ -48,14 +52,16 @@ class PlaceEvidence:
     excess: float
     weight: float
     strong: int
+    accepted: int
     suggested: int
+    similarity: float
     rival: float
     rival_weight: float
 
 
 @dataclass(frozen=True)
 class Penalty:
-    """What one kind of evidence takes from the logit, at three of its four knots; 0 at the best.
+    """What one kind of evidence takes from the logarithm of the odds, at its knots; 0 at the best.
 
     Parameters
     ----------
@@ -80,7 +86,9 @@ KNOTS: Mapping[str, tuple[float, float, float, float]] = {
     "excess": (0.25, 0.12, 0.05, 0.0),
     "weight": (0.0, 0.4, 1.0, 3.0),
     "strong": (0.0, 1.0, 2.0, 4.0),
+    "accepted": (0.0, 1.0, 2.0, 5.0),
     "suggested": (0.0, 1.0, 2.0, 4.0),
+    "similarity": (0.05, 0.2, 0.4, 0.65),
     "rival": (1.0, 0.8, 0.5, 0.2),
     "rival_weight": (2.0, 1.0, 0.4, 0.0),
 }
@@ -92,7 +100,7 @@ class ConfidenceParameters:
 
     Parameters
     ----------
-    best : logit of a pose with the best evidence of every kind
+    best : logarithm of the odds of a pose with the best evidence of every kind
     score, planes, ... : penalty of each kind of evidence
     """
 
@@ -103,13 +111,15 @@ class ConfidenceParameters:
     excess: Penalty = Penalty(9.0, 5.0, 1.5)
     weight: Penalty = Penalty(2.0, 1.5, 1.0)
     strong: Penalty = Penalty(1.5, 0.5, 0.0)
+    accepted: Penalty = Penalty(0.0, 0.0, 0.0)
     suggested: Penalty = Penalty(1.0, 1.0, 0.0)
+    similarity: Penalty = Penalty(0.0, 0.0, 0.0)
     rival: Penalty = Penalty(9.0, 5.0, 2.0)
     rival_weight: Penalty = Penalty(4.0, 2.0, 1.0)
 
 
 def penalties_of(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, float]:
-    """Return what each kind of evidence takes from the logit: >= 0, by name."""
+    """Return what each kind of evidence takes from the logarithm of the odds: >= 0, by name."""
     found = {}
     for name, knots in KNOTS.items():
         values = getattr(p, name).values
@@ -119,10 +129,21 @@ def penalties_of(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, float]:
     return found
 
 
-def confidence_of(e: PlaceEvidence, p: ConfidenceParameters) -> float:
-    """Return the probability that a pose with some evidence is right, 0 to 1."""
-    logit = p.best - sum(penalties_of(e, p).values())
-    return 1.0 / (1.0 + math.exp(-logit))
+def confidences_of(evidence: Sequence[PlaceEvidence], p: ConfidenceParameters) -> list[float]:
+    """Return the probability of each candidate pose of a query to be the right one.
+
+    Parameters
+    ----------
+    evidence : of every candidate of one query, each of another place
+    p : see ConfidenceParameters
+
+    Returns
+    -------
+    confidences : one for one; what they lack of 1 together is the probability that none is right
+    """
+    odds = [math.exp(p.best - sum(penalties_of(e, p).values())) for e in evidence]
+    whole = 1.0 + sum(odds)
+    return [one / whole for one in odds]
 
 
 def weakest_evidence(e: PlaceEvidence, p: ConfidenceParameters) -> str:
@@ -132,12 +153,14 @@ def weakest_evidence(e: PlaceEvidence, p: ConfidenceParameters) -> str:
     return {
         "score": f"the map shows only {e.share:.0%} of what the frame sees",
         "planes": f"only {e.planes:.0f} distinct planes agree, and a few planes fit in many places",
-        "frames": f"only {e.frames} frames of the map see this place",
+        "frames": "few frames of the map see this place",
         "excess": f"a pose fits, but {max(e.excess, 0.0):.0%} of what should be in sight there is "
         "missing: another place may look like this one, or this one has changed",
         "weight": "too few matches vote for the pose",
         "strong": "no strong match votes for the pose",
+        "accepted": "too few matches from different viewpoints agree on the pose",
         "suggested": f"one view alone suggests this pose, of {e.viewpoints} that see the place",
+        "similarity": "the frame looks little like those of the map that suggest this pose",
         "rival": "another pose explains the frame as well: the place repeats, or has a symmetry",
         "rival_weight": "the matches disagree: some vote for another pose",
     }[name]

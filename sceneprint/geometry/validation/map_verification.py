@@ -43,7 +43,7 @@ class MapParameters:
     n_views: int = 10  #: that a pose is scored on, at most
     look_ahead: float = 1.5  #: of a camera, to the middle of what it sees, metres
     reach: float = 3.5  #: between the middles of two views that may share surfaces, metres
-    around_reach: float = 4.0  #: the same where one of the sensors may look anywhere
+    around_reach: float = 4.0  #: the same where a sensor may look anywhere, metres
     same_surfaces: float = 8.0  #: between two sensors that may still see the same surfaces, metres
     near: float = 2.0  #: within which frames of the map are looked for first, metres
     cell: float = 1.0  #: poses this near are looked about once, metres
@@ -57,9 +57,9 @@ class MapParameters:
     n_refining: int = 3  #: views that a pose is refined on
     n_noise: int = 4  #: frames of the map whose own violations are taken for noise
     least_noise: float = 0.02  #: violations of a pose below which that is not asked
-    same_m: float = 0.1  #: poses this near are one
+    same_m: float = 0.1  #: poses this near are one, metres
     same_rad: float = math.radians(6.0)
-    place_m: float = 0.25  #: poses farther apart are of two places
+    place_m: float = 0.25  #: poses farther apart are of two places, metres
     place_rad: float = math.radians(15.0)
     refinement: RefinementParameters = COARSE
     planes: PlaneParameters = field(default_factory=PlaneParameters)

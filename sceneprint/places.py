@@ -1,0 +1,399 @@
+"""The places where a query may have been taken, and what speaks for and against each.
+
+matches, poses, MapViews  --judged_places-->  Place, ...
+
+Accepted matches vote with their poses. These poses, and all others that candidates suggest, are
+judged on the frames of the map that would see the same surfaces.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sceneprint.geometry.registration.icp import error_of, transported
+from sceneprint.geometry.registration.overlap import OverlapParameters
+from sceneprint.geometry.rigid import inverse
+from sceneprint.geometry.validation.confidence import ConfidenceParameters, PlaceEvidence
+from sceneprint.geometry.validation.map_verification import (
+    MapParameters,
+    MapViews,
+    ScoredPose,
+    at_place,
+    compare_poses,
+    different_views,
+    map_frame,
+    refined_starts,
+    same_place,
+    starts_about,
+)
+from sceneprint.geometry.validation.validation import preferred
+from sceneprint.pipeline import PairMatch, answer_numbers
+from sceneprint.types import Floats, Geometry
+
+
+@dataclass(frozen=True)
+class LocalizationParameters:
+    """The numbers of the answer; docs/trust.md says how they were chosen."""
+
+    confidence: float = 0.99  #: least of a pose that is found
+    worth: float = 0.05  #: least confidence of an alternative that is worth a look
+    views: int = 5  #: votes that are averaged, and alternatives, at most
+    weak: float = 0.4  #: weight of a weak or ambiguous match; a strong one counts 1
+    outweigh: float = 2.0  #: times as much weight as any other place, where no map is asked
+    voted_only: bool = False  #: whether a pose needs the vote of a match
+    prior_odds: float = 20.0  #: times those of a pose that a prior expects, by its evidence
+    prior_share: float = 0.9  #: least score of a pose that a prior decides for, beside the best
+    most_noise: float = 0.2  #: violations of the map's own that are believed
+    rivals: int = 2  #: frames elsewhere that are compared before a pose is found, at most
+    rival_distance: float = 1.2  #: times that of the farthest match for the pose, at most
+    map: MapParameters = field(default_factory=MapParameters)
+    judgement: ConfidenceParameters = field(default_factory=ConfidenceParameters)
+
+
+@dataclass(frozen=True, eq=False)
+class QueryFrame:
+    """A frame of a query, and what came of its candidates.
+
+    Parameters
+    ----------
+    geometry : artifact of the frame
+    matches : of `associate`, accepted or not
+    T : (4, 4) T_query_sensor, by odometry; the identity for the frame that is to be placed
+    """
+
+    geometry: Geometry
+    matches: Sequence[PairMatch]
+    T: Floats = field(default_factory=lambda: np.eye(4))
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """What a robot believes of its pose before it asks.
+
+    Parameters
+    ----------
+    parent : frame in which it is given
+    T : (4, 4) T_parent_query
+    covariance : (6, 6) of errors (x, y, z, rx, ry, rz) in the parent's axes: metres, radians
+    """
+
+    parent: str
+    T: Floats
+    covariance: Floats
+
+    def reaches(self, pose: Floats, p: MapParameters) -> bool:
+        """Return whether a frame at T_parent_sensor (4, 4) may see what the robot sees.
+
+        They stand at most `p.same_surfaces` apart, and three deviations of the prior.
+        """
+        deviation = math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+        apart = float(np.linalg.norm(pose[:3, 3] - self.T[:3, 3]))
+        return apart <= p.same_surfaces + 3 * deviation
+
+    def expects(self, T: Floats) -> bool:
+        """Return whether a pose T_parent_query (4, 4) lies where it has 99.9 % of its mass."""
+        off = error_of(self.T, T)
+        return float(off @ np.linalg.solve(self.covariance, off)) <= _CHI_SQUARE_6
+
+
+#: 99.9 % of a chi-square of six degrees of freedom.
+_CHI_SQUARE_6 = 22.458
+
+
+@dataclass(frozen=True, eq=False)
+class _Vote:
+    """A pose that a match speaks for, and from where: both (4, 4) in the parent frame."""
+
+    match: PairMatch
+    T: Floats
+    covariance: Floats | None
+    viewpoint: Floats
+    weight: float
+
+    @property
+    def accepted(self) -> bool:
+        return self.match.validation.status == "accepted"
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A place where the query may have been taken.
+
+    Parameters
+    ----------
+    T : (4, 4) T_parent_query
+    votes : of matches, those to believe most first
+    support, weight : of the votes from different viewpoints, as in AlternativePose
+    evidence : for its pose; None where the map was not asked
+    """
+
+    T: Floats
+    votes: list[_Vote]
+    support: int
+    weight: float
+    evidence: PlaceEvidence | None
+
+    @property
+    def accepted(self) -> list[_Vote]:
+        """The votes of accepted matches."""
+        return [vote for vote in self.votes if vote.accepted]
+
+    @property
+    def strong(self) -> bool:
+        """Whether a strong match votes for it."""
+        return any(vote.match.validation.strength == "strong" for vote in self.votes)
+
+    @property
+    def score(self) -> float:
+        """How well the map bears it out."""
+        return 0.0 if self.evidence is None else self.evidence.score
+
+
+#: Gives the frames of a parent frame that may see what a query at poses (n, 4, 4) sees.
+ViewsOf = Callable[[str, Floats], MapViews]
+
+_NONE = np.empty((0, 4, 4))
+
+
+def parameters_of(frames: Sequence[QueryFrame]) -> LocalizationParameters:
+    """Return the numbers of the model that made the artifacts of a query; see `answer_numbers`."""
+    answer = answer_numbers(frames[0].geometry)
+    return LocalizationParameters(map=answer.map, judgement=answer.confidence)
+
+
+def judged_places(
+    frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats],
+    parents: Sequence[str] | Mapping[int, str] | None, views_of: ViewsOf | None,
+    prior: PosePrior | None, p: LocalizationParameters, overlap_p: OverlapParameters,
+) -> tuple[str, PosePrior | None, list[Place]]:  # fmt: skip
+    """Return every place that a match, the map or the prior suggests, with its evidence.
+
+    Parameters
+    ----------
+    frames, poses, parents, views_of, prior, p, overlap_p : see `localize`
+
+    Returns
+    -------
+    parent : frame in which poses are compared
+    prior : the one given; None where it is of another parent frame
+    places : those with votes first, then by score
+    """
+    parent = _parent(frames, parents)
+    if prior is not None and prior.parent != parent:
+        if _accepts(frames, parents, parent) and not _accepts(frames, parents, prior.parent):
+            prior = None  # what it says of one parent frame tells nothing of another
+        else:
+            parent = prior.parent
+    own = [
+        replace(frame, matches=[
+            m for m in frame.matches if parents is None or parents[m.index] == parent
+        ])
+        for frame in frames
+    ]  # fmt: skip
+    suggested = _suggested(own, poses)
+    votes = _votes(own, poses, p)
+    if views_of is None or (not len(suggested.T) and prior is None):
+        return parent, prior, [_place(group, None, p) for group in _grouped(votes, [], p)]
+    ready = [map_frame(one.geometry, one.T, p.map, overlap_p) for one in frames]
+    starts = _NONE if prior is None else starts_about(prior.T, prior.covariance, p.map)
+    views = views_of(parent, np.concatenate([starts[:1], suggested.T]))
+    near = refined_starts(ready, starts, views, p.map, overlap_p)
+    scored = compare_poses(ready, np.concatenate([near, suggested.T]), views, p.map, overlap_p)
+    return parent, prior, _places(votes, scored, suggested, views, p)
+
+
+def _parent(frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None) -> str:
+    """The parent frame with most strong matches, of equals with most accepted, with most at all."""
+    counts: dict[str, tuple[int, int, int]] = {}
+    for frame in frames:
+        for match in frame.matches:
+            name = "" if parents is None else parents[match.index]
+            strong, accepted, tried = counts.get(name, (0, 0, 0))
+            v = match.validation
+            counts[name] = (
+                strong + (v.strength == "strong"), accepted + (v.status == "accepted"), tried + 1
+            )  # fmt: skip
+    # the first of equals: dicts keep the order in which parents came
+    return max(counts, key=counts.__getitem__, default="")
+
+
+def _accepts(
+    frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None, parent: str
+) -> bool:
+    """Whether a match of a parent frame is accepted."""
+    return any(
+        match.validation.status == "accepted"
+        and ("" if parents is None else parents[match.index]) == parent
+        for frame in frames
+        for match in frame.matches
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Suggestions:
+    """Every pose that a candidate suggests: of each candidate the best first, then the next best.
+
+    Parameters
+    ----------
+    T : (n, 4, 4) T_parent_query
+    viewpoints : (n, 4, 4) T_parent_sensor of each one's candidate
+    similarities : (n,) of the signatures of the candidate and the query
+    """
+
+    T: Floats
+    viewpoints: Floats
+    similarities: Floats
+
+
+def _suggested(
+    frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats]
+) -> _Suggestions:
+    """Return the poses that candidates suggest."""
+    of_each = [
+        (match, poses[match.index] @ match.validation.hypotheses @ inverse(frame.T))
+        for frame in frames
+        for match in frame.matches
+        # of a sensor that cannot have stood so
+        if len(match.validation.hypotheses) and not match.validation.contradicts_up
+    ]
+    most = max((len(hypotheses) for _, hypotheses in of_each), default=0)
+    ranked = [
+        (hypotheses[rank], match)
+        for rank in range(most)
+        for match, hypotheses in of_each
+        if rank < len(hypotheses)
+    ]
+    return _Suggestions(
+        np.array([T for T, _ in ranked]).reshape(-1, 4, 4),
+        np.array([poses[match.index] for _, match in ranked]).reshape(-1, 4, 4),
+        np.array([match.similarity for _, match in ranked]),
+    )
+
+
+def _votes(
+    frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats],
+    p: LocalizationParameters,
+) -> list[_Vote]:  # fmt: skip
+    """Votes of accepted matches in the order of belief, then those of ambiguous ones."""
+    votes: list[_Vote] = []
+    for frame in frames:
+        first = preferred([match.validation for match in frame.matches])
+        unsure = [i for i, m in enumerate(frame.matches) if m.validation.status == "ambiguous"]
+        for match in [frame.matches[i] for i in [*first, *unsure]]:
+            v, viewpoint = match.validation, poses[match.index]
+            if v.T_match_query is None:
+                continue
+            covariance = v.covariance
+            if covariance is not None:
+                covariance = transported(covariance, viewpoint[:3, :3], np.zeros(3))
+            weight = 1.0 if v.strength == "strong" else p.weak
+            T = viewpoint @ v.T_match_query @ inverse(frame.T)
+            votes.append(_Vote(match, T, covariance, viewpoint, weight))
+    if len(frames) > 1:
+        order = preferred([vote.match.validation for vote in votes])
+        votes = [votes[i] for i in order] + [vote for vote in votes if not vote.accepted]
+    return votes
+
+
+def _grouped(
+    votes: Sequence[_Vote], scored: Sequence[ScoredPose], p: LocalizationParameters
+) -> list[list[_Vote]]:
+    """Group votes by place: of the scored poses, in their order, then by themselves."""
+    groups: list[list[_Vote]] = [[] for _ in scored]
+    others: list[list[_Vote]] = []
+    for vote in votes:
+        at = next((k for k, one in enumerate(scored) if one.is_of(vote.T, p.map)), None)
+        if at is not None:
+            groups[at].append(vote)
+            continue
+        for group in others:
+            if same_place(group[0].T, vote.T, p.map):
+                group.append(vote)
+                break
+        else:
+            others.append([vote])
+    return groups + others
+
+
+def _places(
+    votes: Sequence[_Vote], scored: Sequence[ScoredPose], suggested: _Suggestions,
+    views: MapViews, p: LocalizationParameters,
+) -> list[Place]:  # fmt: skip
+    """Return the places of votes and scored poses, with the evidence for each."""
+    groups = _grouped(votes, scored, p)
+    weights = [_weight(group, p)[1] for group in groups]
+    scores = [one.score for one in scored]
+    places = []
+    for k, group in enumerate(groups):
+        pose = scored[k] if k < len(scored) else None
+        others = scores[:k] + scores[k + 1 :]
+        evidence = _evidence(
+            group, pose, suggested, views,
+            max(others, default=0.0), max(weights[:k] + weights[k + 1 :], default=0.0), p,
+        )  # fmt: skip
+        places.append(_place(group, pose, p, evidence))
+    return sorted(places, key=lambda place: not place.votes)
+
+
+def _place(
+    group: list[_Vote], pose: ScoredPose | None, p: LocalizationParameters,
+    evidence: PlaceEvidence | None = None,
+) -> Place:  # fmt: skip
+    """Return the place of some votes, or of a scored pose, or of both."""
+    accepted = any(vote.accepted for vote in group)
+    T = group[0].T if pose is None or accepted else pose.T
+    support, weight = _weight(group, p)
+    return Place(T, group, support, weight, evidence)
+
+
+def _weight(group: Sequence[_Vote], p: LocalizationParameters) -> tuple[int, float]:
+    """Return how many viewpoints vote, and the weight of their first votes.
+
+    Neither a copy of a view nor what other matches gave is a vote of its own.
+    """
+    voting = [vote for vote in group if not vote.match.validation.guided]
+    viewpoints = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)
+    different = different_views(viewpoints, p.map)
+    return len(different), sum(voting[i].weight for i in different)
+
+
+def _evidence(
+    group: Sequence[_Vote], pose: ScoredPose | None, suggested: _Suggestions,
+    views: MapViews, rival: float, rival_weight: float, p: LocalizationParameters,
+) -> PlaceEvidence:  # fmt: skip
+    """Return the evidence for a place: of its votes and of its pose on the map.
+
+    Parameters
+    ----------
+    group : votes
+    pose : None where none at the place was scored
+    suggested : see `_suggested`
+    views : the map's frames
+    rival, rival_weight : best score, and largest weight, of another place
+    p : see LocalizationParameters
+    """
+    weight = _weight(group, p)[1]
+    strong = _weight([v for v in group if v.match.validation.strength == "strong"], p)[0]
+    leading = np.array([v.viewpoint for v in group if v.accepted]).reshape(-1, 4, 4)
+    accepted = len(different_views(leading, p.map))
+    T = group[0].T if pose is None else pose.T
+    here = at_place(suggested.T, T, p.map)
+    suggesting = len(different_views(suggested.viewpoints[here], p.map))
+    similarity = float(suggested.similarities[here].max(initial=0.0))
+    if pose is None:
+        return PlaceEvidence(
+            0.0, 0.0, 0.0, 0, 0, 1.0, weight, strong, accepted, suggesting, similarity,
+            1.0, rival_weight,
+        )  # fmt: skip
+    agreeing = np.unique([i for _, i in pose.views]).astype(np.intp)
+    seen_from = len(different_views(views.poses[agreeing], p.map))
+    excess = pose.violations + pose.hidden - min(pose.noise, p.most_noise)
+    ratio = max(rival, 0.0) / pose.score if pose.score > 0 else 1.0
+    return PlaceEvidence(
+        pose.score, pose.share, pose.planes, len(agreeing), seen_from, excess, weight, strong,
+        accepted, suggesting, similarity, ratio, rival_weight,
+    )  # fmt: skip
