@@ -36,16 +36,16 @@ ABSENT_BLOCK = 100
 def table(told: Sequence[SiteAnswer]) -> list[str]:
     """Shares by kind as lines of Markdown, and over all."""
     lines = [
-        "| kind | queries | answerable | found and right | found and wrong "
+        "| kind | queries | answerable | found and right | found and wrong | wrong of found "
         "| grossly wrong | at most | called strong | ambiguous | not found | ms |",
-        "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
+        "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     kinds = dict.fromkeys(one.kind for one in told)
     for name, own in [*((k, [t for t in told if t.kind == k]) for k in kinds), ("all", list(told))]:
         f = answers([one.answer for one in own])
         keys = (
-            "found_right", "found_wrong", "grossly_wrong", "grossly_wrong_at_most",
-            "found_strong_wrong", "ambiguous", "not_found",
+            "found_right", "found_wrong", "wrong_of_found", "grossly_wrong",
+            "grossly_wrong_at_most", "found_strong_wrong", "ambiguous", "not_found",
         )  # fmt: skip
         shares = " | ".join(f"{f[key] or 0.0:.3f}" for key in keys)
         able = sum(one.answerable for one in own)

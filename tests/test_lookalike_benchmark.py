@@ -8,11 +8,14 @@ import pytest
 
 from benchmarks.lookalikes import ask_site
 from sceneprint.lab.evaluation.protocol import Error, JudgedAnswer
-from sceneprint.lab.evaluation.sites import RIGHT_SCAN, kinds_of
+from sceneprint.lab.evaluation.sites import kinds_of
 from sceneprint.lab.synth.lookalike_surveys import SURVEYED_KINDS
 from sceneprint.lab.synth.lookalikes import KINDS, ORDINARY
 from sceneprint.models import read_model
 from sceneprint.pipeline import Signer, open_signer
+
+#: A scan may be off by so much and still be right.
+SCAN = (0.5, 10.0)
 
 
 @pytest.mark.thorough
@@ -51,11 +54,11 @@ def test_the_answer_of_a_scanner_may_be_five_times_as_far_off() -> None:
     for metres, right, gross in ((0.45, True, False), (0.55, False, False), (2.6, False, True)):
         scanned, seen = (
             JudgedAnswer("found", "strong", Error(share * metres, 0.1), limits=limits)
-            for share, limits in ((1.0, RIGHT_SCAN), (0.2, (0.10, 10.0)))
+            for share, limits in ((1.0, SCAN), (0.2, (0.10, 10.0)))
         )
         assert (scanned.right, scanned.grossly_wrong) == (right, gross)
         assert (seen.right, seen.grossly_wrong) == (right, gross)
-    turned = JudgedAnswer("found", "weak", Error(0.0, math.radians(16)), limits=RIGHT_SCAN)
+    turned = JudgedAnswer("found", "weak", Error(0.0, math.radians(16)), limits=SCAN)
     assert (turned.right, turned.grossly_wrong) == (False, True)
 
 
@@ -64,5 +67,5 @@ def test_a_scanned_site_is_asked() -> None:
     signer = open_signer(read_model("lidar"))
     (answer,) = ask_site(signer, ("bays", 0, 1), seed=1)
     assert (answer.site, answer.answerable) == ("bays-000", True)
-    assert answer.answer.limits == RIGHT_SCAN
+    assert answer.answer.limits == pytest.approx(SCAN)
     assert answer.answer.status == "not_found" or answer.answer.error.metres < 100.0

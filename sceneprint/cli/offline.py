@@ -296,6 +296,7 @@ def run_train(options: argparse.Namespace) -> int:
     """Train and write the model."""
     from sceneprint.lab.training import (
         TrainingParameters,
+        preset_answer,
         preset_parameters,
         preset_scenes,
         preset_whitening,
@@ -334,7 +335,7 @@ def run_train(options: argparse.Namespace) -> int:
     name = re.sub(r"[^A-Za-z0-9_.-]", "-", options.out.stem)[:64] or options.preset
     with _Bars() as bars:
         model = train(name, model_p, mixture_p, p, references, options.jobs, bars.report)
-    save_model(model, options.out)
+    save_model(replace(model, answer=preset_answer(options.preset)), options.out)
     print(
         f"{options.out}: model {model.label}, {model.signature_bytes} bytes a signature, "
         f"trained on {model.provenance['frames_used']} frames and "

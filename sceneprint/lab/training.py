@@ -40,8 +40,9 @@ from sceneprint.geometry.signature.pair_features import (
 )
 from sceneprint.geometry.signature.segmentation import HierarchyParameters, patch_weights
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
+from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.lab.synth import synthesise_room, synthesise_survey
-from sceneprint.models import Model, ModelParameters
+from sceneprint.models import Model, ModelParameters, read_model
 from sceneprint.models.model import AnswerParameters, scaled
 from sceneprint.signing import (
     Signer,
@@ -187,17 +188,21 @@ def _lidar() -> ModelParameters:
 
 
 def preset_answer(preset: str) -> AnswerParameters:
-    """Return the numbers of a preset by which poses are judged, but for what is learnt.
+    """Return the numbers of a preset by which poses are judged.
+
+    Penalties of the confidence are those that the preset was shipped with: they are learnt from
+    answers, which need a model.
 
     Parameters
     ----------
     preset : one of PRESETS
     """
+    confidence = read_model(preset).answer.confidence
     if preset != "lidar":
-        return AnswerParameters()
-    answer = scaled(AnswerParameters(), _FACTOR)
-    refinement = replace(answer.map.refinement, **_SCAN_NOISE)
-    return replace(answer, map=replace(answer.map, refinement=refinement))
+        return AnswerParameters(confidence=confidence)
+    lengths = scaled(MapParameters(), _FACTOR)
+    refinement = replace(lengths.refinement, **_SCAN_NOISE)
+    return AnswerParameters(replace(lengths, refinement=refinement), confidence)
 
 
 #: Called with the stage's name, steps done and their total.

@@ -133,6 +133,9 @@ def test_whole_answers_by_hand() -> None:
         "grossly_wrong": 2 / 8,
         "grossly_wrong_at_most": upper_bound(2, 8),
         "found_strong_wrong": 1 / 8,
+        "wrong_of_found": 3 / 5,
+        "calibration_error": None,  # of answers whose places are not known
+        "reliability": None,
     }
     nothing = answers([])
     assert nothing.pop("queries") == 0

@@ -5,6 +5,7 @@ Task  --judge-->  Judged: pairs, averaged poses
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,10 +26,12 @@ from sceneprint.geometry.retrieval.ranking import (
 )
 from sceneprint.geometry.rigid import average_poses, inverse
 from sceneprint.geometry.validation.acceptance import Mode
-from sceneprint.geometry.validation.confidence import confidence_of
-from sceneprint.geometry.validation.map_verification import looks_ahead
+from sceneprint.geometry.validation.confidence import confidences_of
+from sceneprint.geometry.validation.map_verification import MapParameters, looks_ahead
 from sceneprint.geometry.validation.validation import ValidationParameters, refined_at
 from sceneprint.lab.evaluation.protocol import (
+    PLACE_DEG,
+    RIGHT,
     VIEWS,
     Error,
     FrameStore,
@@ -42,19 +45,21 @@ from sceneprint.lab.evaluation.protocol import (
     unwatched,
 )
 from sceneprint.localization import (
-    LocalizationParameters,
-    Place,
     PosedFrame,
     PoseEstimate,
-    PosePrior,
-    QueryFrame,
     estimate_of,
-    judged_places,
     rival_rows,
     views_of_rows,
 )
 from sceneprint.models.model import AnswerParameters
 from sceneprint.pipeline import PairMatch, associate, searched, validate
+from sceneprint.places import (
+    LocalizationParameters,
+    Place,
+    PosePrior,
+    QueryFrame,
+    judged_places,
+)
 from sceneprint.types import Bytes, Floats, Geometry
 
 
@@ -129,6 +134,7 @@ class Judge:
     database : the frames of the map; empty where only pairs are validated
     answer : of the model
     confidence : least of a pose that is found
+    unrelated_distance : of the model, by which distances are similarities
     """
 
     geometry: Callable[[int], Geometry]
@@ -139,6 +145,7 @@ class Judge:
     database: Sequence[SignedFrame] = ()
     answer: AnswerParameters = field(default_factory=AnswerParameters)
     confidence: float = LocalizationParameters.confidence
+    unrelated_distance: float = math.inf
 
 
 def open_judge(
@@ -149,11 +156,15 @@ def open_judge(
     matching: Matching = "histograms",
     database: Sequence[SignedFrame] = (),
     answer: AnswerParameters | None = None,
+    unrelated_distance: float = math.inf,
 ) -> Judge:
     """Make ready to validate frames of a store."""
     # neighbouring queries have many candidates in common
     geometry = lru_cache(128)(store.geometry)
-    return Judge(geometry, mode, seed, p, matching, database, answer or AnswerParameters())
+    return Judge(
+        geometry, mode, seed, p, matching, database, answer or AnswerParameters(),
+        unrelated_distance=unrelated_distance,
+    )  # fmt: skip
 
 
 def voters(parents: Sequence[str], strong: Sequence[bool], most: int = 5) -> list[int]:
@@ -228,7 +239,7 @@ def judge(judging: Judge, task: QueryTask) -> Judged:
 
 
 def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -> JudgedAnswer:
-    """The answer that a robot gets from the candidates of C, by the true pose.
+    """Return the answer that a robot gets from the candidates of C, judged by the true pose.
 
     What a service does with a query after the selection, in one place: validation until enough
     are accepted, the pose of those, and how sure that is.
@@ -257,9 +268,7 @@ def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -
         )
 
     n = len(task.selection)
-    selected = Ranking(
-        np.array(sorted(task.selection, key=far), np.intp), np.zeros(n, np.int64), np.zeros(n)
-    )  # neither distance decides here
+    selected = _ranking_of(judging, task, sorted(task.selection, key=far))
     query = judging.geometry(task.number)
     validating = partial(
         associate, query, open_geometry=open_geometry,
@@ -287,35 +296,67 @@ def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -
         matches = validating(selected, range(n), known=known)
         told = located(matches)
 
-    def posed(rows: Sequence[int]) -> dict[int, PosedFrame]:
-        return {
-            row: PosedFrame(scenes[row], poses[row], looks_ahead(seen))
-            for row in rows
-            if (seen := open_geometry(row)) is not None
-        }
-
     rivals: list[int] = []
     if task.retrieved is not None and judging.mode == "full":
+        posed = partial(_posed_frames, open_geometry, poses, scenes)
         tried = {match.index for match in matches}
         rivals = rival_rows(told, task.retrieved, tried, posed, looks_ahead(query), own_p)
     if rivals:
-        others = Ranking(np.array(rivals), np.zeros(len(rivals), np.int64), np.zeros(len(rivals)))
+        others = _ranking_of(judging, task, rivals)
         told = located([*matches, *validating(others, range(len(rivals)), retry=False)])
     spent = 1e3 * (time.perf_counter() - start)
     if told is None:
         return JudgedAnswer(milliseconds=spent)
+    return _judged_answer(told, seen, task, own_p, spent)
+
+
+def _posed_frames(
+    open_geometry: Callable[[int], Geometry | None], poses: Sequence[Floats],
+    scenes: Sequence[str], rows: Sequence[int],
+) -> dict[int, PosedFrame]:  # fmt: skip
+    """Return the frames of some rows that a query may find, as `rival_rows` asks for them."""
+    return {
+        row: PosedFrame(scenes[row], poses[row], looks_ahead(seen))
+        for row in rows
+        if (seen := open_geometry(row)) is not None
+    }
+
+
+def _judged_answer(
+    told: PoseEstimate, seen: Sequence[Place], task: QueryTask, p: LocalizationParameters,
+    spent: float,
+) -> JudgedAnswer:  # fmt: skip
+    """Return an answer with the places that it was chosen from, judged by the true pose."""
 
     def error_of(T: Floats) -> Error:
         return pose_error(T, task.pose) if told.parent == task.scene else Error()
 
-    places = tuple(
-        JudgedPlace(one.evidence, confidence_of(one.evidence, own_p.judgement), error_of(one.T))
-        for one in sorted(seen, key=lambda place: -place.score)
-        if one.evidence is not None
-    )
-    if told.average is None:
-        return JudgedAnswer(told.status, milliseconds=spent, places=places)
-    return JudgedAnswer(told.status, told.strength, error_of(told.average.T), spent, places)
+    known = [(one, one.evidence) for one in seen if one.evidence is not None]
+    confidences = confidences_of([evidence for _, evidence in known], p.judgement)
+    places = []
+    for i in sorted(range(len(known)), key=lambda i: -confidences[i]):
+        place, evidence = known[i]
+        error = error_of(place.T)
+        right = error.within(p.map.place_m, PLACE_DEG)
+        places.append(JudgedPlace(evidence, confidences[i], error, right))
+    # as far off as places are apart, so that a scan may be off by more than a depth image
+    limits = RIGHT[0] * p.map.place_m / MapParameters.place_m, RIGHT[1]
+    error = Error() if told.average is None else error_of(told.average.T)
+    return JudgedAnswer(told.status, told.strength, error, spent, tuple(places), limits)
+
+
+def _ranking_of(judging: Judge, task: QueryTask, rows: Sequence[int]) -> Ranking:
+    """Return some rows of R in another order; without R every distance is that of strangers."""
+    index = np.array(rows, np.intp)
+    distances = np.full(len(index), judging.unrelated_distance)
+    if task.retrieved is not None:
+        known = dict(
+            zip(task.retrieved.indices.tolist(), task.retrieved.distances.tolist(), strict=True)
+        )
+        distances = np.array([known.get(row, judging.unrelated_distance) for row in rows])
+    similarities = np.clip(1.0 - distances / judging.unrelated_distance, 0.0, 1.0)
+    whole = np.where(np.isfinite(distances), distances, 0.0).astype(np.int64)
+    return Ranking(index, whole, np.nan_to_num(similarities))
 
 
 def true_transform(task: QueryTask, candidate: Candidate) -> Floats:

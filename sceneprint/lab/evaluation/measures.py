@@ -338,14 +338,18 @@ def absent(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
     }
 
 
-def answers(told: Sequence[JudgedAnswer]) -> Figures:
+def answers(told: Sequence[JudgedAnswer]) -> dict[str, Any]:
     """What robots are told, as shares of all queries; the first four add up to 1.
 
-    `found_right`: within 10 cm and 10 degrees. `found_wrong`: found and not right, of absent
-    scenes always; `grossly_wrong` of them are beyond 50 cm or 15 degrees, and the rate of
-    those is below `grossly_wrong_at_most` (95 %, one-sided). `found_strong_wrong`: wrong ones
-    that were called strong. Null where nothing was asked.
+    `found_right`: within 10 cm and 10 degrees, or the limits of the answers. `found_wrong`: found
+    and not right, of absent scenes always; `grossly_wrong` of them are beyond 50 cm or 15 degrees,
+    and the rate of those is below `grossly_wrong_at_most` (95 %, one-sided). `found_strong_wrong`:
+    wrong ones that were called strong. `wrong_of_found`: wrong ones as a share of those that are
+    found. `calibration_error`: how far the confidence of the likeliest pose is from the share of
+    these that are right; `reliability`: in each tenth of confidences the number of these poses,
+    their mean confidence, and the share that is right. Null where nothing was asked.
     """
+    found = _calibration(told)
     wrong = [one.status == "found" and not one.right for one in told]
     gross = [one.grossly_wrong for one in told]
     return {
@@ -359,7 +363,60 @@ def answers(told: Sequence[JudgedAnswer]) -> Figures:
         "found_strong_wrong": _share(
             [one.strength == "strong" and w for one, w in zip(told, wrong, strict=True)]
         ),
+        "wrong_of_found": _share(
+            [w for one, w in zip(told, wrong, strict=True) if one.status == "found"]
+        ),
+        "calibration_error": None if found is None else found.error,
+        "reliability": None if found is None else found.bins,
     }
+
+
+def _calibration(told: Sequence[JudgedAnswer]) -> Calibration | None:
+    """Return how well confidences predict which likeliest poses are right; None without any."""
+    best = [one.places[0] for one in told if one.places]
+    if not best:
+        return None
+    return calibration([one.confidence for one in best], [one.right for one in best])
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How confidences compare with what was right.
+
+    Parameters
+    ----------
+    error : expected calibration error over ten bins of equal width
+    brier : mean square of confidence less outcome
+    bins : of each bin that has poses: their number, mean confidence, and share that is right
+    """
+
+    error: float
+    brier: float
+    bins: tuple[tuple[int, float, float], ...]
+
+
+def calibration(confidences: Sequence[float], right: Sequence[bool]) -> Calibration:
+    """Return how well confidences predict what is right.
+
+    Parameters
+    ----------
+    confidences, right : one for one; at least one
+
+    Raises
+    ------
+    ValueError : not one for one, or none.
+    """
+    if len(confidences) != len(right) or not len(right):
+        raise ValueError(f"{len(confidences)} confidences of {len(right)} poses")
+    c, y = np.array(confidences, float), np.array(right, float)
+    which = np.minimum((c * 10).astype(int), 9)
+    bins = tuple(
+        (int((which == k).sum()), float(c[which == k].mean()), float(y[which == k].mean()))
+        for k in range(10)
+        if (which == k).any()
+    )
+    error = sum(n * abs(mean - share) for n, mean, share in bins) / len(y)
+    return Calibration(float(error), float(np.mean((c - y) ** 2)), bins)
 
 
 def first_error(outcome: QueryOutcome, of: str) -> Error:

@@ -57,6 +57,9 @@ if TYPE_CHECKING:
 VIEWS = 5
 #: A transform between rooms' frames is right within these metres and degrees.
 RIGHT = (0.10, 10.0)
+#: A candidate pose is of the right place within the model's distance between places, and these
+#: degrees.
+PLACE_DEG = 10.0
 #: An answer beyond these is another place, not an inaccurate one.
 GROSS = (0.50, 15.0)
 
@@ -143,11 +146,13 @@ class JudgedPlace:
     evidence : for the pose
     confidence : computed from it
     error : of the pose; infinite in another parent frame
+    right : whether it is near enough to the true one to be of its place
     """
 
     evidence: PlaceEvidence
     confidence: float
     error: Error
+    right: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -833,7 +838,7 @@ class Prepared:
     queries, database : in the order of the protocol
     left_out : (name, reason) of the others
     milliseconds : median time to sign a frame and work out its geometry; None without frames
-    validation, metric, answer : of the model
+    validation, metric, answer, unrelated_distance : of the model
     """
 
     queries: list[SignedFrame]
@@ -843,6 +848,7 @@ class Prepared:
     validation: ValidationParameters = field(default_factory=ValidationParameters)
     metric: Metric = "l2"
     answer: AnswerParameters = field(default_factory=AnswerParameters)
+    unrelated_distance: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -905,7 +911,7 @@ def prepare_all(
     model = signer.model
     return Prepared(
         by_use["query"], by_use["database"], left_out, median, model.parameters.validation,
-        model.metric, model.answer,
+        model.metric, model.answer, model.unrelated_distance,
     )  # fmt: skip
 
 

@@ -558,7 +558,11 @@ def _answers(found: dict[str, Any]) -> list[str]:
     lines[2] += (
         f"   beyond 50 cm or 15 deg {_share(told['grossly_wrong'])}, at most "
         f"{_share(told['grossly_wrong_at_most'])}; called strong "
-        f"{_share(told['found_strong_wrong'])}"
+        f"{_share(told['found_strong_wrong'])}; of what is found {_share(told['wrong_of_found'])}"
+    )
+    lines.append(
+        f"confidence    calibration error {_share(told['calibration_error'])}, of the likeliest "
+        "pose of each query"
     )
     return lines
 

@@ -318,7 +318,7 @@ def _evaluate_slice(
     ]
     opening = partial(
         open_judge, store, settings.mode, settings.seed, prepared.validation, settings.matching,
-        database, prepared.answer,
+        database, prepared.answer, prepared.unrelated_distance,
     )  # fmt: skip
     judged = watch(map_over(tasks, judge, opening, settings.jobs), "validate", len(tasks))
     return [

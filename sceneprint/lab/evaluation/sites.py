@@ -17,9 +17,9 @@ from sceneprint.lab.evaluation.protocol import JudgedAnswer, SignedFrame, overla
 from sceneprint.lab.synth import synthesise_lookalike, synthesise_lookalike_survey
 from sceneprint.lab.synth.lookalike_surveys import SURVEYED_KINDS
 from sceneprint.lab.synth.lookalikes import KINDS, ORDINARY, LookalikeSite
-from sceneprint.localization import PosePrior
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, prepare
+from sceneprint.places import PosePrior
 from sceneprint.types import AnyFrame, Cloud, Floats, Geometry
 from sceneprint_client.poses import rotation_of
 
@@ -27,8 +27,6 @@ from sceneprint_client.poses import rotation_of
 ANSWERABLE = 0.3
 #: So near, in metres, a scan of the map is near enough to answer a query of a scanner.
 ANSWERABLE_M = 10.0
-#: Metres and degrees to which the pose of a scanner is to be right: half of what is one place.
-RIGHT_SCAN = (0.5, 10.0)
 #: Deviations that a robot states with its prior, and how far that is turned at most, degrees.
 PRIOR_M, PRIOR_DEG = 0.3, 10.0
 
@@ -177,7 +175,7 @@ def ask_site(
     geometries = [*of_map, *of_queries]
     judge = Judge(
         geometries.__getitem__, "full", 0, model.parameters.validation, database=database,
-        answer=model.answer,
+        answer=model.answer, unrelated_distance=model.unrelated_distance,
     )  # fmt: skip
     if confidence is not None:
         judge = replace(judge, confidence=confidence)
@@ -198,8 +196,6 @@ def ask_site(
         )  # fmt: skip
         believed = None if prior is None else prior_about(query.pose, site.name, *prior, rng)
         answer = answer_of(judge, task, believed)
-        if of_scans:
-            answer = replace(answer, limits=RIGHT_SCAN)
         answers.append(SiteAnswer(site.name, kind, number, able[number], answer))
     return answers
 

@@ -635,17 +635,35 @@ def _absent_places(rng: np.random.Generator, index: int, queries: int) -> Shoot:
 
 
 def _ordinary_rooms(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
-    """Different rooms side by side, seen from few places or from many."""
+    """Different rooms side by side, seen from few places or from many, in which people live.
+
+    Things stand about that were elsewhere, or not there, when the map was recorded.
+    """
     rooms = [make_room(rng) for _ in range(3)]
-    each = int(rng.integers(6, 22))
-    map_of = [(room, T) for room in rooms for T in scattered_poses(room, each, rng)]
-    asked = [rooms[k % len(rooms)] for k in range(queries)]
+    most = int(rng.integers(0, 5))
+    before = [with_things(room, int(rng.integers(0, most + 1)), rng) for room in rooms]
+    after = [with_things(room, int(rng.integers(0, most + 1)), rng) for room in rooms]
+    each = int(rng.integers(8, 26))
+    map_of = [(room, T) for room in before for T in scattered_poses(room, each, rng)]
+    asked = [after[k % len(after)] for k in range(queries)]
     starts = np.cumsum([0.0, *(room.size[0] + 0.2 for room in rooms)])
 
     def shift(room: Room) -> Floats:
-        return np.array([starts[next(i for i, one in enumerate(rooms) if one is room)], 0.0, 0.0])
+        k = next(i for i in range(len(rooms)) if room is before[i] or room is after[i])
+        return np.array([starts[k], 0.0, 0.0])
 
     return Shoot(map_of, [(r, scattered_poses(r, 1, rng)[0]) for r in asked], shift)
+
+
+def with_things(room: Room, count: int, rng: np.random.Generator) -> Room:
+    """Return a room with so many chairs, boxes and the like somewhere on its floor."""
+    low, high = room.outline.min(axis=0), room.outline.max(axis=0)
+    things = []
+    for _ in range(count):
+        make = (chair, swivel_chair, floor_thing)[int(rng.integers(0, 3))]
+        at = rng.uniform(low + 0.4, high - 0.4)
+        things.append(make(rng).mesh.moved((at[0], at[1], 0.0), float(rng.uniform(0.0, 6.3))))
+    return replace(room, mesh=join([room.mesh, *things]))
 
 
 _SHOOTS: dict[str, Callable[[np.random.Generator, int, int], Shoot]] = {

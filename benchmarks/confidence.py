@@ -1,0 +1,139 @@
+"""Learn the confidence of answers: `python -m benchmarks.confidence --evidence FILE --out MODEL`.
+
+sites  --collect-->  samples, in a file  --fit-->  numbers, in a model file
+
+Sites of every kind are built, most of them with maps that lack frames and whose poses drift, and
+all their queries are answered. The penalties are fitted to which candidate pose was right.
+Recordings take no part.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from sceneprint.geometry.validation.confidence import PlaceEvidence, confidences_of
+from sceneprint.lab.confidence import JudgedQuery, fit, judged_queries
+from sceneprint.lab.evaluation.measures import calibration
+from sceneprint.lab.evaluation.protocol import map_over
+from sceneprint.lab.evaluation.sites import MapFlaws, SiteAnswer, ask_site
+from sceneprint.models import PRESETS, read_model
+from sceneprint.models.model_file import save_model
+from sceneprint.pipeline import Signer, open_signer
+
+#: Of a hundred queries, how many are taken at places of each kind: a confidence is a probability
+#: among queries that are mixed so. Most robots are in ordinary rooms, or drive about.
+SHARES: dict[str, dict[str, float]] = {
+    "depth": {
+        "rooms": 79.5, "absent": 10, "offices": 4, "opposite": 2, "object": 2, "kitchens": 1,
+        "unmapped": 1.5,
+    },
+    "lidar": {
+        "sites": 70, "absent": 10, "bays": 6, "streets": 6, "halls": 4, "unmapped": 4,
+    },
+}  # fmt: skip
+#: How many sites are built of a kind for each of another, where what decides is rare.
+TIMES = {"rooms": 3, "sites": 3, "unmapped": 2}
+#: Flaws of two maps in three. Scans are taken so often that most may be missing; their poses drift
+#: as it is.
+FLAWS = {"depth": MapFlaws(0.5, 0.01, 0.004), "lidar": MapFlaws(0.9, 0.0, 0.0)}
+#: Least step of the penalty of a pose that one view alone suggests. Two scans of a real street
+#: often agree metres along it, and the streets that are built here are too rich to show that.
+LONE = {"depth": 0.0, "lidar": 2.5}
+#: Seed of the sites that are learnt from.
+SEED = 70
+
+
+def sensor_of(preset: str) -> str:
+    """Return the sensor that a preset is for: "depth" or "lidar"."""
+    return "lidar" if preset == "lidar" else "depth"
+
+
+def collect(
+    preset: str, seed: int, sites: int, queries: int, jobs: int
+) -> Iterator[list[SiteAnswer]]:
+    """Ask sites of every kind with a preset, one site after another.
+
+    Every query is answered with the best pose there is, so that frames elsewhere that look alike
+    are always compared, as they are before a pose is found.
+    """
+    work = [
+        (kind, index * TIMES.get(kind, 1) + k, queries)
+        for index in range(sites)
+        for kind in SHARES[sensor_of(preset)]
+        for k in range(TIMES.get(kind, 1))
+    ]
+    ask = partial(_ask, seed=seed, flaws=FLAWS[sensor_of(preset)])
+    yield from tqdm(
+        map_over(work, ask, partial(_open, preset), jobs), total=len(work), disable=None
+    )
+
+
+def _open(preset: str) -> Signer:
+    return open_signer(read_model(preset))
+
+
+def _ask(
+    signer: Signer, work: tuple[str, int, int], *, seed: int, flaws: MapFlaws
+) -> list[SiteAnswer]:
+    return ask_site(signer, work, seed=seed, flaws=flaws if work[1] % 3 else None, confidence=0.0)
+
+
+def write_samples(path: Path, samples: Iterable[JudgedQuery]) -> None:
+    """Append samples to a file, one JSON object a line."""
+    with path.open("a") as file:
+        for one in samples:
+            file.write(json.dumps(asdict(one)) + "\n")
+
+
+def read_samples(path: Path) -> list[JudgedQuery]:
+    """Return the samples of a file of `write_samples`."""
+    rows: list[dict[str, Any]] = [json.loads(line) for line in path.read_text().splitlines()]
+    return [
+        JudgedQuery(
+            row["site"], row["kind"], row["query"],
+            tuple(PlaceEvidence(**one) for one in row["evidence"]), tuple(row["right"]),
+        )
+        for row in rows
+    ]  # fmt: skip
+
+
+def main() -> None:
+    """Collect samples, fit the numbers of a preset, and write them into a model file."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.confidence", description=__doc__)
+    parser.add_argument("--preset", choices=PRESETS, default=PRESETS[0])
+    parser.add_argument("--seed", type=int, default=SEED, help="of the sites")
+    parser.add_argument("--sites", type=int, default=10, help="of each kind (default: 10)")
+    parser.add_argument("--queries", type=int, default=12, help="of each site (default: 12)")
+    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
+    parser.add_argument(
+        "--evidence", type=Path, required=True, help="file of samples: read, if it is there"
+    )
+    parser.add_argument("--out", type=Path, help="model file that gets the numbers")
+    options = parser.parse_args()
+    model = read_model(options.preset)
+    if not options.evidence.exists():
+        for answers in collect(
+            options.preset, options.seed, options.sites, options.queries, options.jobs
+        ):
+            write_samples(options.evidence, judged_queries(answers))
+    samples = read_samples(options.evidence)
+    sensor = sensor_of(options.preset)
+    parameters = fit(samples, SHARES[sensor], lone=LONE[sensor])
+    confidences = [c for one in samples for c in confidences_of(one.evidence, parameters)]
+    found = calibration(confidences, [right for one in samples for right in one.right])
+    print(f"{len(confidences)} poses; calibration error {found.error:.3f}, Brier {found.brier:.4f}")
+    print(parameters)
+    if options.out is not None:
+        save_model(replace(model, answer=replace(model.answer, confidence=parameters)), options.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""Confidences are learnt: steps and calibration by hand, and known penalties found again."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, fields
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.validation.confidence import (
+    KNOTS,
+    ConfidenceParameters,
+    Penalty,
+    PlaceEvidence,
+    confidences_of,
+    penalties_of,
+)
+from sceneprint.lab.confidence import JudgedQuery, fit, steps_of
+from sceneprint.lab.evaluation.measures import calibration
+
+#: Only these kinds cost anything.
+TRUTH = ConfidenceParameters(
+    best=5.0,
+    **{name: Penalty(0.0, 0.0, 0.0) for name in KNOTS}
+    | {"planes": Penalty(4.0, 2.0, 1.0), "rival": Penalty(3.0, 1.5, 0.5)},
+)
+
+
+def drawn(rng: np.random.Generator) -> PlaceEvidence:
+    """Evidence of every kind, anywhere between its knots."""
+    values = {name: float(rng.uniform(min(knots), max(knots))) for name, knots in KNOTS.items()}
+    names = [one.name for one in fields(PlaceEvidence)]
+    return PlaceEvidence(**{name: values.get(name, 0.0) for name in names})  # type: ignore[arg-type]
+
+
+def test_the_penalty_is_the_sum_of_its_steps() -> None:
+    rng = np.random.default_rng(0)
+    evidence = [drawn(rng) for _ in range(50)]
+    steps = steps_of(evidence)
+    assert steps.shape == (50, 3 * len(KNOTS))
+    assert (steps >= 0).all()
+    assert (steps <= 1).all()
+    increments = [
+        size
+        for name in KNOTS
+        for p in (getattr(TRUTH, name),)
+        for size in (p.fair, p.poor - p.fair, p.worst - p.poor)
+    ]
+    by_hand = [sum(penalties_of(e, TRUTH).values()) for e in evidence]
+    np.testing.assert_allclose(steps @ np.array(increments), by_hand, atol=1e-9)
+
+
+def test_what_was_drawn_from_a_model_is_learnt_again() -> None:
+    """Of 4,000 queries of two candidates: confidences within a few hundredths."""
+    rng = np.random.default_rng(1)
+    samples = []
+    for number in range(4000):
+        pair = (drawn(rng), drawn(rng))
+        confidences = confidences_of(pair, TRUTH)
+        which = int(rng.choice(3, p=[*confidences, 1.0 - sum(confidences)]))
+        samples.append(
+            JudgedQuery("site", "rooms", number, pair, tuple(k == which for k in range(2)))
+        )
+    learnt = fit(samples, {"rooms": 1.0})
+    tried = [(drawn(rng), drawn(rng)) for _ in range(300)]
+    off = [
+        abs(a - b)
+        for pair in tried
+        for a, b in zip(confidences_of(pair, learnt), confidences_of(pair, TRUTH), strict=True)
+    ]
+    assert float(np.mean(off)) < 0.03
+    # no penalty falls with worse evidence
+    for name in KNOTS:
+        p = asdict(getattr(learnt, name))
+        assert p["worst"] >= p["poor"] >= p["fair"] >= 0.0
+
+
+def test_kinds_count_by_their_shares() -> None:
+    """Evidence that is right at one kind of place and wrong at another has the odds of shares."""
+    e = PlaceEvidence(**{one.name: 0.0 for one in fields(PlaceEvidence)})  # type: ignore[arg-type]
+    samples = [JudgedQuery("a", "rooms", k, (e,), (True,)) for k in range(30)]
+    samples += [JudgedQuery("b", "absent", k, (e,), (False,)) for k in range(90)]
+    learnt = fit(samples, {"rooms": 3.0, "absent": 1.0}, ridge=0.0)
+    assert confidences_of([e], learnt) == pytest.approx([0.75], abs=1e-3)
+
+
+def test_a_calibration_by_hand() -> None:
+    found = calibration(
+        [0.95, 0.95, 0.91, 0.15, 0.05, 0.05], [True, True, False, False, True, False]
+    )
+    high, low, least = 2.81 / 3, 0.15, 0.05
+    assert found.bins == (
+        (2, pytest.approx(least), 0.5), (1, pytest.approx(low), 0.0),
+        (3, pytest.approx(high), pytest.approx(2 / 3)),
+    )  # fmt: skip
+    error = (2 * abs(least - 0.5) + low + 3 * abs(high - 2 / 3)) / 6
+    assert found.error == pytest.approx(error)
+    squares = 2 * 0.05**2 + 0.91**2 + 0.15**2 + 0.95**2 + 0.05**2
+    assert found.brier == pytest.approx(squares / 6)
+    assert math.isclose(calibration([1.0], [True]).error, 0.0)
+    with pytest.raises(ValueError, match="2 confidences of 1"):
+        calibration([0.5, 0.5], [True])
