@@ -32,8 +32,8 @@ from sceneprint.pipeline import Signer, open_signer
 #: among queries that are mixed so. Most robots are in ordinary rooms, or drive about.
 SHARES: dict[str, dict[str, float]] = {
     "depth": {
-        "rooms": 79.5, "absent": 10, "offices": 4, "opposite": 2, "object": 2, "kitchens": 1,
-        "unmapped": 1.5,
+        "rooms": 79, "absent": 10, "offices": 4, "opposite": 2, "object": 2, "kitchens": 1,
+        "unmapped": 2,
     },
     "lidar": {
         "sites": 70, "absent": 10, "bays": 6, "streets": 6, "halls": 4, "unmapped": 4,

@@ -30,6 +30,7 @@ TRUTH = ConfidenceParameters(
 def drawn(rng: np.random.Generator) -> PlaceEvidence:
     """Evidence of every kind, anywhere between its knots."""
     values = {name: float(rng.uniform(min(knots), max(knots))) for name, knots in KNOTS.items()}
+    values |= {"frames": 5.0 + values["frames"], "accepted": 5.0 * values.pop("acceptance")}
     names = [one.name for one in fields(PlaceEvidence)]
     return PlaceEvidence(**{name: values.get(name, 0.0) for name in names})  # type: ignore[arg-type]
 

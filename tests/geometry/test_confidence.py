@@ -39,6 +39,12 @@ def test_a_penalty_is_linear_between_its_knots() -> None:
     assert confidences_of([two], P) == pytest.approx([1 / (1 + math.exp(-3.0))])
 
 
+def test_accepted_matches_count_by_the_frames_that_see_the_place() -> None:
+    for frames, accepted, acceptance in ((12, 1, 0.2), (3, 1, 1 / 3), (2, 2, 1.0), (1, 0, 0.0)):
+        e = replace(BEST, frames=frames, accepted=accepted)
+        assert e.acceptance == pytest.approx(acceptance)
+
+
 def test_candidates_share_what_one_of_them_has() -> None:
     """Odds of e^6 and e^5 against 1 that none is right."""
     whole = 1 + math.exp(6.0) + math.exp(5.0)
@@ -51,7 +57,10 @@ def test_candidates_share_what_one_of_them_has() -> None:
 def test_better_evidence_never_lowers_a_confidence(name: str) -> None:
     worst, *_, best = KNOTS[name]
     steps = [worst + (best - worst) * k / 20 for k in range(-3, 24)]
-    found = [confidences_of([replace(BEST, **{name: x})], ConfidenceParameters())[0] for x in steps]
+    # five frames or more see the place, and each accepted match is a fifth
+    field, times = ("accepted", 5.0) if name == "acceptance" else (name, 1.0)
+    tried = [replace(BEST, **{field: times * x}) for x in steps]
+    found = [confidences_of([e], ConfidenceParameters())[0] for e in tried]
     assert found == sorted(found)
 
 

@@ -58,6 +58,15 @@ class PlaceEvidence:
     rival: float
     rival_weight: float
 
+    @property
+    def acceptance(self) -> float:
+        """Accepted matches for each frame that sees the place, of five at most: 0 to 1.
+
+        Where many frames of the map see the right place, most of their matches are accepted, and no
+        more than five are tried for; at a place that only looks alike few are.
+        """
+        return min(self.accepted / max(min(self.frames, 5), 1), 1.0)
+
 
 @dataclass(frozen=True)
 class Penalty:
@@ -86,7 +95,7 @@ KNOTS: Mapping[str, tuple[float, float, float, float]] = {
     "excess": (0.25, 0.12, 0.05, 0.0),
     "weight": (0.0, 0.4, 1.0, 3.0),
     "strong": (0.0, 1.0, 2.0, 4.0),
-    "accepted": (0.0, 1.0, 2.0, 5.0),
+    "acceptance": (0.0, 0.2, 0.5, 1.0),
     "suggested": (0.0, 1.0, 2.0, 4.0),
     "similarity": (0.05, 0.2, 0.4, 0.65),
     "rival": (1.0, 0.8, 0.5, 0.2),
@@ -111,7 +120,7 @@ class ConfidenceParameters:
     excess: Penalty = Penalty(9.0, 5.0, 1.5)
     weight: Penalty = Penalty(2.0, 1.5, 1.0)
     strong: Penalty = Penalty(1.5, 0.5, 0.0)
-    accepted: Penalty = Penalty(0.0, 0.0, 0.0)
+    acceptance: Penalty = Penalty(2.0, 1.5, 0.5)
     suggested: Penalty = Penalty(1.0, 1.0, 0.0)
     similarity: Penalty = Penalty(0.0, 0.0, 0.0)
     rival: Penalty = Penalty(9.0, 5.0, 2.0)
@@ -158,7 +167,7 @@ def weakest_evidence(e: PlaceEvidence, p: ConfidenceParameters) -> str:
         "missing: another place may look like this one, or this one has changed",
         "weight": "too few matches vote for the pose",
         "strong": "no strong match votes for the pose",
-        "accepted": "too few matches from different viewpoints agree on the pose",
+        "acceptance": f"few of the {e.frames} frames that see this place match the frame well",
         "suggested": f"one view alone suggests this pose, of {e.viewpoints} that see the place",
         "similarity": "the frame looks little like those of the map that suggest this pose",
         "rival": "another pose explains the frame as well: the place repeats, or has a symmetry",
