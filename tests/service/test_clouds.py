@@ -84,12 +84,12 @@ def found(answer: Any, status: str = "found") -> dict[str, Any]:
     return told
 
 
-def unconfirmed(answer: Any) -> dict[str, Any]:
-    """Of one weak match, which is not enough to be found: its pose is the only alternative."""
-    told = found(answer, "ambiguous")
-    assert told["location"] is None
+def found_by_the_map(answer: Any) -> dict[str, Any]:
+    """Return an answer whose only match is weak, and which the map's frames bear out."""
+    told = found(answer)
+    assert told["location"]["verified_by"] == "map"
     assert told["matches"][0]["validation"]["strength"] == "weak"
-    assert len(told["alternatives"]) == 1
+    assert told["location"]["strength"] == "weak"
     return told
 
 
@@ -111,15 +111,14 @@ def test_what_is_told_of_a_cloud(served, hall, clouds):
 def test_a_cloud_finds_the_image_of_its_place_and_an_image_the_cloud(served, hall, shots, clouds):
     path, ids = hall
     http = served.client
-    by_cloud = unconfirmed(http.post(f"{path}/queries", **form(write_ply(clouds[0]))))
+    by_cloud = found_by_the_map(http.post(f"{path}/queries", **form(write_ply(clouds[0]))))
     first = by_cloud["matches"][0]
     assert (by_cloud["kind"], first["frame_id"]) == ("cloud", ids[0])
     assert first["validation"]["free_space_violations"] is not None
     T = first["transform"]
     assert (T["parent_frame"], T["child_frame"]) == (f"{ids[0]}.optical", "query.sensor")
     assert np.allclose(T["matrix"], np.eye(4), atol=0.02)
-    (only,) = by_cloud["alternatives"]
-    assert np.allclose(only["pose"]["matrix"], shots[0].pose, atol=0.02)
+    assert np.allclose(by_cloud["location"]["pose"]["matrix"], shots[0].pose, atol=0.02)
 
     by_image = found(http.post(f"{path}/queries", **shots[1].form()))
     first = by_image["matches"][0]
@@ -260,7 +259,7 @@ def test_a_reconstruction_leaves_clouds_out_and_says_so(served, hall, shots, clo
     path, ids = hall
     http = served.client
     asked = form(write_ply(clouds[0]))
-    answer = unconfirmed(http.post(f"{path}/queries", **asked))
+    answer = found_by_the_map(http.post(f"{path}/queries", **asked))
     begun = http.post(f"/v1/queries/{answer['query_id']}/reconstruction", json={})
     assert begun.status_code == 202, begun.text
     job = f"/v1/reconstructions/{begun.json()['job_id']}"
@@ -355,6 +354,6 @@ def test_many_at_once(served, make_map, shots, clouds, until):
     told = http.get(f"{path}/frames/{items[0]['frame_id']}").json()
     assert (told["kind"], told["units_per_metre"], told["session"]) == ("cloud", 1000, "run")
     assert np.allclose(told["pose"]["matrix"], shots[0].pose, atol=1e-6)
-    answer = unconfirmed(http.post(f"{path}/queries", **form(write_ply(clouds[0]))))
+    answer = found_by_the_map(http.post(f"{path}/queries", **form(write_ply(clouds[0]))))
     assert answer["matches"][0]["frame_id"] == items[0]["frame_id"]
     assert np.allclose(answer["matches"][0]["transform"]["matrix"], np.eye(4), atol=0.02)

@@ -99,7 +99,7 @@ def test_bodies_that_are_read_by_hand_are_described(document):
     query = operations(document)["post", "/v1/maps/{map_name}/queries"]["requestBody"]
     options = {"k", "stages", "exact", "filter", "seed", "candidates", "diversity", "validation",
                "prior", "deadline_ms", "explain", "explain_frame", "keep",
-               "record"}  # fmt: skip
+               "record", "confidence"}  # fmt: skip
     assert {"application/json", "multipart/form-data", "image/png"} <= set(query["content"])
     beside = operations(document)["post", "/v1/maps/{map_name}/queries"]["parameters"]
     assert {one["name"] for one in beside if one["in"] == "query"} >= options | {"fx", "meta"}
