@@ -33,15 +33,18 @@ from sceneprint.pipeline import Signer, open_signer
 ABSENT_BLOCK = 100
 
 
-def table(told: Sequence[SiteAnswer]) -> list[str]:
+def table(site_answers: Sequence[SiteAnswer]) -> list[str]:
     """Shares by kind as lines of Markdown, and over all."""
     lines = [
         "| kind | queries | answerable | found and right | found and wrong | wrong of found "
         "| grossly wrong | at most | called strong | ambiguous | not found | ms |",
         "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
-    kinds = dict.fromkeys(one.kind for one in told)
-    for name, own in [*((k, [t for t in told if t.kind == k]) for k in kinds), ("all", list(told))]:
+    kinds = dict.fromkeys(one.kind for one in site_answers)
+    for name, own in [
+        *((k, [t for t in site_answers if t.kind == k]) for k in kinds),
+        ("all", list(site_answers)),
+    ]:
         f = answers([one.answer for one in own])
         keys = (
             "found_right", "found_wrong", "wrong_of_found", "grossly_wrong",
@@ -77,10 +80,12 @@ def main() -> None:
     parser.add_argument("--model", default=PRESETS[0])
     parser.add_argument("--json", type=Path, help="write every answer to this file")
     options = parser.parse_args()
-    known = kinds_of(read_model(options.model))
-    kinds = options.kinds or [kind for kind in known if kind not in ORDINARY]
-    if unknown := [kind for kind in kinds if kind not in known]:
-        parser.error(f"--kinds {unknown[0]}: for {options.model} choose from {', '.join(known)}")
+    supported = kinds_of(read_model(options.model))
+    kinds = options.kinds or [kind for kind in supported if kind not in ORDINARY]
+    if unknown := [kind for kind in kinds if kind not in supported]:
+        parser.error(
+            f"--kinds {unknown[0]}: for {options.model} choose from {', '.join(supported)}"
+        )
     work = [
         (kind, index, options.queries)
         for index in range(options.first, options.first + options.sites)
@@ -92,16 +97,16 @@ def main() -> None:
             ("absent", options.first + b, min(ABSENT_BLOCK, options.absent - b * ABSENT_BLOCK))
             for b in blocks
         ]
-    start, told = time.monotonic(), []
+    start, site_answers = time.monotonic(), []
     prior = None if options.prior is None else (options.prior[0], options.prior[1])
     do = partial(ask_site, seed=options.seed, candidates=options.candidates, prior=prior)
     opening = partial(_open, options.model)
     for of_site in tqdm(map_over(work, do, opening, options.jobs), total=len(work), disable=None):
-        told += of_site
-    print("\n".join(table(told)))
+        site_answers += of_site
+    print("\n".join(table(site_answers)))
     print(f"seed {options.seed}, {len(work)} sites, {time.monotonic() - start:.0f} s")
     if options.json is not None:
-        options.json.write_text(json.dumps([asdict(one) for one in told], indent=1))
+        options.json.write_text(json.dumps([asdict(one) for one in site_answers], indent=1))
 
 
 def _open(model: str) -> Signer:

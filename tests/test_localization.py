@@ -477,8 +477,9 @@ def test_evidence_by_hand() -> None:
     """Two strong votes and a weak one for a place of three frames; another has a vote as well."""
     matches = [
         *seen_at(0.0, [0, 1]), *seen_at(0.0, [2], "weak"), suggested_at(0.0, 3),
-        *seen_at(APART, [4], "weak"),
+        replace(seen_at(APART, [4], "weak")[0], similarity=0.9),  # of another place
     ]  # fmt: skip
+    matches[1] = replace(matches[1], similarity=0.7)
     here = [picture((40, SAME)), picture((30, SAME), (10, FARTHER)), picture((40, SAME))]
     found = judged(matches, here, [picture((10, SAME))])
     assert found.status == "found"
@@ -490,6 +491,7 @@ def test_evidence_by_hand() -> None:
     assert (evidence.score, evidence.excess) == pytest.approx((40 / 60, 0.0))
     assert (evidence.frames, evidence.viewpoints) == (3, 1)  # the frames stand at one place
     assert (evidence.weight, evidence.strong, evidence.suggested) == (pytest.approx(2.4), 2, 4)
+    assert (evidence.accepted, evidence.acceptance, evidence.similarity) == (3, 1.0, 0.7)
     assert (evidence.rival, evidence.rival_weight) == pytest.approx((10 / 40, 0.4))
     assert (itself.weight, itself.support) == (pytest.approx(2.4), 3)
     assert found.rival_ratio == pytest.approx(0.25)

@@ -88,7 +88,6 @@ def fit(
     shares : how often robots are at a place of each kind: a confidence is a probability among
         queries that are mixed so, whatever the numbers of samples
     ridge : weight of the squares by which steps differ from `USUAL_STEP`
-
     lone : least step of the penalty of a pose that one view alone suggests
 
     Returns

@@ -463,7 +463,11 @@ class Query(Given):
     """How to ask; the same whether the frame is uploaded or named."""
 
     k: int = Field(
-        default=5, ge=1, le=50, description="Accepted matches wanted (or matches, unvalidated)."
+        default=5,
+        ge=1,
+        le=50,
+        description="Accepted matches wanted (or matches, "
+        "unvalidated). With fewer than 5 there is less evidence, and fewer poses are found.",
     )
     stages: tuple[Stage, ...] = Field(
         default=STAGES,
