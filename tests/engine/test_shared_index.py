@@ -397,7 +397,8 @@ def test_who_lost_the_turn_publishes_nothing(built: Engine) -> None:
         with database.read() as connection:
             connection.exec_driver_sql(
                 "SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' "
-                f"AND classid = {0x5CE80} AND objid = 7"
+                f"AND classid = {0x5CE80} AND objid = 7 AND database = "
+                "(SELECT oid FROM pg_database WHERE datname = current_database())"
             )
         with pytest.raises(UnusableStore, match="built again"):
             mine()

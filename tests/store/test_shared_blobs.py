@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import subprocess
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -19,6 +20,7 @@ from sceneprint.store import Store, open_blobs, open_database, open_store
 from sceneprint.store.blobs.folder import MARK
 from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.blobs.object_store import ObjectBlobs
+from sceneprint.store.postgres.session_locks import BLOBS
 
 #: Seconds that a removal whose remover is gone is taken to go on.
 LONGEST = "sceneprint.store.postgres.session_locks.LONGEST_S"
@@ -34,6 +36,17 @@ with open_store(sys.argv[1], sys.argv[2]).blobs.kept():
 def objects_of(store: Store) -> ObjectBlobs:
     assert isinstance(store.blobs, ObjectBlobs)
     return store.blobs
+
+
+def lose_lock(store: Store, until: Callable[..., Any]) -> None:
+    """Close the connection that removes, and wait until the server has released its lock."""
+    objects_of(store)._locks.close()
+    locks = text(
+        "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND objid = :blobs "
+        "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
+    )
+    with store.database.read() as connection:
+        until(lambda: connection.execute(locks, {"blobs": BLOBS}).scalar_one() == 0)
 
 
 def test_a_new_database_gets_its_folder_beside_blobs_elsewhere(tmp_path: Path) -> None:
@@ -111,7 +124,9 @@ def test_a_store_that_is_away_is_opened_and_claimed_later(
     store.close()
 
 
-def test_all_processes_share_one_lock(store_url: str, bucket: str) -> None:
+def test_all_processes_share_one_lock(
+    store_url: str, bucket: str, until: Callable[..., Any]
+) -> None:
     store = open_store(store_url, bucket)
     with subprocess.Popen(
         [sys.executable, "-c", HOLDS, store_url, bucket], stdout=subprocess.PIPE, text=True
@@ -123,13 +138,12 @@ def test_all_processes_share_one_lock(store_url: str, bucket: str) -> None:
         with store.blobs.kept():  # others may need them kept as well
             pass
         other.kill()
-    with store.database.read():  # one more round trip: the server sees the end of the connection
-        pass
-    for _ in range(200):
+
+    def removes() -> bool:
         with store.blobs.removing() as allowed:
-            if allowed:
-                break
-    assert allowed
+            return allowed
+
+    until(removes)  # the lock of the dead goes when the server sees the end of its connection
     with store.blobs.removing() as allowed, store.blobs.removing() as also:
         assert (allowed, also) == (True, False)
     store.close()
@@ -159,13 +173,13 @@ def test_what_was_put_is_held_without_asking_until_something_is_removed(
 
 
 def test_a_remover_that_dies_is_not_forgotten(
-    postgres_url: str, bucket: str, monkeypatch: pytest.MonkeyPatch
+    postgres_url: str, bucket: str, monkeypatch: pytest.MonkeyPatch, until: Callable[..., Any]
 ) -> None:
     mine, theirs = (open_store(postgres_url, bucket) for _ in range(2))
     removing = theirs.blobs.removing()
     assert removing.__enter__()
     digest = mine.blobs.put(b"depth")
-    objects_of(theirs)._locks.close()  # as its process would, before it counted to the end
+    lose_lock(theirs, until)  # as its process would, before it counted to the end
     objects_of(theirs).objects.delete(f"blobs/{digest[:2]}/{digest}")
     assert not mine.blobs.holds(digest)
     with mine.blobs.removing() as allowed:  # its lock is free, and its requests may still come
@@ -183,13 +197,13 @@ def test_a_remover_that_dies_is_not_forgotten(
 
 
 def test_who_lost_its_lock_does_not_end_the_removal_of_another(
-    postgres_url: str, bucket: str, monkeypatch: pytest.MonkeyPatch
+    postgres_url: str, bucket: str, monkeypatch: pytest.MonkeyPatch, until: Callable[..., Any]
 ) -> None:
     monkeypatch.setattr(LONGEST, 0.0)
     mine, theirs = (open_store(postgres_url, bucket) for _ in range(2))
     removing = mine.blobs.removing()
     assert removing.__enter__()
-    objects_of(mine)._locks.close()  # as the loss of its connection would
+    lose_lock(mine, until)  # as the loss of its connection would
     with theirs.blobs.removing() as allowed:
         assert allowed
         removing.__exit__(None, None, None)
@@ -240,7 +254,8 @@ def test_a_lock_that_was_lost_is_said(postgres_url: str, bucket: str) -> None:
         connection.execute(
             text(
                 "SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' "
-                "AND mode = 'ShareLock'"
+                "AND mode = 'ShareLock' AND database = "
+                "(SELECT oid FROM pg_database WHERE datname = current_database())"
             )
         )
     with pytest.raises(UnusableStore, match=r"connection was lost.*Do it again"):
