@@ -30,6 +30,7 @@ __all__ = [
     "Intrinsics",
     "Ints32",
     "Patches",
+    "ReferenceSurface",
     "Sphere",
     "Surface",
 ]
@@ -140,6 +141,26 @@ class Cloud:
     name: str = ""
     pose: Floats | None = None
     note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceSurface:
+    """A surface that comes whole as a map: a point cloud, or a triangle mesh.
+
+    Parameters
+    ----------
+    points : (N, 3) float32, metres, relative to `offset`; all finite
+    triangles : (M, 3) int32 indices into `points`, counterclockwise seen from the front; None for
+        a cloud
+    offset : (3,) float64, metres; points + offset are the coordinates of the file. Zero unless
+        the origin is more than a kilometre away
+    up : (3,) float64, unit vector against gravity
+    """
+
+    points: Floats32
+    triangles: Ints32 | None
+    offset: Floats
+    up: Floats
 
 
 #: A frame of either kind.
