@@ -107,6 +107,29 @@ class Layout(Enum):
     CLOUDS = "clouds"
     #: Messages of a recording of ROS; poses of its transforms.
     RECORDING = "recording"
+    #: A database of RTAB-Map: nodes with depth or laser scans, and their poses.
+    RTABMAP = "RTAB-Map"
+    #: A folder of Polycam: `keyframes` with depth, and cameras with poses.
+    POLYCAM = "Polycam"
+    #: A folder or .r3d file of Record3D: metadata with poses, depth.
+    RECORD3D = "Record3D"
+    #: A `transforms.json` of nerfstudio that names depth images.
+    NERFSTUDIO = "nerfstudio"
+    #: An E57 file: scans with the poses of their scanner.
+    E57 = "E57"
+
+    @property
+    def is_export(self) -> bool:
+        """Whether another system has written it, so that nothing around it names its frames."""
+        return self in _EXPORTS
+
+
+_EXPORTS = frozenset(
+    {
+        Layout.RECORDING, Layout.RTABMAP, Layout.POLYCAM, Layout.RECORD3D, Layout.NERFSTUDIO,
+        Layout.E57,
+    }
+)  # fmt: skip
 
 
 class FrameReference(FrameFile):
@@ -175,7 +198,7 @@ class FrameSequence:
     @property
     def place(self) -> Path:
         """Where its parent frame is named: the folder of the scene, or its own."""
-        if self.layout is Layout.RECORDING or self.parent_frame == self.name:
+        if self.layout.is_export or self.parent_frame == self.name:
             return self.folder
         return self.folder.parent
 
@@ -185,7 +208,7 @@ class FrameSequence:
 
 def session_of(sequence: FrameSequence) -> str:
     """Name of a sequence, the same whether its own folder was named or the scene's."""
-    if sequence.layout is Layout.RECORDING or sequence.parent_frame == sequence.name:
+    if sequence.layout.is_export or sequence.parent_frame == sequence.name:
         return sequence.name
     return f"{sequence.parent_frame}/{sequence.folder.name}"
 

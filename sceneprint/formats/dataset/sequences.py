@@ -301,7 +301,9 @@ def find_sequences(
     if ros.is_recording(root) and root.exists():
         return (ros.recording_sequence(root, recording or ros.RecordingOptions()),)
     if root.is_file():
-        return (_single(root),)
+        from sceneprint.formats import exports
+
+        return exports.file_sequences(root) or (_single(root),)
     if not root.is_dir():
         raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
     walked = list(_walk(root))

@@ -1,0 +1,464 @@
+"""RTAB-Map databases: the depth images or laser scans of their nodes, at the optimised poses.
+
+path  --rtabmap_sequences-->  FrameSequence, ...
+
+Tables Node, Data and Admin are read, as rtabmap 0.10 to 0.23 writes them. The file is a stranger's:
+it is opened read-only, nothing in its schema is run, and what a query may read is bounded.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import sqlite3
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from sceneprint.errors import DatasetError, InvalidIntrinsics
+from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
+from sceneprint.formats.depth_file import encode_png
+from sceneprint.formats.exports.rtabmap_blobs import (
+    DEPTH_HEAD,
+    BrokenBlob,
+    RtabmapCamera,
+    Version,
+    cameras,
+    depth_samples,
+    depth_size,
+    is_solid,
+    matrix,
+    scan_placement,
+    scan_points,
+    transform,
+)
+from sceneprint.types import Floats, Floats32, Intrinsics
+from sceneprint_client.api.base import GivenBase
+from sceneprint_client.errors import printable
+from sceneprint_client.sidecars import Camera, CloudSource
+
+_SIGNATURE = b"SQLite format 3\0"
+#: Most bytes of one value, instructions of one query (times 100,000), and nodes.
+_MAXIMUM_VALUE, _MOST_STEPS, _MOST_NODES = 256 << 20, 20_000, 1_000_000
+_COLUMNS = {
+    "Node": {"id", "map_id", "stamp", "pose"},
+    "Data": {"id", "depth", "calibration"},
+    "Admin": {"version"},
+}
+_OLDEST, _NEWEST = (0, 10, 0), (0, 23, 99)
+_REPROCESS = "rtabmap-reprocess old.db new.db"
+_EXPORT_CLOUD = "export its cloud with `rtabmap-export --cloud` and upload that with --as-map"
+
+
+def is_rtabmap(path: Path) -> bool:
+    """Return whether a path is a database that RTAB-Map may have written, by its name and head."""
+    if path.suffix.lower() != ".db":
+        return False
+    try:
+        with path.open("rb") as file:
+            return path.is_file() and file.read(len(_SIGNATURE)) == _SIGNATURE
+    except OSError:  # a reader that opens it states the reason
+        return False
+
+
+_NodeCamera = tuple[Intrinsics, Floats]  #: of its part of the depth image, and T_base_camera
+
+
+@dataclass(eq=False)
+class _Node:
+    """A node of the graph, without its images."""
+
+    id: int
+    session: int
+    stamp: float
+    pose: Floats | None
+    cameras: tuple[_NodeCamera, ...] = ()  #: with depth
+    scan: tuple[int, Floats] | None = None  #: format and T_base_scan of its laser scan
+
+
+@dataclass(frozen=True)
+class RtabmapDepth:
+    """The depth image of one camera of a node, as the bytes of a file.
+
+    Parameters
+    ----------
+    path : of the database
+    node : its id
+    camera, cameras : which of them it is, from the left, and how many share the image
+    """
+
+    path: Path
+    node: int
+    camera: int
+    cameras: int
+
+    def read_bytes(self) -> bytes:
+        """Return a 16-bit PNG of millimetres, or an NPY file of float metres.
+
+        Raises
+        ------
+        DatasetError : the database cannot be read.
+        UnreadableFrame : the image is damaged or none.
+        """
+        blob = _value(self.path, "depth", self.node)
+        known = depth_size(blob[:DEPTH_HEAD])
+        if self.cameras == 1 and known is not None and known[0] == "millimetres":
+            return blob
+        samples = depth_samples(blob)
+        width = samples.shape[1] // self.cameras
+        part = np.s_[:, self.camera * width : (self.camera + 1) * width]
+        if samples.dtype == np.uint16:
+            return encode_png(samples[part].astype(np.uint16))
+        return _npy(samples[part].astype(np.float32))
+
+
+@dataclass(frozen=True)
+class RtabmapScan:
+    """The laser scan of a node, as the bytes of a file.
+
+    Parameters
+    ----------
+    path : of the database
+    node : its id
+    form : rtabmap's number for what each point holds; 0 where not stored
+    """
+
+    path: Path
+    node: int
+    form: int
+
+    def read_bytes(self) -> bytes:
+        """Return an NPY file of points (N, 3), metres.
+
+        Raises
+        ------
+        DatasetError : the database cannot be read.
+        UnreadableCloud : the scan is damaged, or has no heights.
+        """
+        return _npy(scan_points(_value(self.path, "scan", self.node), self.form))
+
+
+def _npy(array: Floats32) -> bytes:
+    file = io.BytesIO()
+    np.save(file, np.ascontiguousarray(array), allow_pickle=False)
+    return file.getvalue()
+
+
+def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, ...]:
+    """Return the frames of a database: one sequence per camera, or of the laser scans.
+
+    Poses are the optimised ones that rtabmap stores when it closes a database. Where there are
+    none, they are those of odometry, and each session of the database has a frame of its own.
+
+    Parameters
+    ----------
+    path : the database
+    name : of the sequences; default: that of the file
+
+    Returns
+    -------
+    sequences : at least one; a `note` says what was left out
+
+    Raises
+    ------
+    DatasetError : the file is no database of RTAB-Map, of a version that is not read, still in
+        use, or damaged; or no node has depth or a laser scan of three dimensions.
+    """
+    name = name or path.stem
+    with _opened(path) as database:
+        version = _version(path, database)
+        optimised = _optimised_poses(database)
+        left_out: Counter[str] = Counter()
+        nodes = [
+            node for node in _nodes(path, database, version, optimised, left_out)
+            if node.cameras or node.scan is not None
+        ]  # fmt: skip
+    if any(node.cameras for node in nodes):
+        left_out["laser scans without depth"] += sum(not node.cameras for node in nodes)
+        nodes = [node for node in nodes if node.cameras]
+    if not nodes:
+        raise DatasetError(
+            f"{path}: No node has a depth image or a laser scan of three dimensions"
+            f"{_listed(left_out, ' (', ')')}. Record with a depth camera or a 3D LiDAR and keep "
+            f"`Mem/BinDataKept` true; or {_EXPORT_CLOUD}."
+        )
+    sequences: list[FrameSequence] = []
+    for world, of_world in _worlds(name, nodes, optimised is not None):
+        sequences += _sequences(path, name, world, of_world)
+    note = _note(sequences, optimised is not None, left_out)
+    return tuple(
+        FrameSequence(one.name, path, one.layout, one.parent_frame, None, one.frames, note)
+        for one in sequences
+    )
+
+
+# The database.
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a database that nothing is run of, and turn its errors into ours."""
+    for suffix in ("-wal", "-journal"):
+        beside = path.with_name(path.name + suffix)
+        if beside.is_file() and beside.stat().st_size:
+            raise DatasetError(
+                f"{path}: There is an unfinished {beside.name} beside the database. Close "
+                "RTAB-Map; if it crashed, open the database in it once."
+            )
+    try:
+        # immutable: without locks, and without any file beside it
+        uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(uri, uri=True)) as database:
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAXIMUM_VALUE)
+            database.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
+            for pragma in ("trusted_schema=OFF", "cell_size_check=ON", "query_only=ON"):
+                database.execute(f"PRAGMA {pragma}")
+            database.text_factory = lambda text: text.decode("utf-8", "replace")
+            steps = iter(range(_MOST_STEPS))
+            database.set_progress_handler(lambda: next(steps, None) is None, 100_000)
+            yield database
+    except (sqlite3.Error, OverflowError, MemoryError) as cause:
+        reason = printable(f"{cause!s:.120}")
+        raise DatasetError(
+            f"{path}: The database cannot be read ({reason}). Copy it again, or repair it with "
+            "`rtabmap-recovery`."
+        ) from cause
+
+
+def _version(path: Path, database: sqlite3.Connection) -> Version:
+    """Return the version of a database that has the tables of RTAB-Map.
+
+    Raises
+    ------
+    DatasetError : it has not, or another version's.
+    """
+    tables = database.execute("SELECT name FROM sqlite_schema WHERE type = 'table'").fetchmany(500)
+    names = {str(row[0]) for row in tables}
+    if "Node" not in names or "Link" not in names:
+        raise DatasetError(
+            f"{path}: This SQLite database is not one of RTAB-Map: it has no tables Node and Link. "
+            "Name a database that rtabmap has written."
+        )
+    text = ""
+    if "Admin" in names:
+        row = database.execute("SELECT version FROM Admin LIMIT 1").fetchone()
+        text = str(row[0]) if row else ""
+    match = re.fullmatch(r"(\d{1,4})\.(\d{1,4})\.(\d{1,4})", text)
+    version = (int(match[1]), int(match[2]), int(match[3])) if match else (0, 0, 0)
+    if version < _OLDEST:
+        raise DatasetError(
+            f"{path}: The database is of RTAB-Map {printable(text[:20]) or 'before 0.5'}, and "
+            f"versions before 0.10 are not read. Convert it with `{_REPROCESS}` of a newer one."
+        )
+    for table, columns in _COLUMNS.items():
+        rows = database.execute(f"PRAGMA table_info({table})").fetchmany(500)
+        missing = columns - {str(row[1]) for row in rows} if table in names else columns
+        if missing:
+            newer = "newer than those known here, up to 0.23" if version > _NEWEST else "incomplete"
+            raise DatasetError(
+                f"{path}: The table {table} of the database (RTAB-Map {text}, {newer}) lacks "
+                f"{', '.join(sorted(missing))}. Convert it with `{_REPROCESS}`, or {_EXPORT_CLOUD}."
+            )
+    return version
+
+
+def _optimised_poses(database: sqlite3.Connection) -> dict[int, Floats] | None:
+    """Return the optimised poses by node; None where the database stores none."""
+    columns = {str(row[1]) for row in database.execute("PRAGMA table_info(Admin)").fetchmany(500)}
+    if not {"opt_ids", "opt_poses"} <= columns:
+        return None
+    row = database.execute("SELECT opt_ids, opt_poses FROM Admin LIMIT 1").fetchone()
+    if row is None or not isinstance(row[0], bytes) or not isinstance(row[1], bytes):
+        return None
+    try:
+        ids, poses = matrix(row[0]).reshape(-1), matrix(row[1])
+    except BrokenBlob:
+        return None
+    if ids.dtype != np.int32 or poses.dtype != np.float32 or poses.size != 12 * ids.size:
+        return None
+    known = {}
+    for node, numbers in zip(ids.tolist(), poses.reshape(-1, 12), strict=True):
+        try:
+            pose = transform(numbers.tobytes())
+        except BrokenBlob:
+            continue
+        if node > 0 and pose is not None:  # landmarks have negative numbers
+            known[node] = pose
+    return known or None
+
+
+def _nodes(
+    path: Path, database: sqlite3.Connection, version: Version,
+    optimised: dict[int, Floats] | None, left_out: Counter[str],
+) -> Iterator[_Node]:  # fmt: skip
+    """Yield the nodes with data, in their order; what is wrong with some is counted."""
+    columns = {str(row[1]) for row in database.execute("PRAGMA table_info(Data)").fetchmany(500)}
+    scan = "substr(d.scan, -12)" if "scan" in columns else "NULL"
+    scan += ", d.scan_info" if "scan_info" in columns else ", NULL"
+    rows = database.execute(
+        f"SELECT n.id, n.map_id, n.stamp, n.pose, substr(d.depth, 1, {DEPTH_HEAD}), d.calibration, "
+        f"{scan} FROM Node n JOIN Data d ON d.id = n.id ORDER BY n.id"
+    )
+    for count, row in enumerate(rows):
+        if count == _MOST_NODES:
+            raise DatasetError(
+                f"{path}: The database has more than {_MOST_NODES} nodes. Split it by sessions."
+            )
+        try:
+            node = _node(row, version, left_out)
+        except (BrokenBlob, TypeError, ValueError, OverflowError) as cause:
+            left_out[f"damaged nodes ({printable(str(cause))})"] += 1
+            continue
+        if optimised is not None:
+            node.pose = optimised.get(node.id)
+        if node.pose is None:
+            left_out[f"nodes without {'a' if optimised is None else 'an optimised'} pose"] += 1
+            continue
+        yield node
+
+
+def _node(row: tuple[Any, ...], version: Version, left_out: Counter[str]) -> _Node:
+    """Return a node of a row, with its pose of odometry.
+
+    Raises
+    ------
+    BrokenBlob, TypeError, ValueError, OverflowError : a column is not what it should be.
+    """
+    number, session, stamp, odometry, head, calibration, scan_tail, scan_info = row
+    node = _Node(int(number), int(session), float(stamp or 0.0), None)
+    node.pose = transform(odometry) if isinstance(odometry, bytes) else None
+    known = depth_size(head) if isinstance(head, bytes) else None
+    if known is not None and isinstance(calibration, bytes):
+        lenses = cameras(calibration, version)
+        node.cameras = tuple(_scaled(lens, known[1] // len(lenses), known[2]) for lens in lenses)
+    elif known is not None:
+        left_out["depth images without a calibration"] += 1
+    elif isinstance(head, bytes) and len(head) > 4:
+        left_out["stereo images without depth"] += 1
+    if isinstance(scan_tail, bytes) and len(scan_tail) == 12:
+        form, T_base_scan = scan_placement(scan_info, version)
+        if is_solid(scan_tail, form):
+            node.scan = form, T_base_scan
+        elif not node.cameras:
+            left_out["laser scans of two dimensions"] += 1
+    return node
+
+
+def _scaled(lens: RtabmapCamera, width: int, height: int) -> _NodeCamera:
+    """Return a camera for a depth image of this size, which may be smaller than the colour image.
+
+    Raises
+    ------
+    BrokenBlob : the image is of another shape, or the camera is none.
+    """
+    across = width / lens.width if lens.width else 1.0
+    down = height / lens.height if lens.height else 1.0
+    if not math.isclose(across, down, rel_tol=0.02):
+        raise BrokenBlob(
+            f"depth of {width} x {height} pixels, calibrated for {lens.width} x {lens.height}"
+        )
+    try:
+        # as rtabmap scales cameras: pixel centres have whole coordinates, and (0, 0) stays
+        intrinsics = Intrinsics(
+            width=width, height=height, fx=lens.fx * across, fy=lens.fy * down,
+            cx=lens.cx * across, cy=lens.cy * down,
+        )  # fmt: skip
+    except InvalidIntrinsics as cause:
+        raise BrokenBlob(str(cause)) from cause
+    return intrinsics, lens.T_base_camera
+
+
+def _value(path: Path, column: str, node: int) -> bytes:
+    """Return a binary value of a node; DatasetError where it is not there."""
+    with _opened(path) as database:
+        row = database.execute(f"SELECT {column} FROM Data WHERE id = ?", (node,)).fetchone()
+    if row is None or not isinstance(row[0], bytes):
+        raise DatasetError(
+            f"{path}: Node {node} has no {column} any more. Read the database again."
+        )
+    return row[0]
+
+
+# Sequences.
+
+
+def _worlds(name: str, nodes: list[_Node], is_optimised: bool) -> Iterator[tuple[str, list[_Node]]]:
+    """Yield the nodes whose poses lead to one frame, with that frame's name."""
+    sessions = sorted({node.session for node in nodes})
+    if is_optimised or len(sessions) == 1:
+        yield name, nodes
+        return
+    for session in sessions:
+        yield f"{name}/map-{session}", [node for node in nodes if node.session == session]
+
+
+def _sequences(path: Path, name: str, world: str, nodes: list[_Node]) -> Iterator[FrameSequence]:
+    count = max(len(node.cameras) for node in nodes)
+    if not count:
+        frames = tuple(_of_scan(path, name, node) for node in nodes)
+        yield FrameSequence(world, path, Layout.RTABMAP, world, None, frames)
+    for place in range(count):
+        sequence = world if count == 1 else f"{world}/camera-{place}"
+        frames = tuple(
+            _of_camera(path, name, node, place) for node in nodes if place < len(node.cameras)
+        )
+        yield FrameSequence(sequence, path, Layout.RTABMAP, world, None, frames)
+
+
+def _of_camera(path: Path, name: str, node: _Node, place: int) -> FrameReference:
+    assert node.pose is not None
+    count, (intrinsics, T_base_camera) = len(node.cameras), node.cameras[place]
+    label = f"{node.id:06d}" if count == 1 else f"{node.id:06d}-{place}"
+    return FrameReference(
+        f"{name}/{label}",
+        path / label,
+        Camera(intrinsics),
+        node.stamp,
+        node.pose @ T_base_camera,
+        source=RtabmapDepth(path, node.id, place, count),
+        base=GivenBase(matrix=T_base_camera.tolist()),
+        original=f"node {label}",
+        sequence=node.id,
+    )
+
+
+def _of_scan(path: Path, name: str, node: _Node) -> FrameReference:
+    assert node.scan is not None
+    assert node.pose is not None
+    form, T_base_scan = node.scan
+    return FrameReference(
+        f"{name}/{node.id:06d}",
+        path / f"{node.id:06d}",
+        None,
+        node.stamp,
+        node.pose @ T_base_scan,
+        CloudSource(),
+        source=RtabmapScan(path, node.id, form),
+        base=GivenBase(matrix=T_base_scan.tolist()),
+        original=f"node {node.id:06d}",
+        sequence=node.id,
+    )
+
+
+def _note(sequences: list[FrameSequence], is_optimised: bool, left_out: Counter[str]) -> str:
+    """Return what was taken and what was left out, for people."""
+    frames = sum(len(one.frames) for one in sequences)
+    poses = "optimised poses"
+    if not is_optimised:
+        poses = (
+            "poses of odometry, as the database stores no optimised ones: "
+            "open and close it in RTAB-Map to have them"
+        )
+    return f"{frames} frames taken, {poses}{_listed(left_out, '; left out: ', '')}"
+
+
+def _listed(counts: Counter[str], before: str, after: str) -> str:
+    parts = [f"{count} {reason}" for reason, count in counts.most_common(6) if count]
+    return f"{before}{', '.join(parts)}{after}" if parts else ""
