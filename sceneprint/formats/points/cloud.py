@@ -20,11 +20,12 @@ from sceneprint.errors import UnreadableCloud, UselessFrame
 from sceneprint.formats.points.las import read_las
 from sceneprint.formats.points.pcd import read_pcd
 from sceneprint.formats.points.ply import read_ply
-from sceneprint.formats.points.rows import FilePoints, check_count, steps
+from sceneprint.formats.points.rows import MAXIMUM_POINTS, FileBytes, FilePoints, check_count, steps
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Cloud, Floats, Floats32
 from sceneprint_client.api.base import CloudFormat
 from sceneprint_client.files import (
+    HEAD,
     MAXIMUM_CLOUD_BYTES,
     NPY_SIGNATURE,
     format_of,
@@ -54,30 +55,31 @@ def read_kitti(data: bytes) -> FilePoints:
             f"The file has {len(data)} bytes, and each point of a KITTI scan has {_KITTI_ROW}: "
             "x, y, z and intensity as float32. Copy the file again, or say its true format."
         )
-    check_count(count)
+    check_count(count, MAXIMUM_POINTS)
     rows = np.frombuffer(data, "<f4").reshape(count, 4)
     return FilePoints(count, (rows[i : i + n, :3].astype(np.float64) for i, n in steps(count)))
 
 
-def read_npy(data: bytes) -> FilePoints:
-    """The points of an NPY file of shape (N, 3), or (N, 4) whose fourth column is passed over.
+def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
+    """The points, at most so many, of an NPY file of shape (N, 3), or (N, 4), the fourth column
+    passed over.
 
     Raises
     ------
     UnreadableCloud : it is none, of another type or shape, or its size contradicts its header.
     """
-    if not data.startswith(NPY_SIGNATURE):
+    if data[: len(NPY_SIGNATURE)] != NPY_SIGNATURE:
         raise UnreadableCloud("This is no NPY file. Write the points with numpy.save.")
     shapes = (
         "The shape of the NPY array is not that of points, (N, 3) or (N, 4). "
         "Write x, y and z of each point in a row."
     )
     advice = "points are float32 in metres (float64 and float16 are taken too). Convert it."
-    header = npy_header(data, UnreadableCloud, advice, shapes)
+    header = npy_header(data[:HEAD], UnreadableCloud, advice, shapes)
     count, width = header.shape
     if width not in (3, 4):
         raise UnreadableCloud(shapes)
-    check_count(count)
+    check_count(count, most)
     expected = count * width * header.dtype.itemsize
     if len(data) - header.start != expected:
         raise UnreadableCloud(
@@ -112,20 +114,21 @@ _FINEST = 0.01
 Keys = NDArray[np.int64]
 
 
-def thinned(points: Floats32, most: int) -> tuple[Floats32, float]:
+def thinned(points: Floats32, most: int, finest: float = _FINEST) -> tuple[Floats32, float]:
     """At most so many of the points: of each voxel the first, in their order.
 
-    Voxels are the smallest of 1 cm, 1.4 cm, 2 cm, ... that leave no more.
+    Voxels are the smallest of 1, 1.4, 2, ... times the finest that leave no more.
 
     Parameters
     ----------
-    points : (N, 3) metres, none beyond 10 km
+    points : (N, 3), none beyond a million times the finest
     most : at least 8: so many voxels meet at the origin, of any size
+    finest : edge of a voxel
 
     Returns
     -------
     points : (n, 3)
-    edge : of the voxels, metres
+    edge : of the voxels
     """
     slots = 1 << max(4, math.ceil(math.log2(1.5 * most)))
     table, kept = np.empty(slots, np.int64), np.empty(most, np.int32)
@@ -133,7 +136,7 @@ def thinned(points: Floats32, most: int) -> tuple[Floats32, float]:
     # does not depend on it
     secret, step = secrets.randbits(62), 0
     while True:
-        edge = _FINEST * math.sqrt(2.0) ** step
+        edge = finest * math.sqrt(2.0) ** step
         n = _firsts(points, 1.0 / edge, secret, table, kept)
         if n >= 0:
             return points[kept[:n]], edge

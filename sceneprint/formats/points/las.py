@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import MissingDependency, UnreadableCloud
-from sceneprint.formats.points.rows import FilePoints, check_count, steps
+from sceneprint.formats.points.rows import MAXIMUM_POINTS, FileBytes, FilePoints, check_count, steps
 from sceneprint.types import Floats
 from sceneprint_client.files import LAS_SIGNATURE
 
@@ -44,7 +44,13 @@ _BYTES, _LAYERED_BYTES = 0, 14
 
 
 def inflated_records(
-    data: bytes, header: int, start: int, form: int, length: int, count: int, row: np.dtype[np.void]
+    data: FileBytes,
+    header: int,
+    start: int,
+    form: int,
+    length: int,
+    count: int,
+    row: np.dtype[np.void],
 ) -> Iterator[NDArray[np.void]]:
     """Yield the records of a LAZ file.
 
@@ -83,9 +89,9 @@ def inflated_records(
 
 
 def _records(
-    lazrs: ModuleType, data: bytes, start: int, vlr: bytes, count: int, row: np.dtype[np.void]
+    lazrs: ModuleType, data: FileBytes, start: int, vlr: bytes, count: int, row: np.dtype[np.void]
 ) -> Iterator[NDArray[np.void]]:
-    source = io.BytesIO(data)
+    source = io.BytesIO(data) if isinstance(data, bytes) else data
     source.seek(start)
     wanted = lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL | lazrs.SELECTIVE_DECOMPRESS_Z
     selection = lazrs.DecompressionSelection(wanted)
@@ -123,7 +129,7 @@ def _lazrs() -> ModuleType:
     return module
 
 
-def _laszip_vlr(data: bytes, at: int, end: int) -> bytes:
+def _laszip_vlr(data: FileBytes, at: int, end: int) -> bytes:
     """The record that tells how points are packed, of those between header and points."""
     (count,) = struct.unpack_from("<I", data, 100)
     for _ in range(min(count, _MAXIMUM_VLRS)):
@@ -164,7 +170,7 @@ def _fits(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:
 
 
 def _check_chunks(
-    data: bytes, start: int, length: int, kinds: list[tuple[int, int]], count: int, chunk: int
+    data: FileBytes, start: int, length: int, kinds: list[tuple[int, int]], count: int, chunk: int
 ) -> None:
     """Refuse chunks that are longer than their file, too many, or too few."""
     lie = UnreadableCloud(f"The chunks of the LAZ file are not those of its points. {_AGAIN}")
@@ -205,15 +211,15 @@ _RECORDS = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
 Records = NDArray[np.void]
 
 
-def read_las(data: bytes) -> FilePoints:
-    """The points of a LAS or LAZ file.
+def read_las(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
+    """The points of a LAS or LAZ file, at most so many.
 
     Raises
     ------
     UnreadableCloud : it is none, of an unknown format, or its header does not fit what follows it.
     MissingDependency : it is LAZ, and lazrs is not installed.
     """
-    if len(data) < _SMALLEST_HEADER or not data.startswith(LAS_SIGNATURE):
+    if len(data) < _SMALLEST_HEADER or data[:4] != LAS_SIGNATURE:
         raise UnreadableCloud("This is no LAS file, or its header is cut off. Copy it again.")
     minor, (header, start) = data[25], struct.unpack_from("<HI", data, 94)
     form, length, count = struct.unpack_from("<BHI", data, 104)
@@ -231,7 +237,7 @@ def read_las(data: bytes) -> FilePoints:
             f"The LAS header has {header} bytes, and points from byte {start} of {len(data)}. "
             f"{_AGAIN}"
         )
-    check_count(count)
+    check_count(count, most)
     transform = struct.unpack_from("<6d", data, 131)
     if not all(map(math.isfinite, transform)) or 0.0 in transform[:3]:
         raise UnreadableCloud(f"The scale of the LAS file is {transform[:3]}. {_AGAIN}")

@@ -15,6 +15,8 @@ import numpy as np
 from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.points.rows import (
     MAXIMUM_INFLATED,
+    MAXIMUM_POINTS,
+    FileBytes,
     FilePoints,
     check_count,
     check_room,
@@ -130,8 +132,10 @@ class Field:
         return self.count * np.dtype(self.kind).itemsize
 
 
-def read_pcd(data: bytes) -> FilePoints:
+def read_pcd(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     """The points of a PCD file, and the place of its VIEWPOINT where that is not the origin.
+
+    At most so many points are read.
 
     Raises
     ------
@@ -147,7 +151,7 @@ def read_pcd(data: bytes) -> FilePoints:
             f"The points of the PCD file have no single {' or '.join(wrong)}. "
             "Write each point's x, y and z."
         )
-    check_count(count)
+    check_count(count, most)
     form = " ".join(entries["DATA"])
     width = sum(field.size for field in fields)
     if form == "ascii":
@@ -170,7 +174,7 @@ def read_pcd(data: bytes) -> FilePoints:
         )
         blocks = columns(np.frombuffer(data, row, count, start), _XYZ)
     elif form == "binary_compressed":
-        blocks = _compressed(data, start, count, fields)
+        blocks = _compressed(data, start, count, fields, most)
     else:
         raise UnreadableCloud(
             f"The PCD file has DATA {form!r:.40}, and known are ascii, binary and "
@@ -179,7 +183,7 @@ def read_pcd(data: bytes) -> FilePoints:
     return FilePoints(count, blocks, _viewpoint(entries.get("VIEWPOINT")))
 
 
-def _written_out(data: bytes, start: int, count: int, fields: list[Field]) -> Iterator[Floats]:
+def _written_out(data: FileBytes, start: int, count: int, fields: list[Field]) -> Iterator[Floats]:
     text, counts = np.frombuffer(data, np.uint8), [field.count for field in fields]
     width = sum(counts)
     if not count:  # a header alone must not ask for room for its columns
@@ -190,7 +194,9 @@ def _written_out(data: bytes, start: int, count: int, fields: list[Field]) -> It
     return parse_blocks(text, start, count, wanted, np.zeros(width, np.bool_))
 
 
-def _compressed(data: bytes, start: int, count: int, fields: list[Field]) -> Iterator[Floats]:
+def _compressed(
+    data: FileBytes, start: int, count: int, fields: list[Field], most: int
+) -> Iterator[Floats]:
     """Field after field, each of all points."""
     size = count * sum(field.size for field in fields)
     if len(data) - start < 8:
@@ -201,9 +207,10 @@ def _compressed(data: bytes, start: int, count: int, fields: list[Field]) -> Ite
             f"The PCD header announces {size} bytes of points, and {inflated} packed into "
             f"{packed} follow, of which {len(data) - start - 8} are there. {_AGAIN}"
         )
-    if size > MAXIMUM_INFLATED:
+    most_bytes = MAXIMUM_INFLATED // MAXIMUM_POINTS * most
+    if size > most_bytes:
         raise UnreadableCloud(
-            f"The compressed points are {size} bytes, and at most {MAXIMUM_INFLATED} are "
+            f"The compressed points are {size} bytes, and at most {most_bytes} are "
             "inflated. Write x, y and z alone."
         )
     everything = inflate(np.frombuffer(data, np.uint8, packed, start + 8), size)
@@ -216,11 +223,12 @@ def _compressed(data: bytes, start: int, count: int, fields: list[Field]) -> Ite
             for i, n in steps(count))  # fmt: skip
 
 
-def _header(data: bytes) -> tuple[dict[str, list[str]], int]:
+def _header(data: FileBytes) -> tuple[dict[str, list[str]], int]:
     """Entries by their names, and where the points begin."""
-    if not is_pcd(data):
+    head = data[:_MAXIMUM_HEADER]
+    if not is_pcd(head):
         raise UnreadableCloud("This is no PCD file: it does not begin with VERSION or FIELDS.")
-    entries, start, head = dict[str, list[str]](), 0, data[:_MAXIMUM_HEADER]
+    entries, start = dict[str, list[str]](), 0
     while "DATA" not in entries:
         end = head.find(b"\n", start)
         if end < 0:

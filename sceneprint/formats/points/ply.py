@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.points.rows import (
+    MAXIMUM_POINTS,
+    FileBytes,
     FilePoints,
     check_count,
     check_room,
@@ -45,7 +47,7 @@ def skip_rows(view: Bytes, start: int, count: int, kinds: Kinds, order: str) -> 
     UnreadableCloud : the bytes end before.
     """
     end = start
-    for _, behind in _walked(view, start, count, kinds, (0, 0, 0), order):
+    for _, behind in walked(view, start, count, kinds, (0, 0, 0), order):
         end = behind
     return end
 
@@ -54,7 +56,7 @@ def list_blocks(
     view: Bytes, start: int, count: int, kinds: Kinds, picked: tuple[int, int, int], order: str
 ) -> Iterator[Floats]:
     """Yield three of the values of each row, (n, 3) each; raises as `skip_rows`."""
-    for places, _ in _walked(view, start, count, kinds, picked, order):
+    for places, _ in walked(view, start, count, kinds, picked, order):
         block = np.empty((len(places), 3))
         for k, value in enumerate(picked):
             kind = np.dtype(order + kinds[value][0])
@@ -63,10 +65,13 @@ def list_blocks(
         yield block
 
 
-def _walked(
+def walked(
     view: Bytes, start: int, count: int, kinds: Kinds, picked: tuple[int, int, int], order: str
 ) -> Iterator[tuple[Places, int]]:
-    """Yield where the picked values of each row are, and where its block ends."""
+    """Yield where the picked values of each row are, and where its block ends.
+
+    Raises as `skip_rows`.
+    """
     sizes = np.array([np.dtype(kind).itemsize for kind, _ in kinds])
     lengths = np.array([np.dtype(length).itemsize if length else 0 for _, length in kinds])
     signed = np.array([length is not None and length[0] == "i" for _, length in kinds])
@@ -151,15 +156,15 @@ class Element:
         return any(p.length for p in self.properties)
 
 
-def read_ply(data: bytes) -> FilePoints:
-    """The vertices of a PLY file; all else in it is passed over.
+def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
+    """The vertices of a PLY file, at most so many; all else in it is passed over.
 
     Raises
     ------
     UnreadableCloud : it is none, its vertices lack x, y or z, or its header does not fit what
         follows it.
     """
-    order, elements, start = _header(data)
+    order, elements, start = ply_header(data)
     names = [element.name for element in elements]
     if names.count("vertex") != 1:
         raise UnreadableCloud(
@@ -175,17 +180,18 @@ def read_ply(data: bytes) -> FilePoints:
             f"The vertices of the PLY file have no single {' or '.join(wrong or _XYZ)}. "
             "Write each point's x, y and z."
         )
-    check_count(vertex.count)
+    check_count(vertex.count, most)
     if order == "":
         return FilePoints(vertex.count, _written_out(data, start, elements[: at + 1]))
     view, begins = np.frombuffer(data, np.uint8), 0
     for i, element in enumerate(elements):
         begins = start if i == at else begins
-        start = _behind(data, start, element, order)
-    if data[start:].strip(b"\r\n"):  # else a type or a count is not what the header says
-        raise UnreadableCloud(
-            f"{len(data) - start} bytes follow what the PLY header announces. {_AGAIN}"
-        )
+        start = element_end(data, start, element, order)
+    rest = len(data) - start
+    if rest > _MAXIMUM_HEADER or data[start:].strip(
+        b"\r\n"
+    ):  # else a type or a count is not what the header says
+        raise UnreadableCloud(f"{rest} bytes follow what the PLY header announces. {_AGAIN}")
     if vertex.has_lists:
         kinds = [(p.kind, p.length) for p in vertex.properties]
         picked = (own.index("x"), own.index("y"), own.index("z"))
@@ -206,7 +212,7 @@ def read_ply(data: bytes) -> FilePoints:
     return FilePoints(vertex.count, columns(table, _XYZ))
 
 
-def _behind(data: bytes, start: int, element: Element, order: str) -> int:
+def element_end(data: FileBytes, start: int, element: Element, order: str) -> int:
     """Where a binary element ends."""
     left = len(data) - start
     if element.count * element.least > left:
@@ -220,7 +226,7 @@ def _behind(data: bytes, start: int, element: Element, order: str) -> int:
     return skip_rows(np.frombuffer(data, np.uint8), start, element.count, kinds, order)
 
 
-def _written_out(data: bytes, start: int, elements: list[Element]) -> Iterator[Floats]:
+def _written_out(data: FileBytes, start: int, elements: list[Element]) -> Iterator[Floats]:
     """The blocks of the last of some elements of an ascii file."""
     *before, vertex = elements
     text = np.frombuffer(data, np.uint8)
@@ -234,8 +240,8 @@ def _written_out(data: bytes, start: int, elements: list[Element]) -> Iterator[F
     return parse_blocks(text, start, vertex.count, wanted, lists)
 
 
-def _header(data: bytes) -> tuple[str, list[Element], int]:
-    """Byte order ("" for ascii), elements, and where the rows begin."""
+def ply_header(data: FileBytes) -> tuple[str, list[Element], int]:
+    """Return byte order ("" for ascii), elements, and where the rows begin."""
     head = data[:_MAXIMUM_HEADER]
     old = head[3:4] == b"\r" and head[4:5] != b"\n"  # ends of lines of an old Macintosh
     ending = b"\r" if old else b"\n"

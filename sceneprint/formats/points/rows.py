@@ -8,6 +8,7 @@ take a minute for the largest file.
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -30,6 +31,10 @@ MAXIMUM_INFLATED = 400 << 20
 BLOCK = 1 << 16
 
 
+#: Bytes of a file, in memory or mapped from the disk.
+FileBytes = bytes | mmap.mmap
+
+
 @dataclass(frozen=True, eq=False)
 class FilePoints:
     """Points in the units and axes of their file.
@@ -47,11 +52,11 @@ class FilePoints:
     viewpoint: Position | None = None
 
 
-def check_count(count: int) -> None:
+def check_count(count: int, most: int) -> None:
     """Refuse a header that announces more points than are read."""
-    if count > MAXIMUM_POINTS:
+    if count > most:
         raise UnreadableCloud(
-            f"The file announces {count} points, and at most {MAXIMUM_POINTS} are read. "
+            f"The file announces {count} points, and at most {most} are read. "
             "Thin the cloud out, to a voxel grid of a few centimetres, or send it in parts."
         )
 
@@ -72,13 +77,15 @@ def columns(table: NDArray[np.void], names: tuple[str, str, str]) -> Iterator[Fl
 
 # Numbers written out, a row to a line.
 
-GOOD, ENDS, FEW, MANY, NO_NUMBER = 0, 1, 2, 3, 4
+#: Why a row cannot be read.
+GOOD, ENDS, FEW, MANY, NO_NUMBER, CORNERS = 0, 1, 2, 3, 4, 5
 
-_SAID = {
+ROW_ERRORS = {
     ENDS: "the file ends before it",
     FEW: "it has fewer values than the header announces",
     MANY: "it has more values than the header announces",
     NO_NUMBER: "one of its values is no number",
+    CORNERS: "its polygon has fewer than 3 corners, or more than 1024",
 }
 
 #: Powers of ten that float64 holds exactly.
@@ -99,7 +106,7 @@ def parse_blocks(
         start, rows, state = parse_rows(text, start, block, wanted, lists)
         if state != GOOD:
             raise UnreadableCloud(
-                f"Row {first + rows + 1} of {count} cannot be read: {_SAID[state]}. "
+                f"Row {first + rows + 1} of {count} cannot be read: {ROW_ERRORS[state]}. "
                 "Copy or write the file again."
             )
         yield block
@@ -155,7 +162,7 @@ def parse_rows(
         if i >= size:
             return i, row, ENDS
         for c in range(len(wanted)):
-            first, i = _word(text, i)
+            first, i = word(text, i)
             if first == i:  # a line's end, or a sign that belongs in no text
                 return i, row, FEW
             if lists[c]:
@@ -163,7 +170,7 @@ def parse_rows(
                 if not good or not (0.0 <= value < 2147483648.0) or value != int(value):
                     return i, row, NO_NUMBER
                 for _ in range(int(value)):
-                    first, i = _word(text, i)
+                    first, i = word(text, i)
                     if first == i:
                         return i, row, FEW
             elif wanted[c] >= 0:
@@ -171,7 +178,7 @@ def parse_rows(
                 if not good:
                     return i, row, NO_NUMBER
                 out[row, wanted[c]] = value
-        first, i = _word(text, i)
+        first, i = word(text, i)
         if first != i:
             return i, row, MANY
         if i < size and text[i] != 10 and text[i] != 13:
@@ -193,7 +200,7 @@ def _skip(text: Bytes, start: int, count: int) -> tuple[int, int]:
 
 
 @kernel
-def _word(text: Bytes, start: int) -> tuple[int, int]:
+def word(text: Bytes, start: int) -> tuple[int, int]:
     """Where the next word of this line begins and ends; of no length where there is none."""
     first = start
     while first < len(text) and (text[first] == 32 or text[first] == 9):

@@ -1,0 +1,189 @@
+"""The triangles of a PLY file; polygons become fans.
+
+bytes  --read_faces-->  triangles (M, 3)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import UnreadableCloud
+from sceneprint.formats.points.ply import Element, element_end, ply_header, walked
+from sceneprint.formats.points.rows import (
+    CORNERS,
+    ENDS,
+    FEW,
+    GOOD,
+    MANY,
+    NO_NUMBER,
+    ROW_ERRORS,
+    FileBytes,
+    check_room,
+    number,
+    skip_lines,
+    word,
+)
+from sceneprint.formats.surface_file.raw_surface import MOST_TRIANGLES
+from sceneprint.geometry.kernel import kernel
+from sceneprint.types import Bytes, Ints32
+
+Indices = NDArray[np.int64]
+
+_NAMES = ("vertex_indices", "vertex_index")
+#: Most corners of a polygon.
+_MOST_CORNERS = 1024
+_AGAIN = "Copy or write the file again."
+
+
+def read_faces(data: FileBytes) -> Ints32 | None:
+    """Return the triangles of the element `face`, (M, 3); None without one.
+
+    Indices are not compared with the number of vertices; those beyond int32 are -1.
+
+    Raises
+    ------
+    UnreadableCloud : the faces have no list of vertices, or fewer or more bytes than announced;
+        a polygon has fewer than 3 or more than 1024 corners; there are too many triangles.
+    """
+    order, elements, start = ply_header(data)
+    names = [element.name for element in elements]
+    if "face" not in names or elements[names.index("face")].count == 0:
+        return None
+    before, face = elements[: names.index("face")], elements[names.index("face")]
+    lists = [k for k, one in enumerate(face.properties) if one.name in _NAMES and one.length]
+    if len(lists) != 1 or face.properties[lists[0]].kind[0] == "f":
+        raise UnreadableCloud(
+            "The faces of the PLY file have no single list of whole numbers called "
+            f"{' or '.join(_NAMES)}. Write each face as a list of its vertices."
+        )
+    check_triangles(face.count)
+    if order == "":
+        blocks = _written_out(data, start, before, face, lists[0])
+    else:
+        for element in before:
+            start = element_end(data, start, element, order)
+        blocks = _binary(data, start, face, lists[0], order)
+    found, count = list[Ints32](), 0
+    for block in blocks:
+        count += len(block)
+        check_triangles(count)
+        found.append(np.where((block < 0) | (block >= 1 << 31), -1, block).astype(np.int32))
+    return np.concatenate(found) if found else None
+
+
+def check_triangles(count: int) -> None:
+    """Refuse a mesh of more triangles than are read."""
+    if count > MOST_TRIANGLES:
+        raise UnreadableCloud(
+            f"The file has {count} triangles or more, and at most {MOST_TRIANGLES} are read. "
+            "Simplify the mesh, or write its vertices alone as a cloud."
+        )
+
+
+def _binary(data: FileBytes, start: int, face: Element, at: int, order: str) -> Iterator[Indices]:
+    element_end(data, start, face, order)  # whether the rows fit into the file
+    view = np.frombuffer(data, np.uint8)
+    kinds = [(one.kind, one.length) for one in face.properties]
+    chosen = face.properties[at]
+    index, length = np.dtype(order + chosen.kind), np.dtype(order + (chosen.length or ""))
+    for places, _ in walked(view, start, face.count, kinds, (at, at, at), order):
+        begins = places[:, 0]
+        sizes = _gathered(view, begins, length, 1)[:, 0]
+        _check_corners(int(sizes.min()), int(sizes.max()))
+        for corners in np.unique(sizes):
+            polygons = _gathered(view, begins[sizes == corners] + length.itemsize, index, corners)
+            yield _fans(polygons)
+
+
+def _gathered(view: Bytes, begins: Indices, kind: np.dtype[np.integer], count: int) -> Indices:
+    """So many numbers from each place (n,): (n, count)."""
+    picked = view[begins[:, None] + np.arange(count * kind.itemsize)]
+    return np.ascontiguousarray(picked).view(kind).astype(np.int64)
+
+
+def _fans(polygons: Indices) -> Indices:
+    """Triangles (n (c - 2), 3) of polygons (n, c)."""
+    c = polygons.shape[1]
+    fan = np.array([(0, k, k + 1) for k in range(1, c - 1)])
+    return polygons[:, fan].reshape(-1, 3)
+
+
+def _check_corners(fewest: int, most: int) -> None:
+    if fewest < 3 or most > _MOST_CORNERS:
+        raise UnreadableCloud(
+            f"A face of the PLY file has {fewest if fewest < 3 else most} corners, and 3 to "
+            f"{_MOST_CORNERS} are read. {_AGAIN}"
+        )
+
+
+def _written_out(
+    data: FileBytes, start: int, before: list[Element], face: Element, at: int
+) -> Iterator[Indices]:
+    text = np.frombuffer(data, np.uint8)
+    for element in before:
+        start = skip_lines(text, start, element.count)
+    check_room(text, start, face.count, len(face.properties))
+    lists = np.array([one.length is not None for one in face.properties])
+    room = np.empty((1 << 16, 3), np.int64)
+    done = 0
+    while done < face.count:
+        start, rows, triangles, state = _fill(text, start, face.count - done, lists, at, room)
+        if state != GOOD:
+            raise UnreadableCloud(
+                f"Row {done + rows + 1} of {face.count} faces cannot be read: "
+                f"{ROW_ERRORS[state]}. {_AGAIN}"
+            )
+        done += rows
+        yield room[:triangles]
+
+
+@kernel
+def _fill(
+    text: Bytes, start: int, most: int, lists: NDArray[np.bool_], at: int, out: Indices
+) -> tuple[int, int, int, int]:
+    """Fill triangles while there is room for any polygon.
+
+    Returns
+    -------
+    place after the last row, rows that were read, triangles, and why there are no more
+    """
+    i, size, n, row = start, len(text), 0, 0
+    while row < most and n + _MOST_CORNERS <= len(out):
+        while i < size and text[i] <= 32 and text[i] >= 9:
+            i += 1
+        for c in range(len(lists)):
+            first, i = word(text, i)
+            if first == i:
+                return i, row, n, ENDS if i >= size else FEW
+            if not lists[c]:
+                continue
+            length, good = number(text, first, i)
+            if not good or not (0.0 <= length <= 1e6) or length != int(length):
+                return i, row, n, NO_NUMBER
+            corners = int(length)
+            if c == at and (corners < 3 or corners > _MOST_CORNERS):
+                return i, row, n, CORNERS
+            a, b = 0, 0
+            for k in range(corners):
+                first, i = word(text, i)
+                if first == i:
+                    return i, row, n, FEW
+                if c != at:
+                    continue
+                value, good = number(text, first, i)
+                if not good or value != np.floor(value) or abs(value) > 4e9:
+                    return i, row, n, NO_NUMBER
+                if k == 0:
+                    a = int(value)
+                elif k > 1:
+                    out[n, 0], out[n, 1], out[n, 2] = a, b, int(value)
+                    n += 1
+                b = int(value)
+        first, i = word(text, i)
+        if first != i:
+            return i, row, n, MANY
+        row += 1
+    return i, row, n, GOOD

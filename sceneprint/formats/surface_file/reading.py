@@ -1,0 +1,370 @@
+"""The door for surfaces: a file of a whole map in, a `ReferenceSurface` in metres out.
+
+bytes, name, options  --read_surface-->  ReadSurface
+
+Where a file does not state its units or its up, and the options do not, they are estimated from the
+surface; the result says which. Axes stay those of the file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import PurePath
+from typing import Literal
+
+import numpy as np
+
+from sceneprint.errors import UnreadableCloud, UselessFrame
+from sceneprint.formats.points.cloud import FARTHEST_M, FEWEST_POINTS, read_npy
+from sceneprint.formats.points.e57 import E57_SIGNATURE, E57Scan, read_e57
+from sceneprint.formats.points.las import read_las
+from sceneprint.formats.points.pcd import read_pcd
+from sceneprint.formats.points.ply import read_ply
+from sceneprint.formats.points.rows import FileBytes, FilePoints, check_count
+from sceneprint.formats.surface_file.las_units import las_units_per_metre
+from sceneprint.formats.surface_file.mesh_file import read_mesh
+from sceneprint.formats.surface_file.ply_faces import read_faces
+from sceneprint.formats.surface_file.raw_surface import (
+    MOST_FILE_POINTS,
+    MOST_VERTICES,
+    TOO_LARGE,
+    RawSurface,
+    gather,
+)
+from sceneprint.geometry.surface.upright import estimate_units, estimate_up
+from sceneprint.types import Floats, Floats32, Ints32, ReferenceSurface
+from sceneprint_client.files import HEAD, format_of, naming
+
+SurfaceFormat = Literal["pcd", "ply", "las", "npy", "e57", "obj", "stl", "glb", "gltf"]
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
+#: Where units or up come from: the options, the file, or the shape of the surface.
+Source = Literal["stated", "file", "estimated"]
+
+AXES: dict[str, Floats] = {
+    f"{sign}{name}": value * np.eye(3)[k]
+    for k, name in enumerate("xyz") for sign, value in (("", 1.0), ("-", -1.0))
+}  # fmt: skip
+#: Farther than this from the origin of the file, the coordinates get an offset, metres.
+FAR_M = 1000.0
+#: Formats that the first bytes tell as they do of a frame's points, and those that names tell.
+_CLOUDS: dict[str | None, SurfaceFormat] = {"pcd": "pcd", "ply": "ply", "las": "las", "npy": "npy"}
+_SUFFIXES: dict[str, SurfaceFormat] = {".obj": "obj", ".stl": "stl", ".gltf": "gltf"}
+_STL_HEADER, _STL_TRIANGLE = 84, 50  #: bytes
+_BLOCK = 1 << 18
+#: Beyond every place on Earth in any unit that is read; products of it are still numbers.
+_MOST_UNITS = 1e15
+#: Extents of a place, metres: what is smaller or larger is worth a note.
+_SMALL_M, _LARGE_M = 1.0, 5000.0
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """What the user states of a surface; None: from the file, else estimated.
+
+    Parameters
+    ----------
+    units_per_metre : of the file's coordinates, 1000 for millimetres
+    up : the axis of the file that is up
+
+    Raises
+    ------
+    UnreadableCloud : units that are no such number, or no axis.
+    """
+
+    units_per_metre: float | None = None
+    up: Axis | None = None
+
+    def __post_init__(self) -> None:
+        units = self.units_per_metre
+        if units is not None and not (math.isfinite(units) and 1e-6 <= units <= 1e9):
+            raise UnreadableCloud(
+                f"The units per metre are {units}, no such number. Say 1 for metres, 1000 for "
+                "millimetres."
+            )
+        if self.up is not None and self.up not in AXES:
+            raise UnreadableCloud(
+                f"{self.up!r:.40} is no axis. Say which one is up: {', '.join(AXES)}."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class ReadSurface:
+    """A surface, and how it was read.
+
+    Parameters
+    ----------
+    surface : in metres, in the axes of the file
+    units : where the units come from
+    up_from : where up comes from
+    notes : sentences for the user: what was estimated, left out or thinned
+    units_per_metre : of the file's coordinates
+    given : points of the file, missing ones too
+    voxel : edge of the voxels that a cloud was thinned to, metres; None if it was not
+    """
+
+    surface: ReferenceSurface
+    units: Source
+    up_from: Source
+    notes: tuple[str, ...]
+    units_per_metre: float
+    given: int
+    voxel: float | None
+
+
+def surface_format(head: bytes, name: str, size: int) -> SurfaceFormat:
+    """Return the format of a file of a whole map, by its first bytes, else by its name.
+
+    Parameters
+    ----------
+    head : the first 10,016 bytes, or all of it
+    name : of the file; its suffix tells OBJ and ascii STL
+    size : of the file, bytes
+
+    Raises
+    ------
+    UnreadableCloud : it is of no known format.
+    """
+    if not size:
+        raise UnreadableCloud("The file is empty. Copy or write it again.")
+    cloud = format_of(head)
+    if cloud in _CLOUDS:
+        return _CLOUDS[cloud]
+    if head.startswith(E57_SIGNATURE):
+        return "e57"
+    if head[:4] == b"glTF":
+        return "glb"
+    if len(head) >= _STL_HEADER:
+        triangles = int.from_bytes(head[80:84], "little")
+        if size == _STL_HEADER + _STL_TRIANGLE * triangles:
+            return "stl"
+    by_name = _SUFFIXES.get(PurePath(name).suffix.lower())
+    if by_name is not None:
+        return by_name
+    if head.lstrip()[:6].lower() == b"solid " and b"facet" in head:
+        return "stl"
+    raise UnreadableCloud(
+        "This is none of PCD, PLY, LAS, LAZ, E57, NPY of shape (N, 3) or (N, 4), OBJ, STL and "
+        "glTF, by its first bytes and its name. Write the map as one of these."
+    )
+
+
+def read_surface(
+    data: FileBytes, name: str, options: SurfaceOptions | None = None,
+    file_format: SurfaceFormat | None = None,
+) -> ReadSurface:  # fmt: skip
+    """Return the surface of a PCD, PLY, LAS, LAZ, E57, NPY, OBJ, STL or glTF file.
+
+    Parameters
+    ----------
+    data : the whole file, in memory or mapped
+    name : of the file, for errors, and for formats that only their suffix tells
+    options : what the user states
+    file_format : where it is known already
+
+    Returns
+    -------
+    read : points that are missing, and triangles that have no area or lack a vertex, are left out;
+        a cloud of more than 10 million points is thinned, the first of each voxel stays
+
+    Raises
+    ------
+    UnreadableCloud : the bytes are of no such format, damaged, of degrees, or of more than is
+        read; a triangle has a vertex that is not there; the surface is larger than 20 km.
+    UselessFrame : fewer than 10 points are there.
+    MissingDependency : lazrs or trimesh is needed and not installed.
+    """
+    stated = options or SurfaceOptions()
+    with naming(name):
+        form = file_format or surface_format(data[:HEAD], name, len(data))
+        return _in_metres(_raw(data, form, stated), stated)
+
+
+def _raw(data: FileBytes, form: SurfaceFormat, options: SurfaceOptions) -> RawSurface:
+    if form in ("obj", "stl", "glb", "gltf"):
+        mesh = read_mesh(data, form)
+        is_gltf = form in ("glb", "gltf")
+        points = FilePoints(len(mesh.vertices), mesh.blocks())
+        raw = _gathered(points, mesh.triangles, AXES["z" if form == "stl" else "y"], options)
+        stated = (1.0, AXES["y"]) if is_gltf else (None, None)
+        return replace(raw, units_per_metre=stated[0], up=stated[1], notes=mesh.notes)
+    if form == "ply":
+        faces = read_faces(data)
+        points = read_ply(data, MOST_FILE_POINTS if faces is None else MOST_VERTICES)
+        return _gathered(points, faces, AXES["z"], options)
+    if form == "las":
+        points = read_las(data, MOST_FILE_POINTS)  # looks at the header first
+        units = options.units_per_metre or las_units_per_metre(data)
+        raw = _gathered(points, None, AXES["z"], replace(options, units_per_metre=units))
+        return replace(raw, units_per_metre=units, up=AXES["z"])
+    if form == "e57":
+        known = replace(options, units_per_metre=options.units_per_metre or 1.0)
+        raw = _gathered(_of_scans(read_e57(data)), None, AXES["z"], known)
+        return replace(raw, units_per_metre=1.0)
+    points = (read_pcd if form == "pcd" else read_npy)(data, MOST_FILE_POINTS)
+    return _gathered(points, None, AXES["z"], options)
+
+
+def _of_scans(scans: tuple[E57Scan, ...]) -> FilePoints:
+    """The points of all scans in the frame of their file."""
+    count = sum(scan.count for scan in scans)
+    check_count(count, MOST_FILE_POINTS)
+
+    def blocks() -> Iterator[Floats]:
+        for scan in scans:
+            T = scan.T_world_scan
+            for block in scan.points().blocks:
+                with np.errstate(all="ignore"):  # what overflows is not finite, and so missing
+                    yield block @ T[:3, :3].T + T[:3, 3]
+
+    return FilePoints(count, blocks())
+
+
+def _gathered(
+    points: FilePoints, triangles: Ints32 | None, usual_up: Floats, options: SurfaceOptions
+) -> RawSurface:
+    if triangles is not None and not len(triangles):
+        triangles = None
+    thin: Callable[[Floats32], float] | None = None
+    if triangles is None:
+
+        def thin(so_far: Floats32) -> float:
+            return options.units_per_metre or _estimated_units(so_far, None, usual_up)
+
+    found, origin, voxel = gather(points.blocks, points.count, thin)
+    return RawSurface(found, origin, triangles, points.count, voxel, None, None, usual_up)
+
+
+def _estimated_units(points: Floats32, triangles: Ints32 | None, usual_up: Floats) -> float:
+    return estimate_units(points, estimate_up(points, triangles, usual_up).up)
+
+
+def _in_metres(raw: RawSurface, options: SurfaceOptions) -> ReadSurface:
+    """Leave out what is missing, and turn units into metres."""
+    notes = list(raw.notes)
+    points, triangles = _cleaned(raw, notes)
+    if not max(float(points.max()), -float(points.min())) < _MOST_UNITS:
+        raise UnreadableCloud(TOO_LARGE)
+    up, up_from = _up(raw, options, points, triangles, notes)
+    units, units_from = _units(raw, options, points, up, notes)
+    offset = _to_metres(points, raw.origin, units)
+    extent = float((points.max(axis=0) - points.min(axis=0)).max())
+    if units_from != "stated" and not _SMALL_M <= extent <= _LARGE_M:
+        notes.append(f"The surface is {extent:.3g} m across, unusual for a place. Check the units.")
+    voxel = None if raw.voxel is None else raw.voxel / units
+    if voxel is not None:
+        notes.append(
+            f"The {raw.given} points were thinned to {len(points)}, one to a voxel of "
+            f"{100 * voxel:.3g} cm."
+        )
+    surface = ReferenceSurface(points, triangles, offset, up)
+    return ReadSurface(surface, units_from, up_from, tuple(notes), units, raw.given, voxel)
+
+
+def _up(
+    raw: RawSurface, options: SurfaceOptions, points: Floats32, triangles: Ints32 | None,
+    notes: list[str],
+) -> tuple[Floats, Source]:  # fmt: skip
+    """Up, and where it comes from."""
+    if options.up is not None:
+        return AXES[options.up], "stated"
+    if raw.up is not None:
+        return raw.up, "file"
+    estimate = estimate_up(points, triangles, raw.usual_up)
+    k = int(np.abs(estimate.up).argmax())
+    axis = f"{'-' if estimate.up[k] < 0 else ''}{'xyz'[k]}"
+    degrees = math.degrees(math.acos(min(1.0, abs(float(estimate.up[k])))))
+    tilt = f", {degrees:.0f} degrees from it" if degrees > 0.5 else ""
+    doubt = "" if estimate.is_clear else " The surface does not show it clearly."
+    notes.append(f"Up was estimated: {axis}{tilt}.{doubt} State it if this is wrong.")
+    return estimate.up, "estimated"
+
+
+def _units(
+    raw: RawSurface, options: SurfaceOptions, points: Floats32, up: Floats, notes: list[str]
+) -> tuple[float, Source]:
+    """Units per metre, and where they come from."""
+    if options.units_per_metre is not None:
+        return options.units_per_metre, "stated"
+    if raw.units_per_metre is not None:
+        return raw.units_per_metre, "file"
+    units = estimate_units(points, up)
+    x, y, z = (points.max(axis=0) - points.min(axis=0)).tolist()
+    name = {1.0: "metres", 100.0: "centimetres", 1000.0: "millimetres"}[units]
+    notes.append(
+        f"Units were estimated: {name}, by the extent of {x:.4g} x {y:.4g} x {z:.4g}. State them "
+        "if this is wrong."
+    )
+    return units, "estimated"
+
+
+def _cleaned(raw: RawSurface, notes: list[str]) -> tuple[Floats32, Ints32 | None]:
+    """Points and triangles without what is missing."""
+    if raw.triangles is None:
+        missing = raw.given - len(raw.points)
+        if missing and raw.voxel is None:
+            notes.append(f"{missing} missing points were left out.")
+        if len(raw.points) < FEWEST_POINTS:
+            raise UselessFrame(
+                f"The file has {len(raw.points)} points that are not missing, fewer than "
+                f"{FEWEST_POINTS}. Check that it is the map that you meant."
+            )
+        return raw.points, None
+    wrong = (raw.triangles < 0) | (raw.triangles >= len(raw.points))
+    if wrong.any():
+        first = int(np.flatnonzero(wrong.any(axis=1))[0])
+        raise UnreadableCloud(
+            f"Triangle {first + 1} of {len(raw.triangles)} has a vertex that is not among the "
+            f"{len(raw.points)} of the file. Copy or write the file again."
+        )
+    points, triangles = _proper(raw.points, raw.triangles)
+    left = len(raw.triangles) - len(triangles)
+    if not len(triangles):
+        raise UselessFrame(
+            f"None of the {left} triangles of the file has an area. Check that it is the map that "
+            "you meant, and write it again."
+        )
+    if left:
+        notes.append(f"{left} triangles without area or with missing vertices were left out.")
+    return points, triangles
+
+
+def _proper(points: Floats32, triangles: Ints32) -> tuple[Floats32, Ints32]:
+    """Triangles that have an area, and the vertices that they use."""
+    proper = np.ones(len(triangles), np.bool_)
+    present = np.asarray(np.isfinite(points).all(axis=1))
+    for first in range(0, len(triangles), _BLOCK):
+        block = triangles[first : first + _BLOCK]
+        a, b, c = (points[block[:, k]].astype(np.float64) for k in range(3))
+        with np.errstate(invalid="ignore", over="ignore"):
+            across = np.cross(b - a, c - a)
+        proper[first : first + _BLOCK] = present[block].all(axis=1) & (across != 0).any(axis=1)
+    if not proper.all():
+        triangles = triangles[proper]
+    used = np.zeros(len(points), np.bool_)
+    used[triangles] = True
+    if used.all():
+        return points, triangles.astype(np.int32, copy=False)
+    places = (np.cumsum(used) - 1).astype(np.int32)
+    return points[used], places[triangles]
+
+
+def _to_metres(points: Floats32, origin: Floats, units: float) -> Floats:
+    """Make the points metres relative to an offset, in place; return the offset (3,)."""
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    widest = float((high - low).max()) / units
+    if not widest <= 2 * FARTHEST_M:
+        raise UnreadableCloud(
+            f"The surface is {widest:.6g} m wide, and at most {2 * FARTHEST_M:g} m is read. State "
+            "the units if these are no metres, and remove points that lie far from the others."
+        )
+    middle = (origin + (low + high) / 2) / units
+    is_far = bool(np.linalg.norm(middle) > FAR_M)
+    offset = np.round(middle) if is_far else np.zeros(3)
+    shift = origin / units - offset
+    if units != 1.0 or shift.any():
+        for first in range(0, len(points), _BLOCK):
+            block = points[first : first + _BLOCK]
+            block[:] = block.astype(np.float64) / units + shift
+    return offset

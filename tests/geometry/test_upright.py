@@ -1,0 +1,164 @@
+"""Which way is up, and in which units: rooms and halls of ours, turned all ways."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from itertools import product
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sceneprint.geometry.surface.upright import (
+    Upright,
+    dominant_directions,
+    estimate_units,
+    estimate_up,
+    pieces_of,
+)
+from sceneprint.lab.synth.dataset import room_and_rng, synthesise_survey
+from sceneprint.types import Floats, Floats32, Ints32
+
+Z = np.array([0.0, 0.0, 1.0])
+#: Rotations that take z to each end of each axis.
+TURNS = {
+    "z": np.eye(3),
+    "-z": np.diag([1.0, -1.0, -1.0]),
+    "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "-y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "x": np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]]),
+    "-x": np.array([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]]),
+}
+
+
+@cache
+def room(index: int) -> tuple[Floats32, Ints32]:
+    """A furnished room: vertices and triangles."""
+    made, _ = room_and_rng(4242, index)
+    return made.vertices, made.faces
+
+
+@cache
+def samples(index: int) -> Floats32:
+    """Points spread evenly over the surface of a room."""
+    vertices, faces = room(index)
+    rng = np.random.default_rng(0)
+    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    chosen = rng.choice(len(faces), 200_000, p=areas / areas.sum())
+    u, v = rng.random((2, len(chosen), 1))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    points = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
+    return (points + rng.normal(0, 0.005, points.shape)).astype(np.float32)
+
+
+@cache
+def survey(index: int) -> Floats32:
+    """The scans of a hall, a storey or a block, in one frame."""
+    clouds = synthesise_survey(4242, index, 6).clouds
+    parts = []
+    for one in clouds:
+        assert one.pose is not None
+        parts.append(one.points @ one.pose[:3, :3].T + one.pose[:3, 3])
+    return np.concatenate(parts).astype(np.float32)
+
+
+def turned(points: Floats32, R: NDArray[np.float64]) -> Floats32:
+    return (points.astype(np.float64) @ R.T).astype(np.float32)
+
+
+def angle(found: Upright, truth: Floats) -> float:
+    return math.degrees(math.acos(min(1.0, max(-1.0, float(found.up @ truth)))))
+
+
+@pytest.mark.parametrize("axis", TURNS)
+@pytest.mark.parametrize("index", [0, 4, 6, 7])
+def test_up_of_a_furnished_room(index: int, axis: str) -> None:
+    vertices, faces = room(index)
+    R = TURNS[axis]
+    for found in (
+        estimate_up(turned(vertices, R), faces, Z),
+        estimate_up(turned(samples(index), R), None, Z),
+    ):
+        np.testing.assert_array_equal(found.up, R @ Z)  # an axis is taken exactly
+        assert found.is_clear
+
+
+@pytest.mark.parametrize("axis", TURNS)
+@pytest.mark.parametrize("index", [1, 3, 6])
+def test_up_of_scans(index: int, axis: str) -> None:
+    found = estimate_up(turned(survey(index), TURNS[axis]), None, Z)
+    assert angle(found, TURNS[axis] @ Z) < 2.0
+
+
+def test_a_tilted_room_is_upright_along_its_walls() -> None:
+    tilt = math.radians(26)
+    R = np.array(
+        [[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]]
+    )
+    for turn in TURNS.values():
+        found = estimate_up(turned(samples(4), turn @ R), None, Z)
+        assert angle(found, turn @ R @ Z) < 1.0
+
+
+def test_ground_that_slopes_leaves_the_usual_axis() -> None:
+    slope = math.radians(5)
+    R = np.array(
+        [[math.cos(slope), 0, math.sin(slope)], [0, 1, 0], [-math.sin(slope), 0, math.cos(slope)]]
+    )
+    found = estimate_up(turned(survey(3), R), None, Z)
+    np.testing.assert_array_equal(found.up, Z)
+
+
+def test_an_empty_cube_is_as_usual_and_not_clear() -> None:
+    corners = np.array(list(product((-1, 1), repeat=3)), np.float32)
+    faces = np.array(
+        [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
+         (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)], np.int32
+    )  # fmt: skip
+    for usual in (*np.eye(3), *-np.eye(3)):
+        found = estimate_up(corners, faces, usual)
+        np.testing.assert_array_equal(found.up, usual)
+        assert not found.is_clear
+
+
+@pytest.mark.parametrize("n", [1, 2, 11, 500])
+def test_surfaces_that_show_nothing_are_as_usual(n: int) -> None:
+    spread = np.random.default_rng(0).normal(size=(n, 3)).astype(np.float32)
+    for points in (spread, np.zeros((n, 3), np.float32), spread * np.array([1, 0, 0], np.float32)):
+        found = estimate_up(points, None, Z)
+        assert math.isclose(float(np.linalg.norm(found.up)), 1.0)
+        assert not (found.is_clear and n < 12)
+
+
+def test_dominant_directions_of_a_tilted_box_are_its_normals() -> None:
+    rng = np.random.default_rng(2)
+    R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    points = rng.uniform(-1, 1, (60_000, 3)) * (6, 4, 3)
+    side = np.arange(len(points)) % 3
+    points[np.arange(len(points)), side] = (
+        np.sign(points[np.arange(len(points)), side]) * (np.array([6, 4, 3])[side])
+    )
+    found = dominant_directions(pieces_of(turned(points.astype(np.float32), R), None))
+    assert len(found) == 3
+    cosines = np.abs(found @ R)
+    np.testing.assert_allclose(np.sort(cosines.max(axis=1)), 1.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("extent", "units"),
+    [
+        ((5, 4, 2.6), 1), ((60, 80, 12), 1), ((1100, 95, 55), 1), ((8000, 9000, 140), 1),
+        ((5000, 4000, 2600), 1000), ((42_000, 18_000, 2700), 1000), ((1e6, 8e5, 1200), 1000),
+        ((500, 400, 260), 100), ((2500, 1200, 270), 100), ((9000, 9000, 400), 1),
+        ((0.4, 0.3, 0.2), 1),
+    ],
+)  # fmt: skip
+def test_units_by_the_height_and_extent_of_a_place(
+    extent: tuple[float, float, float], units: int
+) -> None:
+    points = np.random.default_rng(1).uniform(-0.5, 0.5, (20_000, 3)) * extent / 0.98
+    for turn in TURNS.values():
+        assert estimate_units(turned(points.astype(np.float32), turn), turn @ Z) == units
