@@ -37,6 +37,7 @@ from sceneprint.errors import (
 )
 from sceneprint.formats.archive import is_archive
 from sceneprint.formats.dataset import FrameReference, FrameSequence, find_sequences
+from sceneprint.formats.exports import is_export
 from sceneprint.models import PRESETS
 from sceneprint_client.api.base import NOVEL, checked
 from sceneprint_client.api.frames import ImportOptions
@@ -179,9 +180,9 @@ _HEAD, _PAUSE_S = 512, 2.0
 
 
 def is_archive_file(path: Path) -> bool:
-    """Whether a path is a file that begins as an archive does."""
+    """Whether a path is a file that begins as an archive does, and is no capture of Record3D."""
     try:
-        if not path.is_file():
+        if not path.is_file() or is_export(path):
             return False
         with path.open("rb") as file:
             return is_archive(file.read(_HEAD))

@@ -37,6 +37,8 @@ from typing import IO, Any, BinaryIO, Literal, Protocol, cast
 from sceneprint.errors import DatasetError, SceneprintError, UnreadableArchive
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence
 from sceneprint.formats.dataset.sequences import find_each, is_of_colour
+from sceneprint.formats.exports.nerfstudio import TRANSFORMS, ScaledNpy
+from sceneprint.formats.exports.polycam import CAMERAS
 from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, MAXIMUM_IMAGE_BYTES, is_cloud
 from sceneprint_client.sidecars import CLOUDS_FILE, INTRINSICS_FILE
 
@@ -445,9 +447,10 @@ def _open_entry(magic: bytes) -> _Stream:
 
 #: What an archive and its sequence are called where nobody says.
 DEFAULT_NAME = "import"
-_LISTS = ("depth.txt", "groundtruth.txt")
+_LISTS = ("depth.txt", "groundtruth.txt", TRANSFORMS)
 _TEXTS = (INTRINSICS_FILE, CLOUDS_FILE, "TrainSplit.txt", "TestSplit.txt")
 _MAXIMUM_LIST, _MAXIMUM_TEXT, _MAXIMUM_TEXTS = 1 << 26, 1 << 16, 1 << 27  #: bytes; of all of them
+_HEAD_BYTES = 1024  #: of an image, which tell its size
 _PARENTS = ("0", "1", "2", "3", "4")  #: a camera is looked for above the frames: not beyond these
 
 #: What a file system says where a file and a folder have one name, or a name is none for it.
@@ -491,7 +494,9 @@ class Archive:
         UnreadableArchive : its member is damaged, encrypted or too large.
         """
         limit = MAXIMUM_IMAGE_BYTES if reference.cloud is None else MAXIMUM_CLOUD_BYTES
-        return self._read(self._members[reference.path], limit)
+        data = self._read(self._members[reference.path], limit)
+        # depth in units that no camera can state
+        return reference.source.converted(data) if isinstance(reference.source, ScaledNpy) else data
 
     def told(self, error: SceneprintError) -> str:
         """What an error says, without the private folder."""
@@ -526,6 +531,8 @@ class Archive:
                 "weighs, which no depth images do. Pack them less."
             )
         left = _MAXIMUM_TEXTS
+        # cameras of other systems are of colour images; sizes of depth images are in their heads
+        of_exports = any(_is_of_export(parts) for parts, _, _ in found)
         for parts, member, wanted in found:
             path = above.joinpath(*parts)
             if path in self._members:
@@ -541,6 +548,8 @@ class Archive:
                 self._refuse(member, "another member has the name of its folder, or its own")
                 continue
             self._members[path] = member
+            if wanted == "image" and of_exports and member.trouble is None:
+                path.write_bytes(self._head(member))
             if wanted == "text" and member.trouble is not None:
                 self._refuse(member, member.trouble)
             elif wanted == "text":
@@ -552,6 +561,17 @@ class Archive:
             except DatasetError as error:
                 raise UnreadableArchive(self.told(error)) from error
             self.refused += [(printable_name(one), self.told(error)) for one, error in refused]
+
+    def _head(self, member: ArchiveEntry) -> bytes:
+        """Return the first bytes of a member; none where they cannot be read."""
+        if member.open is None:
+            self._file.seek(member.start)
+            return self._file.read(min(_HEAD_BYTES, member.size))
+        try:
+            with member.open() as content:
+                return content.read(_HEAD_BYTES)
+        except _MALFORMED:
+            return b""
 
     def _unpack(self, path: Path, member: ArchiveEntry, left: int) -> int:
         """Write a text; a damaged one stays empty, which its reader refuses."""
@@ -622,8 +642,8 @@ def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iter
             raise UnreadableArchive(
                 "There is no depth image or cloud in the archive, or only in archives within it. "
                 "Pack a 7-Scenes scene or sequence, a TUM RGB-D folder (depth.txt), or a folder of "
-                "16-bit PNG or float NPY images, with its intrinsics.json; or one of PLY, PCD, "
-                "KITTI .bin, LAS or LAZ clouds."
+                "16-bit PNG or float NPY images, with its intrinsics.json; one of PLY, PCD, "
+                "KITTI .bin, LAS or LAZ clouds; or an export of Polycam or nerfstudio."
             )
         yield archive
 
@@ -638,6 +658,13 @@ def _entries_of(file: BinaryIO) -> Iterator[ArchiveEntry]:
     raise UnreadableArchive("This is neither a zip nor a tar. Pack the sequence again.")
 
 
+def _is_of_export(parts: tuple[str, ...]) -> bool:
+    """Whether a member is what other systems write beside their depth images."""
+    *folders, name = parts
+    of_camera = name.lower().endswith(".json") and folders[-1:] in ([one] for one in CAMERAS)
+    return of_camera or name == TRANSFORMS
+
+
 def _wanted(parts: tuple[str, ...]) -> Wanted | None:
     """What a member is to a sequence by its name; hidden files and colour are nothing."""
     *folders, name = parts
@@ -645,7 +672,7 @@ def _wanted(parts: tuple[str, ...]) -> Wanted | None:
     # the first folder may be what the packed folder was called
     if hidden or any(is_of_colour(folder) for folder in folders[1:]):
         return None
-    if name in _TEXTS or name in _LISTS or name.endswith(".pose.txt"):
+    if name in _TEXTS or name in _LISTS or name.endswith(".pose.txt") or _is_of_export(parts):
         return "text"
     lowered = name.lower()
     if lowered.endswith((".png", ".npy")) and not lowered.endswith(".color.png"):

@@ -296,27 +296,27 @@ def find_sequences(
     # a name such as .. is none; a symlink's own name is what the user knows it by
     path = Path(path)
     root = path.resolve() if ".." in path.parts else path.absolute()
+    from sceneprint.formats import exports
     from sceneprint.formats import recording as ros  # what it takes, only bags need
 
     if ros.is_recording(root) and root.exists():
         return (ros.recording_sequence(root, recording or ros.RecordingOptions()),)
     if root.is_file():
-        from sceneprint.formats import exports
-
-        return exports.file_sequences(root) or (_single(root),)
+        return exports.file_sequences(root) if exports.is_export(root) else (_single(root),)
     if not root.is_dir():
         raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
     walked = list(_walk(root))
     if any(layout is Layout.RECORDING for _, _, layout in walked):
         return _recordings(root, walked, recording or ros.RecordingOptions())
-    found = tuple(_sequence(*one, _name(one[0], root), camera) for one in walked)
+    found = tuple(each for one in walked for each in _sequences_in(*one, root, camera))
     if not found:
         raise DatasetError(
             f"{path}: There is no depth image or cloud here or up to {_DEPTH} folders below. Name "
             "a 7-Scenes scene or sequence (frame-000000.depth.png), a TUM RGB-D folder "
             "(depth.txt), a folder of 16-bit PNG or float NPY depth images, one of PLY, PCD, "
-            "KITTI .bin, LAS or LAZ clouds, one such file, or recordings of ROS (.mcap, .db3 or "
-            ".bag files, rosbag2 folders)."
+            "KITTI .bin, LAS or LAZ clouds, one such file, recordings of ROS (.mcap, .db3 or "
+            ".bag files, rosbag2 folders), an RTAB-Map database (.db), E57, or an export of "
+            "Polycam, Record3D or nerfstudio."
         )
     _check_parent_frames(found)
     return found
@@ -389,13 +389,14 @@ def find_each(
     ------
     DatasetError : there are too many folders, or two scenes have one name.
     """
-    found, refused = [], []
+    found: list[FrameSequence] = []
+    refused = []
     for one in _walk(root):
         if one[2] is Layout.RECORDING:
             continue
         name = _name(one[0], root)
         try:
-            found.append(_sequence(*one, name))
+            found += _sequences_in(*one, root)
         except SceneprintError as error:
             refused.append((name, error))
     sequences = tuple(found)
@@ -404,9 +405,11 @@ def find_each(
 
 
 def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
-    """Yield the folders that are sequences, depth first in natural order; and those that hold
-    recordings of ROS, with their names.
+    """Yield the folders that are sequences, depth first in natural order; those that hold
+    recordings of ROS, with their names; and files that other systems wrote, which have no names.
     """
+    from sceneprint.formats import exports
+
     seen: set[Path] = set()  # resolved: a symlink back up is not entered twice
     waiting = [(root, 0)]
     while waiting:
@@ -428,6 +431,10 @@ def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
         if bags:
             yield folder, bags, Layout.RECORDING
             folders = [name for name in folders if name not in bags]
+        layout = exports.folder_layout(folder, files, folders)
+        if layout is not None:
+            yield folder, files, layout
+            continue
         layout = layout_of(files)
         # a scene may hold a picture or a mesh of itself beside its sequences
         scene = any(_SEQUENCE_FOLDER.fullmatch(name) for name in folders) or (
@@ -437,6 +444,8 @@ def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
         if layout is not None and not (layout in (Layout.PLAIN, Layout.CLOUDS) and scene):
             yield folder, files, layout
         elif depth < _DEPTH:
+            exported = [folder / one for one in files if exports.is_export(folder / one)]
+            yield from ((path, [], Layout.E57) for path in exported)
             waiting += [
                 (folder / name, depth + 1) for name in reversed(folders) if not is_of_colour(name)
             ]
@@ -481,6 +490,19 @@ def is_of_colour(folder: str) -> bool:
     """Whether a folder of that name is left out; rgbd_dataset_freiburg1_xyz is none of them."""
     name = folder.lower().replace("rgbd", "")
     return any(colour in name for colour in _COLOUR_FOLDERS)
+
+
+def _sequences_in(
+    path: Path, files: list[str], layout: Layout, root: Path, camera: Camera | None = None
+) -> tuple[FrameSequence, ...]:
+    """Return the sequences of what `_walk` yields."""
+    from sceneprint.formats import exports
+
+    if not layout.is_export:
+        return (_sequence(path, files, layout, _name(path, root), camera),)
+    if path.is_file():
+        return exports.file_sequences(path, _name(path.with_suffix(""), root))
+    return (exports.folder_sequence(path, layout, _name(path, root)),)
 
 
 def _sequence(

@@ -1,0 +1,138 @@
+"""The scans of an E57 file as frames: clouds with the pose of their scanner.
+
+path  --e57_sequence-->  FrameSequence
+"""
+
+from __future__ import annotations
+
+import io
+import mmap
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sceneprint.errors import DatasetError, UnreadableCloud
+from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
+from sceneprint.formats.points.cloud import FEWEST_POINTS, MOST_POINTS, thinned
+from sceneprint.formats.points.e57 import E57Scan, read_e57, with_viewpoint
+from sceneprint_client.files import naming
+from sceneprint_client.sidecars import CloudSource
+
+SUFFIX = ".e57"
+#: Farthest that a point may be from its scanner, metres; scanners write sky beyond.
+_FARTHEST_M = 5_000.0
+
+
+@dataclass(frozen=True)
+class E57Source:
+    """A scan of an E57 file, as the bytes of a file.
+
+    Parameters
+    ----------
+    path : of the file
+    place : of the scan in it, from 0
+    """
+
+    path: Path
+    place: int
+
+    def read_bytes(self) -> bytes:
+        """Return an NPY file of points (N, 3), float32 metres in the axes of the scan.
+
+        Of more than 5 million points, one per voxel is taken, as the service would.
+
+        Raises
+        ------
+        UnreadableCloud : the file is damaged, or cannot be read.
+        """
+        with naming(f"{self.path}, scan {self.place + 1}"), _scans(self.path) as scans:
+            if self.place >= len(scans):
+                raise UnreadableCloud("The scan is no longer there. Read the file again.")
+            scan = scans[self.place]
+            points, n = np.empty((scan.count, 3), np.float32), 0
+            for block in scan.points().blocks:
+                near = block[(np.abs(block) <= _FARTHEST_M).all(axis=1)]
+                points[n : n + len(near)] = near
+                n += len(near)
+        points = points[:n]
+        if n > MOST_POINTS:
+            points, _ = thinned(points, MOST_POINTS)
+        file = io.BytesIO()
+        np.save(file, points, allow_pickle=False)
+        return file.getvalue()
+
+
+@contextmanager
+def _scans(path: Path) -> Iterator[tuple[E57Scan, ...]]:
+    try:
+        with path.open("rb") as file:
+            if file.seek(0, io.SEEK_END) == 0:
+                raise UnreadableCloud("The file is empty. Copy it again.")
+            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            yield read_e57(data)  # whose views of it are gone with the scans, and then the map
+    except OSError as cause:
+        raise UnreadableCloud(
+            f"The file cannot be read ({cause.strerror}). Copy it again."
+        ) from cause
+
+
+def e57_sequence(path: Path, name: str) -> FrameSequence:
+    """Return the scans of a file that were seen from one place.
+
+    Parameters
+    ----------
+    path : of the file
+    name : of the sequence
+
+    Returns
+    -------
+    sequence : its `note` says what was left out
+
+    Raises
+    ------
+    DatasetError : the file is damaged, or holds only merged clouds.
+    """
+    try:
+        with _scans(path) as scans:
+            seen = with_viewpoint(scans)
+            left_out = Counter[str]()
+            frames = list[FrameReference]()
+            for place, (scan, has_viewpoint) in enumerate(zip(scans, seen, strict=True)):
+                if scan.count < FEWEST_POINTS:
+                    left_out["scans without points"] += 1
+                elif not has_viewpoint:
+                    left_out["clouds without a viewpoint"] += 1
+                else:
+                    frames.append(_frame(path, name, place, scan))
+            thick = sum(one.count > MOST_POINTS for one in scans)
+    except UnreadableCloud as cause:
+        raise DatasetError(f"{path}: {cause}") from cause
+    reasons = ", ".join(f"{count} {reason}" for reason, count in left_out.items())
+    if not frames:
+        raise DatasetError(
+            f"{path}: No scan of the file was seen from one place ({reasons}). Upload the file as "
+            "a whole with --as-map, or export structured scans with their poses."
+        )
+    note = f"{len(frames)} of {len(scans)} scans taken"
+    note += f"; left out: {reasons}" if reasons else ""
+    note += f"; {thick} of more than {MOST_POINTS} points are thinned" if thick else ""
+    return FrameSequence(name, path, Layout.E57, name, None, tuple(frames), note)
+
+
+def _frame(path: Path, name: str, place: int, scan: E57Scan) -> FrameReference:
+    label = f"scan-{place + 1:04d}"
+    return FrameReference(
+        f"{name}/{label}",
+        path / label,
+        None,
+        None,
+        scan.T_world_scan if scan.has_pose else None,
+        CloudSource(),
+        source=E57Source(path, place),
+        original=scan.name or label,
+        sequence=place,
+    )

@@ -1,0 +1,109 @@
+"""Folders of Polycam's raw data: depth of a LiDAR, and cameras with ARKit's poses.
+
+folder  --polycam_sequence-->  FrameSequence
+
+By the description in github.com/PolyCam/polyform: `keyframes/corrected_cameras/TIME.json`, or
+`keyframes/cameras/` where the poses were not optimised, has fx, fy, cx, cy, width and height of the
+colour image and the rows t_00 to t_23 of camera to world; `keyframes/depth/TIME.png` has 16-bit
+millimetres at a lower resolution. TIME is in microseconds. The camera has ARKit's axes (x right, y
+up, z backward); the world has y up against gravity.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+from sceneprint.errors import DatasetError, SceneprintError
+from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
+from sceneprint.formats.exports.opengl import (
+    Lens,
+    depth_camera,
+    depth_size,
+    number,
+    optical,
+    pixels,
+    sequence_of,
+    transform,
+)
+from sceneprint_client.files import read_object
+
+KEYFRAMES, CAMERAS = "keyframes", ("corrected_cameras", "cameras")
+_MAXIMUM_CAMERA_BYTES = 65_536
+_MOST_FRAMES = 100_000
+_REMEDY = (
+    "In Polycam, turn developer mode on, capture in LiDAR or Room mode, and export raw data; photo "
+    "captures have no depth."
+)
+
+
+def is_polycam(folder: Path, folders: list[str]) -> bool:
+    """Return whether a folder, with these folders in it, is an export of Polycam."""
+    if folder.name == KEYFRAMES:
+        return any(one in folders for one in CAMERAS)
+    return KEYFRAMES in folders and any((folder / KEYFRAMES / one).is_dir() for one in CAMERAS)
+
+
+def polycam_sequence(folder: Path, name: str) -> FrameSequence:
+    """Return the frames of a folder with `keyframes`.
+
+    Parameters
+    ----------
+    folder : that holds `keyframes`, or that itself
+    name : of the sequence
+
+    Returns
+    -------
+    sequence : its `note` says what was left out
+
+    Raises
+    ------
+    DatasetError : no frame has depth and a camera, or the folder cannot be read.
+    """
+    from sceneprint.formats.dataset.sequences import list_folder
+
+    if folder.name == KEYFRAMES:
+        name = folder.parent.name if name == KEYFRAMES else name.removesuffix(f"/{KEYFRAMES}")
+        folder = folder.parent
+    keyframes = folder / KEYFRAMES
+    place = next(keyframes / one for one in CAMERAS if (keyframes / one).is_dir())
+    files, left_out, frames = list_folder(place)[0], Counter[str](), list[FrameReference]()
+    for file in files[:_MOST_FRAMES]:
+        stem, dot, suffix = file.rpartition(".")
+        if not dot or suffix.lower() != "json":
+            continue
+        depth = keyframes / "depth" / f"{stem}.png"
+        if not depth.is_file():
+            left_out["cameras without a depth image"] += 1
+            continue
+        try:
+            frames.append(_frame(folder, place / file, depth, name, len(frames)))
+        except SceneprintError as error:
+            left_out[f"frames that are damaged ({_reason(error, place)})"] += 1
+    return sequence_of(folder, Layout.POLYCAM, name, frames, left_out, _REMEDY)
+
+
+def _reason(error: SceneprintError, place: Path) -> str:
+    return str(error).replace(f"{place}/", "")
+
+
+def _frame(folder: Path, file: Path, depth: Path, name: str, place: int) -> FrameReference:
+    """Return a frame; DatasetError, InvalidIntrinsics or UnreadableFrame where it is none."""
+    fields = read_object(file, _MAXIMUM_CAMERA_BYTES, DatasetError, '{"fx": 1, "t_00": 1, ...}')
+    fx, fy, cx, cy = (number(fields.get(key), key) for key in ("fx", "fy", "cx", "cy"))
+    width, height = (pixels(fields.get(key), key) for key in ("width", "height"))
+    lens = Lens(fx, fy, cx, cy, width, height)
+    rows = [[fields.get(f"t_{row}{column}") for column in range(4)] for row in range(3)]
+    T_world_camera = optical(transform(rows, "The pose t_00 to t_23"))
+    x, y, z = (
+        float(value) for value in T_world_camera[1, :3]
+    )  # the world's y, in the camera's axes
+    return FrameReference(
+        f"{name}/{file.stem}",
+        depth,
+        depth_camera(lens, depth_size(depth), 1000.0, up=(x, y, z)),
+        int(file.stem) * 1e-6 if file.stem.isascii() and file.stem[:18].isdigit() else None,
+        T_world_camera,
+        original=depth.relative_to(folder).as_posix(),
+        sequence=place,
+    )

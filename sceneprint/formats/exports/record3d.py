@@ -1,0 +1,275 @@
+"""Captures of Record3D: .r3d files, and folders of one that was unpacked.
+
+path  --record3d_sequence-->  FrameSequence
+
+An .r3d file is a zip with `metadata`, JSON, and for each frame `rgbd/N.depth`: float32 metres, dw x
+dh, packed with LZFSE. `metadata` has w and h of the colour images, `perFrameIntrinsicCoeffs` (fx,
+fy, cx, cy of each frame) or K (column by column), and `poses`: qx, qy, qz, qw, x, y, z of camera to
+world in ARKit's axes (x right, y up, z backward).
+
+The export "EXR + JPG sequence" has depth as OpenEXR, which is not read.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zlib
+from collections import Counter
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sceneprint.errors import (
+    DatasetError,
+    MissingDependency,
+    SceneprintError,
+    UnreadableArchive,
+    UnreadableFrame,
+)
+from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
+from sceneprint.formats.exports.opengl import (
+    Lens,
+    depth_camera,
+    number,
+    optical,
+    pixels,
+    sequence_of,
+    transform,
+)
+from sceneprint.types import MAXIMUM_SAMPLES, Floats
+from sceneprint_client.errors import printable
+from sceneprint_client.files import naming, read_bytes
+from sceneprint_client.poses import rotation_of
+
+METADATA, FRAMES = "metadata", "rgbd"
+SUFFIX = ".r3d"
+_MAXIMUM_METADATA_BYTES = 64 << 20
+_MOST_FRAMES = 100_000
+_REMEDY = "In Record3D, export the capture as .r3d (shareable internal format)."
+#: Width and height of depth in portrait, of the LiDAR, where an old file does not state it.
+_LIDAR = (192, 256)
+
+
+def is_record3d(files: list[str], folders: list[str]) -> bool:
+    """Return whether a folder, with these files and folders in it, is an unpacked capture."""
+    return (METADATA in files and FRAMES in folders) or (
+        "metadata.json" in files and "depth" in folders and "rgb" in folders
+    )
+
+
+@dataclass(frozen=True)
+class LzfseDepth:
+    """A depth image of a capture, as the bytes of a file.
+
+    Parameters
+    ----------
+    capture : the .r3d file, or the folder
+    name : of the depth file within
+    width, height : pixels
+    """
+
+    capture: Path
+    name: str
+    width: int
+    height: int
+
+    def read_bytes(self) -> bytes:
+        """Return an NPY file of float32 metres.
+
+        Raises
+        ------
+        UnreadableFrame : the file is damaged, or of another size.
+        MissingDependency : lzfse is not installed.
+        """
+        size = 4 * self.width * self.height
+        with naming(str(self.capture / self.name)):
+            # what does not shrink is stored as it is: a little larger
+            samples = _inflated(_content(self.capture, self.name, size + 65_536), size)
+        file = io.BytesIO()
+        depth = np.frombuffer(samples, "<f4").reshape(self.height, self.width)
+        np.save(file, depth, allow_pickle=False)
+        return file.getvalue()
+
+
+def _inflated(packed: bytes, size: int) -> bytes:
+    """Return the content of a depth file; it has exactly so many bytes."""
+    if len(packed) == size:
+        return packed
+    try:
+        import lzfse
+    except ImportError as cause:
+        raise MissingDependency(
+            "Depth of Record3D is packed with LZFSE, and the package lzfse is not installed. "
+            "Run: pip install 'sceneprint[record3d]'"
+        ) from cause
+    try:
+        samples: bytes = lzfse.decompress(packed)
+    except (lzfse.error, ValueError, MemoryError) as cause:
+        raise UnreadableFrame(
+            f"The depth does not inflate ({cause}). Copy the capture again."
+        ) from cause
+    if len(samples) != size:
+        raise UnreadableFrame(
+            f"The depth has {len(samples)} bytes, and its metadata announce {size}. Export the "
+            "capture again."
+        )
+    return samples
+
+
+# Parts of a capture: of the zip, or of the folder.
+
+_LOCAL_HEADER = struct.Struct("<4s4xH16xHH")
+_STORED, _DEFLATED = 0, 8
+
+
+def _content(capture: Path, name: str, limit: int) -> bytes:
+    """Return the bytes of a part; UnreadableFrame where it is not there, damaged or too long."""
+    if capture.is_dir():
+        return read_bytes(capture / name, limit, UnreadableFrame)
+    try:
+        status = capture.stat()
+        place = _places(capture, status.st_mtime_ns, status.st_size).get(name)
+        if place is None or place[2] > limit:
+            raise UnreadableFrame(
+                f"There is no {name} of at most {limit} bytes. Export the capture again."
+            )
+        start, packed, size = place
+        with capture.open("rb") as file:
+            file.seek(start)
+            _, method, names, extra = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
+            file.seek(names + extra, io.SEEK_CUR)
+            data = file.read(min(packed, 2 * limit))
+        if method == _DEFLATED:
+            data = zlib.decompressobj(-zlib.MAX_WBITS).decompress(data, size + 1)
+        if method not in (_STORED, _DEFLATED) or len(data) != size:
+            raise UnreadableFrame(f"{name} is damaged. Copy the capture again.")
+    except (OSError, UnreadableArchive, zlib.error, struct.error) as cause:
+        raise UnreadableFrame(
+            printable(f"The capture cannot be read ({cause}). Copy it again.")
+        ) from cause
+    return data
+
+
+@lru_cache(maxsize=4)
+def _places(capture: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, int, int]]:
+    """Return place, packed size and size of each member of a zip."""
+    from sceneprint.formats.archive import zip_entries
+
+    with capture.open("rb") as file:
+        return {
+            one.name: (one.start, one.packed, one.size)
+            for one in zip_entries(file)
+            if one.trouble is None
+        }
+
+
+# Frames.
+
+
+def record3d_sequence(capture: Path, name: str) -> FrameSequence:
+    """Return the frames of a capture.
+
+    Parameters
+    ----------
+    capture : an .r3d file, or a folder with `metadata` and `rgbd`
+    name : of the sequence
+
+    Returns
+    -------
+    sequence : its `note` says what was left out
+
+    Raises
+    ------
+    DatasetError : the capture is damaged, exported in another form, or no frame has depth.
+    """
+    if capture.is_dir() and not (capture / METADATA).is_file():
+        raise DatasetError(
+            f"{capture}: This export of Record3D has depth as OpenEXR, which is not read. {_REMEDY}"
+        )
+    try:
+        fields = json.loads(_content(capture, METADATA, _MAXIMUM_METADATA_BYTES))
+        if not isinstance(fields, dict) or not isinstance(fields.get("poses"), list):
+            raise DatasetError("They have no list of poses.")
+        width, height = (pixels(fields.get(key), key) for key in ("w", "h"))
+        portrait = _LIDAR if width < height else _LIDAR[::-1]
+        size = (
+            pixels(fields.get("dw", portrait[0]), "dw"),
+            pixels(fields.get("dh", portrait[1]), "dh"),
+        )
+        if size[0] * size[1] > MAXIMUM_SAMPLES:
+            raise DatasetError(f"They announce depth of {size[0]} x {size[1]} pixels.")
+    except (ValueError, RecursionError, SceneprintError) as cause:
+        reason = printable(f"{cause!s:.200}")
+        raise DatasetError(
+            f"{capture}: The metadata cannot be read ({reason}). {_REMEDY}"
+        ) from cause
+    frames, left_out = list[FrameReference](), Counter[str]()
+    for place, pose in enumerate(fields["poses"][:_MOST_FRAMES]):
+        file = f"{FRAMES}/{place}.depth"
+        if not _is_there(capture, file):
+            left_out["frames without depth"] += 1
+            continue
+        try:
+            lens = _lens(fields, place, width, height)
+            frames.append(
+                FrameReference(
+                    f"{name}/{place:06d}",
+                    capture / file,
+                    depth_camera(lens, size, 1.0),
+                    _stamp(fields, place),
+                    optical(_pose(pose)),
+                    source=LzfseDepth(capture, file, *size),
+                    original=file,
+                    sequence=place,
+                )
+            )
+        except SceneprintError as error:
+            left_out[f"frames that are damaged ({error})"] += 1
+    return sequence_of(capture, Layout.RECORD3D, name, frames, left_out, _REMEDY)
+
+
+def _is_there(capture: Path, file: str) -> bool:
+    if capture.is_dir():
+        return (capture / file).is_file()
+    status = capture.stat()
+    return file in _places(capture, status.st_mtime_ns, status.st_size)
+
+
+def _lens(fields: dict[str, Any], place: int, width: int, height: int) -> Lens:
+    """Return the camera of a frame; DatasetError where it is none."""
+    rows, K = fields.get("perFrameIntrinsicCoeffs"), fields.get("K")
+    if isinstance(rows, list) and place < len(rows) and isinstance(rows[place], list):
+        values = rows[place][:4]
+    elif isinstance(K, list) and len(K) == 9:
+        values = [K[0], K[4], K[6], K[7]]  # column by column
+    else:
+        raise DatasetError("neither K nor perFrameIntrinsicCoeffs")
+    if len(values) != 4:
+        raise DatasetError("a camera with fewer than four numbers")
+    fx, fy, cx, cy = (number(value, "an intrinsic") for value in values)
+    return Lens(fx, fy, cx, cy, width, height)
+
+
+def _pose(values: object) -> Floats:
+    """Return T_world_camera (4, 4) in ARKit's axes; DatasetError where it is none."""
+    if not isinstance(values, list) or len(values) != 7:
+        raise DatasetError("a pose without seven numbers")
+    numbers = np.array([number(value, "a pose") for value in values])
+    length = float(np.linalg.norm(numbers[:4]))
+    if not 0.9 < length < 1.1:
+        raise DatasetError("a pose without a unit quaternion")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation_of(numbers[:4] / length), numbers[4:]
+    return transform(T.tolist(), "a pose")
+
+
+def _stamp(fields: dict[str, Any], place: int) -> float | None:
+    stamps = fields.get("frameTimestamps")
+    if isinstance(stamps, list) and place < len(stamps):
+        return number(stamps[place], "a time stamp")
+    return None
