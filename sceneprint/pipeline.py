@@ -306,6 +306,9 @@ def _same_model(a: Signature | Geometry, b: Signature | Geometry | Model) -> Non
 
 # What is made of a ranking's candidates: matches in the order to believe them.
 
+#: Accepted matches that the pose of a query rests on: confidences are learnt with as many.
+VERDICT_MATCHES = 5
+
 #: Gives the parent frame and T_parent_sensor (4, 4) of a row of the database, if it has a pose.
 PoseOf = Callable[[int], tuple[str, Floats] | None]
 
@@ -332,7 +335,7 @@ def associate(
     ranking: Ranking,
     among: Sequence[int],
     open_geometry: Callable[[int], Geometry | None],
-    k: int = 5,
+    k: int = VERDICT_MATCHES,
     seed: int = 0,
     p: ValidationParameters | None = None,
     mode: Mode = "full",

@@ -317,7 +317,8 @@ def add_asking_options(command: argparse.ArgumentParser) -> None:
         type=positive,
         default=5,
         metavar="K",
-        help="number of accepted matches to return (default: 5)",
+        help="largest number of accepted matches to list; the pose does not depend on it "
+        "(default: 5)",
     )
     command.add_argument("--exact", action="store_true", help="compare every frame of the map")
     add_seed_option(command)

@@ -69,17 +69,25 @@ def test_an_answer_has_the_numbers_of_the_library(
     geometries = [prepared[i][1] for i in others]
     query, seen = prepared[asked]
     ranking = retrieve(query, signatures, signer.model)
-    chosen = diversify(ranking, signatures, max(10, k))
-    matches = associate(seen, ranking, chosen.indices, geometries.__getitem__, k, seed)
+    # the pose rests on five accepted matches of ten candidates
+    ten = diversify(ranking, signatures, 10).indices.tolist()
+    deciding = associate(seen, ranking, ten, geometries.__getitem__, 5, seed)
     poses = [np.array(full.get_frame("hall", names[i]).pose.matrix) for i in others]
     rooms = [uploads[i].room for i in others]
-    views_of = views_of_rows(matches, poses, geometries.__getitem__, rooms)
-    place = localize([QueryFrame(seen, matches)], poses, rooms, views_of)
+    views_of = views_of_rows(deciding, poses, geometries.__getitem__, rooms)
+    place = localize([QueryFrame(seen, deciding)], poses, rooms, views_of)
+    # the list has `k` accepted ones
+    chosen = diversify(ranking, signatures, max(10, k))
+    among = [*ten, *(i for i in chosen.indices.tolist() if i not in ten)]
+    tried = associate(seen, ranking, among, geometries.__getitem__, max(5, k), seed)
+    accepted = [m.index for m in tried if m.validation.status == "accepted"]
+    matches = [m for m in tried if m.index not in accepted[k:]]
 
     answer = full.query_frame("hall", names[asked], Query(k=k, seed=seed))
-    tried = answer.matches[: len(matches)]
-    assert [m.frame_id for m in tried] == [names[others[m.index]] for m in matches]
-    for told, match in zip(tried, matches, strict=True):
+    first = answer.matches[: len(matches)]
+    assert [m.frame_id for m in first] == [names[others[m.index]] for m in matches]
+    assert (answer.counts.validated, answer.counts.accepted) == (len(tried), len(accepted))
+    for told, match in zip(first, matches, strict=True):
         v = match.validation
         assert told.distance == match.distance
         assert told.similarity == match.similarity
@@ -101,6 +109,7 @@ def test_an_answer_has_the_numbers_of_the_library(
     assert ranks == {
         names[others[ranking.indices[i]]]: (i + 1, gain)
         for i, gain in zip(chosen.indices.tolist(), chosen.gains.tolist(), strict=True)
+        if ranking.indices[i] not in accepted[k:]
     }
     rest = [m.rank for m in answer.matches[len(matches) :]]
     assert rest == sorted(rest)
@@ -109,15 +118,34 @@ def test_an_answer_has_the_numbers_of_the_library(
     }
 
 
+def test_the_pose_does_not_depend_on_how_many_matches_are_listed(full: Engine, ids: Ids) -> None:
+    frame_id = ids(full)[8]
+    usual = full.query_frame("hall", frame_id, Query())
+    assert usual.status == "found"
+    for k in (1, 2, 4, 7, 11):
+        answer = full.query_frame("hall", frame_id, Query(k=k))
+        assert (answer.status, answer.reason) == (usual.status, usual.reason)
+        assert answer.location == usual.location
+        listed = [m for m in answer.matches if m.validation.status == "accepted"]
+        assert len(listed) == min(k, answer.counts.accepted)
+        if k < 5:
+            assert listed == usual.matches[:k]
+            assert answer.counts == usual.counts
+    second = usual.matches[1].frame_id
+    told = full.query_frame("hall", frame_id, Query(k=1, explain_frame=second)).explained_frame
+    assert told.lost_at == "turn"
+    assert told.reason.startswith("more than `k` matches are accepted")
+
+
 @pytest.mark.parametrize(
     ("stages", "k", "matches", "selected", "validated"),
     [
         (("retrieve",), 3, 3, 0, 0),
         (("retrieve",), 50, 12, 0, 0),
         (("retrieve", "diversify"), 3, 3, 3, 0),
-        (("retrieve", "validate"), 1, 10, 0, 1),
+        (("retrieve", "validate"), 1, 6, 0, 5),
         (("retrieve", "validate"), 11, 11, 0, 11),
-        (("retrieve", "diversify", "validate"), 1, 10, 10, 1),
+        (("retrieve", "diversify", "validate"), 1, 7, 10, 10),
     ],
 )
 def test_stages_are_done_as_asked(
@@ -134,7 +162,8 @@ def test_stages_are_done_as_asked(
     assert chosen == ({(True, False)} if "diversify" in stages else {(None, True)})
     if "validate" in stages:
         assert answer.status == "found"
-        assert counts.accepted == min(k, sum(m.transform is not None for m in answer.matches), 6)
+        accepted = sum(m.validation.status == "accepted" for m in answer.matches)
+        assert accepted == min(k, counts.accepted)
         assert answer.location is not None
     else:
         assert answer.status == "unvalidated"

@@ -231,7 +231,7 @@ def test_answers_speak_of_the_robots_base(
 
 def test_the_uncertainty_of_a_place_is_told_in_its_axes(full: Engine, uploads: Any) -> None:
     one = uploads[8]
-    answer = full.queries.upload(["hall"], one.data, one.meta, Query(k=1))
+    answer = full.queries.upload(["hall"], one.data, one.meta, Query(candidates=1))
     (match,) = [m for m in answer.matches if m.validation.status == "accepted"]
     assert answer.location is not None
     assert answer.location.uncertainty is not None
@@ -287,7 +287,7 @@ def test_guided_matches_are_searched_for_where_the_answer_is_undecided(
 ) -> None:  # fmt: skip
     """Two frames whose poses are 3 m off vote elsewhere, after others have guided the rest."""
     path = room_views(21, 0, 48, along_path=True, step=3).frames
-    for i in (2, 6, 0, 8, 7, 1, 10, 11):
+    for i in (2, 6, 0, 10, 11):
         frame, pose = path[i], path[i].pose
         assert pose is not None
         if i >= 10:
@@ -298,10 +298,11 @@ def test_guided_matches_are_searched_for_where_the_answer_is_undecided(
     work_off(empty)
     asking = make_upload(path[4], "room")
     meta = asking.meta.model_copy(update={"pose": None})
-    answer = empty.queries.upload(["hall"], asking.data, meta, Query(k=8, candidates=8))
+    answer = empty.queries.upload(["hall"], asking.data, meta, Query())
     assert answer.status == "ambiguous"
     assert {one.validation.search for one in answer.matches} == {"correspondences"}
-    first, second = answer.alternatives[:2]
+    first = answer.alternatives[0]
     assert first.support > 2  # that many had guided the others, which vote now as well
     assert difference(np.array(first.pose.matrix), asking.pose)[0] < 0.02
-    assert np.array(second.pose.matrix)[0, 3] - asking.pose[0, 3] == pytest.approx(3.0, abs=0.1)
+    assert first.evidence is not None
+    assert first.evidence.rival_weight >= 0.8  # the two frames that are off vote for another pose

@@ -187,7 +187,7 @@ def test_candidates_near_a_prior_are_tried_first(full: Engine, uploads: Any, ids
     rooms = dict(zip(ids(full), (one.room for one in uploads), strict=True))
 
     def tried(prior: dict[str, Any] | None) -> list[str]:
-        query = Query.model_validate({"keep": False, "k": 1, "prior": prior})
+        query = Query.model_validate({"keep": False, "prior": prior})
         meta = uploads[8].meta.model_copy(update={"pose": None})
         answer = full.queries.upload(["hall"], uploads[8].data, meta, query)
         assert len(answer.matches) == 10

@@ -181,11 +181,12 @@ def test_a_frame_that_there_is_no_time_to_explain_changes_no_answer(
     assert answer.explained_frame.lost_at == "selection"
     assert (answer.counts.validated, answer.counts.accepted) == (3, 0)
     assert (answer.status, answer.deadline_reached) == ("not_found", False)  # all were tried
-    most = 1
+    most = 5
     asked.clear()
-    answer = ask(full, names[0], **how, k=1, explain_frame=ranked[2].frame_id)
-    assert (len(asked), answer.status, answer.deadline_reached) == (2, "found", False)
-    assert (answer.explained_frame.lost_at, answer.matches[2].validation.reason) == (
+    how["candidates"] = 6
+    answer = ask(full, names[0], **how, explain_frame=ranked[5].frame_id)
+    assert (len(asked), answer.status, answer.deadline_reached) == (6, "found", False)
+    assert (answer.explained_frame.lost_at, answer.matches[5].validation.reason) == (
         "turn", "enough matches were accepted before it",
     )  # fmt: skip
 
@@ -214,39 +215,47 @@ def test_every_frame_of_the_ranking_is_explained(
     full: Engine, prepared: Prepared, ids: Ids
 ) -> None:
     names = ids(full)
-    plain = ask(full, names[0], k=2, candidates=5, stages=["retrieve", "diversify", "validate"])
-    answer = ask(full, names[0], k=2, candidates=5, explain=True)
-    assert told(answer, "explanations") == told(plain, "explanations")
-    assert set(answer.milliseconds) - set(plain.milliseconds) == {"explain"}
-    found = answer.explanations
-    assert [one.rank for one in found] == [*range(1, 12)]
-    assert [one.frame_id for one in found] == [
-        one.frame_id for one in ask(full, names[0], k=50, stages=["retrieve"]).matches
-    ]
-    matches = {one.frame_id: one for one in answer.matches}
     vectors = {name: one.vector for name, (one, _) in zip(names, prepared, strict=True)}
+    ranked = [one.frame_id for one in ask(full, names[0], k=50, stages=["retrieve"]).matches]
     outcomes = set()
-    for one in found:
-        outcomes.add(one.outcome)
-        assert one.distance == distances(vectors[names[0]], vectors[one.frame_id][None], "l2")[0]
-        if one.frame_id not in matches:
-            assert (one.stage, one.outcome) == ("retrieve", "not_selected")
-            nearest = min(
-                (distances(vectors[one.frame_id], vectors[name][None], "l2")[0], match.rank, name)
-                for name, match in matches.items()
-            )
-            said = f"most similar to the selected frame {nearest[2]} (distance {nearest[0]})"
-            assert one.reason.startswith(said)
-            continue
-        match = matches[one.frame_id]
-        assert (one.rank, one.similarity) == (match.rank, match.similarity)
-        if match.validation.status == "skipped":
-            assert (one.stage, one.outcome) == ("diversify", "skipped")
-            assert one.reason == "enough matches were accepted before it"
-        else:
-            assert (one.stage, one.outcome) == ("validate", match.validation.status)
-            assert one.reason.startswith(f"{one.outcome}: {match.validation.reason}")
-    assert {"not_selected", "skipped", "accepted"} <= outcomes
+    for candidates in (5, 11):  # some of the ranking, and all of it
+        how: dict[str, Any] = {"k": 2, "candidates": candidates}
+        plain, answer = ask(full, names[0], **how), ask(full, names[0], **how, explain=True)
+        assert told(answer, "explanations") == told(plain, "explanations")
+        assert set(answer.milliseconds) - set(plain.milliseconds) == {"explain"}
+        found = answer.explanations
+        assert [one.rank for one in found] == [*range(1, 12)]
+        assert [one.frame_id for one in found] == ranked
+        matches = {one.frame_id: one for one in answer.matches}
+        accepted = [one.frame_id for one in found if one.outcome == "accepted"]
+        assert len(accepted) == answer.counts.accepted
+        chosen = {*matches, *accepted}  # accepted ones beyond `k` are not listed
+        assert len(chosen) == candidates
+        for one in found:
+            outcomes.add(one.outcome)
+            d = distances(vectors[names[0]], vectors[one.frame_id][None], "l2")[0]
+            assert one.distance == d
+            if one.frame_id not in chosen:
+                assert (one.stage, one.outcome) == ("retrieve", "not_selected")
+                nearest = min(
+                    (
+                        distances(vectors[one.frame_id], vectors[name][None], "l2")[0],
+                        ranked.index(name), name,
+                    )
+                    for name in chosen
+                )  # fmt: skip
+                said = f"most similar to the selected frame {nearest[2]} (distance {nearest[0]})"
+                assert one.reason.startswith(said)
+            elif one.frame_id in matches:
+                match = matches[one.frame_id]
+                assert (one.rank, one.similarity) == (match.rank, match.similarity)
+                if match.validation.status == "skipped":
+                    assert (one.stage, one.outcome) == ("diversify", "skipped")
+                    assert one.reason == "enough matches were accepted before it"
+                else:
+                    assert (one.stage, one.outcome) == ("validate", match.validation.status)
+                    assert one.reason.startswith(f"{one.outcome}: {match.validation.reason}")
+    assert outcomes == {"not_selected", "skipped", "accepted", "rejected"}
     plain = ask(full, names[0], k=3, stages=["retrieve"], explain=True).explanations
     assert [one.outcome for one in plain] == ["ranked"] * 3 + ["not_selected"] * 8
     assert plain[3].reason == "not among the first 3 of the ranking, which were the candidates"

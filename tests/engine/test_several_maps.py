@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 from sceneprint.engine import Engine
@@ -65,12 +66,12 @@ def test_a_pose_is_of_one_map(two: Engine, uploads: Any) -> None:
     assert min(counts.values()) >= 1
     assert {name: part.counts.accepted for name, part in both.per_map.items()} == counts
     assert both.counts.accepted == sum(counts.values())
-    alone = ask(two, ["hall"], uploads[8], k=50, candidates=50, stages=["retrieve", "validate"])
     # both maps call the parent frame the same, and still only the one with most strong votes
     assert {one.pose_in_map.parent_frame for one in accepted} == {uploads[8].room}
-    assert both.location == alone.location
     assert both.location.map == "hall"
-    diverse = ask(two, MAPS, uploads[8], k=3)
+    off = np.array(both.location.pose.matrix)[:3, 3] - uploads[8].pose[:3, 3]
+    assert np.linalg.norm(off) < 0.03
+    diverse = ask(two, MAPS, uploads[8])
     assert diverse.counts.selected == 10 == len(diverse.matches)
     assert sum(part.counts.selected for part in diverse.per_map.values()) == 10
     assert diverse.matches[0].rank == 1

@@ -405,7 +405,7 @@ class ExplainedFrame(ApiRecord):
     transform: Transform | None = Field(description="Query to the frame, of that alignment.")
     lost_at: Lost | None = Field(
         description="Where it was lost; null where it is a match. `turn`: enough were accepted "
-        "before it; `query`: it is the query itself."
+        "before it, or `k` others are listed before it; `query`: it is the query itself."
     )
     reason: str
 
@@ -466,8 +466,8 @@ class Query(Given):
         default=5,
         ge=1,
         le=50,
-        description="Accepted matches wanted (or matches, "
-        "unvalidated). With fewer than 5 there is less evidence, and fewer poses are found.",
+        description="Accepted matches to list, at most (or matches, unvalidated). The status and "
+        "the pose do not depend on it: they rest on the first 5 that are accepted.",
     )
     stages: tuple[Stage, ...] = Field(
         default=STAGES,
@@ -489,8 +489,9 @@ class Query(Given):
         default=None,
         ge=1,
         le=200,
-        description="How many of the ranking are selected and validated until `k` are accepted, "
-        "some 20 ms each; default: 10, or `k` where that is more. Without validation `k` counts.",
+        description="How many of the ranking are selected, and validated until 5 are accepted, "
+        "some 20 ms each; default: 10. Where `k` is more than 5, validation goes on until `k` are "
+        "accepted, and by default among `k` candidates. Without validation `k` counts.",
     )
     diversity: Annotated[Diversity | None, JsonText] = Field(
         default=None, description="The scales of the selection."

@@ -18,6 +18,7 @@ from sceneprint.engine.search.response import (
     ExplainedQuery,
     alternative_records,
     explain,
+    listed,
     location_record,
     match_records,
     why,
@@ -30,13 +31,13 @@ from sceneprint.engine.search.retrieval import (
     search_maps,
 )
 from sceneprint.engine.search.verification import (
+    CANDIDATES,
     Validated,
     nearest_first,
     placed,
     prior_of,
     validate_elsewhere,
     validated,
-    wanted_of,
 )
 from sceneprint.engine.serializers import query_sensor
 from sceneprint.engine.upkeep.repair import resign_frames
@@ -51,26 +52,26 @@ from sceneprint.geometry.retrieval.ranking import (
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.localization import PoseEstimate, unconfirmed
 from sceneprint.models import Model
-from sceneprint.pipeline import PairMatch, searched
+from sceneprint.pipeline import VERDICT_MATCHES, PairMatch, searched
 from sceneprint.places import PosePrior, QueryFrame
 from sceneprint.store import Store
 from sceneprint.store.maps import frames_of
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats, Geometry
-from sceneprint_client.api import Answer, AnswerStatus, Counts, FrameName, OfMap, Query
+from sceneprint_client.api import Answer, AnswerStatus, Counts, FrameName, Match, OfMap, Query
 from sceneprint_client.api.query import Cause
 
 
 @dataclass
 class _Clock:
-    """Milliseconds of each stage, one after the other."""
+    """Milliseconds of each stage; a stage that is resumed adds to its time."""
 
     spent: dict[str, float]
     _since: float = field(default_factory=time.perf_counter)
 
     def stage(self, name: str) -> None:
         now = time.perf_counter()
-        self.spent[name] = round(1e3 * (now - self._since), 2)
+        self.spent[name] = round(self.spent.get(name, 0.0) + 1e3 * (now - self._since), 2)
         self._since = now
 
 
@@ -92,8 +93,8 @@ class _Attempt:
     searched : its R
     selection : C, or None where it was not asked for
     among, scales : distances within R, and what C was selected by
-    chosen : positions in R of the candidates
-    tried : what validation made of them
+    chosen : positions in R of the candidates: C, or the first of R
+    tried : what came of those candidates that the pose rests on, whatever `k` is
     rows : of the frames that are shown, by number
     matches : those that were tried and are still there
     rivals : the same of frames beyond `chosen`, which show another place than the one found
@@ -228,7 +229,7 @@ def _searched(
         return attempt
     tried = validated(
         store, attempt.searched, attempt.tried.chosen, asked.geometry, query, deadline, p,
-        asked.up, known,
+        asked.up, known, guided=False,
     )  # fmt: skip
     if tried.late:
         return attempt
@@ -247,14 +248,17 @@ def _attempt(
     for place in places:
         if place.view.damaged:
             resign_frames(store, place.row, sorted(place.view.damaged), place.row.model_id)
-    ranking, wanted = searched.ranking, wanted_of(query)
+    ranking = searched.ranking
     clock.stage("retrieve")
-    among, selection, scales = _selection(searched, query, model, wanted)
+    for_pose = (query.candidates or CANDIDATES) if "validate" in query.stages else query.k
+    for_list = for_pose if query.candidates else max(for_pose, query.k)
+    among, scales, selections = _selections(searched, query, model, (for_list, for_pose))
     clock.stage("diversify")
-    chosen = range(min(wanted, len(ranking))) if selection is None else selection.indices.tolist()
-    first = chosen if prior is None else nearest_first(
-        store, ranking, chosen, prior, model.answer.map
-    )  # fmt: skip
+    selection, smaller = selections
+    chosen = range(min(for_list, len(ranking))) if selection is None else selection.indices.tolist()
+    first = chosen[:for_pose] if smaller is None else smaller.indices.tolist()
+    if prior is not None:
+        first = nearest_first(store, ranking, first, prior, model.answer.map)
     p = model.parameters.validation
     tried = validated(store, searched, first, asked.geometry, query, deadline, p, asked.up)
     clock.stage("validate")
@@ -269,13 +273,13 @@ def _answer(
     store: Store, places: Sequence[SearchedMap], model: Model, last: _Attempt,
     estimate: PoseEstimate | None, query: Query, deadline: Deadline, clock: _Clock, earlier: int,
 ) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
-    """What is told of the frame that was asked for."""
-    asked, searched, tried, p = last.asked, last.searched, last.tried, model.parameters.validation
-    ranking = searched.ranking
+    """Return the answer to the frame that was asked for."""
+    asked, searched, p = last.asked, last.searched, model.parameters.validation
+    ranking, tried = searched.ranking, _all_tried(store, last, query, deadline, p)
+    clock.stage("validate")
     # what was rejected elsewhere is no match of anyone's
     rivals_left = [one for one in last.rivals if one.validation.status != "rejected"]
-    matches = [*last.matches, *rivals_left]
-    chosen = [*last.chosen, *(ranking.indices.tolist().index(one.index) for one in rivals_left)]
+    matches = [*(one for one in tried.matches if one.index in last.rows), *rivals_left]
     names = {place.row.number: place.row.name for place in places}
     own = query_sensor(_name(asked), asked.kind, list(names.values()))
     found = Candidates(
@@ -294,18 +298,18 @@ def _answer(
     clock.spent["total"] = round(sum(clock.spent.values()), 2)
     counts = [_counts(searched, i, found, tried, matches) for i in range(len(places))]
     total = _sum(counts)
-    posed = any(
-        last.rows[one.index].pose is not None
-        for one in matches
-        if one.validation.status == "accepted"
+    deciding = [*last.matches, *rivals_left]
+    accepted = [last.rows[m.index] for m in deciding if m.validation.status == "accepted"]
+    posed = any(row.pose is not None for row in accepted)
+    outcome = answer_status(
+        query, estimate, last.tried, deciding, total, asked.geometry, p, posed=posed
     )
-    outcome = answer_status(query, estimate, tried, matches, total, asked.geometry, p, posed=posed)
     told = Answer(
         query_id=uuid.uuid4().hex,
         status=outcome.status,
         reason=outcome.reason,
         cause=outcome.cause,
-        matches=match_records(found, chosen, matches),
+        matches=_listed_matches(found, last, tried, rivals_left, query.k),
         location=location_record(found, estimate) if outcome.status == "found" else None,
         alternatives=alternative_records(found, estimate) if outcome.status == "ambiguous" else [],
         seed=query.seed,
@@ -326,17 +330,51 @@ def _answer(
     return told, tuple(ranking.indices.tolist())
 
 
-def _selection(
-    searched: Searched, query: Query, model: Model, wanted: int
-) -> tuple[Ints64 | None, Selection | None, DiversityParameters | None]:
-    """C, with the distances within R and the scales that it was selected by; Sec. III-D."""
+def _listed_matches(
+    found: Candidates, last: _Attempt, tried: Validated, elsewhere: Sequence[PairMatch], k: int
+) -> list[Match]:
+    """Return the first `k` accepted candidates and the others, and those elsewhere, as JSON."""
+    shown = listed([one for one in tried.matches if one.index in last.rows], k)
+    hidden = {one.index for one in tried.matches} - {one.index for one in shown}
+    order = found.ranking.indices.tolist()
+    chosen = [position for position in last.chosen if order[position] not in hidden]
+    beyond = [order.index(one.index) for one in elsewhere]
+    return match_records(found, [*chosen, *beyond], [*shown, *elsewhere])
+
+
+def _all_tried(
+    store: Store, last: _Attempt, query: Query, deadline: Deadline, p: ValidationParameters
+) -> Validated:
+    """Return what came of all candidates, after validating more where `k` asks for more matches."""
+    tried = last.tried
+    accepted = sum(one.validation.status == "accepted" for one in tried.matches)
+    rest = [position for position in last.chosen if position not in tried.chosen]
+    if query.k > VERDICT_MATCHES and (rest or accepted == VERDICT_MATCHES) and not tried.late:
+        known = {one.index: one.validation for one in tried.matches}
+        return validated(
+            store, last.searched, [*tried.chosen, *rest], last.asked.geometry, query, deadline, p,
+            last.asked.up, known, k=query.k, retry=False,
+        )  # fmt: skip
+    return replace(tried, chosen=last.chosen)
+
+
+def _selections(
+    searched: Searched, query: Query, model: Model, sizes: Sequence[int]
+) -> tuple[Ints64 | None, DiversityParameters | None, list[Selection | None]]:
+    """Return distances within R, the scales, and C of each size; Sec. III-D.
+
+    A smaller C is a part of a larger one, as the selection is greedy.
+    """
     if "diversify" not in query.stages:
-        return None, None, None
+        return None, None, [None for _ in sizes]
     scales = None
     if query.diversity is not None:
         scales = DiversityParameters(query.diversity.sigma, query.diversity.omega)
     among = pairwise_distances(searched.signatures(), model.metric)
-    return among, diversify(searched.ranking.distances, among, wanted, scales), scales
+    of_size = {
+        size: diversify(searched.ranking.distances, among, size, scales) for size in set(sizes)
+    }
+    return among, scales, [of_size[size] for size in sizes]
 
 
 def _per_map(places: Sequence[SearchedMap], counts: Sequence[Counts]) -> dict[str, OfMap]:

@@ -96,6 +96,18 @@ class Candidates:
         return transform(T_parent_query @ inverse(T_base_query), parent, name)
 
 
+def listed(matches: Sequence[PairMatch], k: int) -> list[PairMatch]:
+    """Return matches without those accepted beyond the first `k`.
+
+    Parameters
+    ----------
+    matches : in the order of `associate`, so that the first accepted ones are those to believe most
+    k : how many accepted ones to list
+    """
+    accepted = [one.index for one in matches if one.validation.status == "accepted"]
+    return [one for one in matches if one.index not in accepted[k:]]
+
+
 def match_records(
     found: Candidates, chosen: Sequence[int], matches: Sequence[PairMatch]
 ) -> list[ToldMatch]:
@@ -489,6 +501,14 @@ def _lost(
             "with more `candidates`, or with `explain` to see which candidate it resembles"
         )
     status = {match.index: match.validation for match in tried.matches}.get(row.number)
+    if status is not None and row.number not in [
+        match.index for match in listed(tried.matches, asking.query.k)
+    ]:
+        told = figures(validation_record(status))
+        return (
+            "turn",
+            f"more than `k` matches are accepted, and others are listed before it; {told}",
+        )
     if status is not None and status.status == "accepted":
         return None, f"it is a match, {figures(validation_record(status))}"
     if status is not None:

@@ -29,7 +29,7 @@ from sceneprint.geometry.validation.map_verification import (
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.localization import PosedFrame, PoseEstimate, localize, rival_rows
 from sceneprint.models import Model
-from sceneprint.pipeline import PairMatch, associate
+from sceneprint.pipeline import VERDICT_MATCHES, PairMatch, associate
 from sceneprint.places import LocalizationParameters, PosePrior, QueryFrame
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import has_parent_frame
@@ -45,7 +45,7 @@ from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Prior, Query, ValidationOptions
 from sceneprint_client.api.query import FARTHEST_PRIOR, LEAST_DEVIATION, MOST_DEVIATION
 
-#: Candidates that are selected and validated, unless more matches are wanted: more cost time.
+#: Candidates that are validated for the pose of a query, unless it gives a number: more cost time.
 CANDIDATES = 10
 #: Limits that take the place of another one where nothing is known of free space, or where the
 #: frames share little: a limit that the caller sets holds in each of its places.
@@ -82,13 +82,6 @@ class Validated:
     geometries: dict[int, Geometry] = field(default_factory=dict)
 
 
-def wanted_of(query: Query) -> int:
-    """How many candidates a query asks for."""
-    if "validate" not in query.stages:
-        return query.k
-    return query.candidates or max(CANDIDATES, query.k)
-
-
 def thresholds(
     given: ValidationOptions | None, p: ValidationParameters
 ) -> tuple[ValidationParameters, Mode]:
@@ -107,9 +100,10 @@ def thresholds(
 def validated(
     store: Store, searched: Searched, chosen: Sequence[int], geometry: Geometry | None,
     query: Query, deadline: Deadline, p: ValidationParameters, up: Floats | None = None,
-    known: Mapping[int, PairValidation] | None = None, retry: bool = True,
+    known: Mapping[int, PairValidation] | None = None, *, k: int = VERDICT_MATCHES,
+    guided: bool = True, retry: bool = True,
 ) -> Validated:  # fmt: skip
-    """Try candidates in the order of R.
+    """Validate candidates in their order until `k` are accepted.
 
     Parameters
     ----------
@@ -120,8 +114,9 @@ def validated(
     query, deadline : see there
     p : of the model
     up : (3,) in the query's sensor, where it is known
-    known : validations of an earlier pass, by number; every other candidate is searched now.
-        None: candidates may be guided
+    known : validations of an earlier pass, by number
+    k : accepted matches after which to stop
+    guided : whether the transforms of later candidates may follow from earlier matches
     retry : see `associate`
     """
     if geometry is None:
@@ -130,7 +125,7 @@ def validated(
     with store.database.read() as connection:
         blobs = geometry_blobs(connection, ranking.indices[list(chosen)].tolist(), model_id)
         ups = {} if up is None else known_ups(connection, ranking.indices.tolist())
-        viewpoints = [] if known is not None else viewpoints_among(connection, list(blobs))
+        viewpoints = viewpoints_among(connection, list(blobs)) if guided else []
     posed = {one.number: (parent_key(one), one.pose) for one in viewpoints}
     unreadable: dict[int, str] = {}
     opened: dict[int, Geometry] = {}
@@ -148,7 +143,7 @@ def validated(
         return geometry_of
 
     matches = associate(
-        geometry, ranking, chosen, open_geometry, query.k, query.seed,
+        geometry, ranking, chosen, open_geometry, k, query.seed,
         *thresholds(query.validation, p), deadline.allows, up=up, up_of=ups.get, pose_of=posed.get,
         known=known, retry=retry,
     )  # fmt: skip
@@ -200,7 +195,7 @@ def validate_elsewhere(
     chosen = np.flatnonzero(np.isin(searched.ranking.indices, numbers)).tolist()
     return validated(
         store, searched, chosen, geometry, query, deadline, model.parameters.validation, up,
-        known={}, retry=False,
+        guided=False, retry=False,
     )  # fmt: skip
 
 

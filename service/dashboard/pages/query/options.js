@@ -18,7 +18,7 @@ export const GROUPS = {
 /** @type {Field[]} */
 export const FIELDS = [
   { name: "k", group: "search", label: "Matches", kind: "range", min: 1, max: 50, step: 1, default: 5,
-    hint: "Validation stops once this many are accepted." },
+    hint: "Accepted matches to list. The pose does not depend on it: it rests on the first five that are accepted." },
   { name: "candidates", group: "search", label: "Candidates", kind: "range", min: 1, max: 200, step: 1, default: 10,
     hint: "Number of ranked frames to select and validate, about 20 ms each. Default: 10, or the number of matches if larger." },
   { name: "stages", group: "search", label: "Stages", kind: "choice", default: "retrieve,diversify,validate",

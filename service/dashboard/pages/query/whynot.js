@@ -15,7 +15,7 @@ const LOST = {
   ranking: ["Lost in the ranking", "Other signatures are nearer.", null],
   selection: ["Lost in the selection", "Other ranked frames were selected as candidates.",
     (answer) => [{ candidates: Math.min(200, Math.max(2 * answer.counts.selected, answer.counts.ranked)) }, "Query with the whole ranking as candidates"]],
-  turn: ["It was not tried", "Enough matches were accepted before it.", (answer) => [{ k: Math.min(50, answer.counts.accepted + 5) }, "Query for more matches"]],
+  turn: ["Others come before it", "Enough matches were accepted before it.", (answer) => [{ k: Math.min(50, answer.counts.accepted + 5) }, "Query for more matches"]],
   deadline: ["Lost to the deadline", "The deadline passed before it was tried.", () => [{ deadline_ms: null }, "Query without a deadline"]],
   validation: ["Lost at validation", "It does not fit the query.", null],
 };
