@@ -130,7 +130,7 @@ def _jumping(data: Path, offset: Path, library: Path) -> Iterator[tuple[str, Par
         for part in (serving, working):
             part.begin()
         with Client(url) as client:
-            wait_until(client.healthy, "the service answers")
+            wait_until(lambda: is_idle(client), "the service is ready")  # its code is loaded
         yield url, working
     finally:
         for part in (serving, working):

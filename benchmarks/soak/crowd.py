@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.soak.crowd_audit import CrowdFigures, K, check
+from benchmarks.soak.kills import is_idle, wait_until
 from benchmarks.soak.load import MAP, MODEL, Shot, free_port, service, workers
 from benchmarks.soak.writers import read_shots, write_shots
 from sceneprint.errors import SceneprintError, UnknownFrame
@@ -88,11 +89,7 @@ def crowd(
 
 def _wait_for(url: str) -> None:
     with Client(url) as client:
-        end = time.monotonic() + 120
-        while not client.healthy():
-            if time.monotonic() > end:
-                raise AssertionError("the service does not start")
-            time.sleep(0.1)
+        wait_until(lambda: is_idle(client), "the service is ready")
 
 
 def _ended(process: SpawnProcess) -> int | None:
