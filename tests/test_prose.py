@@ -30,6 +30,7 @@ EDITED = [
     "docs/api.md",
     "docs/clouds.md",
     "docs/recordings.md",
+    "docs/exports.md",
     "docs/tracker.md",
     "docs/offline.md",
     "docs/associations.md",

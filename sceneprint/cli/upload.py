@@ -334,8 +334,9 @@ def add_upload(commands: Any) -> None:
         description="Upload every frame of the given files and folders (7-Scenes, TUM RGB-D or "
         "plain depth images, with an intrinsics.json beside them or in a folder above; or point "
         "clouds), and wait until they are signed. Of a recording of ROS (MCAP, rosbag2, ROS 1 "
-        "bag) keyframes are uploaded. A zip or tar archive is sent whole and unpacked by the "
-        "service. A frame that the map already has is not stored twice.",
+        "bag) keyframes are uploaded. RTAB-Map databases, E57 files, and exports of Polycam, "
+        "Record3D and nerfstudio are taken with their poses. A zip or tar archive is sent whole "
+        "and unpacked by the service. A frame that the map already has is not stored twice.",
     )
     command.add_argument(
         "map", metavar="MAP", help="map to upload to; created if it does not exist"

@@ -273,7 +273,8 @@ def find_sequences(
     one depth image or cloud, and folders of these. Clouds in a folder seq-01 that such a split
     file names are a sequence of a 7-Scenes scene as well. A sequence is named by its place below
     the path, or by its own folder where that is the path. A recording of ROS (.mcap, .db3, .bag,
-    a rosbag2 folder) is one sequence, named after it; so is each of a folder of recordings.
+    a rosbag2 folder) is one sequence, named after it; so is each of a folder of recordings. Files
+    and folders of other systems (RTAB-Map, E57, Polycam, Record3D, nerfstudio) are sequences too.
 
     Parameters
     ----------
