@@ -1,49 +1,58 @@
 """A surface as a sensor at a pose sees it: what is nearer hides what is behind; holes stay missing.
 
-surface, pose  --Renderer.view-->  depth (H, W) of a camera, or points (K, 3) of a scanner
+    surface, pose  --Renderer.view-->  depth (H, W) of a camera, or points (K, 3) of a scanner
+
+A scanner looks through the six faces of a cube about it.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numpy.typing import NDArray
 
-from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.rigid import inverse
-from sceneprint.geometry.surface.camera import project
-from sceneprint.geometry.surface.range_image import directions
 from sceneprint.geometry.views.parameters import ViewParameters
-from sceneprint.types import Floats, Floats32, Intrinsics, ReferenceSurface, camera_of
+from sceneprint.geometry.views.raster import draw_discs, draw_triangles, pinhole
+from sceneprint.geometry.views.samples import blocks_of, on_surface, thinned
+from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, ReferenceSurface
+
+#: Radius of the disc that stands for a point, as a share of how far points are apart.
+_OVERLAP = 0.7
+#: And of the disc that stands for a point on no plane, as of a wire or a leaf.
+_LONELY = 0.3
+#: Neighbours that a normal is of are in cells so many times as wide as points are apart.
+_NEIGHBOURHOOD = 3.0
+#: Side of a block, as a share of the sensor's range.
+_BLOCK = 1.0 / 20.0
+#: Of a view, the side of the surface that fewer pixels show than this share is not shown.
+LEAST_SIDE = 0.3
 
 
-@kernel
-def _splat(points: Floats32, T: Floats, camera: Floats, size: float, image: Floats32) -> None:
-    """Draw each point as a square as wide as `size` at its depth; the nearest stays."""
-    height, width = image.shape
-    closed = camera[0] == 1
-    focal = 1.0 / camera[2] if closed else camera[2]
-    for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        column, line, depth = project(
-            camera,
-            T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
-            T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
-            T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
-        )
-        if not camera[1] < depth < camera[7]:
-            continue
-        half = min(size * focal / depth / 2, 8.0)
-        if line + half < 0 or line - half >= height:
-            continue
-        if not closed and (column + half < 0 or column - half >= width):
-            continue
-        for v in range(max(int(line - half), 0), min(int(line + half) + 1, height)):
-            for u in range(int(np.floor(column - half)), int(np.floor(column + half)) + 1):
-                if closed:
-                    u = u % width
-                elif u < 0 or u >= width:
-                    continue
-                if image[v, u] == 0 or depth < image[v, u]:
-                    image[v, u] = depth
+def cube_faces(size: int) -> tuple[Intrinsics, Floats]:
+    """Return the camera of a face of a cube about the eye, and R_sensor_face (6, 3, 3).
+
+    Parameters
+    ----------
+    size : pixels along an edge
+    """
+    camera = Intrinsics(size, size, size / 2, size / 2, (size - 1) / 2, (size - 1) / 2)
+    turns = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            ahead, right = np.zeros(3), np.zeros(3)
+            ahead[axis], right[(axis + 1) % 3] = sign, 1.0
+            turns.append(np.stack([right, np.cross(ahead, right), ahead], axis=1))
+    return camera, np.array(turns)
+
+
+def rays_of(camera: Intrinsics) -> Floats32:
+    """Return (H, W, 3) rays through the centres of the pixels, of depth 1."""
+    rays = np.ones((camera.height, camera.width, 3), np.float32)
+    rays[..., 0] = (np.arange(camera.width) - camera.cx) / camera.fx
+    rays[..., 1] = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
+    return rays
 
 
 class Renderer:
@@ -56,11 +65,33 @@ class Renderer:
     """
 
     def __init__(self, surface: ReferenceSurface, parameters: ViewParameters) -> None:
-        self._p = parameters
+        self._p = p = parameters
         points = np.ascontiguousarray(surface.points, np.float32)
-        if surface.triangles is not None:
-            points = points[surface.triangles].mean(axis=1, dtype=np.float32)
-        self._points = points
+        side = p.farthest * _BLOCK
+        if surface.triangles is None:
+            points = thinned(points, p.grain)
+            points, normals, spacing = on_surface(points, _NEIGHBOURHOOD * p.grain)
+            share = np.where((normals != 0).any(axis=1), _OVERLAP, _LONELY)
+            radii = (share * np.maximum(spacing, p.grain)).astype(np.float32)
+            order, self._blocks = blocks_of(points, side, radii)
+            self._points, self._normals, self._radii = points[order], normals[order], radii[order]
+            self._triangles: Ints32 | None = None
+        else:
+            triangles = np.ascontiguousarray(surface.triangles, np.int32)
+            corners = points[triangles]
+            middles = corners.mean(axis=1, dtype=np.float32)
+            extents = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
+            order, self._blocks = blocks_of(middles, side, extents.astype(np.float32))
+            self._points, self._triangles = points, triangles[order]
+        if p.camera is None:
+            self._camera, self._faces = cube_faces(max(math.ceil(2.0 / p.step), 8))
+        else:
+            self._camera, self._faces = p.camera, np.eye(3)[None]
+        self._rays = rays_of(self._camera)
+        # of a scanner: how far along each ray, and which of them look where it does
+        self._lengths = np.linalg.norm(self._rays, axis=2)
+        up = np.einsum("hwi,fi->fhw", self._rays, self._faces[:, 2]) / self._lengths
+        self._wanted = (p.camera is not None) | (np.abs(up) <= math.sin(p.elevation))
 
     def view(self, T_map_sensor: Floats) -> Floats32:
         """Return what the sensor sees at a pose.
@@ -74,12 +105,38 @@ class Renderer:
         depth : (H, W) float32, metres along the optical axis, 0 where missing; of a camera
         points : (K, 3) float32, metres, in the sensor's axes; of a scanner
         """
-        p = self._p
-        image = np.zeros((p.camera.height, p.camera.width), np.float32)
-        camera = np.append(camera_of(p.camera, p.nearest), p.farthest)
-        _splat(self._points, inverse(T_map_sensor), camera, 0.05, image)
-        if isinstance(p.camera, Intrinsics):
-            return image
-        seen = image > 0
-        points: Floats32 = (directions(p.camera)[seen] * image[seen][:, None]).astype(np.float32)
-        return points
+        drawn = [self._face(T_map_sensor, R) for R in self._faces]
+        depth = np.stack([one for one, _ in drawn])
+        back = np.stack([one for _, one in drawn])
+        ranges = depth * self._lengths if self._p.camera is None else depth
+        seen = (ranges >= self._p.nearest) & (ranges <= self._p.farthest) & self._wanted
+        share = float(back[seen].mean()) if seen.any() else 0.0
+        if share < LEAST_SIDE:
+            seen &= ~back
+        elif share > 1.0 - LEAST_SIDE:  # the mesh is inside out
+            seen &= back
+        if self._p.camera is not None:
+            shown: Floats32 = np.where(seen[0], depth[0], np.float32(0.0))
+            return shown
+        points = [
+            (self._rays[mask] * one[mask][:, None]) @ R.T.astype(np.float32)
+            for one, mask, R in zip(depth, seen, self._faces, strict=True)
+        ]
+        return np.concatenate(points)
+
+    def _face(self, T_map_sensor: Floats, R: Floats) -> tuple[Floats32, NDArray[np.bool_]]:
+        """Depth of one image, inf where nothing is seen, and what is seen from behind."""
+        turn = np.eye(4)
+        turn[:3, :3] = R
+        T, camera = inverse(T_map_sensor @ turn), pinhole(self._camera)
+        depth = np.full((self._camera.height, self._camera.width), np.inf, np.float32)
+        starts, ends = self._blocks.in_view(T, camera, depth.shape, self._p.farthest)
+        if self._triangles is None:
+            item = np.full(depth.shape, -1, np.int32)
+            draw_discs(
+                self._points, self._normals, self._radii, starts, ends, T, camera, depth, item
+            )
+            return depth, np.zeros(depth.shape, np.bool_)
+        back = np.zeros(depth.shape, np.uint8)
+        draw_triangles(self._points, self._triangles, starts, ends, T, camera, depth, back)
+        return depth, back.astype(np.bool_)

@@ -1,0 +1,213 @@
+"""Real frames located on a map that is one surface: `python -m benchmarks.reference_maps hall`.
+
+surface  --choose_views, Renderer-->  views, signed  <--  real frames, each answered
+
+`hall`: scans 0-99 joined into one cloud, scans 100-174 located in it. `redkitchen`: frames 0-599
+fused to one mesh, frames 650-999 located in it. `rooms` and `halls`: synthetic meshes, to choose
+numbers on. With --frames the map is the real frames themselves, for comparison.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from sceneprint.errors import UselessFrame
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.fusion import FusionParameters, fuse
+from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.views import Renderer, ViewParameters, choose_views, view_parameters
+from sceneprint.lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
+from sceneprint.lab.evaluation.protocol import JudgedAnswer
+from sceneprint.lab.evaluation.sites import signed
+from sceneprint.lab.synth.dataset import (
+    premises_and_rng,
+    room_and_rng,
+    synthesise_room,
+    synthesise_survey,
+)
+from sceneprint.lab.synth.mesh import SyntheticMesh
+from sceneprint.pipeline import Signer, open_signer, prepare
+from sceneprint.types import AnyFrame, Cloud, DepthFrame, Intrinsics, ReferenceSurface
+
+#: A pose is right within so many metres and degrees.
+RIGHT = {"depth": (0.25, 5.0), "lidar": (0.5, 5.0)}
+#: Side of the voxels that a joined cloud is thinned to, metres.
+VOXEL_M = 0.1
+
+
+@dataclass(frozen=True)
+class Place:
+    """A surface, the frames it was made of, and frames that are to be located in it."""
+
+    preset: str
+    surface: ReferenceSurface
+    frames: Sequence[AnyFrame]
+    queries: Sequence[AnyFrame]
+
+
+def hall(recordings: Path) -> Place:
+    """Return the hall: scans 0-99 as a cloud, thinned to a point a voxel."""
+    references = find_sequences(recordings / "lidar" / "hall")[0].frames
+    scans = {int(one.path.stem.split("-")[-1]): one.read() for one in references}
+    frames = [one for number, one in scans.items() if number < 100]
+    points = np.concatenate(
+        [moved(one.pose, one.points) for one in frames if isinstance(one, Cloud)]  # type: ignore[arg-type]
+    )
+    cells = np.floor(points / VOXEL_M).astype(np.int64)
+    _, index, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(index, points[:, k]) for k in range(3)], axis=1)
+    surface = ReferenceSurface(
+        (sums / counts[:, None]).astype(np.float32), None, np.zeros(3), np.array([0.0, 0.0, 1.0])
+    )
+    return Place("lidar", surface, frames, [one for number, one in scans.items() if number >= 100])
+
+
+def redkitchen(recordings: Path) -> Place:
+    """Return the kitchen: every fifth of frames 0-599 as a mesh."""
+    references = find_sequences(recordings / "7scenes" / "redkitchen")[0].frames
+    frames = [one.read_depth() for one in references[:600:5]]
+    fused, _ = fuse(frames, FusionParameters(voxel_m=0.02, most_blocks=400_000, farthest_m=4.0))
+    surface = ReferenceSurface(
+        fused.points.astype(np.float32), fused.triangles, np.zeros(3), np.array([0.0, -1.0, 0.0])
+    )
+    return Place("depth", surface, frames, [one.read_depth() for one in references[650:1000:10]])
+
+
+def rooms(number: int) -> Place:
+    """Return a synthetic room."""
+    room, _ = room_and_rng(53, number)
+    queries = synthesise_room(53, number, 20).frames
+    frames = synthesise_room(53, number, 80, along_path=True).frames
+    return Place("depth", _surface(room.mesh), frames, queries)
+
+
+def halls(number: int) -> Place:
+    """Return a synthetic hall, storey or block."""
+    premises, _ = premises_and_rng(53, number)
+    walked = synthesise_survey(53, number, 60, along_path=True).clouds
+    queries = synthesise_survey(53, number, 20).clouds
+    return Place("lidar", _surface(premises.mesh), walked, queries)
+
+
+def _surface(mesh: SyntheticMesh) -> ReferenceSurface:
+    return ReferenceSurface(
+        mesh.vertices.astype(np.float32), mesh.faces, np.zeros(3), np.array([0.0, 0.0, 1.0])
+    )
+
+
+def views(place: Place, p: ViewParameters) -> tuple[list[AnyFrame], str]:
+    """Return the views of a surface as frames, and how long choosing and rendering took."""
+    began = time.process_time()
+    plan = choose_views(place.surface, p)
+    chosen = time.process_time() - began
+    renderer = Renderer(place.surface, p)
+    frames: list[AnyFrame] = []
+    for number, pose in enumerate(plan.poses):
+        seen, name = renderer.view(pose), f"view-{number:06d}"
+        frames.append(
+            DepthFrame(seen, p.camera, name, pose)
+            if isinstance(p.camera, Intrinsics)
+            else Cloud(seen, name=name, pose=pose)
+        )
+    spent = time.process_time() - began - chosen
+    floor = "none" if plan.floor is None else f"at {plan.floor:.2f} m"
+    return frames, (
+        f"{len(plan.poses)} of {plan.candidates} views, {plan.covered:.3f} covered, floor {floor}; "
+        f"{chosen:.1f} s choosing, {spent:.1f} s rendering"
+    )
+
+
+def answers(place: Place, frames: Sequence[AnyFrame], signer: Signer) -> list[JudgedAnswer]:
+    """Answer all queries on a map of some frames, as a service does."""
+    model = signer.model
+    _, database, of_map = signed(frames, "map", signer, 0)
+    _, asked, of_queries = signed(place.queries, "map", signer, len(database))
+    geometries = [*of_map, *of_queries]
+    judge = Judge(
+        geometries.__getitem__, "full", 0, model.parameters.validation, database=database,
+        answer=model.answer, unrelated_distance=model.unrelated_distance,
+    )  # fmt: skip
+    ranked = rank(
+        np.stack([q.signature for q in asked]), np.stack([d.signature for d in database]),
+        np.ones((len(asked), len(database)), np.bool_), metric=model.metric,
+    )  # fmt: skip
+    rows, found = np.arange(len(database)), []
+    for query, one in zip(asked, ranked, strict=True):
+        among = tuple(Candidate(j, j, "map", database[j].pose, 0.0, 0.0) for j in one.selection)
+        task = QueryTask(
+            query.number, "map", query.pose, [], one.selection, among, rows, one.retrieved
+        )
+        found.append(answer_of(judge, task))
+    return found + [JudgedAnswer()] * (len(place.queries) - len(asked))
+
+
+def signing_seconds(frames: Sequence[AnyFrame], signer: Signer) -> float:
+    """Return processor seconds to sign one frame."""
+    began = time.process_time()
+    for frame in frames:
+        try:
+            prepare(frame, signer)
+        except UselessFrame:
+            continue
+    return (time.process_time() - began) / len(frames)
+
+
+def report(name: str, place: Place, signer: Signer, options: argparse.Namespace) -> Counter[str]:
+    """Locate all queries of a place, print what came of it, and return the counts."""
+    if options.frames:
+        frames, text = list(place.frames), f"{len(place.frames)} real frames"
+    else:
+        p = view_parameters(signer.model.parameters, heights=options.height)
+        if options.spacing:
+            p = replace(p, spacing=options.spacing)
+        renders = views(place, p)
+        renders = views(place, p)  # again: kernels are compiled now
+        frames, text = renders
+        real, rendered = (signing_seconds(some, signer) for some in (place.frames, frames))
+        text += f"; signing {1e3 * rendered:.0f} ms each, a real frame {1e3 * real:.0f} ms"
+    counts: Counter[str] = Counter()
+    metres = []
+    for one in answers(place, frames, signer):
+        right = one.error.within(*RIGHT[place.preset])
+        counts[one.status if one.status != "found" else "right" if right else "wrong"] += 1
+        if one.status == "found" and right:
+            metres.append(one.error.metres)
+    print(f"{name}: {len(place.queries)} queries: {dict(counts)}, median {np.median(metres):.3f} m")
+    print(f"  {text}", flush=True)
+    return counts
+
+
+def main() -> None:
+    """Measure one place, or several synthetic ones."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.reference_maps", description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("place", choices=("hall", "redkitchen", "rooms", "halls"))
+    parser.add_argument("--recordings", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--count", type=int, default=6, help="synthetic places (default: 6)")
+    parser.add_argument("--frames", action="store_true", help="the map is the real frames")
+    parser.add_argument("--height", type=float, nargs="+", help="of the sensor above the floor")
+    parser.add_argument("--spacing", type=float, help="between viewpoints, metres")
+    options = parser.parse_args()
+    signer = open_signer("lidar" if options.place in ("hall", "halls") else "depth")
+    if options.place in ("hall", "redkitchen"):
+        make = hall if options.place == "hall" else redkitchen
+        report(options.place, make(options.recordings), signer, options)
+        return
+    total: Counter[str] = Counter()
+    for number in range(options.count):
+        place = rooms(number) if options.place == "rooms" else halls(number)
+        total += report(f"{options.place} {number}", place, signer, options)
+    print(f"all: {dict(total)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+"""Where a sensor may be: heights above the floors of a surface.
+
+    surfels  --find_floors-->  Floors
+    Floors, parameters  --candidate_places-->  places (C, 3)
+
+All in level axes, z upwards. A floor is what is level over a few metres, the lowest that there is,
+and again whatever is level a storey above that. Whether a place is free is seen from there: see
+`lookout.py`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.geometry.views.parameters import ViewParameters
+from sceneprint.geometry.views.samples import Surfels
+from sceneprint.types import Floats, Ints64
+
+#: Cosine between up and the normal of what is level.
+_LEVEL = 0.9
+#: Surfaces that differ less in height are one floor, metres.
+_STEP = 0.15
+#: Least height of a storey, metres.
+_STOREY = 2.0
+#: A floor fills at least this share of the cells around a column, the lowest and one above.
+_LEAST_FLOOR, _LEAST_STOREY = 0.12, 0.3
+#: Columns are so many times as wide as viewpoints are apart; columns and heights, at most.
+_COLUMN, _MOST_BINS = 2.0, 8_000_000
+_MOST_STOREYS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Floors:
+    """Heights of floors in a grid of columns.
+
+    Parameters
+    ----------
+    low : (2,) corner of the grid, metres
+    side : of a column, metres
+    heights : (S, nx, ny) metres, by storey; NaN where there is none
+    level : (L, 3) points of level surfaces
+    """
+
+    low: Floats
+    side: float
+    heights: Floats
+    level: Floats
+
+    @property
+    def lowest(self) -> float | None:
+        """Return the height of the lowest floor, its median; None where there is no floor."""
+        known = self.heights[0][np.isfinite(self.heights[0])]
+        return float(np.median(known)) if len(known) else None
+
+
+def find_floors(pieces: Surfels, side: float) -> Floors:
+    """Find the floors of a surface.
+
+    Parameters
+    ----------
+    pieces : in level axes
+    side : of a column, metres; it grows where there were too many
+    """
+    # either side up: a mesh may be inside out, and no place above a ceiling is free
+    level = pieces.points[np.abs(pieces.normals[:, 2]) > _LEVEL].astype(np.float64)
+    low, high = pieces.points.min(axis=0), pieces.points.max(axis=0)
+    step = max(_STEP, float(high[2] - low[2]) / 2000.0)
+    while True:
+        shape = np.floor((high - low) / (side, side, step)).astype(np.int64) + 1
+        if math.prod(shape.tolist()) <= _MOST_BINS:
+            break
+        side *= 1.3
+    bins = np.floor((level - low) / (side, side, step)).astype(np.int64)
+    counts, sums = np.zeros(shape), np.zeros(shape)
+    np.add.at(counts, tuple(bins.T), 1.0)
+    np.add.at(sums, tuple(bins.T), level[:, 2])
+    counts, sums = (_with_neighbours(one) for one in (counts, sums))
+    whole = 9.0 * (side / pieces.cell) ** 2
+    storeys, base = [], np.full(shape[:2], -np.inf)
+    centres = low[2] + (np.arange(shape[2]) + 0.5) * step
+    for storey in range(_MOST_STOREYS):
+        least = _LEAST_STOREY if storey else _LEAST_FLOOR
+        is_floor = (counts >= least * whole) & (centres > (base + _STOREY)[..., None])
+        exists = is_floor.any(axis=2)
+        if not exists.any():
+            break
+        # the fullest of the first few, so that a floor's own noise makes no second one
+        first = is_floor.argmax(axis=2)
+        near = np.abs(np.arange(shape[2]) - first[..., None]) <= 1
+        at = np.where(near, counts, -1.0).argmax(axis=2)[..., None]
+        height = np.take_along_axis(sums, at, 2)[..., 0]
+        height /= np.maximum(np.take_along_axis(counts, at, 2)[..., 0], 1.0)
+        storeys.append(np.where(exists, height, np.nan))
+        base = np.where(exists, height, np.inf)
+    heights = np.stack(storeys) if storeys else np.full((1, *shape[:2]), np.nan)
+    return Floors(low[:2].astype(np.float64), side, heights, level)
+
+
+def _with_neighbours(values: Floats) -> Floats:
+    """Sums over the 3 x 3 columns around each, and over the bins just above and below."""
+    for axis in range(3):
+        padded = np.pad(values, [(1, 1) if a == axis else (0, 0) for a in range(3)])
+        before, own, after = (padded.take(range(k, k + values.shape[axis]), axis) for k in range(3))
+        values = before + own + after
+    return values
+
+
+def candidate_places(floors: Floors, pieces: Surfels, p: ViewParameters, spacing: float) -> Floats:
+    """Return places at the heights of the sensor above the floors, (C, 3) in level axes.
+
+    The front of a mesh tells what is free, so that places beside a floor that was not seen count
+    as well; in a cloud a place needs floor below it. Without any floor, places are spread over
+    all heights of the surface.
+
+    Parameters
+    ----------
+    floors : of `find_floors`
+    pieces : of the surface, in level axes
+    p : see ViewParameters
+    spacing : between places, metres
+    """
+    low, high = pieces.points.min(axis=0), pieces.points.max(axis=0)
+    axes = [np.arange(a + spacing / 2, b, spacing) for a, b in zip(low[:2], high[:2], strict=True)]
+    if any(len(axis) == 0 for axis in axes):
+        return np.zeros((0, 3))
+    flat = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    main = floors.lowest
+    if main is None:
+        rise = np.arange(low[2] + p.clearance, high[2] - p.clearance, max(spacing, 0.5))
+        places = [np.column_stack([flat, np.full(len(flat), z)]) for z in rise]
+        return np.concatenate(places) if places else np.zeros((0, 3))
+    column = np.floor((flat - floors.low) / floors.side).astype(np.int64)
+    column = np.clip(column, 0, np.array(floors.heights.shape[1:]) - 1)
+    found = []
+    for storey, heights in enumerate(floors.heights):
+        height = heights[column[:, 0], column[:, 1]]
+        if storey == 0 and pieces.one_sided:
+            height = np.where(np.isnan(height), main, height)
+        own, height = flat[~np.isnan(height)], height[~np.isnan(height)]
+        if not pieces.one_sided:
+            held = _has_floor(floors.level, own, height, max(2.0 * pieces.cell, p.clearance))
+            own, height = own[held], height[held]
+        found += [np.column_stack([own, height + above]) for above in p.heights]
+    return np.concatenate(found)
+
+
+def _has_floor(level: Floats, places: Floats, heights: Floats, reach: float) -> NDArray[np.bool_]:
+    """Whether there is something level below a place (P, 2), about as high as its floor."""
+    low = np.minimum(level.min(axis=0), np.append(places.min(axis=0), heights.min())) - 2 * reach
+    size = np.array([reach, reach, 2 * _STEP])
+    span = np.floor((level.max(axis=0) - low) / size).astype(np.int64) + 4
+
+    def key(cells: Ints64) -> Ints64:
+        inside = ((cells >= 0) & (cells < span)).all(axis=-1)
+        numbers: Ints64 = (cells[..., 0] * span[1] + cells[..., 1]) * span[2] + cells[..., 2]
+        return np.where(inside, numbers, -1)
+
+    known = np.unique(key(np.floor((level - low) / size).astype(np.int64)))
+    at = np.floor((np.column_stack([places, heights]) - low) / size).astype(np.int64)
+    around = np.zeros(len(places), np.int64)
+    for dx in (-1, 0, 1):
+        for dy in (-1, 0, 1):
+            near = np.zeros(len(places), np.bool_)
+            for dz in (-1, 0, 1):
+                near |= np.isin(key(at + np.array([dx, dy, dz])), known)
+            around += near
+    # most of the nine: on a floor, not beside it
+    return around >= 6

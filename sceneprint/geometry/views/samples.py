@@ -1,0 +1,308 @@
+"""A surface as points with normals, one in each cell of a grid.
+
+points (N, 3)  --thinned-->  points (n, 3)
+points (n, 3)  --on_surface-->  points (n, 3), normals (n, 3), spacing (n,)
+surface, cell  --surfels-->  Surfels
+points (n, 3)  --blocks_of-->  order (n,), Blocks
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.surface.voxels import least_axis
+from sceneprint.types import Floats, Floats32, Ints32, Ints64, ReferenceSurface
+
+#: Cells along an axis, at most: three numbers of cells are one key.
+_MOST_CELLS = 1 << 20
+#: A point's neighbours lie on a plane where the least of their variances is at most this share of
+#: the middle one.
+_FLAT = 0.15
+#: Samples of the triangles of a mesh, at most.
+_MOST_SAMPLES = 4_000_000
+
+
+def cell_keys(points: Floats32, cell: float) -> tuple[Ints64, Ints64]:
+    """Return the number of each point's cell, and how many cells there are along each axis.
+
+    Parameters
+    ----------
+    points : (N, 3)
+    cell : side of a cell, metres
+
+    Returns
+    -------
+    keys : (N,), (x * shape[1] + y) * shape[2] + z; a cell on each side of the points is empty
+    shape : (3,)
+    """
+    low = points.min(axis=0).astype(np.float64) - cell
+    shape = np.floor((points.max(axis=0) - low) / cell).astype(np.int64) + 2
+    keys = np.zeros(len(points), np.int64)
+    for axis in range(3):
+        keys *= shape[axis]
+        keys += np.floor((points[:, axis] - low[axis]) / cell).astype(np.int64)
+    return keys, shape
+
+
+def fitting_cell(points: Floats32, cell: float) -> float:
+    """Return the side of a cell, so large that cells can be numbered."""
+    return max(cell, float(np.ptp(points, axis=0).max(initial=0.0)) / (_MOST_CELLS - 4))
+
+
+def thinned(points: Floats32, cell: float) -> Floats32:
+    """Return the mean of the points in each cell, (n, 3); those of a cell of one are as they were.
+
+    Parameters
+    ----------
+    points : (N, 3), one or more
+    cell : side of a cell, metres
+    """
+    keys, _ = cell_keys(points, fitting_cell(points, cell))
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
+    counts = np.diff(np.append(starts, len(keys)))
+    result = np.empty((len(starts), 3), np.float32)
+    for axis in range(3):
+        sums = np.add.reduceat(points[order, axis].astype(np.float64), starts)
+        result[:, axis] = sums / counts
+    return result
+
+
+@kernel
+def _fit(
+    points: Floats32, order: Ints64, starts: Ints64, keys: Ints64, shape: Ints64, flat: float,
+    normals: Floats32, heights: Floats, crowds: Floats,
+) -> None:  # fmt: skip
+    """The plane of each cell, by the points of it and of the cells around it: normal and height,
+    normal . x; and their mean number in a cell.
+    """
+    m, values, axis = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    for cell in range(len(keys)):
+        first, second, n, cells = np.zeros(3), np.zeros((3, 3)), 0, 0
+        at = order[starts[cell]]
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                wanted = keys[cell] + (dx * shape[1] + dy) * shape[2]
+                k = np.searchsorted(keys, wanted - 1)
+                while k < len(keys) and keys[k] <= wanted + 1:
+                    cells += 1
+                    for i in range(starts[k], starts[k + 1]):
+                        j = order[i]
+                        n += 1
+                        for a in range(3):
+                            da = points[j, a] - points[at, a]
+                            first[a] += da
+                            for b in range(a + 1):
+                                second[a, b] += da * (points[j, b] - points[at, b])
+                    k += 1
+        crowds[cell] = n / cells
+        for a in range(3):
+            for b in range(a + 1):
+                m[a, b] = second[a, b] / n - first[a] / n * first[b] / n
+                m[b, a] = m[a, b]
+        least_axis(m, values, axis)
+        low, high = min(values[0], values[1], values[2]), max(values[0], values[1], values[2])
+        middle = values[0] + values[1] + values[2] - low - high
+        if n >= 4 and low <= flat * middle:
+            for a in range(3):
+                normals[cell, a] = axis[a]
+                heights[cell] += axis[a] * (points[at, a] + first[a] / n)
+
+
+def on_surface(points: Floats32, cell: float) -> tuple[Floats32, Floats32, Floats32]:
+    """Return the points of a cloud moved onto the plane of their neighbours, and its normal.
+
+    Walls of a map are as thick as its poses drift, and a sensor would see their nearest points: it
+    is the middle that is right.
+
+    Parameters
+    ----------
+    points : (N, 3), one or more
+    cell : neighbours are the points in this cell and those around it, metres
+
+    Returns
+    -------
+    moved : (N, 3); those whose neighbours lie on no plane stay where they are
+    normals : (N, 3), towards either side; 0 where the neighbours lie on no plane
+    spacing : (N,) metres, as if those neighbours were spread evenly on a plane
+    """
+    cell = fitting_cell(points, cell)
+    keys, shape = cell_keys(points, cell)
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
+    starts = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
+    normals, crowds = np.zeros((len(starts), 3), np.float32), np.zeros(len(starts))
+    heights = np.zeros(len(starts))
+    ends = np.append(starts, len(keys))
+    _fit(points, order, ends, ordered[starts], shape, _FLAT, normals, heights, crowds)
+    of = np.searchsorted(ordered[starts], keys)
+    spacing = (cell / np.sqrt(crowds)).astype(np.float32)
+    towards = normals[of]
+    off = np.einsum("ij,ij->i", points.astype(np.float64), towards) - heights[of]
+    moved = (points - off[:, None] * towards).astype(np.float32)
+    return moved, towards, spacing[of]
+
+
+@dataclass(frozen=True, eq=False)
+class Surfels:
+    """Pieces of a surface, about one in each cell that it passes through.
+
+    Parameters
+    ----------
+    points : (S, 3) float32, metres
+    normals : (S, 3) float32, unit length; towards the front of a mesh, either side of a cloud; 0
+        where unknown
+    cell : side of a cell, metres
+    one_sided : whether normals tell the front
+    """
+
+    points: Floats32
+    normals: Floats32
+    cell: float
+    one_sided: bool
+
+
+def surfels(surface: ReferenceSurface, cell: float, most: int) -> Surfels:
+    """Return pieces of a surface, one for each cell and each side that faces another way.
+
+    Parameters
+    ----------
+    surface : see ReferenceSurface
+    cell : side of a cell, metres; it grows until there are few enough
+    most : of them
+    """
+    if surface.triangles is None:
+        points = np.ascontiguousarray(surface.points, np.float32)
+        points = thinned(points, cell / 6)
+        points, normals, _ = on_surface(points, cell / 2)
+    else:
+        points, normals = _samples(surface.points, surface.triangles, cell / 2)
+    cell = fitting_cell(points, cell)
+    while True:
+        keys, _ = cell_keys(points, cell)
+        towards = np.abs(normals).argmax(axis=1)
+        towards += 3 * (normals[np.arange(len(normals)), towards] < 0)
+        _, first = np.unique(keys * 6 + towards, return_index=True)
+        if len(first) <= most:
+            break
+        cell *= max(math.sqrt(len(first) / most), 1.05)
+    return Surfels(points[first], normals[first], cell, surface.triangles is not None)
+
+
+@kernel
+def _count_samples(points: Floats32, triangles: Ints32, step: float) -> float:
+    total = 0.0
+    for m in range(len(triangles)):
+        a, b, c = points[triangles[m, 0]], points[triangles[m, 1]], points[triangles[m, 2]]
+        one = np.ceil(np.sqrt(((b - a) ** 2).sum()) / step)
+        other = np.ceil(np.sqrt(((c - a) ** 2).sum()) / step)
+        total += max(one, 1.0) * max(other, 1.0)
+    return total
+
+
+@kernel
+def _sample(
+    points: Floats32, triangles: Ints32, step: float, places: Floats32, normals: Floats32
+) -> int:
+    """Points on a grid over each triangle, at least its centre, and its normal."""
+    n = 0
+    for m in range(len(triangles)):
+        a, b, c = points[triangles[m, 0]], points[triangles[m, 1]], points[triangles[m, 2]]
+        u, v = b - a, c - a
+        x, y, z = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+        area = np.sqrt(x * x + y * y + z * z)
+        if not area > 0:
+            continue
+        one = max(int(np.ceil(np.sqrt((u * u).sum()) / step)), 1)
+        other = max(int(np.ceil(np.sqrt((v * v).sum()) / step)), 1)
+        for i in range(one):
+            for j in range(other):
+                s, t = (i + 1 / 3) / one, (j + 1 / 3) / other
+                if s + t >= 1.0:
+                    continue
+                for k in range(3):
+                    places[n, k] = a[k] + s * u[k] + t * v[k]
+                normals[n, 0], normals[n, 1], normals[n, 2] = x / area, y / area, z / area
+                n += 1
+    return n
+
+
+def _samples(points: Floats32, triangles: Ints32, step: float) -> tuple[Floats32, Floats32]:
+    """Points on the triangles of a mesh about `step` apart, farther where they were too many."""
+    points = np.ascontiguousarray(points, np.float32)
+    triangles = np.ascontiguousarray(triangles, np.int32)
+    while (total := _count_samples(points, triangles, step)) > max(
+        _MOST_SAMPLES, 1.2 * len(triangles)
+    ):
+        step *= 1.3
+    places = np.empty((int(total), 3), np.float32)
+    normals = np.empty((int(total), 3), np.float32)
+    n = _sample(points, triangles, step, places, normals)
+    return places[:n], normals[:n]
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Things in order of where they are, so that most that are out of view are passed over.
+
+    Parameters
+    ----------
+    starts, ends : (B,) of each block among the things
+    centres : (B, 3) metres
+    radii : (B,) metres, of a ball that holds the block
+    """
+
+    starts: Ints64
+    ends: Ints64
+    centres: Floats
+    radii: Floats
+
+    def in_view(
+        self, T: Floats, camera: Floats, shape: tuple[int, ...], farthest: float
+    ) -> tuple[Ints64, Ints64]:
+        """Return where the blocks that a camera may see start and end.
+
+        Parameters
+        ----------
+        T : (4, 4) T_camera_points
+        camera : fx, fy, cx, cy
+        shape : height and width of its image
+        farthest : metres of depth
+        """
+        x, y, z = (self.centres @ T[:3, :3].T + T[:3, 3]).T
+        r = self.radii
+        seen = (z > -r) & (z - r < farthest)
+        for along, focal, middle, size in (
+            (x, camera[0], camera[2], shape[1]), (y, camera[1], camera[3], shape[0]),
+        ):  # fmt: skip
+            for slope, sign in ((-(middle + 0.5) / focal, 1.0), ((size - middle) / focal, -1.0)):
+                # outside where it is farther than its radius beyond a side of the view
+                seen &= sign * (along - slope * z) > -r * math.sqrt(1.0 + slope * slope)
+        return self.starts[seen], self.ends[seen]
+
+
+def blocks_of(points: Floats32, side: float, extents: Floats32) -> tuple[Ints64, Blocks]:
+    """Return things in order of their blocks, and the blocks.
+
+    Parameters
+    ----------
+    points : (N, 3) their middles
+    side : of a block, metres
+    extents : (N,) how far each reaches from its middle, metres
+    """
+    side = fitting_cell(points, side)
+    keys, _ = cell_keys(points, side)
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
+    starts = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
+    ends = np.append(starts[1:], len(order))
+    own = points[order].astype(np.float64)
+    low, high = np.minimum.reduceat(own, starts), np.maximum.reduceat(own, starts)
+    reach = np.maximum.reduceat(extents[order].astype(np.float64), starts)
+    radii = np.linalg.norm(high - low, axis=1) / 2 + reach
+    return order, Blocks(starts, ends, (low + high) / 2, radii)

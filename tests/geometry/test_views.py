@@ -1,0 +1,346 @@
+"""Views of a surface: what they show, where they are taken from, and what they cover."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import InvalidRequest
+from sceneprint.geometry.rigid import inverse, moved
+from sceneprint.geometry.views import Renderer, ViewParameters, choose_views, view_parameters
+from sceneprint.geometry.views.plan import level_axes
+from sceneprint.geometry.views.raster import draw_triangles, pinhole
+from sceneprint.geometry.views.render import cube_faces, rays_of
+from sceneprint.geometry.views.samples import blocks_of, on_surface, surfels, thinned
+from sceneprint.lab.synth.dataset import room_and_rng
+from sceneprint.models import read_model
+from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, ReferenceSurface
+
+CAMERA = Intrinsics(80, 60, 73.0, 73.0, 39.5, 29.5)
+ROOM = np.array([6.0, 5.0, 2.5])
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def box(size: Floats, *, inwards: bool) -> tuple[Floats32, Ints32]:
+    """The corners and the triangles of a box from the origin; their fronts inside, or outside."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * size
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = np.array([t for a, b, c, d in sides for t in ((a, b, c), (a, c, d))], np.int32)
+    return corners.astype(np.float32), triangles[:, ::-1] if inwards else triangles
+
+
+def room(*, inwards: bool = True, up: Floats = UP) -> ReferenceSurface:
+    points, triangles = box(ROOM, inwards=inwards)
+    return ReferenceSurface(points, np.ascontiguousarray(triangles), np.zeros(3), up)
+
+
+def cloud_of_room(spacing: float = 0.04) -> ReferenceSurface:
+    """Points on the walls, the floor and the ceiling of the room, on a grid."""
+    sheets = []
+    for axis in range(3):
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        grid = np.meshgrid(*(np.arange(spacing / 2, ROOM[k], spacing) for k in (a, b)))
+        for at in (0.0, ROOM[axis]):
+            sheet = np.full((grid[0].size, 3), at)
+            sheet[:, a], sheet[:, b] = grid[0].ravel(), grid[1].ravel()
+            sheets.append(sheet)
+    points = np.concatenate(sheets).astype(np.float32)
+    return ReferenceSurface(points, None, np.zeros(3), UP)
+
+
+def depth_parameters(camera: Intrinsics = CAMERA) -> ViewParameters:
+    p = view_parameters(read_model("depth").parameters, camera)
+    return replace(p, spacing=0.8, cell=0.15)
+
+
+def looking(place: tuple[float, float, float], yaw: float, pitch: float) -> Floats:
+    """T_map_sensor of a camera in a place, z up."""
+    flat = np.array([math.cos(yaw), math.sin(yaw), 0.0])
+    ahead = math.cos(pitch) * flat + math.sin(pitch) * UP
+    right = np.cross(flat, UP)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    T[:3, 3] = place
+    return T
+
+
+def depth_in_room(T: Floats, camera: Intrinsics) -> Floats:
+    """The depth (H, W) of the walls of the room, seen from inside: each ray leaves by the first."""
+    rays = rays_of(camera).astype(float) @ T[:3, :3].T
+    with np.errstate(divide="ignore"):
+        leaves = np.where(rays > 0, (ROOM - T[:3, 3]) / rays, -T[:3, 3] / rays)
+    return np.asarray(leaves.min(axis=2))
+
+
+POSES = [
+    looking((1.5, 2.0, 1.2), 0.3, -0.2),
+    looking((4.4, 3.1, 0.9), 2.9, 0.3),
+    looking((3.0, 2.5, 1.6), -1.4, -0.6),
+]
+
+
+@pytest.mark.parametrize("T", POSES)
+@pytest.mark.parametrize("inwards", [True, False])
+def test_a_view_of_a_mesh_shows_the_depth_of_its_walls(T: Floats, inwards: bool) -> None:
+    # a mesh that is inside out is shown as well, as all of it is seen from behind
+    seen = Renderer(room(inwards=inwards), depth_parameters()).view(T)
+    assert seen.dtype == np.float32
+    np.testing.assert_allclose(seen, depth_in_room(T, CAMERA), rtol=1e-4)
+
+
+@pytest.mark.parametrize("T", POSES)
+def test_a_view_of_a_cloud_shows_the_depth_of_its_walls(T: Floats) -> None:
+    seen, expected = Renderer(cloud_of_room(), depth_parameters()).view(T), depth_in_room(T, CAMERA)
+    assert (seen > 0).mean() > 0.97
+    error = np.abs(seen - expected)[seen > 0]
+    # only where walls meet does a disc reach beyond its own
+    assert np.quantile(error, 0.8) < 1e-3
+    assert error.max() < 0.25
+
+
+def test_what_is_out_of_range_is_missing() -> None:
+    T, p = POSES[0], depth_parameters()
+    expected = depth_in_room(T, CAMERA)
+    seen = Renderer(room(), replace(p, nearest=1.6, farthest=3.0)).view(T)
+    within = (expected > 1.6) & (expected < 3.0)
+    assert (seen[within] > 0).all()
+    assert (seen[~within] == 0).all()
+    assert 0 < within.mean() < 1
+
+
+def test_a_nearer_surface_hides_what_is_behind_it_in_a_cloud_as_in_a_mesh() -> None:
+    grid = np.stack(np.meshgrid(np.arange(-2, 2, 0.03), np.arange(-2, 2, 0.03)), axis=-1)
+    wall = np.column_stack([np.full(grid[..., 0].size, 3.0), grid.reshape(-1, 2)])
+    board = wall[np.abs(wall[:, 1:]).max(axis=1) < 0.5] - (1.0, 0.0, 0.0)
+    points = np.concatenate([wall, board]).astype(np.float32)
+    surface = ReferenceSurface(points, None, np.zeros(3), UP)
+    seen = Renderer(surface, depth_parameters()).view(looking((0, 0, 0), 0.0, 0.0))
+    rays = np.abs(rays_of(CAMERA)[..., :2]).max(axis=2)
+    np.testing.assert_allclose(seen[rays < 0.23], 2.0, atol=1e-4)
+    np.testing.assert_allclose(seen[(rays > 0.27) & (rays < 0.4)], 3.0, atol=1e-4)
+
+
+def test_a_surface_that_is_seen_from_behind_is_missing_and_hides_what_is_behind_it() -> None:
+    # a wall whose front faces the camera; before a third of it a board that turns its back
+    wall = np.array([[3, -3, -3], [3, -3, 3], [3, 3, 3], [3, 3, -3]], np.float32)
+    board = np.array([[2, -0.3, -0.3], [2, 0.3, -0.3], [2, 0.3, 0.3], [2, -0.3, 0.3]], np.float32)
+    quads = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
+    surface = ReferenceSurface(np.concatenate([wall, board]), quads, np.zeros(3), UP)
+    seen = Renderer(surface, depth_parameters()).view(looking((0, 0, 0), 0.0, 0.0))
+    rays = np.abs(rays_of(CAMERA)[..., :2]).max(axis=2)
+    assert (seen[rays < 0.149] == 0).all()
+    np.testing.assert_allclose(seen[rays > 0.151], 3.0, rtol=1e-5)
+
+
+def test_a_scanner_sees_all_around() -> None:
+    p = replace(view_parameters(read_model("lidar").parameters), nearest=0.1)
+    T = looking((2.0, 3.0, 1.0), 0.7, 0.1)
+    points = moved(T, Renderer(room(), p).view(T).astype(float))
+    to_wall = np.minimum(np.abs(points), np.abs(points - ROOM)).min(axis=1)
+    assert to_wall.max() < 1e-3
+    rays = (points - T[:3, 3]) @ T[:3, :3]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    assert np.abs(rays[:, 2]).max() <= math.sin(p.elevation) + 1e-6
+    # as many points as pixels of the cube look there, and some in each small part of the band
+    size, turns = cube_faces(math.ceil(2.0 / p.step))
+    every = np.concatenate([rays_of(size).reshape(-1, 3) @ R.T for R in turns])
+    every /= np.linalg.norm(every, axis=1, keepdims=True)
+    assert len(points) == (np.abs(every[:, 2]) <= math.sin(p.elevation)).sum()
+    column = ((np.arctan2(rays[:, 1], rays[:, 0]) + math.pi) / (2 * math.pi) * 90).astype(int)
+    row = ((rays[:, 2] / math.sin(p.elevation) + 1) * 10).astype(int)
+    counts = np.bincount(np.clip(column, 0, 89) * 20 + np.clip(row, 0, 19), minlength=1800)
+    assert counts.min() > 5
+
+
+def test_triangles_are_drawn_as_rays_meet_them() -> None:
+    rng = np.random.default_rng(5)
+    # some behind the camera, some across its plane
+    middles = rng.uniform(-2, 2, (60, 1, 3)) + np.array([0, 0, 1.5])
+    points = (middles + rng.uniform(-1, 1, (60, 3, 3))).reshape(-1, 3).astype(np.float32)
+    triangles = np.arange(180, dtype=np.int32).reshape(-1, 3)
+    depth = np.full((60, 80), np.inf, np.float32)
+    back = np.zeros((60, 80), np.uint8)
+    whole = np.array([0]), np.array([60])
+    draw_triangles(points, triangles, *whole, np.eye(4), pinhole(CAMERA), depth, back)
+    rays = rays_of(CAMERA).reshape(-1, 3).astype(float)
+    nearest, behind = np.full(len(rays), np.inf), np.zeros(len(rays), bool)
+    edge = np.full(len(rays), np.inf)  # how near a ray comes to the rim of a triangle
+    for a, b, c in points[triangles].astype(float):
+        normal = np.cross(b - a, c - a)
+        t = (normal @ a) / (rays @ normal)
+        solution = np.linalg.lstsq(np.stack([b - a, c - a], 1), (rays * t[:, None] - a).T)[0]
+        rim = np.minimum(solution.min(axis=0), 1 - solution.sum(axis=0))
+        edge = np.minimum(edge, np.abs(rim))
+        first = (rim >= 0) & (t > 1e-3) & (t < nearest)
+        nearest[first], behind[first] = t[first], (rays @ normal > 0)[first]
+    sure = edge > 1e-4
+    np.testing.assert_allclose(depth.ravel()[sure], nearest[sure], rtol=1e-4)
+    seen = sure & np.isfinite(nearest)
+    assert seen.mean() > 0.3
+    assert (back.ravel()[seen] == behind[seen]).all()
+
+
+def test_no_ray_passes_between_two_triangles() -> None:
+    rng = np.random.default_rng(6)
+    heights = rng.uniform(1.0, 1.4, (40, 40))
+    x, y = np.meshgrid(np.linspace(-1.5, 1.5, 40), np.linspace(-1.5, 1.5, 40))
+    points = np.stack([x, y, heights], axis=-1).reshape(-1, 3).astype(np.float32)
+    first = (np.arange(39)[:, None] * 40 + np.arange(39)).ravel()
+    triangles = np.concatenate(
+        [np.stack([first, first + 1, first + 41], 1), np.stack([first, first + 41, first + 40], 1)]
+    ).astype(np.int32)
+    depth, back = np.full((60, 80), np.inf, np.float32), np.zeros((60, 80), np.uint8)
+    whole = np.array([0]), np.array([len(triangles)])
+    draw_triangles(points, triangles, *whole, np.eye(4), pinhole(CAMERA), depth, back)
+    assert np.isfinite(depth).all()
+
+
+def test_blocks_out_of_view_hold_nothing_that_is_seen() -> None:
+    rng = np.random.default_rng(7)
+    points = rng.uniform(-6, 6, (4000, 3)).astype(np.float32)
+    extents = rng.uniform(0, 0.2, 4000).astype(np.float32)
+    order, blocks = blocks_of(points, 1.0, extents)
+    assert sorted(order.tolist()) == list(range(4000))
+    T = inverse(looking((1.0, -2.0, 0.5), 0.8, 0.2))
+    starts, ends = blocks.in_view(T, pinhole(CAMERA), (60, 80), 5.0)
+    kept = set(np.concatenate([order[a:b] for a, b in zip(starts, ends, strict=True)]).tolist())
+    x, y, z = moved(T, points.astype(float)).T
+    u, v = 73 * x / z + 39.5, 73 * y / z + 29.5
+    seen = (z > 0.01) & (z < 5) & (u > -0.5) & (u < 79.5) & (v > -0.5) & (v < 59.5)
+    assert set(np.flatnonzero(seen).tolist()) <= kept
+    assert len(kept) < 2000
+
+
+def test_points_of_a_cell_become_their_mean() -> None:
+    points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [2.5, 0.0, 0.0]], np.float32)
+    found = thinned(points, 1.0)
+    # cells are counted from the least corner
+    np.testing.assert_allclose(np.sort(found, axis=0)[:, 0], [0.2, 2.5], atol=1e-6)
+    assert len(found) == 2
+
+
+def test_the_normal_of_a_plane_of_points() -> None:
+    rng = np.random.default_rng(8)
+    flat = rng.uniform(-1, 1, (3000, 2))
+    points = np.column_stack([flat, 0.5 * flat[:, 0]]).astype(np.float32)
+    _, normals, spacing = on_surface(points, 0.15)
+    inner = np.abs(flat).max(axis=1) < 0.9
+    expected = np.array([-0.5, 0, 1]) / math.sqrt(1.25)
+    assert np.abs(normals[inner] @ expected).min() > 0.9999
+    assert 0.02 < np.median(spacing) < 0.05  # 3000 points on 4.5 square metres: 0.039 m
+    scattered = rng.uniform(-1, 1, (3000, 3)).astype(np.float32)
+    assert (on_surface(scattered, 0.3)[1] == 0).all(axis=1).mean() > 0.9
+
+
+def test_both_sides_of_a_thin_wall_are_pieces_of_their_own() -> None:
+    points, triangles = box(np.array([2.0, 0.02, 2.0]), inwards=False)
+    pieces = surfels(ReferenceSurface(points, triangles, np.zeros(3), UP), 0.2, 10_000)
+    assert pieces.one_sided
+    for sign in (-1, 1):
+        assert (pieces.normals[:, 1] * sign > 0.99).sum() >= 100  # 10 x 10 cells and more
+
+
+@pytest.mark.parametrize("inwards", [True, False])
+def test_cameras_stand_in_the_room_at_their_heights(inwards: bool) -> None:
+    p = replace(depth_parameters(), heights=(0.5, 1.5))
+    plan = choose_views(room(inwards=inwards), p)
+    assert len(plan.poses) > 10
+    assert plan.floor == pytest.approx(0.0, abs=0.02)
+    places = np.concatenate([plan.poses, plan.held_out])[:, :3, 3]
+    assert (places > 0.3).all()
+    assert (places < ROOM - 0.3).all()
+    np.testing.assert_allclose(np.sort(np.unique(places[:, 2].round(3))), (0.5, 1.5), atol=0.03)
+    # right-handed, upright: x of the camera is level, y looks down
+    for T in plan.poses:
+        assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+        assert T[2, 0] == pytest.approx(0.0, abs=1e-9)
+        assert T[2, 1] < 0
+
+
+def test_scanners_stand_in_the_room_whose_cloud_has_no_sides() -> None:
+    p = view_parameters(read_model("lidar").parameters)
+    cloud = cloud_of_room(0.1)
+    # ground outside, seen through a door
+    x, y = np.meshgrid(np.arange(6.0, 12.0, 0.1), np.arange(0.0, 5.0, 0.1))
+    outside = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]).astype(np.float32)
+    surface = replace(cloud, points=np.concatenate([cloud.points, outside]))
+    plan = choose_views(surface, replace(p, spacing=1.0))
+    assert len(plan.poses) >= 1
+    places = plan.poses[:, :3, 3]
+    assert (places > 0.5).all()
+    assert (places < ROOM - 0.5).all()
+    np.testing.assert_allclose(places[:, 2], 1.0, atol=0.05)
+
+
+def test_up_may_be_any_axis_and_the_same_views_are_chosen_each_time() -> None:
+    up = np.array([0.0, -1.0, 0.0])
+    axes = level_axes(up)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    points, triangles = box(ROOM, inwards=True)
+    surface = ReferenceSurface(
+        (points @ axes.astype(np.float32)).astype(np.float32),
+        np.ascontiguousarray(triangles), np.zeros(3), up,
+    )  # fmt: skip
+    p = depth_parameters()
+    first, second = choose_views(surface, p), choose_views(surface, p)
+    np.testing.assert_array_equal(first.poses, second.poses)
+    np.testing.assert_array_equal(first.held_out, second.held_out)
+    heights = first.poses[:, :3, 3] @ up
+    assert first.floor == pytest.approx(0.0, abs=0.02)
+    assert (heights > 0.3).all()
+    assert (heights < ROOM[2] - 0.3).all()
+
+
+def test_views_cover_a_furnished_room_from_free_places() -> None:
+    scene, _ = room_and_rng(53, 1)
+    surface = ReferenceSurface(scene.vertices, scene.faces, np.zeros(3), UP)
+    p = replace(depth_parameters(), spacing=0.6)
+    plan = choose_views(surface, p)
+    assert plan.covered > 0.7
+    assert len(set(map(bytes, plan.poses))) == len(plan.poses)
+    assert not set(map(bytes, plan.poses)) & set(map(bytes, plan.held_out))
+    # what held-out views see, within 3 m, is seen by the chosen ones as well
+    pieces = surfels(surface, 0.2, 100_000).points.astype(float)
+    renderer = Renderer(surface, p)
+    chosen, others = (_seen(renderer, poses, pieces) for poses in (plan.poses, plan.held_out))
+    assert (chosen & others).sum() > 0.95 * others.sum()
+    assert others.sum() > 500
+
+
+def _seen(renderer: Renderer, poses: Floats, points: Floats) -> np.ndarray:
+    """Which points some view shows, 3 m away at most."""
+    seen = np.zeros(len(points), bool)
+    for T in poses:
+        depth = renderer.view(T)
+        x, y, z = moved(inverse(T), points).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = 73 * x / z + 39.5, 73 * y / z + 29.5
+        inside = (z > 0.3) & (z < 3) & (u > -0.5) & (u < 79.49) & (v > -0.5) & (v < 59.49)
+        row, column = np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)
+        seen[inside] |= np.abs(depth[row, column] - z[inside]) < 0.05
+    return seen
+
+
+def test_a_surface_without_free_space_has_no_views() -> None:
+    points = np.random.default_rng(9).uniform(0, 0.2, (500, 3)).astype(np.float32)
+    plan = choose_views(ReferenceSurface(points, None, np.zeros(3), UP), depth_parameters())
+    assert plan.poses.shape == (0, 4, 4)
+    assert plan.covered == 0.0
+
+
+def test_parameters_follow_the_model() -> None:
+    depth, lidar = (view_parameters(read_model(n).parameters) for n in ("depth", "lidar"))
+    assert depth.camera is not None
+    assert lidar.camera is None
+    assert (depth.nearest, depth.farthest) == (0.3, 9.0)
+    assert (lidar.nearest, lidar.farthest) == (0.6, 60.0)
+    own = view_parameters(read_model("lidar").parameters, CAMERA, (0.7, 0.2))
+    assert own.camera == CAMERA
+    assert own.heights == (0.2, 0.7)
+    for wrong in ([], [0.0], [-1.0, 1.0], [math.nan]):
+        with pytest.raises(InvalidRequest, match="above 0 metres"):
+            view_parameters(read_model("depth").parameters, heights=wrong)
