@@ -1,9 +1,10 @@
 """A decoder's process: loads what it needs, gives up everything else, decodes until it is ended.
 
-    python -m sceneprint.decoders.child_process CONTROL MEMORY PARENT BYTES plain|kernels
+    python -m sceneprint.decoders.child_process CONTROL MEMORY PARENT BYTES plain|kernels [MORE]
 
 CONTROL is a socket with a JSON message each way for each task. MEMORY is shared with the parent: it
-holds the bytes of the upload, then the array. Nothing is pickled: the parent checks every reply.
+holds the bytes of the upload, then the array. MORE is for other programs that serve tasks like this
+one. Nothing is pickled: the parent checks every reply.
 """
 
 from __future__ import annotations
@@ -37,8 +38,10 @@ SHARED_BYTES = 512 << 20
 #: Most bytes of a message, and characters of an error or traceback in it.
 MESSAGE_BYTES, MOST_TEXT = 1 << 16, 8000
 
-#: bytes, request -> reply, and the array that comes with it
-Task = Callable[[bytes, dict[str, Any]], tuple[dict[str, Any], NDArray[Any] | None]]
+#: One array, or several behind one another.
+Arrays = NDArray[Any] | tuple[NDArray[Any], ...] | None
+#: bytes, request -> reply, and the arrays that come with it
+Task = Callable[[bytes, dict[str, Any]], tuple[dict[str, Any], Arrays]]
 
 
 def _samples(data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], NDArray[Any]]:
@@ -57,8 +60,14 @@ def _points(data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], NDArr
 TASKS: Mapping[str, Task] = {"samples": _samples, "points": _points}
 
 
-def serve(tasks: Mapping[str, Task]) -> None:
-    """Be a decoder until the parent closes the socket, or is gone."""
+def serve(tasks: Mapping[str, Task], warm: Callable[[bool], None] | None = None) -> None:
+    """Be a decoder until the parent closes the socket, or is gone.
+
+    Parameters
+    ----------
+    tasks : by their names
+    warm : loads all that the tasks need, and kernels if so asked; default: `load_decoders`
+    """
     control, memory, parent, more_bytes = map(int, sys.argv[1:5])
     # signals that stop a service reach its whole group, and it still has uploads in hand
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -67,7 +76,7 @@ def serve(tasks: Mapping[str, Task]) -> None:
         return
     shared = mmap.mmap(memory, SHARED_BYTES)
     try:
-        _warm(kernels=sys.argv[5] == "kernels")
+        (warm or load_decoders)(sys.argv[5] == "kernels")
         _to_nowhere()
         protections = asdict(close_process(more_bytes))
     except Exception:
@@ -81,12 +90,16 @@ def serve(tasks: Mapping[str, Task]) -> None:
 def _done(tasks: Mapping[str, Task], request: dict[str, Any], shared: mmap.mmap) -> dict[str, Any]:
     """Do a task; what is wrong with the upload is a reply too."""
     try:
-        reply, array = tasks[request["task"]](shared[: request["bytes"]], request)
-        if array is not None:
+        reply, arrays = tasks[request["task"]](shared[: request["bytes"]], request)
+        if arrays is None:
+            return reply
+        first = 0
+        for array in arrays if isinstance(arrays, tuple) else (arrays,):
             size = array.nbytes
-            np.frombuffer(shared, np.uint8, size)[:] = (
+            np.frombuffer(shared, np.uint8, size, first)[:] = (
                 np.ascontiguousarray(array).view(np.uint8).reshape(-1)
             )
+            first += size
     except SceneprintError as error:
         return {"error": type(error).__name__, "text": str(error)[:MOST_TEXT]}
     except MemoryError:
@@ -111,10 +124,11 @@ def _to_nowhere() -> None:
 # What is imported or compiled on first use, used once: afterwards no file can be read.
 
 
-def _warm(*, kernels: bool) -> None:
+def load_decoders(kernels: bool) -> None:
+    """Read a file of each format, those of compiled decoders only if kernels are wanted."""
     for data in _images():
         decode_samples(data)
-    for data, form in _arrays():
+    for data, form in array_samples():
         read_points(data, form, UNSAID, 1.0)
     with suppress(ImportError):  # an extra; a LAZ file says what is missing
         import lazrs  # noqa: F401
@@ -123,7 +137,7 @@ def _warm(*, kernels: bool) -> None:
             decode_samples(wrong)
     if not kernels:
         return
-    for data, form in _texts():
+    for data, form in text_samples():
         read_points(data, form, UNSAID, 1.0)
     for module in (rows, pcd, ply):
         for one in vars(module).values():
@@ -138,7 +152,8 @@ def _images() -> list[bytes]:
     return found + [_npy(np.ones((2, 2), kind)) for kind in ("f2", "f4", "f8", "u2")]
 
 
-def _arrays() -> list[tuple[bytes, Any]]:
+def array_samples() -> list[tuple[bytes, Any]]:
+    """Files whose decoders need no kernels."""
     points = np.ones((12, 3), np.float32)
     header = bytearray(227)
     struct.pack_into("<4s", header, 0, b"LASF")
@@ -149,7 +164,7 @@ def _arrays() -> list[tuple[bytes, Any]]:
     return [(_npy(points), "npy"), (bytes(16 * 12), "kitti"), (bytes(header) + bytes(240), "las")]
 
 
-def _texts() -> list[tuple[bytes, Any]]:
+def text_samples() -> list[tuple[bytes, Any]]:
     """Files whose decoders are compiled: PCD and PLY."""
     row = b"1 2 3\n"
     head = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 12\nHEIGHT 1\n"

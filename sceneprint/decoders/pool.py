@@ -70,11 +70,11 @@ _ENVIRONMENT = (
 )  # fmt: skip
 
 
-class _Ended(Exception):
+class DecoderEnded(Exception):
     """The process is gone; its text says of what."""
 
 
-class _Process:
+class DecoderProcess:
     """One process, and what it shares with this one. It has one task at a time.
 
     Parameters
@@ -82,10 +82,20 @@ class _Process:
     program : module that it runs
     more_bytes : that it may take for its work; 0 for no limit
     compiled : whether it loads kernels
+    files : descriptors that it may read, and arguments of the program
+    more : arguments after these
     """
 
-    def __init__(self, program: str, more_bytes: int, *, compiled: bool) -> None:
-        self.compiled = compiled
+    def __init__(
+        self,
+        program: str,
+        more_bytes: int,
+        *,
+        compiled: bool,
+        files: tuple[int, ...] = (),
+        more: tuple[str, ...] = (),
+    ) -> None:
+        self.compiled, self._more_bytes = compiled, more_bytes
         self.protections = Protections(no_new_privileges=False, seccomp=False, landlock=0)
         memory = os.memfd_create("sceneprint-decoder", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -97,10 +107,11 @@ class _Process:
             given = (theirs.fileno(), memory, os.getpid(), more_bytes)
             kind = "kernels" if compiled else "plain"
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", program, *map(str, given), kind],
+                [sys.executable, "-P", "-m", program, *map(str, given), kind, *map(str, files),
+                 *more],
                 env={name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
                 | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
-                pass_fds=given[:2], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                pass_fds=(*given[:2], *files), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
             )  # fmt: skip
         except BaseException:
@@ -116,11 +127,11 @@ class _Process:
         return self._process.pid
 
     def await_ready(self) -> None:
-        """Wait until it has closed itself in; _Ended where it cannot."""
+        """Wait until it has closed itself in; DecoderEnded where it cannot."""
         reply = self._receive(_BEGIN_S)
         walls = reply.get("ready")
         if not isinstance(walls, dict):
-            raise _Ended(str(reply.get("broke", reply))[-2000:])
+            raise DecoderEnded(str(reply.get("broke", reply))[-2000:])
         self.protections = Protections(
             walls["no_new_privileges"] is True, walls["seccomp"] is True, int(walls["landlock"])
         )
@@ -130,20 +141,51 @@ class _Process:
 
         Raises
         ------
-        _Ended : it died of the task.
+        DecoderEnded : it died of the task.
         DecoderFailure : it took too long.
         """
         self._shared[: len(data)] = data
         try:
             self._socket.send(json.dumps({**request, "bytes": len(data)}).encode())
         except OSError as error:
-            raise _Ended(self._cause()) from error
+            raise DecoderEnded(self._cause()) from error
         return self._receive(seconds * _PATIENCE, seconds)
 
-    def array_of(self, kind: str, shape: tuple[int, ...]) -> NDArray[Any]:
-        """A copy of the array that came with a reply."""
+    def result(
+        self, reply: dict[str, Any], checked: Callable[[DecoderProcess, dict[str, Any]], Any]
+    ) -> Any:
+        """What a reply says.
+
+        Parameters
+        ----------
+        reply : of `run`
+        checked : makes the result of a reply that it has looked at; any error: a lie
+
+        Raises
+        ------
+        DecoderEnded : the reply is none.
+        DecoderFailure : the task needed too much memory.
+        FrameError, MissingDependency : what the decoder found.
+        """
+        if reply.get("memory") is True:
+            raise DecoderFailure(
+                f"it needs more than {self._more_bytes >> 20} MiB of memory to decode"
+            )
+        if "broke" in reply:
+            text = str(reply["broke"])
+            log.error("decoder failed", extra={"pid": self.pid, "traceback": text})
+            raise RuntimeError(f"A decoder failed: {text.strip().rpartition(chr(10))[2][:200]}")
+        if "error" in reply:
+            raise _error_of(reply)
+        try:
+            return checked(self, reply)
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+            raise DecoderEnded(f"its answer is no result: {str(error)[:80]}") from error
+
+    def array_of(self, kind: str, shape: tuple[int, ...], first: int = 0) -> NDArray[Any]:
+        """A copy of the array that came with a reply, from its first byte in the memory."""
         count = math.prod(shape)
-        found = np.frombuffer(self._shared, kind, count).copy()
+        found = np.frombuffer(self._shared, kind, count, first).copy()
         return found.reshape(shape)
 
     def forget(self, size: int) -> None:
@@ -171,13 +213,13 @@ class _Process:
         except OSError:
             message = b""
         if not message:
-            raise _Ended(self._cause())
+            raise DecoderEnded(self._cause())
         try:
             reply = json.loads(message)
         except (ValueError, RecursionError) as error:
-            raise _Ended("its answer is no JSON") from error
+            raise DecoderEnded("its answer is no JSON") from error
         if not isinstance(reply, dict):
-            raise _Ended("its answer is no record")
+            raise DecoderEnded("its answer is no record")
         return reply
 
     def _cpu_s(self) -> float:
@@ -198,14 +240,14 @@ class _Slot:
 
     def __init__(self, pool: DecoderPool) -> None:
         self._pool = pool
-        self.process: _Process | None = None
+        self.process: DecoderProcess | None = None
 
     def samples(self, data: bytes) -> Samples:
         """See Decoder."""
         if len(data) > MAXIMUM_IMAGE_BYTES:  # refused by its length, unread
             return decode_samples(data)
 
-        def checked(process: _Process, reply: dict[str, Any]) -> Samples:
+        def checked(process: DecoderProcess, reply: dict[str, Any]) -> Samples:
             kind, shape = reply["type"], _shape(reply, MAXIMUM_SAMPLES)
             if kind not in ("<u2", "<f4"):
                 raise ValueError(f"type {kind!r:.40}")
@@ -225,7 +267,7 @@ class _Slot:
             "units_per_metre": units_per_metre,
         }  # fmt: skip
 
-        def checked(process: _Process, reply: dict[str, Any]) -> ReadPoints:
+        def checked(process: DecoderProcess, reply: dict[str, Any]) -> ReadPoints:
             shape, given = _shape(reply, 3 * MAXIMUM_POINTS), int(reply["given"])
             if shape[1] != 3 or not shape[0] <= given <= MAXIMUM_POINTS:
                 raise ValueError(f"{shape} points of {given}")
@@ -246,7 +288,7 @@ class _Slot:
 
     def run(
         self, request: dict[str, Any], data: bytes,
-        checked: Callable[[_Process, dict[str, Any]], Any], *, compiled: bool = False,
+        checked: Callable[[DecoderProcess, dict[str, Any]], Any], *, compiled: bool = False,
     ) -> Any:  # fmt: skip
         """Have a task done; once more in another process if the first died, perhaps not of it.
 
@@ -265,11 +307,11 @@ class _Slot:
         """
         try:
             return self._run(request, data, checked, compiled=compiled)
-        except _Ended as first:
+        except DecoderEnded as first:
             self._pool.note(self, str(first))
             try:
                 return self._run(request, data, checked, compiled=compiled)
-            except _Ended as again:
+            except DecoderEnded as again:
                 self._pool.note(self, str(again))
                 raise DecoderFailure(f"it crashes the decoder ({again})") from again
         except DecoderFailure as error:
@@ -284,27 +326,14 @@ class _Slot:
 
     def _run(
         self, request: dict[str, Any], data: bytes,
-        checked: Callable[[_Process, dict[str, Any]], Any], *, compiled: bool,
+        checked: Callable[[DecoderProcess, dict[str, Any]], Any], *, compiled: bool,
     ) -> Any:  # fmt: skip
         process = self.process
         if process is None or (compiled and not process.compiled):
             self.end()
             process = self.process = self._pool.begin(compiled=compiled)
         reply = process.run(request, data, self._pool.seconds)
-        if reply.get("memory") is True:
-            raise DecoderFailure(
-                f"it needs more than {self._pool.more_bytes >> 20} MiB of memory to decode"
-            )
-        if "broke" in reply:
-            text = str(reply["broke"])
-            log.error("decoder failed", extra={"pid": process.pid, "traceback": text})
-            raise RuntimeError(f"A decoder failed: {text.strip().rpartition(chr(10))[2][:200]}")
-        if "error" in reply:
-            raise _error_of(reply)
-        try:
-            found = checked(process, reply)
-        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-            raise _Ended(f"its answer is no result: {str(error)[:80]}") from error
+        found = process.result(reply, checked)
         size = getattr(found, "nbytes", len(data))
         process.forget(max(size, len(data)))
         return found
@@ -373,13 +402,13 @@ class DecoderPool:
             slot.end()
         self._starter.shutdown()
 
-    def begin(self, *, compiled: bool) -> _Process:
+    def begin(self, *, compiled: bool) -> DecoderProcess:
         """Start a process and wait until it is ready; Busy where that fails."""
         try:
             if self._closed:
-                raise _Ended("the service stops")
+                raise DecoderEnded("the service stops")
             begin = self._starter.submit(
-                _Process, self._program, self.more_bytes, compiled=compiled
+                DecoderProcess, self._program, self.more_bytes, compiled=compiled
             )
             process = begin.result()
             try:
@@ -391,7 +420,7 @@ class DecoderPool:
             except BaseException:
                 process.end()
                 raise
-        except (_Ended, DecoderFailure, OSError, RuntimeError) as error:
+        except (DecoderEnded, DecoderFailure, OSError, RuntimeError) as error:
             log.error("decoder cannot be started", extra={"error": str(error)})
             raise errors.Busy(
                 "No decoder can be started for this upload; the service's log says why. Nothing "
@@ -425,6 +454,6 @@ def _shape(reply: dict[str, Any], most: int) -> tuple[int, int]:
 def _error_of(reply: dict[str, Any]) -> errors.SceneprintError:
     kind = _ERRORS.get(str(reply["error"]))
     if kind is None:
-        raise _Ended(f"it raised {str(reply['error'])[:40]!r}")
+        raise DecoderEnded(f"it raised {str(reply['error'])[:40]!r}")
     text = reply.get("text")
     return kind(text if isinstance(text, str) else "")

@@ -19,7 +19,7 @@ import pytest
 from benchmarks.waiting import PATIENCE_S
 from sceneprint import errors
 from sceneprint.decoders import LocalDecoders
-from sceneprint.decoders.child_process import _arrays, _images, _texts
+from sceneprint.decoders.child_process import _images, array_samples, text_samples
 from sceneprint.decoders.pool import DecoderPool
 from sceneprint.decoders.sandbox import filter_program
 from sceneprint_client.sidecars import UNSAID
@@ -64,7 +64,7 @@ def test_arrays_are_the_same_as_in_this_process(pool: DecoderPool) -> None:
         for data in _images():
             here, there = local.samples(data), slot.samples(data)
             assert (here.dtype, here.tobytes()) == (there.dtype, there.tobytes())
-        for data, form in (*_arrays(), *_texts()):
+        for data, form in (*array_samples(), *text_samples()):
             near, far = (one.points(data, form, UNSAID, 0.5) for one in (local, slot))
             assert near.points.tobytes() == far.points.tobytes()
             assert (near.viewpoint, near.given) == (far.viewpoint, far.given)

@@ -1,0 +1,154 @@
+"""A file of a whole map, read in a process of its own that may do nothing but compute.
+
+file, name, options  --read_surface_confined-->  ReadSurface, checked again
+
+The file is handed over open, so its bytes are not copied; the arrays come back in shared memory.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from sceneprint.decoders.pool import DecoderEnded, DecoderProcess
+from sceneprint.errors import Busy, DecoderFailure, UnreadableCloud
+from sceneprint.formats.points.cloud import FARTHEST_M
+from sceneprint.formats.surface_file.raw_surface import (
+    MOST_FILE_POINTS,
+    MOST_TRIANGLES,
+    MOST_VERTICES,
+)
+from sceneprint.formats.surface_file.reading import (
+    FAR_M,
+    ReadSurface,
+    Source,
+    SurfaceOptions,
+    surface_format,
+)
+from sceneprint.types import Floats, Floats32, Ints32, ReferenceSurface
+from sceneprint_client.files import HEAD, naming
+
+_PROGRAM = "sceneprint.decoders.surface_process"
+#: Most notes of a file, and characters of one.
+_MOST_NOTES, _LONGEST_NOTE = 20, 1000
+
+
+@dataclass(frozen=True)
+class SurfaceLimits:
+    """What the reading of a file may take.
+
+    Parameters
+    ----------
+    more_bytes : memory beside the file and the result; 0 for no limit
+    seconds : processor time
+    """
+
+    more_bytes: int = 2 << 30
+    seconds: float = 600.0
+
+
+def read_surface_confined(
+    file: int | Path, name: str, options: SurfaceOptions | None = None,
+    limits: SurfaceLimits | None = None,
+) -> ReadSurface:  # fmt: skip
+    """Return the surface of a file, read by a process of its own; see `read_surface`.
+
+    Parameters
+    ----------
+    file : open for reading, or its path; a regular file that nobody changes meanwhile
+    name : of the file, for errors and for formats that only its suffix tells
+    options : what the user states
+    limits : default: 2 GiB and 10 minutes
+
+    Raises
+    ------
+    UnreadableCloud, UselessFrame, MissingDependency : as `read_surface`.
+    DecoderFailure : the reading crashed, took too long, or needed too much memory.
+    Busy : no process can be started.
+    OSError : the file cannot be opened.
+    """
+    if isinstance(file, int):
+        return _read(file, name, options or SurfaceOptions(), limits or SurfaceLimits())
+    descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    try:
+        return _read(descriptor, name, options or SurfaceOptions(), limits or SurfaceLimits())
+    finally:
+        os.close(descriptor)
+
+
+def _read(file: int, name: str, options: SurfaceOptions, limits: SurfaceLimits) -> ReadSurface:
+    status = os.fstat(file)
+    with naming(name):
+        if not stat.S_ISREG(status.st_mode):
+            raise UnreadableCloud("This is no regular file. Name a file that holds the map.")
+        form = surface_format(os.pread(file, HEAD, 0), name, status.st_size)
+    request = {
+        "task": "surface", "name": name, "up": options.up,
+        "units_per_metre": options.units_per_metre,
+    }  # fmt: skip
+    process = DecoderProcess(
+        _PROGRAM, limits.more_bytes, compiled=True, files=(file,), more=(form,)
+    )
+    try:
+        try:
+            process.await_ready()
+        except (DecoderEnded, DecoderFailure) as error:
+            raise Busy(
+                f"No process can be started to read {name} ({error}). Nothing was stored. Retry "
+                "in a minute."
+            ) from error
+        try:
+            read: ReadSurface = process.result(process.run(request, b"", limits.seconds), _checked)
+        except DecoderEnded as error:
+            raise DecoderFailure(f"it crashes the decoder ({error})") from error
+        return read
+    finally:
+        process.end()
+
+
+def _checked(process: DecoderProcess, reply: dict[str, Any]) -> ReadSurface:
+    """The result of a reply; any error is a lie of the process."""
+    n, m, given = reply["points"], reply["triangles"], reply["given"]
+    _check(_is_whole(n, 1, MOST_VERTICES) and _is_whole(given, n, MOST_FILE_POINTS), "points")
+    points: Floats32 = process.array_of("<f4", (n, 3))
+    far = 2 * FARTHEST_M + FAR_M
+    _check(bool(points.min() >= -far and points.max() <= far), "points beyond reach")
+    triangles: Ints32 | None = None
+    if m is not None:
+        _check(_is_whole(m, 1, MOST_TRIANGLES), "triangles")
+        triangles = process.array_of("<i4", (m, 3), points.nbytes)
+        _check(bool(triangles.min() >= 0 and triangles.max() < n), "triangles of other points")
+    offset, up = _numbers(reply["offset"]), _numbers(reply["up"])
+    _check(abs(float(np.linalg.norm(up)) - 1.0) < 1e-6, "no direction")
+    units, voxel, notes = reply["units_per_metre"], reply["voxel"], reply["notes"]
+    _check(math.isfinite(units) and units > 0 and (voxel is None or 0 < voxel < far), "lengths")
+    sources = get_args(Source)
+    _check(reply["units"] in sources and reply["up_from"] in sources, "sources")
+    _check(isinstance(notes, list) and len(notes) <= _MOST_NOTES, "notes")
+    return ReadSurface(
+        ReferenceSurface(points, triangles, offset, up), reply["units"], reply["up_from"],
+        tuple(str(one)[:_LONGEST_NOTE] for one in notes), float(units), given, voxel,
+    )  # fmt: skip
+
+
+def _check(holds: bool, what: str) -> None:
+    if not holds:
+        raise ValueError(what)
+
+
+def _is_whole(value: object, least: int, most: int) -> bool:
+    return type(value) is int and least <= value <= most
+
+
+def _numbers(values: list[float]) -> Floats:
+    """Three finite numbers."""
+    x, y, z = map(float, values)
+    found = np.array([x, y, z])
+    _check(bool(np.isfinite(found).all()), "no position")
+    return found

@@ -1,0 +1,141 @@
+"""Files of whole maps read in a process of its own: equal arrays, walls, limits, lies."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from sceneprint.decoders.pool import DecoderProcess
+from sceneprint.decoders.surface_decoder import SurfaceLimits, read_surface_confined
+from sceneprint.decoders.surface_process import mesh_samples
+from sceneprint.errors import DecoderFailure, UnreadableCloud
+from sceneprint.formats.surface_file import ReadSurface, SurfaceOptions, read_surface
+
+STATED = SurfaceOptions(units_per_metre=2.0, up="-y")
+
+
+def ball(form: str) -> bytes:
+    data = trimesh.creation.icosphere(subdivisions=2).export(file_type=form)
+    return data.encode() if isinstance(data, str) else bytes(data)
+
+
+def rows(n: int = 5000) -> bytes:
+    file = io.BytesIO()
+    points = np.random.default_rng(2).uniform((-8, -6, 0), (8, 6, 3), (n, 3))
+    np.save(file, points + np.array([500_000.0, 4_000_000.0, 100.0]))
+    return file.getvalue()
+
+
+def assert_equal(here: ReadSurface, there: ReadSurface) -> None:
+    for a, b in (
+        (here.surface.points, there.surface.points),
+        (here.surface.triangles, there.surface.triangles),
+        (here.surface.offset, there.surface.offset),
+        (here.surface.up, there.surface.up),
+    ):
+        if a is None or b is None:
+            assert a is b
+        else:
+            assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
+    names = ("units", "up_from", "notes", "units_per_metre", "given", "voxel")
+    assert [getattr(here, name) for name in names] == [getattr(there, name) for name in names]
+
+
+@pytest.mark.parametrize("name", ["ball.ply", "ball.obj", "map.npy"])
+def test_surfaces_are_the_same_as_in_this_process(tmp_path: Path, name: str) -> None:
+    data = rows() if name == "map.npy" else ball(name[-3:])
+    path, options = tmp_path / "upload", STATED if name == "ball.ply" else None
+    path.write_bytes(data)
+    with path.open("rb") as file:
+        there = read_surface_confined(file.fileno(), name, options)
+    assert_equal(read_surface(data, name, options), there)
+
+
+@pytest.mark.parametrize("form", ["gltf", "stl"])
+def test_what_meshes_need_is_loaded_before_the_walls(tmp_path: Path, form: str) -> None:
+    """A glTF file with lines and points beside triangles: trimesh imports more for them."""
+    data = next(data for data, one in mesh_samples() if one == form)
+    path = tmp_path / "upload"
+    path.write_bytes(data)
+    assert_equal(read_surface(data, f"a.{form}"), read_surface_confined(path, f"a.{form}"))
+
+
+def test_errors_are_the_same_as_in_this_process(tmp_path: Path) -> None:
+    path, data = tmp_path / "upload", ball("ply")[:-100]
+    path.write_bytes(data)
+    with pytest.raises(UnreadableCloud) as here:
+        read_surface(data, "ball.ply")
+    with pytest.raises(UnreadableCloud, match=r"^ball\.ply: ") as there:
+        read_surface_confined(path, "ball.ply")
+    assert str(here.value) == str(there.value)
+
+
+def test_what_is_no_file_of_a_map_starts_no_process(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UnreadableCloud, match=r"a\.ply: This is no regular file"):
+        read_surface_confined(tmp_path / "pipe", "a.ply")
+    (tmp_path / "text").write_text("hello")
+    with pytest.raises(UnreadableCloud, match=r"a\.txt: This is none of PCD"):
+        read_surface_confined(tmp_path / "text", "a.txt")
+
+
+def many(tree: dict[str, Any], copies: int) -> bytes:
+    """A scene that places one part so often, just not too often to be refused."""
+    mesh = next(node["mesh"] for node in tree["nodes"] if "mesh" in node)
+    tree["nodes"] = [{"mesh": mesh} for _ in range(copies)]
+    tree["scenes"], tree["scene"] = [{"nodes": list(range(copies))}], 0
+    text = json.dumps(tree).encode()
+    return text + b" " * (-len(text) % 4)
+
+
+def test_memory_and_time_are_limited(tmp_path: Path) -> None:
+    data = trimesh.creation.icosphere(subdivisions=6).export(file_type="glb")
+    length = struct.unpack_from("<I", data, 12)[0]
+    text = many(json.loads(data[20 : 20 + length]), 200)
+    body = data[20 + length :]
+    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(body), len(text), 0x4E4F534A)
+    path = tmp_path / "upload"
+    path.write_bytes(head + text + body)  # a few megabytes that become 8 million vertices
+    assert path.stat().st_size < 4 << 20
+    with pytest.raises(DecoderFailure, match="more than 256 MiB of memory"):
+        read_surface_confined(path, "a.glb", None, SurfaceLimits(256 << 20, 60.0))
+    with pytest.raises(DecoderFailure, match=r"longer than 0\.3 s"):
+        read_surface_confined(path, "a.glb", None, SurfaceLimits(2 << 30, 0.3))
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [
+        {"points": 0}, {"points": 10**9}, {"points": 2.0}, {"given": 1}, {"triangles": 10**9},
+        {"triangles": 400}, {"up": [0, 0, 2]}, {"offset": [0, 0, float("nan")]}, {"offset": [1]},
+        {"units": "guessed"}, {"units_per_metre": -1}, {"notes": "x" * 30}, {"voxel": -1.0},
+    ],
+)  # fmt: skip
+def test_a_reply_that_lies_is_no_result(
+    tmp_path: Path, lie: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = {
+        "points": 12, "triangles": None, "given": 12, "offset": [0, 0, 0], "up": [0, 0, 1],
+        "units": "file", "up_from": "file", "notes": [], "units_per_metre": 1.0, "voxel": None,
+    }  # fmt: skip
+    path = tmp_path / "upload"
+    path.write_bytes(rows(20))
+
+    def run(self: DecoderProcess, *_: object) -> dict[str, Any]:
+        block = np.full(400 * 3, 7, np.int32)  # of no triangle: index 7 is fine, 12 is none
+        block[40:] = 12
+        self._shared[: block.nbytes] = block.tobytes()
+        return truth | lie
+
+    monkeypatch.setattr(DecoderProcess, "await_ready", lambda self: None)
+    monkeypatch.setattr(DecoderProcess, "run", run)
+    with pytest.raises(DecoderFailure, match="its answer is no result"):
+        read_surface_confined(path, "map.npy")
