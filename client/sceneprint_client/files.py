@@ -226,6 +226,8 @@ SUFFIXES: dict[str, CloudFormat] = {
 
 #: Suffixes of recordings of ROS, whose messages are many frames.
 RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
+#: Suffixes of files of other systems that hold frames with poses: E57, Record3D, RTAB-Map.
+EXPORT_SUFFIXES = (".e57", ".r3d", ".db")
 
 
 def format_of(data: bytes) -> CloudFormat | None:

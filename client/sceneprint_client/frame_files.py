@@ -35,6 +35,7 @@ from sceneprint_client.errors import (
     UnreadableFrame,
 )
 from sceneprint_client.files import (
+    EXPORT_SUFFIXES,
     HEAD,
     MAXIMUM_CLOUD_BYTES,
     MAXIMUM_IMAGE_BYTES,
@@ -483,6 +484,11 @@ def _named(path: Path) -> FrameFile:
     if file.suffix.lower() in RECORDING_SUFFIXES:
         raise DatasetError(
             f"{path}: This is a recording of ROS, and one frame is wanted. Upload it with "
+            "`sceneprint upload`, or send the frames that sceneprint.find_sequences returns."
+        )
+    if file.suffix.lower() in EXPORT_SUFFIXES:
+        raise DatasetError(
+            f"{path}: The file may hold several frames, and one is wanted. Upload it with "
             "`sceneprint upload`, or send the frames that sceneprint.find_sequences returns."
         )
     return find_frame_file(file)

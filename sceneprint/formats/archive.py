@@ -39,6 +39,7 @@ from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequ
 from sceneprint.formats.dataset.sequences import find_each, is_of_colour
 from sceneprint.formats.exports.nerfstudio import TRANSFORMS, ScaledNpy
 from sceneprint.formats.exports.polycam import CAMERAS
+from sceneprint.formats.exports.record3d import DEPTH_SUFFIX, FRAMES
 from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, MAXIMUM_IMAGE_BYTES, is_cloud
 from sceneprint_client.sidecars import CLOUDS_FILE, INTRINSICS_FILE
 
@@ -475,6 +476,8 @@ class Archive:
         self.refused: list[tuple[str, str]] = []
         #: Members that are no part of a sequence, such as colour images.
         self.ignored = 0
+        #: Whether it has depth as Record3D packs it.
+        self.is_record3d = False
         #: Sound ones, though each of their frames may still turn out damaged.
         self.sequences: tuple[FrameSequence, ...] = ()
 
@@ -604,6 +607,7 @@ class Archive:
                 self._refuse(member, member.trouble)
             else:
                 self.ignored += 1
+                self.is_record3d |= parts[-2:-1] == (FRAMES,) and parts[-1].endswith(DEPTH_SUFFIX)
         return found
 
     def _refuse(self, member: ArchiveEntry, reason: str) -> None:
@@ -638,6 +642,11 @@ def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iter
                 f"The archive cannot be called {printable_name(name)}: {error}."
             ) from error
         archive.lay_out(own)
+        if not archive.sequences and archive.is_record3d:
+            raise UnreadableArchive(
+                "This is a capture of Record3D, whose depth a service does not inflate. Run "
+                "`sceneprint upload MAP FILE.r3d`."
+            )
         if not archive.sequences and not archive.refused:
             raise UnreadableArchive(
                 "There is no depth image or cloud in the archive, or only in archives within it. "

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sceneprint.errors import DatasetError, MissingDependency, UnreadableFrame
+from sceneprint.errors import DatasetError, MissingDependency, UnreadableArchive, UnreadableFrame
 from sceneprint.formats.archive import open_archive
 from sceneprint.formats.dataset import FrameSequence, Layout, find_sequences
 from sceneprint.formats.depth_file import decode_frame, encode_png
-from sceneprint_client.frame_files import meta_of
+from sceneprint_client.frame_files import meta_of, sendable
 from sceneprint_client.poses import quaternion_of
 
 Floats = NDArray[np.float64]
@@ -338,6 +338,16 @@ def test_zips_of_folders(
             assert room.error_of_depth(frame.depth, shape, T_room_world @ reference.pose) < 1e-3
 
 
+def test_a_capture_of_record3d_is_not_inflated_by_a_service(room: Any, tmp_path: Path) -> None:
+    file = packed(record3d(tmp_path / "a", room), tmp_path / "a.r3d")
+    with (
+        file.open("rb") as opened,
+        pytest.raises(UnreadableArchive, match=r"sceneprint upload MAP FILE\.r3d"),
+        open_archive(opened, tmp_path),
+    ):
+        pass
+
+
 # E57.
 
 
@@ -370,6 +380,8 @@ def test_scans_of_an_e57_file_are_frames(room: Any, tmp_path: Path) -> None:
     assert [one.original for one in sequence.frames] == ["Setup 0", "Setup 1", "Setup 2"]
     [same] = find_sequences(tmp_path)
     assert same.name == "hall"
+    with pytest.raises(DatasetError, match="may hold several frames"):
+        sendable(path, None, with_pose=False)
 
 
 def test_a_merged_e57_is_refused_with_the_remedy(room: Any, tmp_path: Path) -> None:

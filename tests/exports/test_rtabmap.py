@@ -8,7 +8,7 @@ import sqlite3
 import struct
 import zlib
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from sceneprint.errors import DatasetError, UnreadableCloud, UnreadableFrame
+from sceneprint.errors import DatasetError, SceneprintError, UnreadableCloud, UnreadableFrame
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.formats.dataset.frame_reference import session_of
 from sceneprint.formats.depth_file import encode_png
@@ -372,6 +372,22 @@ def test_views_in_the_place_of_tables_are_not_run(room: Any, tmp_path: Path) -> 
         )
     with pytest.raises(DatasetError, match="not one of RTAB-Map"):
         find_sequences(path)
+
+
+def test_random_damage_is_refused_by_an_error_of_ours(room: Any, tmp_path: Path) -> None:
+    rng = np.random.default_rng(11)
+    for version, packed in (("0.11.11", png), ("0.21.4", rvl), ("0.23.0", float_png)):
+        path = write(tmp_path / f"{version}.db", version, nodes_of(room, version, packed))
+        good = path.read_bytes()
+        for _ in range(60):
+            broken = bytearray(good)
+            for at in rng.integers(0, len(good), rng.integers(1, 20)):
+                broken[at] = rng.integers(0, 256)
+            path.write_bytes(broken if rng.random() < 0.9 else broken[: rng.integers(1, len(good))])
+            with suppress(SceneprintError):
+                for reference in find_sequences(path)[0].frames:
+                    with suppress(SceneprintError):
+                        reference.read()
 
 
 def test_nothing_is_written_beside_the_database(room: Any, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,13 @@ import pytest
 from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableCloud
-from sceneprint.formats.points.e57 import E57Scan, read_e57, unpacked, with_viewpoint
+from sceneprint.formats.points.e57 import (
+    E57Scan,
+    _checksums,
+    read_e57,
+    unpacked,
+    with_viewpoint,
+)
 
 pye57 = pytest.importorskip("pye57", reason="pye57 is not installed")
 Points = NDArray[np.float64]
@@ -230,6 +237,18 @@ def test_a_later_version_and_huge_pages_are_refused(file: bytes) -> None:
         everything(changed(file, 40, struct.pack("<Q", 1 << 50)))
     with pytest.raises(UnreadableCloud, match="no E57 file"):
         everything(b"ply\n" + file[4:])
+
+
+def test_random_damage_behind_right_checksums_is_an_error_of_ours(file: bytes) -> None:
+    rng = np.random.default_rng(4)
+    pages = np.frombuffer(file, np.uint8).reshape(-1, 1024)
+    for _ in range(150):
+        broken = pages.copy()
+        for _ in range(rng.integers(1, 20)):
+            broken[rng.integers(0, len(pages)), rng.integers(0, 1020)] = rng.integers(0, 256)
+        broken[:, 1020:] = _checksums(broken[:, :1020].copy()).astype(">u4")[:, None].view(np.uint8)
+        with suppress(UnreadableCloud):
+            everything(broken.tobytes())
 
 
 def test_packets_that_lie_are_refused(file: bytes) -> None:

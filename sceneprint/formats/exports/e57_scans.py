@@ -54,10 +54,11 @@ class E57Source:
                 raise UnreadableCloud("The scan is no longer there. Read the file again.")
             scan = scans[self.place]
             points, n = np.empty((scan.count, 3), np.float32), 0
-            for block in scan.points().blocks:
-                near = block[(np.abs(block) <= _FARTHEST_M).all(axis=1)]
-                points[n : n + len(near)] = near
-                n += len(near)
+            with np.errstate(all="ignore"):  # what is no number is missing
+                for block in scan.points().blocks:
+                    near = block[(np.abs(block) <= _FARTHEST_M).all(axis=1)]
+                    points[n : n + len(near)] = near
+                    n += len(near)
         points = points[:n]
         if n > MOST_POINTS:
             points, _ = thinned(points, MOST_POINTS)

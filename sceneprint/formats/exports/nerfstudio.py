@@ -73,7 +73,9 @@ class ScaledNpy:
         if samples.dtype == np.uint16:  # these are scaled by the camera's depth scale
             return data
         file = io.BytesIO()
-        np.save(file, (samples * np.float32(self.metres)).astype(np.float32), allow_pickle=False)
+        with np.errstate(all="ignore"):  # what overflows is missing
+            metres = (samples * np.float32(self.metres)).astype(np.float32)
+        np.save(file, metres, allow_pickle=False)
         return file.getvalue()
 
 

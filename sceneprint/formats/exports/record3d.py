@@ -46,7 +46,7 @@ from sceneprint_client.errors import printable
 from sceneprint_client.files import naming, read_bytes
 from sceneprint_client.poses import rotation_of
 
-METADATA, FRAMES = "metadata", "rgbd"
+METADATA, FRAMES, DEPTH_SUFFIX = "metadata", "rgbd", ".depth"
 SUFFIX = ".r3d"
 _MAXIMUM_METADATA_BYTES = 64 << 20
 _MOST_FRAMES = 100_000
@@ -210,7 +210,7 @@ def record3d_sequence(capture: Path, name: str) -> FrameSequence:
         ) from cause
     frames, left_out = list[FrameReference](), Counter[str]()
     for place, pose in enumerate(fields["poses"][:_MOST_FRAMES]):
-        file = f"{FRAMES}/{place}.depth"
+        file = f"{FRAMES}/{place}{DEPTH_SUFFIX}"
         if not _is_there(capture, file):
             left_out["frames without depth"] += 1
             continue

@@ -224,7 +224,8 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
             steps = iter(range(_MOST_STEPS))
             database.set_progress_handler(lambda: next(steps, None) is None, 100_000)
             yield database
-    except (sqlite3.Error, OverflowError, MemoryError) as cause:
+    # what SQLite says may quote bytes of the file that are no text
+    except (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError) as cause:
         reason = printable(f"{cause!s:.120}")
         raise DatasetError(
             f"{path}: The database cannot be read ({reason}). Copy it again, or repair it with "
