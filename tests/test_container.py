@@ -641,7 +641,7 @@ def test_service_and_worker_run_as_composed(
             "/maps/hall/frames",
             files={"frame": ("frame.npy", data.read_bytes())},
             data={"meta": json.dumps({"intrinsics": camera})},
-            headers={"Prefer": "wait=60"},
+            headers={"Prefer": "wait=200"},
         )
         assert (added.status_code, added.json()["state"]) == (201, "indexed"), added.text
         found = client.post(

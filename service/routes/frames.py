@@ -75,7 +75,7 @@ def delete_frame(map_name: str, frame_id: str, here: Here) -> None:
 
 
 #: Longest time to wait for a worker, seconds.
-LONGEST_WAIT_S = 60.0
+LONGEST_WAIT_S = 200.0
 #: Pause between two looks, seconds: short at first, as most frames are signed at once.
 FIRST_PAUSE_S, LONGEST_PAUSE_S, GROWTH = 0.03, 0.5, 1.5
 

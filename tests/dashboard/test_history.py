@@ -22,7 +22,7 @@ def asked(station):
         form = sent.form(priority="10")
         form["data"]["meta"] = json.dumps(sent.meta)
         added = station.client.post(
-            f"{path}/frames", headers={"Prefer": "wait=60"}, **form
+            f"{path}/frames", headers={"Prefer": "wait=200"}, **form
         )  # fmt: skip
         assert added.json()["state"] == "indexed", added.text
     found = []

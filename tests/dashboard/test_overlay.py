@@ -195,7 +195,7 @@ def test_an_ambiguous_match_has_its_rival(
     page: Page, station: Any, settle: Any, axe: Any, until: Any, pixels: Any
 ) -> None:
     path = station.make_map("boxes")
-    added = station.client.post(f"{path}/frames", **box(0), headers={"Prefer": "wait=50"})
+    added = station.client.post(f"{path}/frames", **box(0), headers={"Prefer": "wait=200"})
     assert added.json()["state"] == "indexed", added.text
     answer = station.client.post(f"{path}/queries", **box(0.3)).json()
     assert answer["status"] == "ambiguous"

@@ -227,7 +227,7 @@ def patrolled(station: Any) -> dict[str, Any]:
     for sent in station.frames[:3]:
         form = sent.form(priority="10")
         form["data"]["meta"] = json.dumps(sent.meta)
-        added = station.client.post(f"{path}/frames", headers={"Prefer": "wait=60"}, **form)
+        added = station.client.post(f"{path}/frames", headers={"Prefer": "wait=200"}, **form)
         assert added.json()["state"] == "indexed", added.text
     answers = [ask(station, who, sent) for who, sent in
                (("spot", 0), ("cart", 1), ("cart", 8), ("spot", 2))]  # fmt: skip

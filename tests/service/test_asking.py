@@ -29,7 +29,7 @@ def maps(served, make_map, shots) -> dict[str, list[str]]:
         for i in views:
             meta = {"session": f"room {i // 3}", "robot": "r1", "pose": {"matrix": shots[i].pose}}
             sent = served.client.post(
-                f"{path}/frames", **shots[i].form(**meta), headers={"Prefer": "wait=60"}
+                f"{path}/frames", **shots[i].form(**meta), headers={"Prefer": "wait=200"}
             )
             assert sent.json()["state"] == "indexed"
             found[name].append(sent.json()["frame_id"])

@@ -73,7 +73,7 @@ def test_each_change_has_its_lines(recorder: Recorder, small_shots: Any, until: 
         one.form(session=f"s{i // 2}", pose=pose_of(i), captured_at=f"2026-11-16T09:30:0{i}Z")
         for i, one in enumerate(small_shots[:4])
     ]
-    wait = {"Prefer": "wait=60"}
+    wait = {"Prefer": "wait=200"}
     taken = [
         do("add_frame", ["frame.received"], hall, headers=wait, **form).json()["frame_id"]
         for form in forms

@@ -15,7 +15,7 @@ from PIL import Image
 from sceneprint.formats.export import write_ply
 from sceneprint.types import DepthFrame, Floats
 
-WAIT = {"Prefer": "wait=60"}
+WAIT = {"Prefer": "wait=200"}
 #: Where the second of three clouds says that it was seen from, metres in its own coordinates.
 VIEWPOINT = (2.0, -1.0, 0.5)
 

@@ -13,7 +13,7 @@ def shaken(begin, make_map, small_shots):
     server = begin()
     path = make_map(server, "hall")
     for shot in small_shots[:2]:
-        sent = server.client.post(f"{path}/frames", **shot.form(), headers={"Prefer": "wait=60"})
+        sent = server.client.post(f"{path}/frames", **shot.form(), headers={"Prefer": "wait=200"})
         assert sent.status_code == 201
     return server
 
@@ -40,7 +40,7 @@ def test_a_database_that_vanishes_is_told_of_and_comes_back(
     with truth(shaken.folder) as connection:
         connection.exec_driver_sql("ALTER TABLE away RENAME TO jobs")
     until(lambda: shaken.client.get("/readyz").status_code == 200)
-    sent = shaken.client.post(path, **small_shots[2].form(), headers={"Prefer": "wait=60"})
+    sent = shaken.client.post(path, **small_shots[2].form(), headers={"Prefer": "wait=200"})
     assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
     assert len(shaken.workers) == 1
     assert shaken.log("worker died") == []
@@ -57,7 +57,7 @@ def test_a_disk_that_takes_no_blobs_takes_no_frames(shaken, small_shots, refused
     blobs.unlink()
     away.rename(blobs)
     sent = shaken.client.post(
-        "/v1/maps/hall/frames", **small_shots[3].form(), headers={"Prefer": "wait=60"}
+        "/v1/maps/hall/frames", **small_shots[3].form(), headers={"Prefer": "wait=200"}
     )
     assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
 

@@ -26,7 +26,7 @@ from service.metrics import Sampler
 
 def test_what_was_done_is_told(served, make_map, shots, until):
     path, client = make_map(served, "figures"), served.client
-    sent = client.post(f"{path}/frames", **shots[0].form(), headers={"Prefer": "wait=60"}).json()
+    sent = client.post(f"{path}/frames", **shots[0].form(), headers={"Prefer": "wait=200"}).json()
     asked = client.post(f"{path}/queries", json={"frame_id": sent["frame_id"], "k": 1})
     assert asked.status_code == 200
     own = client.get("/v1/stats", params={"map": "figures", "minutes": 5}).json()

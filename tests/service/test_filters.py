@@ -21,7 +21,7 @@ def rooms(served, make_map, shots) -> dict[str, Any]:
             "pose": {"matrix": shot.pose, "parent_frame": "house"}, "tags": ["day", f"n{i}"],
         }  # fmt: skip
         sent = served.client.post(
-            f"{path}/frames", **shot.form(**meta), headers={"Prefer": "wait=60"}
+            f"{path}/frames", **shot.form(**meta), headers={"Prefer": "wait=200"}
         )
         assert sent.json()["state"] == "indexed"
         ids.append(sent.json()["frame_id"])
@@ -94,7 +94,7 @@ def test_what_makes_no_sense_is_named(served, rooms, shots, refused, given, fiel
 
 def test_a_frame_is_kept_only_where_the_map_lacks_its_place(served, make_map, shots, refused):
     path = make_map(served, "novel")
-    wait = {"Prefer": "wait=60"}
+    wait = {"Prefer": "wait=200"}
 
     def send(shot, if_novel: str, headers: dict[str, str]) -> Any:
         form = shot.form()

@@ -28,7 +28,7 @@ BIN = Path(sys.executable).parent
 #: Largest file that a process may write from now on, where no disk can be mounted: less than the
 #: log of the database or a frame, more than our own logs.
 NARROW = 1 << 17
-WAIT = {"Prefer": "wait=60"}
+WAIT = {"Prefer": "wait=200"}
 
 
 def pending(server) -> dict[str, int]:

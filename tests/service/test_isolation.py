@@ -219,7 +219,7 @@ def there(walled, small_shots, until) -> dict[str, There]:
         session = f"run-of-{name}"
         sent = [
             walled.ask(
-                "boss", "POST", f"/v1/maps/{name}/frames", headers={"Prefer": "wait=60"},
+                "boss", "POST", f"/v1/maps/{name}/frames", headers={"Prefer": "wait=200"},
                 **shot.form(
                     session=session if number < 2 else f"{session}-2",
                     captured_at=f"2026-11-16T09:30:0{number}Z",

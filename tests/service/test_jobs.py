@@ -44,7 +44,7 @@ def test_a_job_is_cancelled_and_tried_again(idle, make_map, small_shots, refused
 def test_what_is_over_cannot_be_cancelled(served, make_map, small_shots, refused):
     path = make_map(served, "over")
     form = small_shots[1].form()
-    done = served.client.post(f"{path}/frames", **form, headers={"Prefer": "wait=60"}).json()
+    done = served.client.post(f"{path}/frames", **form, headers={"Prefer": "wait=200"}).json()
     assert done["state"] == "indexed"
     answer = served.client.post(f"/v1/jobs/{done['job_id']}/cancel")
     refused(answer, 409, "job-over", "is succeeded")

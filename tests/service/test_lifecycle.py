@@ -184,7 +184,7 @@ def test_service_and_worker_alone_do_the_job_together(begin, make_map, small_sho
     assert (sent.status_code, service.workers) == (202, [])
     worker = begin(command=(sys.executable, "-m", "worker"), wait=False, **given)
     waited = service.client.post(
-        f"{path}/frames", **small_shots[1].form(), headers={"Prefer": "wait=60"}
+        f"{path}/frames", **small_shots[1].form(), headers={"Prefer": "wait=200"}
     )
     assert (waited.status_code, waited.json()["state"]) == (201, "indexed")
     answer = service.client.post(f"{path}/queries", **small_shots[0].form()).json()

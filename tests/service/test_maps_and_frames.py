@@ -58,10 +58,10 @@ def test_an_upload_is_safe_then_signed_and_the_same_one_is_there_already(
     assert served.client.get(sent.headers["location"]).json()["frame_id"] == added["frame_id"]
 
     waited = served.client.post(
-        f"{path}/frames", **small_shots[1].form(**meta), headers={"Prefer": "wait=50"}
+        f"{path}/frames", **small_shots[1].form(**meta), headers={"Prefer": "wait=200"}
     )
     assert waited.status_code == 201, waited.text
-    assert waited.headers["preference-applied"] == "wait=50"
+    assert waited.headers["preference-applied"] == "wait=200"
     assert waited.json()["state"] == "indexed"
     assert waited.json()["frame_id"] != added["frame_id"]
 
@@ -110,7 +110,7 @@ def test_pages_hold_every_frame_once_and_in_order(served, make_map, small_shots,
     sent = []
     for shot in small_shots[:7]:
         answer = served.client.post(
-            f"{path}/frames", **shot.form(), headers={"Prefer": "respond-async, wait=50"}
+            f"{path}/frames", **shot.form(), headers={"Prefer": "respond-async, wait=200"}
         )
         assert answer.status_code == 201
         sent.append(answer.json()["frame_id"])

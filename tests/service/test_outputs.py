@@ -28,7 +28,7 @@ def shown(served, make_map, small_shots):
                 "pose": {"parent_frame": "hall", "translation": {"x": i, "y": 0, "z": 1},
                          "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}}  # fmt: skip
         added = served.client.post(
-            f"{path}/frames", **shot.form(**meta), headers={"Prefer": "wait=50"}
+            f"{path}/frames", **shot.form(**meta), headers={"Prefer": "wait=200"}
         )
         assert added.json()["state"] == "indexed", added.text
         ids.append(added.json()["frame_id"])

@@ -16,7 +16,7 @@ def drawn(served, make_map, small_shots) -> dict[str, Any]:
     path, ids = make_map(served, "drawn"), []
     for i in (0, 1):
         sent = served.client.post(
-            f"{path}/frames", **small_shots[i].form(), headers={"Prefer": "wait=60"}
+            f"{path}/frames", **small_shots[i].form(), headers={"Prefer": "wait=200"}
         )
         assert sent.json()["state"] == "indexed", sent.text
         ids.append(sent.json()["frame_id"])

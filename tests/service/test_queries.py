@@ -21,7 +21,7 @@ def rooms(served, make_map, shots) -> dict[str, Any]:
         shot = shots[i]
         meta = {"session": f"room {i // 3}", "robot": "r1", "pose": {"matrix": shot.pose}}
         sent = served.client.post(
-            f"{path}/frames", **shot.form(**meta), headers={"Prefer": "wait=60"}
+            f"{path}/frames", **shot.form(**meta), headers={"Prefer": "wait=200"}
         )
         assert sent.json()["state"] == "indexed"
         ids.append(sent.json()["frame_id"])

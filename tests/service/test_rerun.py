@@ -18,7 +18,7 @@ def asked(served, make_map, shots) -> dict[str, Any]:
         sent = served.client.post(
             f"{path}/frames",
             **shots[i].form(session="s", captured_at=f"2026-11-16T09:30:0{i}Z"),
-            headers={"Prefer": "wait=60"},
+            headers={"Prefer": "wait=200"},
         )
         assert sent.json()["state"] == "indexed"
     base = {"base_frame": "base_link", "matrix": np.eye(4).tolist()}
@@ -83,7 +83,7 @@ def test_the_question_is_told(served, asked):
 
 def test_a_stored_frame_is_asked_again_of_other_maps(served, asked, make_map, shots):
     path = make_map(served, "again-too")
-    served.client.post(f"{path}/frames", **shots[2].form(), headers={"Prefer": "wait=60"})
+    served.client.post(f"{path}/frames", **shots[2].form(), headers={"Prefer": "wait=200"})
     frame_id = asked["matches"][0]["frame_id"]
     first = served.client.post(
         "/v1/maps/again/queries", json={"frame_id": frame_id, "stages": "retrieve"}
@@ -99,7 +99,7 @@ def test_another_frame_of_the_same_id_is_not_asked_in_its_place(served, make_map
 
     def put(i: int) -> None:
         reply = served.client.put(
-            f"{path}/frames/door", **shots[i].form(), headers={"Prefer": "wait=60"}
+            f"{path}/frames/door", **shots[i].form(), headers={"Prefer": "wait=200"}
         )
         assert reply.json()["state"] == "indexed", reply.text
 

@@ -16,7 +16,7 @@ def path(served, make_map, shots) -> str:
     for shot in shots[:2]:
         meta = {"session": "morning", "robot": "r1", "pose": {"matrix": shot.pose}}
         sent = served.client.post(
-            f"{home}/frames", **shot.form(**meta), headers={"Prefer": "wait=60"}
+            f"{home}/frames", **shot.form(**meta), headers={"Prefer": "wait=200"}
         )
         assert sent.json()["state"] == "indexed"
     return str(home)

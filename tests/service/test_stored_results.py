@@ -22,7 +22,7 @@ def asked(served, make_map, shots) -> dict[str, Any]:
     path = make_map(served, "looked-at")
     for i in (0, 1, 3):
         sent = served.client.post(
-            f"{path}/frames", **shots[i].form(session="s"), headers={"Prefer": "wait=60"}
+            f"{path}/frames", **shots[i].form(session="s"), headers={"Prefer": "wait=200"}
         )
         assert sent.json()["state"] == "indexed"
     form = shots[0].form(pose={"parent_frame": "w", "matrix": np.eye(4).tolist()})

@@ -33,7 +33,7 @@ def query(shot, **more: object) -> dict[str, Any]:
 def test_a_frame_has_the_id_it_was_put_under(served, hall, small_shots, refused) -> None:
     http, shot = served.client, small_shots[60]
     path = f"{hall}/frames/Robot-1_0.png"
-    first = http.put(path, **shot.form(session="a"), headers={"Prefer": "wait=60"})
+    first = http.put(path, **shot.form(session="a"), headers={"Prefer": "wait=200"})
     assert (first.status_code, first.json()["frame_id"]) == (201, "Robot-1_0.png")
     again = http.put(path, **shot.form(session="a"))
     assert (again.status_code, again.json()) == (200, first.json())
@@ -110,7 +110,7 @@ def test_a_body_that_is_the_frame_is_taken_as_the_form_is(served, hall, small_sh
 
 def test_a_query_may_be_a_body_too(served, hall, small_shots) -> None:
     http, shot = served.client, small_shots[3]
-    sent = http.put(f"{hall}/frames/asked", **shot.form(), headers={"Prefer": "wait=60"})
+    sent = http.put(f"{hall}/frames/asked", **shot.form(), headers={"Prefer": "wait=200"})
     assert sent.status_code == 201
     asked = query(shot, k=1, stages="retrieve")
     by_body = http.post(f"{hall}/queries", **asked).json()
@@ -165,7 +165,7 @@ def test_a_key_makes_an_upload_take_effect_once(served, hall, small_shots, refus
     first = http.post(f"{hall}/frames", **shot.form(session="k"), headers=key)
     assert "idempotent-replayed" not in first.headers
     again = http.post(
-        f"{hall}/frames", **shot.form(session="k"), headers={**key, "Prefer": "wait=60"}
+        f"{hall}/frames", **shot.form(session="k"), headers={**key, "Prefer": "wait=200"}
     )
     assert again.headers["idempotent-replayed"] == "true"
     assert again.json() == {**first.json(), "state": "indexed"}
