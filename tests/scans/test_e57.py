@@ -140,6 +140,11 @@ def test_ranges_and_angles_become_positions(tmp_path: Path, single: bool) -> Non
 def test_a_merged_cloud_has_no_viewpoint_and_registered_scans_have(tmp_path: Path) -> None:
     merged = read_e57(simple(tmp_path / "a.e57", POINTS[:100]))
     assert with_viewpoint(merged) == [False]
+    shift, turn = np.array([5e5, 4e6, 0]), np.array([0.8, 0, 0, 0.6])
+    shifted = read_e57(simple(tmp_path / "a.e57", POINTS[:100], translation=shift))
+    assert with_viewpoint(shifted) == [False]
+    turned = read_e57(simple(tmp_path / "a.e57", POINTS[:100], rotation=turn))
+    assert with_viewpoint(turned) == [True]
     columns = {f"cartesian{axis}": POINTS[:100, k].copy() for k, axis in enumerate("XYZ")}
     with pye57.E57(str(tmp_path / "b.e57"), "w") as file:
         for x in (0.0, 4.0):

@@ -183,10 +183,13 @@ def with_viewpoint(scans: tuple[E57Scan, ...]) -> list[bool]:
     """Return for each scan of a file whether its points were seen from the scan's origin.
 
     That holds for structured scans and for ranges and angles. It also holds for scans with a pose
-    where at least one scan has been moved by its pose: merged clouds are stored without.
+    in a file whose poses differ or turn a scan: merged clouds have none, or one that shifts them
+    to the coordinates of a map.
     """
-    moved = any(not np.array_equal(one.T_world_scan, np.eye(4)) for one in scans)
-    return [one.is_structured or one.is_spherical or (one.has_pose and moved) for one in scans]
+    poses = [one.T_world_scan for one in scans if one.has_pose]
+    turned = any(not np.allclose(T[:3, :3], np.eye(3), atol=1e-9) for T in poses)
+    registered = turned or any(not np.array_equal(T, poses[0]) for T in poses)
+    return [one.is_structured or one.is_spherical or (one.has_pose and registered) for one in scans]
 
 
 # Pages: payload, and a checksum of it.
