@@ -29,6 +29,7 @@ from benchmarks.fleet.postgres import NoServer, Server
 from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.waiting import until as wait_until
 from sceneprint.cli.demo import write_building
+from sceneprint.formats.export import write_ply
 from sceneprint.geometry.registration.patch_descriptors import (
     Compression,
     PatchDescriptorParameters,
@@ -38,6 +39,7 @@ from sceneprint.geometry.signature.mixture import Mixture
 from sceneprint.geometry.signature.pair_features import Projection, TableLayout
 from sceneprint.geometry.signature.segmentation import HierarchyParameters, SegmentationParameters
 from sceneprint.lab.synth import KINECT, SynthRoom, synthesise_room
+from sceneprint.lab.synth.rooms import make_room
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer
 from sceneprint.settings import Settings
@@ -465,6 +467,13 @@ def room_frames(room_views: Callable[..., SynthRoom]) -> tuple[DepthFrame, ...]:
         for room in rooms
         for i, frame in enumerate(room.frames)
     )
+
+
+@pytest.fixture(scope="session")
+def room_mesh() -> bytes:
+    """The mesh of a furnished room as a PLY file, in metres, z up."""
+    room = make_room(np.random.default_rng(3))
+    return write_ply(room.vertices, faces=room.faces)
 
 
 @pytest.fixture(scope="session")

@@ -39,7 +39,7 @@ from sceneprint_client.api.sessions import (
     NewDifference,
 )
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
-from sceneprint_client.errors import InvalidRequest, UnreadableArchive
+from sceneprint_client.errors import InvalidRequest, UnreadableArchive, UnreadableCloud
 from sceneprint_client.http import (
     ServiceConnection,
     association_path,
@@ -184,7 +184,7 @@ class JobMethods(ServiceConnection):
             self._let_work(pause)
             begun = look()
 
-    # archives: imports are jobs
+    # archives and whole maps: imports are jobs
 
     def import_archive(
         self, map_name: str, archive: Path | BinaryIO, options: ImportOptions | None = None
@@ -219,6 +219,39 @@ class JobMethods(ServiceConnection):
                 f"{archive}: The file cannot be read ({error.strerror}). Check its name."
             ) from error
 
+    def import_map(
+        self, map_name: str, file: Path | BinaryIO, options: ImportOptions | None = None
+    ) -> Job:
+        """Import a map that comes as one file, a cloud or a mesh: a worker renders views of it.
+
+        Parameters
+        ----------
+        map_name : of the map that they become frames of
+        file : PCD, PLY (points or mesh), LAS, LAZ, OBJ, STL, glTF or E57
+        options : with `as` = `map`; default: that, and the name of the file. Of a file without a
+            path, `name` says its format by its ending
+
+        Returns
+        -------
+        job : wait for it with `wait`; its `result` is a MapImportResult, and `import_items` lists
+            the views
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : options of an archive.
+        UnreadableCloud : no file of a map, or it cannot be read.
+        """
+        if not isinstance(file, Path):
+            return self._send_archive(map_name, file, _of_map(options, None))
+        try:
+            with file.open("rb") as opened:
+                return self._send_archive(map_name, opened, _of_map(options, file.name))
+        except OSError as error:
+            raise UnreadableCloud(
+                f"{file}: The file cannot be read ({error.strerror}). Check its name."
+            ) from error
+
     def import_job(self, map_name: str, job_id: str) -> Job:
         """An import of a map; UnknownMap or UnknownJob if it does not exist."""
         return self._ask(Job, "GET", _import_path(map_name, job_id))
@@ -230,7 +263,7 @@ class JobMethods(ServiceConnection):
     def _send_archive(self, map_name: str, archive: BinaryIO, options: ImportOptions) -> Job:
         """Send an archive, from its start at each try."""
         path = f"{map_path(map_name)}/imports"
-        parameters = {"options": options.model_dump_json(exclude_defaults=True)}
+        parameters = {"options": options.model_dump_json(exclude_defaults=True, by_alias=True)}
 
         def send() -> httpx.Response:
             archive.seek(0)
@@ -596,6 +629,19 @@ class JobMethods(ServiceConnection):
 
 def _import_path(map_name: str, job_id: str) -> str:
     return f"{map_path(map_name)}/imports/{job_path(job_id).rpartition('/')[2]}"
+
+
+def _of_map(options: ImportOptions | None, name: str | None) -> ImportOptions:
+    """Return the options of the import of a map; InvalidRequest where they are of an archive."""
+    if options is None:
+        own = {"as": "map"} if name is None else {"as": "map", "name": name[-64:].lstrip(".")}
+        return checked(ImportOptions, "The map's name", **own)
+    if options.as_ != "map":
+        raise InvalidRequest(
+            "The options are those of an archive. Make them with `as` = `map`.",
+            (("as", "not `map`"),),
+        )
+    return options
 
 
 def _chunks(file: BinaryIO) -> Iterator[bytes]:

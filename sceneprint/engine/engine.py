@@ -13,7 +13,8 @@ from sceneprint.decoders import Decoders, LocalDecoders
 from sceneprint.decoders.pool import DecoderPool
 from sceneprint.engine.admin import operations
 from sceneprint.engine.admin.operations import Audit, OperatorTasks
-from sceneprint.engine.ingest.archive_import import Imports
+from sceneprint.engine.ingest.archive_import import MAP_KIND, Imports
+from sceneprint.engine.ingest.map_import import MapImporter
 from sceneprint.engine.ingest.uploads import Upload, Uploads
 from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.jobs import signature_job as working
@@ -124,6 +125,10 @@ class Engine:
         self.uploads = Uploads(self.store, self.bell)
         self.tasks = Tasks(self.store, self.bell)
         self.imports = Imports(self.store, self.tasks, self.uploads, settings.import_bytes)
+        map_importer = MapImporter(
+            self.store, self.signers, self.uploads, self.queries, 0.75 * settings.job_s
+        )
+        self.tasks.register(MAP_KIND, map_importer)
         self.associations = AssociationJobs(self.store, self.tasks)
         self.tasks.register(ASSOCIATE, Associating(self.store, self.signers, self._readers))
         self.coverage = CoverageJobs(self.store, self.tasks)

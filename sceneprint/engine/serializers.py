@@ -156,7 +156,8 @@ def job_progress(job: JobRow) -> Progress | None:
     """How far a long job has come; None before its first slice is over."""
     if job.progress is None:
         return None
-    return Progress(done=job.progress.get("done", 0), total=job.progress.get("total"))
+    known = {name: job.progress[name] for name in Progress.model_fields if name in job.progress}
+    return Progress(**{"done": 0} | known)
 
 
 def job_record(

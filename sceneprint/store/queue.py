@@ -487,10 +487,13 @@ def finish(
     )  # fmt: skip
 
 
-def go_on(connection: Connection, held: JobRow, progress: dict[str, Any]) -> None:
+def go_on(
+    connection: Connection, held: JobRow, progress: dict[str, Any], after_s: float = 0.0
+) -> None:
     """Queue a long job again after a part of it, behind those that wait.
 
-    However many tries it took, they count no more: it came further.
+    However many tries it took, they count no more: it came further. It is not claimed within
+    `after_s` seconds.
 
     Raises
     ------
@@ -500,7 +503,7 @@ def go_on(connection: Connection, held: JobRow, progress: dict[str, Any]) -> Non
     # go before them with every part
     _hold(
         connection, held, state=JobState.QUEUED, attempts=1, failures=0,
-        leased_until=None, worker=None, run_after=now(connection), progress=progress,
+        leased_until=None, worker=None, run_after=now(connection) + after_s, progress=progress,
     )  # fmt: skip
 
 
@@ -731,8 +734,7 @@ def items_of(
 def add_files(connection: Connection, job_number: int, files: Iterable[JobFile]) -> None:
     """Let a job have files; one of the same name gives way."""
     for one in files:
-        own = (job_files.c.job_number == job_number) & (job_files.c.name == one.name)
-        connection.execute(delete(job_files).where(own))
+        remove_parts(connection, job_number, items=False, files=[one.name])
         connection.execute(insert(job_files).values(job_number=job_number, **asdict(one)))
         if one.name == ARCHIVE:
             _count_archive(connection, job_number, one.bytes)

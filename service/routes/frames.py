@@ -23,6 +23,7 @@ from sceneprint_client.api.frames import (
     Batch,
     ImportItem,
     ImportOptions,
+    camera_fields,
     check_frame_id,
 )
 from sceneprint_client.api.listing import FramePage
@@ -274,7 +275,7 @@ async def _settled(
     return added
 
 
-# Archives of sequences into a map.
+# Archives of sequences, and maps that come as one file, into a map.
 
 imports_router = v1_router("/maps/{map_name}/imports", "imports")
 
@@ -285,12 +286,31 @@ TYPES = (
 )  # fmt: skip
 #: Bytes that are written at once.
 _CHUNK = 1 << 20
-_TEXTS = ("name", "robot", "session", "parent_frame", "every", "with_poses")
-_PARAMETERS = (*_TEXTS, "tags", "base", "base_frame", "up", "priority", "if_novel")
+_TEXTS = (
+    "as",
+    "name",
+    "robot",
+    "session",
+    "parent_frame",
+    "every",
+    "with_poses",
+    "units_per_metre",
+)
+_PARAMETERS = (
+    *_TEXTS, "tags", "base", "base_frame", "up", "heights", "camera", "priority", "if_novel",
+)  # fmt: skip
+#: Of those that are lists: how they are written.
+_LISTS = {
+    "tags": "Of all frames, with commas between.",
+    "heights": "Of a map: heights of the sensor above the floor, metres, with commas between; "
+    "default: those of the model's sensors.",
+    "camera": "Of a map of depth images: the robot's camera as fx,fy,cx,cy,width,height.",
+}
 
 
 def _described_import() -> dict[str, Any]:
-    own = ImportOptions.model_json_schema(ref_template="#/components/schemas/{model}")["properties"]
+    schema_of = ImportOptions.model_json_schema(ref_template="#/components/schemas/{model}")
+    own = schema_of["properties"]
     base = {one["name"]: one for one in bodies.parameters() if one["name"].startswith("base")}
     text = "ImportOptions as JSON, in place of what follows."
     parameters: list[dict[str, Any]] = [
@@ -305,11 +325,13 @@ def _described_import() -> dict[str, Any]:
     for name in _PARAMETERS:
         told = own.get(name, {})
         schema = OPTIONS.get(name) or {"type": "string"}
-        if name in ("every", "with_poses", "name"):
-            schema = {key: told[key] for key in ("type", "default", "minimum") if key in told}
+        if name in ("as", "every", "with_poses", "name"):
+            known = ("type", "enum", "default", "minimum")
+            schema = {key: told[key] for key in known if key in told}
+        if name == "units_per_metre":
+            schema = {"type": "number", "exclusiveMinimum": 0}
         said = told.get("description") or base.get(name, {}).get("description", "")
-        if name == "tags":
-            said = "Of all frames, with commas between."
+        said = _LISTS.get(name, said)
         parameters.append(
             {"name": name, "in": "query", "required": False, "schema": schema, "description": said}
         )
@@ -328,11 +350,17 @@ async def add_import(
     map_name: str, request: Request, here: Here, asking: Asking, response: Response,
     key: IdempotencyKey = None,
 ) -> Job:  # fmt: skip
-    """Take an archive of sequences into a map; the body is the archive itself.
+    """Take an archive of sequences into a map, or a map that comes as one file; the body is the
+    file itself.
 
-    A zip, or a tar (plain, .gz, .bz2 or .xz), of a 7-Scenes scene or sequence, a TUM RGB-D folder,
-    or depth images with their intrinsics.json. When this answers, the archive is safe; a worker
-    takes its frames one by one, and what is wrong with one costs no other.
+    An archive is a zip, or a tar (plain, .gz, .bz2 or .xz), of a 7-Scenes scene or sequence, a TUM
+    RGB-D folder, or depth images with their intrinsics.json. When this answers, the archive is
+    safe; a worker takes its frames one by one, and what is wrong with one costs no other.
+
+    With `as=map` the body is one cloud or mesh of a whole place (PCD, PLY, LAS, LAZ, OBJ, STL, glTF
+    or E57), and `name` the name of its file. A worker renders views of it, adds them as frames with
+    poses, and looks others up to see where a robot would be found: `result` of the job has this
+    (MapImportResult).
     """
     if media_type(request) not in TYPES:
         raise UnsupportedType(
@@ -340,7 +368,7 @@ async def add_import(
             f"{', '.join(TYPES)}."
         )
     options = _options(request)
-    receiving = contextmanager_in_threadpool(here.engine.imports.receive(map_name))
+    receiving = contextmanager_in_threadpool(here.engine.imports.receive(map_name, options))
     async with here.uploads.place(), receiving as receiver:
         archive = await _received(receiver, request, here)
         once = guarded(asking, key, "import", map_name, archive.blob, options)
@@ -368,7 +396,9 @@ def list_import_items(
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> Page[ImportItem]:
-    """What came of each frame of the archive so far, and of members that are none."""
+    """What came of each frame of the archive so far, and of members that are none; or of each view
+    of a map.
+    """
     return here.engine.imports.items(map_name, job_id, cursor, limit)
 
 
@@ -403,15 +433,21 @@ def _options(request: Request) -> ImportOptions:
                 tuple((name, "beside options") for name in sorted(given)),
             )
         try:
-            return checked(ImportOptions, from_json(text), "The archive options")
+            return checked(ImportOptions, from_json(text), "The import options")
         except ValueError as error:
             raise MalformedBody("The parameter `options` is not JSON. Send an object.") from error
     fields: dict[str, Any] = {name: given[name] for name in _TEXTS if name in given}
-    if given.get("tags"):
-        fields["tags"] = given["tags"].split(",")
+    for name in ("tags", "heights"):
+        if given.get(name):
+            fields[name] = given[name].split(",")
+    if "camera" in given:
+        fields["camera"] = camera_fields(given["camera"])
     bodies.add_transform(fields, given, "base", "T_base_sensor", "base_frame")
-    bodies.add_up(fields, given)
+    if fields.get("as") == "map" and "up" in given:
+        fields["up"] = given["up"]
+    else:
+        bodies.add_up(fields, given)
     if "priority" in given:
         fields["priority"] = given["priority"]
     fields["if_novel"] = novelty_of(given.get("if_novel"))
-    return checked(ImportOptions, fields, "The archive options")
+    return checked(ImportOptions, fields, "The import options")

@@ -17,12 +17,13 @@ from sceneprint.errors import (
     UnknownJob,
     UnknownMap,
     UnreadableArchive,
+    UnreadableCloud,
 )
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, meta_of
 from sceneprint_client.api import JobState
 from sceneprint_client.api.base import GivenBase
-from sceneprint_client.api.frames import ImportOptions
+from sceneprint_client.api.frames import ImportOptions, MapImportResult
 
 BASE = GivenBase.model_validate(
     {
@@ -165,3 +166,30 @@ def test_what_is_no_archive_is_refused_at_the_door(
     job, items = done(client, map_name, notes)
     assert (job.state, items) == (JobState.FAILED, [])
     assert job.error
+
+
+def test_a_map_that_is_one_file(
+    client: Client, map_name: str, room_mesh: bytes, tmp_path: Path
+) -> None:
+    client.create_map(map_name, model="depth")
+    file = tmp_path / "room.ply"
+    file.write_bytes(room_mesh)
+    camera = {"fx": 73, "fy": 73, "cx": 39.5, "cy": 29.5, "width": 80, "height": 60}
+    options = ImportOptions.model_validate(
+        {"as": "map", "name": "room.ply", "camera": camera, "heights": [1.2], "session": "given"}
+    )
+    job = client.import_map(map_name, file, options)
+    assert (job.kind, job.map) == ("import-map", map_name)
+    [over] = client.wait([job.job_id], timeout_s=PATIENCE_S)
+    assert (over.state, over.error) == (JobState.SUCCEEDED, None)
+    result = MapImportResult.model_validate(over.result)
+    frames = [one for one in client.frames(map_name) if one.state == "indexed"]
+    assert len(frames) == result.views > 0
+    assert {(one.session, *one.tags) for one in frames} == {("given", "virtual")}
+    assert len(list(client.import_items(map_name, job.job_id))) == over.progress.views
+    with pytest.raises(InvalidRequest, match="`as` = `map`"):
+        client.import_map(map_name, file, ImportOptions())
+    with pytest.raises(UnreadableCloud, match="cannot be read"):
+        client.import_map(map_name, tmp_path / "none.ply")
+    with pytest.raises(UnreadableCloud):
+        client.import_map(map_name, io.BytesIO(b"no map"))

@@ -49,7 +49,8 @@ def test_an_archive_from_the_door_to_its_frames(served, yard, small_shots, until
     refused(http.post(f"{yard}/imports", **other), 422, "idempotency-conflict")
     until(lambda: http.get(path).json()["state"] == "succeeded")
     told = http.get(path).json()
-    assert told["progress"] == {"done": 6, "total": 6}
+    assert (told["progress"]["done"], told["progress"]["total"]) == (6, 6)
+    assert told["progress"]["phase"] is None
     assert told["result"] == {
         "sequences": 1, "received": 4, "there": 0, "refused": 2, "ignored": 0,
     }  # fmt: skip
@@ -111,3 +112,47 @@ def test_an_archive_has_a_limit_of_its_own(begin, make_map, small_shots, refused
         archive.addfile(info, io.BytesIO(bytes(info.size)))
     bomb = sent(made.getvalue(), "application/x-xz")
     refused(server.client.post(f"{path}/imports", **bomb), 422, "unreadable-archive", "240000")
+
+
+#: A camera of few pixels at one height: few views, which are rendered and signed quickly.
+_SMALL = {"camera": "73,73,39.5,29.5,80,60", "heights": "1.2"}
+
+
+def test_a_map_that_is_one_file_becomes_views(
+    served, make_map, room_mesh, small_shots, until, refused
+) -> None:
+    http, path = served.client, make_map(served, "room")
+    options = {"as": "map", "name": "room.ply", "up": "z", **_SMALL}
+
+    def post(data: bytes = room_mesh, **more: str) -> Any:
+        return http.post(f"{path}/imports", **sent(data, "application/octet-stream", **more))
+
+    refused(
+        post(**options | {"up": "0,0,1"}),
+        422,
+        "invalid-request",
+        "up.axis: Input should be 'x', '-x'",
+    )
+    refused(post(**options | {"camera": "1,2"}), 422, "invalid-request", "six numbers")
+    refused(post(**options | {"every": "2"}), 422, "invalid-request", "every")
+    refused(post(heights="1"), 422, "invalid-request", "`as` = `map`")
+    refused(post(zipped(small_shots[:1]), **options), 422, "invalid-request", "archive")
+    refused(post(b"no map", **options | {"name": "room"}), 422, "unreadable-cloud", "PLY")
+    begun = post(**options)
+    assert begun.status_code == 202, begun.text
+    where = begun.headers["location"]
+    assert where == f"{path}/imports/{begun.json()['job_id']}"
+    until(lambda: http.get(where).json()["state"] not in ("queued", "running"))
+    told = http.get(where).json()
+    assert (told["kind"], told["state"]) == ("import-map", "succeeded"), told
+    result, progress = told["result"], told["progress"]
+    assert progress["phase"] == "test"
+    assert progress["views"] == progress["rendered"] == progress["signed"] > 0
+    assert (result["parent_frame"], result["session"]) == ("room", "room")
+    assert result["tested"] == progress["tested"] > 0
+    assert result["wrong"] == 0
+    frames = http.get(f"{path}/frames", params={"tag": "virtual", "limit": 1}).json()["items"]
+    assert frames[0]["pose"]["parent_frame"] == "room"
+    assert frames[0]["intrinsics"]["width"] == 80
+    items = http.get(f"{where}/items", params={"limit": 1}).json()
+    assert items["items"][0]["name"] == "room.ply/00000"

@@ -310,11 +310,23 @@ OUTCOMES: tuple[Outcome, ...] = (
 # Jobs as JSON.
 
 
+#: What the import of a map does, in this order.
+ImportPhase = Literal["read", "choose", "render", "sign", "test"]
+
+
 class Progress(ApiRecord):
     """How far a long job has come."""
 
     done: int = Field(description="Steps that are over: frames, members of an archive.")
     total: int | None = Field(default=None, description="Of so many, where that is known.")
+    phase: ImportPhase | None = Field(
+        default=None, description="What the import of a map does; null of other jobs, as below."
+    )
+    points: int | None = Field(default=None, description="Points that were read.")
+    views: int | None = Field(default=None, description="Viewpoints that were chosen.")
+    rendered: int | None = Field(default=None, description="Views that were rendered and added.")
+    signed: int | None = Field(default=None, description="Views that were signed.")
+    tested: int | None = Field(default=None, description="Other views that were looked up.")
 
 
 class MapJob(ApiRecord):
@@ -333,8 +345,8 @@ class Job(ApiRecord):
 
     job_id: str
     kind: str = Field(
-        description="`sign`, `import`, `associate`, `coverage`, `difference`, `surface`, "
-        "`reconstruct`, or `reencode`: that one signs an indexed frame once more, with "
+        description="`sign`, `import`, `import-map`, `associate`, `coverage`, `difference`, "
+        "`surface`, `reconstruct`, or `reencode`: that one signs an indexed frame once more, with "
         "the model to come or as what was made of it is damaged."
     )
     state: JobState
@@ -404,7 +416,7 @@ KINDS = {
         "A query was answered, or failed; `data` has `query_id`, `status`, `robot`, `pose` where "
         "it was found, and more about it."
     ),
-    "import.done": "An archive was imported, as far as it could be; `data` is its result.",
+    "import.done": "An archive or a map was imported, as far as it could be; `data` is its result.",
     "association.found": "A job that looked for associations is over; `data` is its result.",
     "surface.updated": "A job that fused the surface of a map is over; `data` has `frames` and "
     "`tiles`.",

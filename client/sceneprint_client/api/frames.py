@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from datetime import datetime
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
-from pydantic import Field, StringConstraints
+from pydantic import Discriminator, Field, StringConstraints, Tag, model_validator
 
 from sceneprint_client.api.base import (
     MOST_TAGS,
@@ -129,38 +129,156 @@ class Batch(ApiRecord):
     items: list[BatchItem] = Field(description="In the order in which the frames were sent.")
 
 
-class ImportOptions(Given):
-    """What is said of all frames of an archive."""
+#: An axis of a file's coordinates, or its opposite.
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
+#: Up as an axis of a file, or in the axes of a sensor.
+AxisOrUp = Annotated[
+    Annotated[Axis, Tag("axis")] | Annotated[Up, Tag("direction")],
+    Discriminator(lambda up: "axis" if isinstance(up, str) else "direction"),
+]
+#: Of frames that were rendered from a map that came as one file.
+VIRTUAL = "virtual"
+#: Options that only an import of frames has, and those that only one of a whole map has.
+_OF_FRAMES = ("with_poses", "every", "T_base_sensor")
+_OF_MAP = ("heights", "units_per_metre", "camera")
 
+
+class ImportOptions(Given):
+    """What an import takes its file for, and metadata of all frames that it adds."""
+
+    as_: Literal["frames", "map"] = Field(
+        default="frames",
+        alias="as",
+        description="`frames`: an archive of sequences, whose frames are added. `map`: a cloud or "
+        "mesh of a whole place, of which views are rendered and added, tagged `virtual`.",
+    )
     name: FolderName = Field(
         default="import",
-        description="Names what lies at the top of the archive, outside of any folder.",
+        description="Names what lies at the top of the archive, outside of any folder. Of a map, "
+        "the name of its file.",
     )
     robot: Label | None = Field(
         default=None, description="Who took the frames, and whose the poses' frame is."
     )
     session: Label | None = Field(
-        default=None, description="In which run; default: the name of each sequence."
+        default=None,
+        description="In which run; default: the name of each sequence, or of the map's file.",
     )
     tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
     parent_frame: Label | None = Field(
         default=None,
-        description="What all poses lead to; default: the scene's name, after ROBOT/ if given.",
+        description="What all poses lead to; default: the name of the scene, or of the map's "
+        "file, after ROBOT/ if given.",
     )
     with_poses: bool = Field(default=True, description="Take the poses that are in the archive.")
     every: int = Field(default=1, ge=1, description="Take every Nth frame of a sequence.")
     T_base_sensor: GivenBase | None = Field(
         default=None, description="Where the sensor sits on the robot."
     )
-    up: Up | None = Field(
+    up: AxisOrUp | None = Field(
         default=None,
-        description="Up in the sensor's axes, of all frames: where the sensor is carried level.",
+        description="Up in the sensor's axes, of all frames: where the sensor is carried level. Of "
+        "a map, the axis of its file that points up, such as `z` or `-y`; default: as the file "
+        "says, else estimated.",
+    )
+    heights: list[Annotated[float, Field(gt=0, le=1000)]] = Field(
+        default=[],
+        max_length=8,
+        description="Of a map: heights of the robot's sensor above the floor, metres; default: "
+        "those of the model's sensors.",
+    )
+    units_per_metre: float | None = Field(
+        default=None,
+        gt=0,
+        description="Of a map: 1000 for a file in millimetres; default: as the file says, else "
+        "estimated.",
+    )
+    camera: CameraIntrinsics | None = Field(
+        default=None,
+        description="Of a map of depth images: the robot's camera, whose views are rendered.",
     )
     priority: int = Field(
         default=0, ge=-MOST_PRIORITY, le=MOST_PRIORITY, description="Of the frames' jobs."
     )
     if_novel: float | None = Field(
         default=None, gt=0, le=1, description="As of an upload, for each frame."
+    )
+
+    @model_validator(mode="after")
+    def _of_its_kind(self) -> ImportOptions:
+        if self.as_ == "map":
+            idle, hint = _OF_FRAMES, "does not apply to a map; leave it out"
+        else:
+            idle, hint = _OF_MAP, "applies only with `as` = `map`"
+        for name in idle:
+            if getattr(self, name) != type(self).model_fields[name].get_default():
+                raise ValueError(f"{name}: {hint}")
+        if self.up is not None and isinstance(self.up, str) != (self.as_ == "map"):
+            axes = f"one of {', '.join(get_args(Axis))}, the axis of the file that points up"
+            raise ValueError(
+                f"up: {axes if self.as_ == 'map' else 'a unit vector in the axes of the sensor'}"
+            )
+        if self.as_ == "map" and len(self.tags) >= MOST_TAGS:
+            raise ValueError(f"tags: at most {MOST_TAGS - 1}, as {VIRTUAL!r} is added")
+        return self
+
+
+def camera_fields(text: str) -> dict[str, float]:
+    """Return the fields of a camera that is written as `fx,fy,cx,cy,width,height`.
+
+    Raises
+    ------
+    InvalidRequest : these are not six numbers.
+    """
+    names = ("fx", "fy", "cx", "cy", "width", "height")
+    try:
+        return dict(zip(names, map(float, text.split(",")), strict=True))
+    except ValueError as error:
+        raise InvalidRequest(
+            f"The camera {text!r:.80} is not six numbers. Write {','.join(names)}, in pixels.",
+            (("camera", f"not {','.join(names)}"),),
+        ) from error
+
+
+class WeakArea(ApiRecord):
+    """A square of the floor in which a robot would not be found reliably."""
+
+    centre: Vector = Field(description="In the parent frame of the map, on the floor.")
+    width_m: float
+    views: int = Field(description="Views in it that were looked up.")
+    found: int = Field(description="Of these, those that were found at their poses.")
+
+
+class MapImportResult(ApiRecord):
+    """What became of a map that came as one file: `result` of its job."""
+
+    points: int
+    triangles: int = Field(description="0 of a cloud.")
+    units_per_metre: float
+    units_from: str = Field(description="`stated`, `file` or `estimated`.")
+    up: Direction = Field(description="In the axes of the file.")
+    up_from: str = Field(description="As `units_from`.")
+    offset: Vector = Field(
+        description="The coordinates of the file, in metres, are those of poses plus this; zero "
+        "unless the file lies far from its origin."
+    )
+    notes: list[str] = Field(description="What was done to the file on the way.")
+    session: str
+    parent_frame: str = Field(description="What the poses of all views lead to.")
+    views: int = Field(description="Frames that the map has of it.")
+    refused: int = Field(description="Views that could not be added: see the import's items.")
+    seen: float = Field(description="Share of the surface that the views see, 0 to 1.")
+    tested: int = Field(description="Views that were not added, and looked up in the end.")
+    found: int = Field(description="Of these, those that were found at their poses.")
+    wrong: int
+    ambiguous: int
+    not_found: int
+    coverage: float | None = Field(
+        description="`found` / `tested`: the share of the place where a robot would be found; null "
+        "where nothing was looked up."
+    )
+    weak: list[WeakArea] = Field(
+        description="Where fewer than half of the tested views were found, the worst first."
     )
 
 

@@ -1,10 +1,12 @@
-"""Archives of sequences into a map: stored whole on upload, then read frame by frame by a worker.
+"""Files into a map: stored whole on upload. Archives of sequences are then read frame by frame by a
+worker; for a map that comes as one file, see `map_import`.
 
 chunks  --Receiver-->  a seekable blob  --Imports.begin-->  job  --Imports.handle-->  items
 """
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -21,7 +23,7 @@ from sceneprint.engine.ingest.uploads import UploadResult as UploadOutcome
 from sceneprint.engine.jobs.lifecycle import get_job
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept, Tasks
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
-from sceneprint.formats.archive import Archive, Inflater, open_archive
+from sceneprint.formats.archive import BLOCK, Archive, Inflater, is_archive, open_archive
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.formats.dataset.frame_reference import (
     FrameSequence,
@@ -29,16 +31,22 @@ from sceneprint.formats.dataset.frame_reference import (
     parent_frame_of,
     session_of,
 )
+from sceneprint.formats.surface_file import surface_format
+from sceneprint.geometry.views import ViewParameters, view_parameters
+from sceneprint.models import ModelParameters, parse_model
 from sceneprint.store import Store, queue
 from sceneprint.store.blobs.folder import IncomingBlob
 from sceneprint.store.database_errors import unusable
 from sceneprint.store.deletion import make_room
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import find_map, living_map
+from sceneprint.store.maps import find_map, living_map, model_content
 from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.tables import ARCHIVE, MapRow
+from sceneprint.types import Intrinsics
 from sceneprint_client.api import Job, Page
+from sceneprint_client.api.base import GivenDirection
 from sceneprint_client.api.frames import ImportItem, ImportOptions
+from sceneprint_client.files import HEAD
 from sceneprint_client.frame_files import meta_of
 
 # Frames of an archive into a map, some at a time; what is wrong with one costs no other.
@@ -107,7 +115,7 @@ def take(
             outcomes.append(_too_large())
     rest = iter(_added(uploads, task.of_map.name, taken, fence))
     return [
-        _item(step.name, outcome or next(rest))
+        import_item(step.name, outcome or next(rest))
         for step, outcome in zip(steps, outcomes, strict=True)
     ]
 
@@ -146,13 +154,14 @@ def _upload(archive: Archive, step: Step, options: ImportOptions) -> Upload:
         with_pose=options.with_poses,
         parent_frame=options.parent_frame or parent_frame_of(step.sequence, options.robot),
         base=options.T_base_sensor,
-        up=None if options.up is None else options.up.unit,
+        up=options.up.unit if isinstance(options.up, GivenDirection) else None,
     )
     data = archive.data_of(step.reference)
     return Upload(data, meta, options.priority, options.if_novel)
 
 
-def _item(name: str, outcome: UploadOutcome) -> ImportItem:
+def import_item(name: str, outcome: UploadOutcome) -> ImportItem:
+    """Return what came of one frame of an import."""
     item = item_of(outcome)
     return ImportItem(
         name=name,
@@ -163,25 +172,60 @@ def _item(name: str, outcome: UploadOutcome) -> ImportItem:
     )
 
 
-KIND = "import"
+#: Kinds of the jobs: of archives, and of maps that come as one file.
+KIND, MAP_KIND = "import", "import-map"
 #: Seconds between two searches for archives of imports that have ended.
 TIDY_S = 5.0
 #: How much more a compressed tar may hold than the largest archive that is taken.
 _UNPACKED = 4
+#: Pixels along the longer side of a rendered view, at most.
+_MOST_PIXELS = 640
+
+
+class _MapBytes:
+    """Passes the file of a map on as it is.
+
+    Parameters
+    ----------
+    name : of the file
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name, self._head, self._size = name, b"", 0
+
+    def pieces(self, chunk: bytes) -> Iterator[bytes]:
+        """Yield the chunk; raises InvalidRequest where the file is an archive."""
+        if len(self._head) < HEAD:
+            self._head += chunk[: HEAD - len(self._head)]
+            if len(self._head) >= BLOCK and is_archive(self._head):
+                raise errors.InvalidRequest(
+                    "The file is an archive, and a map is one cloud or mesh. Unpack it, or leave "
+                    "`as` out to import the frames in it.",
+                    (("as", "the file is an archive"),),
+                )
+        self._size += len(chunk)
+        yield chunk
+
+    def end(self) -> Iterator[bytes]:
+        """Yield nothing; raises UnreadableCloud where what came is no map."""
+        surface_format(self._head, self._name, self._size)
+        yield from ()
 
 
 class Receiver:
-    """An archive on its way in; see `Imports.receive`.
+    """A file on its way in; see `Imports.receive`.
 
     Parameters
     ----------
     blob : that it becomes, compressed tars inflated
-    most_bytes : that it may have
+    source : makes of what comes what is stored
     reserve : counts a number of bytes against the quota of the map before they are written
     """
 
-    def __init__(self, blob: IncomingBlob, most_bytes: int, reserve: Callable[[int], None]) -> None:
-        self._blob, self._inflater, self._reserve = blob, Inflater(most_bytes), reserve
+    def __init__(
+        self, blob: IncomingBlob, source: Inflater | _MapBytes, reserve: Callable[[int], None]
+    ) -> None:
+        self._blob, self._source, self._reserve = blob, source, reserve
 
     def write(self, chunk: bytes) -> None:
         """Take the next part.
@@ -189,14 +233,15 @@ class Receiver:
         Raises
         ------
         UnreadableArchive : it is no archive, is damaged, or holds more than it may.
+        UnreadableCloud : it is no file of a map.
         QuotaExceeded : the map has no room for it.
         StoreFull, UnusableStore : it cannot be written.
         """
-        self._write(self._inflater.pieces(chunk))
+        self._write(self._source.pieces(chunk))
 
     def end(self) -> queue.JobFile:
         """Keep it, durable; raises as `write`."""
-        self._write(self._inflater.end())
+        self._write(self._source.end())
         return queue.JobFile(
             ARCHIVE, self._blob.keep(), self._blob.size, "application/octet-stream"
         )
@@ -207,8 +252,32 @@ class Receiver:
             self._blob.write(piece)
 
 
+def view_parameters_of(model: ModelParameters, options: ImportOptions) -> ViewParameters:
+    """Return how the views of a map are made.
+
+    Raises
+    ------
+    InvalidRequest : a camera, where the model of the map is one of scans.
+    """
+    k = options.camera
+    camera = None
+    if k is not None:
+        if not isinstance(view_parameters(model).camera, Intrinsics):
+            raise errors.InvalidRequest(
+                "The model of the map is one for scans all around, and `camera` would have no "
+                "effect. Leave it out, or import into a map with the model `depth`.",
+                (("camera", "does not apply to a map of scans"),),
+            )
+        n = math.ceil(max(k.width, k.height) / _MOST_PIXELS)
+        camera = Intrinsics(
+            k.width // n, k.height // n, k.fx / n, k.fy / n, (k.cx + 0.5) / n - 0.5,
+            (k.cy + 0.5) / n - 0.5,
+        )  # fmt: skip
+    return view_parameters(model, camera, options.heights or None)
+
+
 class Imports:
-    """Imports of archives.
+    """Imports of archives, and the begin of those of maps.
 
     Parameters
     ----------
@@ -223,8 +292,8 @@ class Imports:
         tasks.register(KIND, self.handle)
 
     @contextmanager
-    def receive(self, map_name: str) -> Iterator[Receiver]:
-        """Take an archive in parts; what is not kept by `Receiver.end` is removed.
+    def receive(self, map_name: str, options: ImportOptions) -> Iterator[Receiver]:
+        """Take a file in parts; what is not kept by `Receiver.end` is removed.
 
         Its bytes count against the quota of the map as they come, until this ends: call `begin`
         before.
@@ -232,10 +301,14 @@ class Imports:
         Raises
         ------
         UnknownMap : no such map.
+        InvalidRequest : a camera for a map of scans.
         ReadOnlyStore, StoreFull, UnusableStore : nothing can be kept.
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
+            if options.camera is not None:
+                content = model_content(connection, row.model_id)
+                view_parameters_of(parse_model(content, row.model_id).parameters, options)
         self._store.database.require_writable()
         incoming, reserved = self._uploads.incoming, 0
 
@@ -246,7 +319,9 @@ class Imports:
 
         try:
             with self._store.blobs.incoming() as blob:
-                yield Receiver(blob, _UNPACKED * self._most, reserve)
+                whole = options.as_ == "map"
+                source = _MapBytes(options.name) if whole else Inflater(_UNPACKED * self._most)
+                yield Receiver(blob, source, reserve)
         finally:
             incoming.add(row.number, -reserved)
 
@@ -267,7 +342,7 @@ class Imports:
         options: ImportOptions,
         once: IdempotentRequest | None = None,
     ) -> tuple[Job, bool]:
-        """Queue the import of an archive that was received.
+        """Queue the import of a file that was received.
 
         Returns
         -------
@@ -279,13 +354,14 @@ class Imports:
         UnknownMap, IdempotencyConflict, QuotaExceeded : see `Tasks.begin`; the archive is removed.
         Conflict : an import of the same archive has just ended, and removed it.
         """
-        data = options.model_dump(mode="json")
+        data = options.model_dump(mode="json", by_alias=True)
+        kind = MAP_KIND if options.as_ == "map" else KIND
         try:
-            job, again = self._tasks.begin(KIND, map_name, data, options.priority, [archive], once)
+            job, again = self._tasks.begin(kind, map_name, data, options.priority, [archive], once)
         except Swept as error:
             raise errors.Conflict(
-                "An import of the same archive ended while this one was received, and its bytes "
-                "were removed with it. Send the archive again."
+                "An import of the same file ended while this one was received, and its bytes were "
+                "removed with it. Send the file again."
             ) from error
         except errors.SceneprintError:
             collect_deleted_blobs(self._store, [archive.blob])
@@ -299,14 +375,14 @@ class Imports:
         with self._store.database.read() as connection:
             find_map(connection, map_name)
         job = get_job(self._store, job_id)
-        if job.kind != KIND or job.map != map_name:
+        if job.kind not in (KIND, MAP_KIND) or job.map != map_name:
             raise queue.unknown_job(job_id)
         return job
 
     def items(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100
     ) -> Page[ImportItem]:
-        """What came of the members of an archive so far, in their order.
+        """What came of the members of an archive, or the views of a map, so far, in their order.
 
         Raises
         ------

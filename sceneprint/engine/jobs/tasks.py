@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -27,6 +27,7 @@ from sceneprint.errors import (
     LostLease,
     MissingDependency,
     NotFound,
+    QuotaExceeded,
     SceneprintError,
     StoreError,
     UnknownJob,
@@ -37,7 +38,7 @@ from sceneprint.store.audit_log import record_change
 from sceneprint.store.deletion import make_room
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import find_map, map_of
+from sceneprint.store.maps import find_map, living_map, map_of
 from sceneprint.store.tables import ARCHIVE, JobRow, MapRow
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Job, JobState
@@ -94,6 +95,7 @@ class SliceResult:
     event : kind of the event that tells of the end, such as association.found; its data is `result`
     write : what else the commit stores; returns blobs that may be of no use any more
     blobs : that `write` comes to refer to; they are there
+    after_s : seconds before the next slice, where the job waits for others
     """
 
     over: bool
@@ -105,6 +107,7 @@ class SliceResult:
     event: str | None = None
     write: Callable[[Connection], Collection[str]] | None = None
     blobs: Collection[str] = ()
+    after_s: float = 0.0
 
 
 #: Whether a slice is to end at its next step, as its time is over or somebody else waits.
@@ -118,7 +121,9 @@ log = logging.getLogger(__name__)
 #: Seconds of a slice at most, and between two looks whether another job waits that goes before.
 SLICE_S, LOOK_S = 15.0, 0.1
 #: Errors that trying again cannot help: what was asked for cannot be done.
-HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency)
+HOPELESS = (
+    FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, QuotaExceeded,
+)  # fmt: skip
 
 
 def ends_within(is_over: IsOver, seconds: float) -> IsOver:
@@ -276,14 +281,15 @@ class Tasks:
                         connection, outcome.event, name, None, job.id, **(outcome.result or {})
                     )
             else:
-                queue.go_on(connection, task.job, outcome.progress)
+                queue.go_on(connection, task.job, outcome.progress, outcome.after_s)
             self._check(outcome.files)
             self._check_blobs(outcome.blobs)
             # after the job: it may be gone, and nothing can be of one that is
             queue.append_items(connection, job.number, outcome.items)
             before = queue.files_of(connection, job.number)
+            gone = _make_room(connection, task.map, before, outcome.files)
             queue.add_files(connection, job.number, outcome.files)
-            gone = queue.remove_parts(connection, job.number, items=False, files=outcome.drop)
+            gone += queue.remove_parts(connection, job.number, items=False, files=outcome.drop)
             gone += [before[one.name].blob for one in outcome.files if one.name in before]
             return gone if outcome.write is None else [*gone, *outcome.write(connection)]
 
@@ -316,6 +322,18 @@ class Tasks:
                 return queue.fail(connection, task.job, reason, trace)
         except LostLease:
             return None
+
+
+def _make_room(
+    connection: Connection, row: MapRow | None, before: Mapping[str, queue.JobFile],
+    files: Collection[queue.JobFile],
+) -> list[str]:  # fmt: skip
+    """Make room for an archive that takes the place of a smaller one; returns doomed blobs."""
+    [size] = [one.bytes for one in files if one.name == ARCHIVE] or [0]
+    if row is None or size == 0:
+        return []
+    held = before[ARCHIVE].bytes if ARCHIVE in before else 0
+    return make_room(connection, living_map(connection, row), size - held, new=False)
 
 
 def _about(task: LongJob, **more: object) -> dict[str, object]:

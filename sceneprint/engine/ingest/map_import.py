@@ -1,0 +1,481 @@
+"""A map that comes whole, as one cloud or mesh: views of it are rendered and become its frames.
+
+file  --read-->  surface  --choose-->  viewpoints  --render-->  frames  --sign, test-->  result
+
+Each step takes one slice of the job or more. The file of the job is the upload at first, then the
+surface that was read from it, then the surface with the viewpoints. It counts against the quota of
+the map until the job is over.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import shutil
+import tempfile
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import PurePath
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.lib import format as npy
+from sqlalchemy import Connection, func, select
+
+from sceneprint.decoders.surface_decoder import SurfaceLimits, read_surface_confined
+from sceneprint.engine.ingest.archive_import import import_item, view_parameters_of
+from sceneprint.engine.ingest.uploads import Upload, Uploads
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult
+from sceneprint.engine.maps.map_coverage import outcome_of
+from sceneprint.engine.maps.map_plans import QueriedPosition, coverage_plans
+from sceneprint.engine.search.query import Queries, steadily
+from sceneprint.engine.search.retrieval import Deadline, prepare_upload
+from sceneprint.engine.search.up_vectors import PlanAxes, plan_axes
+from sceneprint.engine.signers import Signers
+from sceneprint.errors import (
+    DecoderFailure,
+    FrameError,
+    InvalidRequest,
+    QuotaExceeded,
+    UnreadableCloud,
+)
+from sceneprint.formats.depth_file import encode_png
+from sceneprint.formats.surface_file import SurfaceOptions
+from sceneprint.geometry.views import Renderer, ViewParameters, choose_views
+from sceneprint.store import Store, queue
+from sceneprint.store.database_errors import unusable
+from sceneprint.store.frame_queries import PathFrame
+from sceneprint.store.maps import living_map, use_of
+from sceneprint.store.tables import ARCHIVE, MapRow, frames
+from sceneprint.types import Floats, Floats32, Intrinsics, ReferenceSurface
+from sceneprint_client.api import Answer, Filter, FrameMeta, FrameState, Query
+from sceneprint_client.api.base import (
+    CameraIntrinsics,
+    Direction,
+    GivenDirection,
+    GivenPose,
+    Vector,
+)
+from sceneprint_client.api.coverage import COVERAGE_OUTCOMES, NewMapCoverage
+from sceneprint_client.api.frames import VIRTUAL, ImportOptions, MapImportResult, WeakArea
+
+#: Views that are rendered before they are added in one commit.
+_AT_ONCE = 16
+#: Seconds between two looks whether all views are signed.
+_PAUSE_S = 1.0
+#: Stored units of a metre in rendered depth images.
+_DEPTH_SCALE = 1000.0
+#: Most areas that a result names as weak.
+_MOST_WEAK = 20
+
+# The file of the job: arrays one after the other, as NPY.
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSurface:
+    """What a job has of its map.
+
+    Parameters
+    ----------
+    surface : as it was read
+    poses, held_out : (V, 4, 4) and (H, 4, 4) T_map_sensor of the views that are added, and of those
+        that the map is tested with; none before they are chosen
+    floor : height of the floor along `up`, metres
+    """
+
+    surface: ReferenceSurface
+    poses: Floats
+    held_out: Floats
+    floor: float = 0.0
+
+    def write(self, file: Any) -> None:
+        """Write it to what has `write`."""
+        s = self.surface
+        triangles = np.empty((0, 3), np.int32) if s.triangles is None else s.triangles
+        floor = np.array([self.floor])
+        for array in (s.points, triangles, s.offset, s.up, self.poses, self.held_out, floor):
+            npy.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
+
+    @classmethod
+    def read(cls, file: BinaryIO) -> StoredSurface:
+        """Read what `write` wrote."""
+        arrays = [npy.read_array(file, allow_pickle=False) for _ in range(7)]
+        points, triangles, offset, up, poses, held_out, floor = arrays
+        surface = ReferenceSurface(points, triangles if len(triangles) else None, offset, up)
+        return cls(surface, poses, held_out, float(floor[0]))
+
+
+_NO_POSES: Floats = np.empty((0, 4, 4))
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A rendered view, as a robot would send it."""
+
+    data: bytes
+    meta: FrameMeta
+
+
+class _Views:
+    """Renders the views of a job.
+
+    Parameters
+    ----------
+    stored : its surface and viewpoints
+    parameters : of the sensor
+    options : of the import
+    """
+
+    def __init__(
+        self, stored: StoredSurface, parameters: ViewParameters, options: ImportOptions
+    ) -> None:
+        self._stored, self._p, self._options = stored, parameters, options
+        self._renderer = Renderer(stored.surface, parameters)
+
+    def upload(self, number: int) -> Upload:
+        """Return a view of the map as a frame to add.
+
+        Its id follows from what it shows and where: the same view is added once, and two equal
+        views of two places are two frames.
+        """
+        pose, options = self._stored.poses[number], self._options
+        view = self.view(pose)
+        session, parent = names_of(options)
+        R_sensor_map = pose[:3, :3].T
+        up = R_sensor_map @ self._stored.surface.up
+        meta = view.meta.model_copy(
+            update={
+                "robot": options.robot,
+                "session": session,
+                "tags": [*options.tags, VIRTUAL],
+                "name": f"{options.name}/{number:05d}",
+                "sequence": number,
+                "pose": GivenPose(matrix=pose.tolist(), parent_frame=parent),
+                "up": GivenDirection(x=up[0], y=up[1], z=up[2]),
+            }
+        )
+        place = f"{options.robot}\n{session}\n{parent}\n".encode() + pose.tobytes()
+        frame_id = hashlib.sha256(place + view.data).hexdigest()[:32]
+        return Upload(view.data, meta, options.priority, options.if_novel, frame_id)
+
+    def view(self, pose: Floats) -> _View:
+        """Return a view as a robot without any knowledge of its pose would send it."""
+        seen, camera = self._renderer.view(pose), self._p.camera
+        if not isinstance(camera, Intrinsics):
+            return _View(_npy(seen), FrameMeta())
+        samples = np.clip(np.round(seen * _DEPTH_SCALE), 0, 65534).astype(np.uint16)
+        intrinsics = CameraIntrinsics(
+            width=camera.width, height=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx,
+            cy=camera.cy,
+        )  # fmt: skip
+        return _View(
+            encode_png(samples), FrameMeta(intrinsics=intrinsics, depth_scale=_DEPTH_SCALE)
+        )
+
+
+def _npy(points: Floats32) -> bytes:
+    out = io.BytesIO()
+    npy.write_array(out, points, allow_pickle=False)
+    return out.getvalue()
+
+
+def names_of(options: ImportOptions) -> tuple[str, str]:
+    """Return session and parent frame of the views of an import."""
+    stem = PurePath(options.name).stem
+    own = stem if options.robot is None else f"{options.robot}/{stem}"
+    return options.session or stem, options.parent_frame or own
+
+
+class MapImporter:
+    """Does the imports of maps that come as one file.
+
+    Parameters
+    ----------
+    store, signers, uploads, queries : of the engine
+    seconds : processor time that the reading of a file may take
+    """
+
+    def __init__(
+        self, store: Store, signers: Signers, uploads: Uploads, queries: Queries, seconds: float
+    ) -> None:
+        self._limits = SurfaceLimits(seconds=seconds)
+        self._store, self._signers = store, signers
+        self._uploads, self._queries = uploads, queries
+        self._phases = {
+            "read": self._read, "choose": self._choose, "render": self._render,
+            "sign": self._await_signatures, "test": self._test,
+        }  # fmt: skip
+
+    def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
+        """Do a slice: one phase, or a part of it."""
+        options = ImportOptions.model_validate(task.data)
+        with self._store.database.read() as connection:
+            file = queue.files_of(connection, task.job.number).get(ARCHIVE)
+        if file is None:
+            raise InvalidRequest(
+                "The file of the map was removed when its import failed or was cancelled. Send it "
+                "again."
+            )
+        phase = self._phases[task.progress.get("phase", "read")]
+        return phase(task, options, file, is_over)
+
+    # phases
+
+    def _read(
+        self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
+    ) -> SliceResult:
+        """Read the file in a process of its own."""
+        del is_over, task
+        axis = options.up if isinstance(options.up, str) else None
+        asked = SurfaceOptions(units_per_metre=options.units_per_metre, up=axis)
+        with self._opened(file) as opened, tempfile.TemporaryFile() as local:
+            try:
+                descriptor = opened.fileno()
+            except OSError:  # of an object store
+                shutil.copyfileobj(opened, local)
+                local.flush()
+                descriptor = local.fileno()
+            try:
+                read = read_surface_confined(descriptor, options.name, asked, self._limits)
+            except DecoderFailure as error:
+                raise UnreadableCloud(
+                    f"{options.name} cannot be read: {error}. Thin the points or simplify the "
+                    "mesh, or write it in another format."
+                ) from error
+        surface = read.surface
+        progress = {
+            "done": 0, "total": None, "phase": "choose", "points": len(surface.points),
+            "triangles": 0 if surface.triangles is None else len(surface.triangles),
+            "units_per_metre": read.units_per_metre, "units_from": read.units,
+            "up_from": read.up_from, "notes": list(read.notes),
+        }  # fmt: skip
+        kept = self._keep(StoredSurface(surface, _NO_POSES, _NO_POSES))
+        return SliceResult(False, progress, files=[kept])
+
+    def _choose(
+        self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
+    ) -> SliceResult:
+        """Choose the viewpoints."""
+        del is_over
+        stored = self._stored(file)
+        plan = choose_views(stored.surface, self._parameters(task.of_map, options))
+        n, tests = len(plan.poses), len(plan.held_out)
+        if not n:
+            raise InvalidRequest(
+                "There is no place in the map from which a sensor would see enough of it. Check "
+                "the units and the axis that points up, or name the height of the sensor."
+            )
+        self._require_room(task.of_map, n)
+        floor = 0.0 if plan.floor is None else plan.floor
+        chosen = replace(stored, poses=plan.poses, held_out=plan.held_out, floor=floor)
+        progress = task.progress | {
+            "phase": "render", "total": 2 * n + tests, "views": n, "rendered": 0, "refused": 0,
+            "signed": 0, "tested": 0, "outcomes": [], "seen": plan.covered,
+        }  # fmt: skip
+        return SliceResult(False, progress, files=[self._keep(chosen)])
+
+    def _render(
+        self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
+    ) -> SliceResult:
+        """Render views and add them, at least some."""
+        views = self._views(task, options, self._stored(file))
+        progress, items = dict(task.progress), list[dict[str, Any]]()
+
+        def fence(connection: Connection) -> None:  # cancelled, or of a map that was made anew
+            queue.check_held(connection, task.job)
+
+        while progress["rendered"] < progress["views"] and (not items or not is_over()):
+            first = progress["rendered"]
+            some = [views.upload(i) for i in range(first, min(first + _AT_ONCE, progress["views"]))]
+            outcomes, _ = self._uploads.add_all(task.of_map.name, some, fence=fence)
+            for upload, outcome in zip(some, outcomes, strict=True):
+                if isinstance(outcome.error, QuotaExceeded):
+                    raise QuotaExceeded(
+                        f"{outcome.error} {first} of {progress['views']} views were added; the "
+                        "same file sent again adds the others."
+                    )
+                item = import_item(str(upload.meta.name), outcome)
+                progress["refused"] += outcome.added is None
+                items.append(item.model_dump(mode="json"))
+            progress["rendered"] += len(some)
+        if progress["rendered"] == progress["views"]:
+            progress["phase"] = "sign"
+        return SliceResult(False, _counted(progress), items)
+
+    def _await_signatures(
+        self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
+    ) -> SliceResult:
+        """Look whether all views are signed; the map can be tested then."""
+        del options, file, is_over
+        progress = dict(task.progress)
+        states = self._states(task)
+        waiting = states[FrameState.RECEIVED] + states[FrameState.SIGNING]
+        progress["signed"] = progress["views"] - waiting
+        if waiting:
+            return SliceResult(False, _counted(progress), after_s=_PAUSE_S)
+        progress["phase"] = "test"
+        return SliceResult(False, _counted(progress))
+
+    def _test(
+        self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
+    ) -> SliceResult:
+        """Look up views that were not added, at least one, or conclude."""
+        stored = self._stored(file)
+        poses, progress = stored.held_out, dict(task.progress)
+        outcomes = progress["outcomes"] = list(progress["outcomes"])
+        views = self._views(task, options, stored)
+        while len(outcomes) < len(poses):
+            outcomes.append(self._outcome(task.of_map, views, poses[len(outcomes)], options))
+            progress["tested"] = len(outcomes)
+            if len(outcomes) < len(poses) and is_over():
+                return SliceResult(False, _counted(progress))
+        result = self._result(task, options, stored, progress)
+        return SliceResult(
+            True, _counted(progress), drop=[ARCHIVE], result=result.model_dump(mode="json"),
+            event="import.done",
+        )  # fmt: skip
+
+    # what the phases share
+
+    def _parameters(self, row: MapRow, options: ImportOptions) -> ViewParameters:
+        with self._store.database.read() as connection:
+            row = living_map(connection, row)
+        return view_parameters_of(self._signers(row.model_id).model.parameters, options)
+
+    def _views(self, task: LongJob, options: ImportOptions, stored: StoredSurface) -> _Views:
+        return _Views(stored, self._parameters(task.of_map, options), options)
+
+    def _opened(self, file: queue.JobFile) -> BinaryIO:
+        try:
+            return self._store.blobs.open(file.blob)
+        except FileNotFoundError as error:
+            raise InvalidRequest("The file of the map is missing. Send it again.") from error
+        except OSError as error:
+            raise unusable("The file of the map cannot be read", error) from error
+
+    def _stored(self, file: queue.JobFile) -> StoredSurface:
+        with self._opened(file) as opened:
+            return StoredSurface.read(opened)
+
+    def _keep(self, stored: StoredSurface) -> queue.JobFile:
+        with self._store.blobs.incoming() as blob:
+            stored.write(blob)
+            return queue.JobFile(ARCHIVE, blob.keep(), blob.size, "application/octet-stream")
+
+    def _require_room(self, row: MapRow, views: int) -> None:
+        """See that the quota has room for so many frames, before any is added."""
+        with self._store.database.read() as connection:
+            row = living_map(connection, row)
+            held = use_of(connection, row.number).frames
+        if row.quota_frames is not None and held + views > row.quota_frames:
+            raise QuotaExceeded(
+                f"The map needs {views} views, and holds {held} frames of the {row.quota_frames} "
+                "that its quota allows. Ask the operator for a larger quota (PATCH "
+                f"/v1/maps/{row.name})."
+            )
+
+    def _states(self, task: LongJob) -> Counter[str]:
+        """How many views of the map are in each state."""
+        found = Counter[str]()
+        with self._store.database.read() as connection:
+            items = queue.items_of(connection, task.job.number)
+            ids = [item["frame_id"] for item in items if item["frame_id"] is not None]
+            for start in range(0, len(ids), 500):
+                asked = select(frames.c.state, func.count()).where(
+                    frames.c.map_number == task.of_map.number,
+                    frames.c.id.in_(ids[start : start + 500]),
+                )
+                for state, count in connection.execute(asked.group_by(frames.c.state)):
+                    found[state] += count
+        return found
+
+    def _outcome(self, row: MapRow, views: _Views, pose: Floats, options: ImportOptions) -> str:
+        """What a robot would be answered whose sensor is at a pose; one core does it."""
+        session, parent = names_of(options)
+        view = views.view(pose)
+        query = Query(keep=False, filter=Filter(session=[session], tags=[VIRTUAL]))
+
+        def ask(rows: list[MapRow]) -> Answer:
+            signer = self._signers(rows[0].model_id)
+            ready = prepare_upload(view.data, view.meta, signer, query, self._store.decoders)
+            return self._queries.answer(rows, ready, query, Deadline(None))
+
+        try:
+            answer = steadily(self._store, [row.name], ask)
+        except FrameError:  # nothing in it can be signed
+            return "not_found"
+        stop = PathFrame(
+            -1, "", None, None, None, parent, pose.tolist(), is_cloud=view.meta.intrinsics is None
+        )
+        return str(outcome_of(answer, stop, NewMapCoverage())["outcome"])
+
+    def _result(
+        self, task: LongJob, options: ImportOptions, stored: StoredSurface,
+        progress: dict[str, Any],
+    ) -> MapImportResult:  # fmt: skip
+        surface, outcomes = stored.surface, progress["outcomes"]
+        session, parent = names_of(options)
+        counts = Counter(outcomes)
+        known = ("points", "triangles", "units_per_metre", "units_from", "up_from", "notes")
+        facts: dict[str, Any] = {name: progress[name] for name in known}
+        facts |= {name: counts[name] for name in COVERAGE_OUTCOMES}
+        return MapImportResult(
+            **facts,
+            up=Direction(**_xyz(surface.up)),
+            offset=Vector(**_xyz(surface.offset)),
+            session=session,
+            parent_frame=parent,
+            views=self._states(task)[FrameState.INDEXED],
+            refused=progress["refused"],
+            seen=progress["seen"],
+            tested=len(outcomes),
+            coverage=counts["found"] / len(outcomes) if outcomes else None,
+            weak=weak_areas(stored, outcomes),
+        )
+
+
+def _counted(progress: dict[str, Any]) -> dict[str, Any]:
+    """Progress with the sum of its steps."""
+    return progress | {"done": sum(progress[name] for name in ("rendered", "signed", "tested"))}
+
+
+def weak_areas(stored: StoredSurface, outcomes: list[Any]) -> list[WeakArea]:
+    """Squares of the floor in which fewer than half of the tested views were found.
+
+    Parameters
+    ----------
+    stored : with the poses of the views
+    outcomes : of each view, in their order
+
+    Returns
+    -------
+    areas : those with the most views that were not found come first
+    """
+    if not outcomes:
+        return []
+    up = stored.surface.up
+    flat = plan_axes(up)
+    queried = [
+        QueriedPosition(pose[:3, 3], one)
+        for pose, one in zip(stored.held_out, outcomes, strict=True)
+    ]
+    plans, width = coverage_plans(
+        {"": queried}, {"": stored.poses[:, :3, 3]}, {"": PlanAxes(flat, "frames")}, None
+    )
+    found = []
+    for cell in plans[0].cells:
+        views = sum(getattr(cell, name) for name in COVERAGE_OUTCOMES)
+        if 2 * cell.found < views:
+            column, row = width * (cell.column + 0.5), width * (cell.row + 0.5)
+            centre = column * flat[0] + row * flat[1] + stored.floor * up
+            found.append(
+                WeakArea(
+                    centre=Vector(**_xyz(centre)), width_m=width, views=views, found=cell.found
+                )
+            )
+    return sorted(found, key=lambda one: one.found - one.views)[:_MOST_WEAK]
+
+
+def _xyz(vector: Floats) -> dict[str, float]:
+    x, y, z = vector.tolist()
+    return {"x": x, "y": y, "z": z}

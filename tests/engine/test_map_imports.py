@@ -1,0 +1,272 @@
+"""A map that comes as one mesh: views of it become frames, once, whatever is done in between."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from sceneprint.engine import Engine
+from sceneprint.engine.ingest import map_import
+from sceneprint.engine.ingest.map_import import StoredSurface, weak_areas
+from sceneprint.engine.jobs.lifecycle import cancel
+from sceneprint.engine.jobs.tasks import LongJob, SliceResult
+from sceneprint.engine.maps.map_lifecycle import edit_map
+from sceneprint.errors import InvalidRequest, LostLease, QuotaExceeded, UnreadableCloud
+from sceneprint.settings import Settings
+from sceneprint.store.maps import find_map
+from sceneprint.store.queue import files_of
+from sceneprint.types import ReferenceSurface
+from sceneprint_client.api import FrameState, Job, JobState, NewMap
+from sceneprint_client.api.frames import ImportOptions, MapImportResult
+
+#: A camera of few pixels, so that views are rendered and signed quickly.
+CAMERA = {"fx": 146.0, "fy": 146.0, "cx": 79.5, "cy": 59.5, "width": 160, "height": 120}
+
+
+def options_of(**more: Any) -> ImportOptions:
+    """Options of the import of `room.ply`, with a small camera at one height."""
+    usual = {"as": "map", "name": "room.ply", "up": "z", "camera": CAMERA, "heights": [1.0]}
+    return ImportOptions.model_validate({**usual, **more})
+
+
+def begun(engine: Engine, data: bytes, **more: Any) -> Job:
+    options = options_of(**more)
+    with engine.imports.receive("hall", options) as receiver:
+        for start in range(0, len(data), 100_000):
+            receiver.write(data[start : start + 100_000])
+        file = receiver.end()
+    return engine.imports.begin("hall", file, options)[0]
+
+
+def claimed(engine: Engine) -> LongJob:
+    while True:  # views that wait to be signed are left waiting
+        work = engine.claim("test")
+        if isinstance(work, LongJob):
+            return work
+        assert work is not None
+
+
+def slice_of(engine: Engine, task: LongJob, is_over: Callable[[], bool]) -> SliceResult:
+    """What a slice of the import comes to, if it is never stored: its worker dies."""
+    return engine.tasks._handlers["import-map"](task, is_over)
+
+
+def used_bytes(engine: Engine) -> int:
+    with engine.store.database.read() as connection:
+        return find_map(connection, "hall").used_bytes
+
+
+@pytest.fixture(scope="session")
+def chosen_folder(once: Callable[[str, Callable[[Path], object]], Path], room_mesh: bytes) -> Path:
+    """A data folder in which the import of a room has its viewpoints, and no view yet. Only to be
+    copied.
+    """
+
+    def make(folder: Path) -> None:
+        with Engine(Settings(data_dir=folder)) as engine:
+            engine.create_map(NewMap(name="hall", model="depth"))
+            begun(engine, room_mesh, tags=["given"], robot="r1")
+            for _ in ("read", "choose"):
+                assert engine.run(claimed(engine)) == JobState.QUEUED
+
+    return once("chosen", make)
+
+
+@pytest.fixture
+def chosen(chosen_folder: Path, tmp_path: Path, make_engine: Callable[..., Engine]) -> Engine:
+    """An engine on a copy of `chosen_folder`."""
+    shutil.copytree(chosen_folder, tmp_path / "data")
+    return make_engine()
+
+
+def test_a_room_becomes_a_map_in_which_it_is_found(
+    chosen: Engine, due_now: Callable[..., None]
+) -> None:
+    phases = list[str]()
+    state = None
+    while state != JobState.SUCCEEDED:
+        work = chosen.claim("test")
+        if work is None:  # the import waits for the last views to be signed
+            due_now(chosen)
+            continue
+        state = chosen.run(work)
+        if isinstance(work, LongJob):
+            assert state in (JobState.QUEUED, JobState.SUCCEEDED)
+            job_id = work.job.id
+            phases.append(work.progress["phase"])
+        else:
+            state = None
+    assert list(dict.fromkeys(phases)) == ["render", "sign", "test"]
+    done = chosen.imports.get("hall", job_id)
+    result, progress = MapImportResult.model_validate(done.result), done.progress
+    assert progress is not None
+    frames = chosen.list_frames("hall", limit=1000).items
+    assert result.views == sum(one.state == FrameState.INDEXED for one in frames) > 0
+    assert (result.session, result.parent_frame) == ("room", "r1/room")
+    for one in frames:
+        assert one.tags == ["given", "virtual"]
+        assert one.pose is not None
+        assert one.up is not None
+        assert one.pose.parent_frame == "r1/room"
+        # up in the sensor, turned by the pose, is that of the file
+        up = np.array(one.pose.matrix)[:3, :3] @ [one.up.x, one.up.y, one.up.z]
+        np.testing.assert_allclose(up, [0, 0, 1], atol=1e-9)
+    assert result.tested == result.found + result.wrong + result.ambiguous + result.not_found > 0
+    assert result.wrong == 0
+    assert result.coverage == result.found / result.tested
+    assert progress.views == progress.rendered == progress.signed == len(frames) + result.refused
+    assert (progress.tested, progress.done) == (result.tested, progress.total)
+    # neither the file nor what was read of it is left
+    assert used_bytes(chosen) == sum(one.bytes for one in frames)
+    items = chosen.imports.items("hall", job_id, limit=1000).items
+    assert {one.frame_id for one in items} - {None} == {one.frame_id for one in frames}
+
+
+def test_a_slice_that_was_lost_adds_nothing_twice(
+    chosen: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_import, "_AT_ONCE", 3)
+    task = claimed(chosen)
+    lost = slice_of(chosen, task, lambda: True)
+    assert [one["status"] for one in lost.items] == [202, 202, 202]
+    again = slice_of(chosen, task, lambda: False)  # there is time for all now
+    assert [one["status"] for one in again.items[:3]] == [200, 200, 200]
+    assert [one["frame_id"] for one in again.items[:3]] == [one["frame_id"] for one in lost.items]
+    names = [one.name for one in chosen.list_frames("hall", limit=1000).items]
+    assert len(set(names)) == len(names) > 3
+    assert set(names) <= {f"room.ply/{i:05d}" for i in range(task.progress["views"])}
+    once_more = slice_of(chosen, task, lambda: False)
+    assert 202 not in {one["status"] for one in once_more.items}
+    assert [one.name for one in chosen.list_frames("hall", limit=1000).items] == names
+
+
+class Between:
+    """An end of a slice that is not reached, and what happens when it is looked for."""
+
+    def __init__(self, do: Callable[[], object]) -> None:
+        self._do = do
+
+    def __call__(self) -> bool:
+        self._do()
+        return False
+
+
+def test_a_cancelled_import_adds_no_view_more(
+    chosen: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_import, "_AT_ONCE", 2)
+    task = claimed(chosen)
+    with chosen.store.database.read() as connection:
+        [file] = files_of(connection, task.job.number).values()
+    assert used_bytes(chosen) == file.bytes
+    with pytest.raises(LostLease):
+        slice_of(chosen, task, Between(lambda: cancel(chosen.store, task.job.id)))
+    frames = chosen.list_frames("hall").items
+    assert len(frames) == 2
+    assert used_bytes(chosen) == sum(one.bytes for one in frames)
+    assert not chosen.store.blobs.holds(file.blob)
+
+
+def test_a_map_that_is_made_anew_takes_no_view_of_an_import_into_the_one_before(
+    chosen: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_import, "_AT_ONCE", 2)
+
+    def make_anew() -> None:
+        chosen.delete_map("hall")
+        chosen.create_map(NewMap(name="hall", model="depth"))
+
+    with pytest.raises(LostLease):
+        slice_of(chosen, claimed(chosen), Between(make_anew))
+    assert chosen.list_frames("hall").items == []
+    assert list(chosen.store.blobs.digests()) == []
+
+
+def test_what_the_quota_has_no_room_for_is_refused_as_early_as_can_be(
+    chosen: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sceneprint.engine.ingest.archive_import.TIDY_S", 0.0)
+    task = claimed(chosen)
+    edit_map(chosen.store, "hall", {"quota_frames": 1})
+    before = replace(task, job=replace(task.job, progress={**task.progress, "phase": "choose"}))
+    with pytest.raises(QuotaExceeded, match=r"needs \d+ views, .* of the 1 that its quota allows"):
+        slice_of(chosen, before, lambda: True)
+    edit_map(chosen.store, "hall", {"quota_frames": None, "quota_bytes": used_bytes(chosen) + 10})
+    with pytest.raises(QuotaExceeded):
+        begun(chosen, b"ply\n" + bytes(20))
+    assert chosen.run(task) == JobState.FAILED
+    error = str(chosen.get_job(task.job.id).error)
+    assert "0 of" in error
+    assert "the same file sent again adds the others" in error
+    chosen.imports.tidy()
+    assert (used_bytes(chosen), list(chosen.store.blobs.digests())) == (0, [])
+
+
+def test_a_surface_needs_room_beyond_that_of_its_file(empty: Engine) -> None:
+    """A PLY of text with short numbers, whose points are larger as arrays."""
+    rows = "".join(f"{x} {y} {z}\n" for x in range(9) for y in range(9) for z in range(9))
+    data = "ply\nformat ascii 1.0\nelement vertex 729\nproperty float x\nproperty float y\n"
+    data += f"property float z\nend_header\n{rows}"
+    job = begun(empty, data.encode())
+    edit_map(empty.store, "hall", {"quota_bytes": len(data) + 10})
+    assert empty.run(claimed(empty)) == JobState.FAILED
+    assert "its quota allows" in str(empty.get_job(job.job_id).error)
+    assert used_bytes(empty) == len(data)
+
+
+def test_files_that_are_no_map_are_refused(empty: Engine, room_mesh: bytes) -> None:
+    for data in (b"", b"no map at all", b"PK\x03\x04" + bytes(600)):
+        with pytest.raises((UnreadableCloud, InvalidRequest)):
+            begun(empty, data, name="room")
+    assert list(empty.store.blobs.digests()) == []
+    job = begun(empty, room_mesh[: len(room_mesh) // 2])
+    assert empty.run(claimed(empty)) == JobState.FAILED
+    assert "room.ply" in str(empty.get_job(job.job_id).error)
+    empty.create_map(NewMap(name="yard", model="lidar"))
+    with (
+        pytest.raises(InvalidRequest, match="`camera` would have no effect"),
+        empty.imports.receive("yard", options_of()),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"as": "map", "every": 2}, "every: does not apply to a map"),
+        ({"as": "map", "with_poses": False}, "with_poses: does not apply"),
+        ({"as": "map", "up": [0, 0, 1]}, "up: one of x, -x, y, -y, z, -z"),
+        ({"as": "map", "heights": [0.0]}, "greater than 0"),
+        ({"up": "z"}, "up: a unit vector in the axes of the sensor"),
+        ({"heights": [1.0]}, "heights: applies only with `as` = `map`"),
+        ({"units_per_metre": 1000}, "units_per_metre: applies only"),
+        ({"camera": CAMERA}, "camera: applies only"),
+    ],
+)
+def test_options_of_another_import_are_errors(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        ImportOptions.model_validate(fields)
+
+
+def test_weak_areas_are_where_most_views_are_lost() -> None:
+    """Views along x, 1 m apart: of ten at x = 0 all are found, of four at x = 9 one."""
+    points = np.zeros((3, 3), np.float32)
+    surface = ReferenceSurface(points, None, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    held_out = np.tile(np.eye(4), (14, 1, 1))
+    held_out[:10, 0, 3], held_out[10:, 0, 3] = 0.1, 9.1
+    held_out[:, 1, 3], held_out[:, 2, 3] = 0.1, 1.5
+    stored = StoredSurface(surface, held_out, held_out, 0.5)
+    outcomes = ["found"] * 11 + ["ambiguous", "not_found", "wrong"]
+    [area] = weak_areas(stored, outcomes)
+    assert (area.views, area.found) == (4, 1)
+    assert area.width_m == 0.5
+    assert (area.centre.x, area.centre.y, area.centre.z) == (9.25, 0.25, 0.5)
+    assert weak_areas(stored, ["found"] * 14) == []
+    assert weak_areas(stored, []) == []
