@@ -169,11 +169,11 @@ def up_of(text: str) -> list[float]:
     return [x, y, z]
 
 
-def add_up_option(command: argparse.ArgumentParser) -> None:
-    """`--up`."""
+def add_up_option(command: argparse.ArgumentParser, read: Callable[[str], object] = up_of) -> None:
+    """`--up`, which `read` takes from its text."""
     command.add_argument(
         "--up",
-        type=up_of,
+        type=read,
         metavar="X,Y,Z",
         help="up in the sensor's axes, a unit vector, as 0,-1,0 for a camera held level (write "
         "--up=-1,0,0 if it starts with a minus)",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,17 @@ from tqdm import tqdm
 
 from sceneprint.cli import positive
 from sceneprint.cli.bag import add_recording_options, recording_options, tell
+from sceneprint.cli.imports import (
+    STALL_S,
+    add_map_options,
+    axis_or_up,
+    check_map_options,
+    hint_at_maps,
+    import_archives,
+    import_maps,
+    is_archive_file,
+    is_starting,
+)
 from sceneprint.cli.options import (
     add_service_options,
     add_up_option,
@@ -22,9 +34,9 @@ from sceneprint.cli.options import (
     open_client,
     priority_of,
     share_of,
+    up_of,
 )
 from sceneprint.errors import (
-    Busy,
     DatasetError,
     FrameConflict,
     FrameError,
@@ -32,15 +44,11 @@ from sceneprint.errors import (
     MapExists,
     MissingDependency,
     Refused,
-    UnknownFrame,
     UnknownMap,
 )
-from sceneprint.formats.archive import is_archive
 from sceneprint.formats.dataset import FrameReference, FrameSequence, find_sequences
-from sceneprint.formats.exports import is_export
 from sceneprint.models import PRESETS
-from sceneprint_client.api.base import NOVEL, checked
-from sceneprint_client.api.frames import ImportOptions
+from sceneprint_client.api.base import NOVEL
 
 if TYPE_CHECKING:
     from sceneprint_client import Client
@@ -119,9 +127,6 @@ class Tally:
 
 # Waiting until the frames of an upload are signed.
 
-#: Seconds without a frame signed after which no worker is believed to be there.
-STALL_S = 120.0
-
 
 def wait_for_all(client: Client, map_name: str, tally: Tally, *, may_be_redundant: bool) -> bool:
     """Wait for the jobs as long as some end now and then; whether all did.
@@ -154,16 +159,6 @@ def wait_for_all(client: Client, map_name: str, tally: Tally, *, may_be_redundan
     return True
 
 
-def is_starting(client: Client) -> bool:
-    """Whether the service still compiles kernels, so that its workers have not begun."""
-    try:
-        client.status()
-    except Busy:
-        print("the service compiles its kernels, once after an installation", file=sys.stderr)
-        return True
-    return False
-
-
 def _is_redundant(client: Client, map_name: str, job: Job) -> bool:
     """Whether a frame was signed and not kept: its job alone does not tell."""
     from sceneprint_client.api import FrameState, JobState
@@ -173,98 +168,13 @@ def _is_redundant(client: Client, map_name: str, job: Job) -> bool:
     return client.frame(map_name, str(job.frame_id)).state is FrameState.REDUNDANT
 
 
-# Archives given to `sceneprint upload`: sent whole, and waited for until all frames are taken.
-
-#: Bytes that tell whether a file is an archive, and seconds between two looks at an import.
-_HEAD, _PAUSE_S = 512, 2.0
-
-
-def is_archive_file(path: Path) -> bool:
-    """Whether a path is a file that begins as an archive does, and is no capture of Record3D."""
-    try:
-        if not path.is_file() or is_export(path):
-            return False
-        with path.open("rb") as file:
-            return is_archive(file.read(_HEAD))
-    except OSError:  # whoever reads it says so
-        return False
-
-
-def import_all(
-    client: Client, options: argparse.Namespace, archives: list[Path], tally: Tally
-) -> bool:
-    """Send archives and count their frames; False where workers do nothing for long."""
-    for path in archives:
-        said = checked(
-            ImportOptions,
-            f"The metadata of {path.name}",
-            name=path.name.partition(".")[0][:64] or "import",
-            robot=options.robot,
-            session=options.session,
-            tags=options.tag,
-            parent_frame=options.parent_frame,
-            with_poses=not options.no_pose,
-            every=options.every,
-            T_base_sensor=options.base,
-            up=options.up,
-            priority=options.priority,
-            if_novel=options.if_novel,
-        )
-        with path.open("rb") as file:
-            job = client.import_archive(options.map, file, said)
-        if options.no_wait:
-            print(f"{path.name}: received; import {job.job_id} adds its frames")
-            continue
-        job, moves = _waited(client, path.name, job)
-        _count(client, options.map, job, tally)
-        if not moves:
-            return False
-        if job.error is not None:
-            tally.refuse(path.name, job.error)
-    return True
-
-
-def _waited(client: Client, name: str, job: Job) -> tuple[Job, bool]:
-    """An import once it is over, or when it has not moved for long."""
-    moved, seen = time.monotonic(), -1
-    with tqdm(desc=name, unit="frame", disable=None) as bar:
-        while not job.state.over:
-            [job] = client.wait([job.job_id], timeout_s=_PAUSE_S)
-            if job.progress is not None:
-                bar.total = job.progress.total
-                bar.update(job.progress.done - bar.n)
-            done = -1 if job.progress is None else job.progress.done
-            if done != seen:
-                moved, seen = time.monotonic(), done
-            elif time.monotonic() - moved > STALL_S:
-                if not is_starting(client):
-                    return job, False
-                moved = time.monotonic()
-    return job, True
-
-
-def _count(client: Client, map_name: str, job: Job, tally: Tally) -> None:
-    from sceneprint_client.api import Added, FrameState
-
-    for item in client.import_items(map_name, job.job_id):
-        if item.frame_id is None or item.job_id is None:
-            tally.refuse(item.name, "refused" if item.problem is None else item.problem.detail)
-            continue
-        state = FrameState.RECEIVED
-        if item.status == 200:  # it may be over long since
-            try:
-                state = client.frame(map_name, item.frame_id).state
-            except UnknownFrame:  # deleted meanwhile
-                continue
-        added = Added(frame_id=item.frame_id, job_id=item.job_id, state=state, reason=None)
-        tally.count(item.name, added, item.status == 202)
-
-
 # What is said of all frames of a command.
 
 
-def add_frame_options(command: argparse.ArgumentParser) -> None:
-    """`--robot` and its like: metadata of frames."""
+def add_frame_options(
+    command: argparse.ArgumentParser, up: Callable[[str], object] = up_of
+) -> None:
+    """`--robot` and its like: metadata of frames; `up` reads what `--up` is."""
     command.add_argument(
         "--robot",
         metavar="NAME",
@@ -292,7 +202,7 @@ def add_frame_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--base-frame", metavar="NAME", help="name of the robot's base frame (default: base_link)"
     )
-    add_up_option(command)
+    add_up_option(command, up)
 
 
 def meta_for(
@@ -330,19 +240,20 @@ def add_upload(commands: Any) -> None:
     """
     command = commands.add_parser(
         "upload",
-        help="upload depth frames and point clouds to a map of a service",
+        help="upload depth frames, point clouds or a whole map to a map of a service",
         description="Upload every frame of the given files and folders (7-Scenes, TUM RGB-D or "
         "plain depth images, with an intrinsics.json beside them or in a folder above; or point "
         "clouds), and wait until they are signed. Of a recording of ROS (MCAP, rosbag2, ROS 1 "
         "bag) keyframes are uploaded. RTAB-Map databases, E57 files, and exports of Polycam, "
         "Record3D and nerfstudio are taken with their poses. A zip or tar archive is sent whole "
-        "and unpacked by the service. A frame that the map already has is not stored twice.",
+        "and unpacked by the service. With --as-map, one cloud or mesh of a whole place becomes "
+        "the map. A frame that the map already has is not stored twice.",
     )
     command.add_argument(
         "map", metavar="MAP", help="map to upload to; created if it does not exist"
     )
     command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
-    add_frame_options(command)
+    add_frame_options(command, axis_or_up)
     command.add_argument(
         "--create",
         action=argparse.BooleanOptionalAction,
@@ -379,6 +290,7 @@ def add_upload(commands: Any) -> None:
         metavar="N",
         help="number of concurrent uploads (default: 4)",
     )
+    add_map_options(command)
     add_recording_options(command)
     add_service_options(command)
     command.set_defaults(run=run_upload)
@@ -386,6 +298,11 @@ def add_upload(commands: Any) -> None:
 
 def run_upload(options: argparse.Namespace) -> int:
     """Upload; returns 2 where a frame was not indexed."""
+    check_map_options(options)
+    if options.as_map:
+        with open_client(options) as client:
+            _see_to_map(client, options)
+            return import_maps(client, options)
     archives = [path for path in options.paths if is_archive_file(path)]
     paths = [path for path in options.paths if path not in archives]
     sequences = sequences_of(paths, options)
@@ -397,7 +314,7 @@ def run_upload(options: argparse.Namespace) -> int:
         _see_to_map(client, options)
         try:
             _send_all(client, options, found, tally)
-            stalled = not import_all(client, options, archives, tally)
+            stalled = not import_archives(client, options, archives, tally)
             if not options.no_wait and not stalled:
                 novel = options.if_novel is not None
                 stalled = not wait_for_all(client, options.map, tally, may_be_redundant=novel)
@@ -406,6 +323,7 @@ def run_upload(options: argparse.Namespace) -> int:
             tally.report(max(len(found), counted), time.perf_counter() - start)
             for sequence in sequences:
                 tell(sequence)
+            hint_at_maps(paths)
             if stalled:
                 print(
                     f"{len(tally.waiting)} frames are stored and waiting, but none was signed "

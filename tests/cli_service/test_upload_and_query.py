@@ -326,3 +326,55 @@ def test_an_upload_waits_for_a_service_that_compiles(
         client._worker._engine.signers._compiled.clear()  # type: ignore[union-attr]
         assert is_starting(client)
     assert "the service compiles its kernels" in capsys.readouterr().err
+
+
+def test_a_map_that_is_one_file_is_uploaded_as_a_map(
+    sceneprint: Run, service_url: str, room_mesh: bytes, tmp_path: Path
+) -> None:
+    file = tmp_path / "room.ply"
+    file.write_bytes(room_mesh)
+    small = ("--camera", "73,73,39.5,29.5,80,60", "--height", "1.2")
+    done = sceneprint("upload", "mesh", file, "--as-map", "--up", "z", "--units", "m", *small)
+    created, views, how, *_ = done.stdout.splitlines()
+    assert created.startswith("created map mesh with model depth-")
+    assert re.fullmatch(
+        r"room\.ply: \d+ views are in map mesh and see \d+% of its surface\. Their poses lead to "
+        r"room\..*",
+        views,
+    )
+    assert how == "units: m (as you said); up: z (as you said)"
+    assert re.search(
+        r"^A robot would be found in \d+% of this place: of \d+ other views ", done.stdout, re.M
+    )
+    with Client(service_url) as client:
+        frames = list(client.frames("mesh"))
+        client.delete_map("mesh")
+    assert {tag for one in frames for tag in one.tags} == {"virtual"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--as-map", "--every", "2"), "every: does not apply to a map"),
+        (("--as-map", "--up", "0,0,1"), "up: one of x, -x"),
+        (("--height", "1"), "--height is for a map that is one file. Add --as-map"),
+        (("--up", "z"), "--up z is an axis of a file, for --as-map"),
+    ],
+)
+def test_options_of_another_upload_are_errors(
+    sceneprint: Run, house: str, room_mesh: bytes, tmp_path: Path, options: Any, message: str
+) -> None:
+    file = tmp_path / "room.ply"
+    file.write_bytes(room_mesh)
+    done = sceneprint("upload", house, file, *options, expect=2)
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_what_is_no_map_is_refused(sceneprint: Run, house: str, tmp_path: Path) -> None:
+    file = tmp_path / "map.txt"
+    file.write_bytes(b"no map")
+    for paths in ((file,), (tmp_path,), (tmp_path / "none.pcd",)):
+        done = sceneprint("upload", house, *paths, "--as-map", expect=2)
+        assert done.stdout == ""
+        assert len(done.stderr.splitlines()) == 1

@@ -1,0 +1,331 @@
+"""Files that `sceneprint upload` sends whole: archives of sequences, and maps that are one file.
+
+files  --import_archives-->  frames, counted
+files  --import_maps-->  views of each, and where a robot would be found
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+from tqdm import tqdm
+
+from sceneprint.cli.options import up_of
+from sceneprint.errors import Busy, DatasetError, InvalidRequest, UnknownFrame
+from sceneprint.formats.archive import is_archive
+from sceneprint.formats.exports import is_export
+from sceneprint_client.api.base import checked
+from sceneprint_client.api.frames import Axis, ImportOptions, MapImportResult, camera_fields
+from sceneprint_client.files import is_cloud
+
+if TYPE_CHECKING:
+    from sceneprint.cli.upload import Tally
+    from sceneprint_client import Client
+    from sceneprint_client.api import Job, Progress
+    from sceneprint_client.api.base import Direction
+
+#: Seconds without a frame signed after which no worker is believed to be there.
+STALL_S = 120.0
+
+
+def is_starting(client: Client) -> bool:
+    """Whether the service still compiles kernels, so that its workers have not begun."""
+    try:
+        client.status()
+    except Busy:
+        print("the service compiles its kernels, once after an installation", file=sys.stderr)
+        return True
+    return False
+
+
+# Archives given to `sceneprint upload`: sent whole, and waited for until all frames are taken.
+
+#: What the bar calls the phases of the import of a map.
+_PHASES = {
+    "read": "read", "choose": "choose viewpoints", "render": "render views", "sign": "sign views",
+    "test": "look up other views",
+}  # fmt: skip
+#: Bytes that tell whether a file is an archive, and seconds between two looks at an import.
+_HEAD, _PAUSE_S = 512, 2.0
+
+
+def is_archive_file(path: Path) -> bool:
+    """Whether a path is a file that begins as an archive does, and is no capture of Record3D."""
+    try:
+        if not path.is_file() or is_export(path):
+            return False
+        with path.open("rb") as file:
+            return is_archive(file.read(_HEAD))
+    except OSError:  # whoever reads it says so
+        return False
+
+
+def import_archives(
+    client: Client, options: argparse.Namespace, archives: list[Path], tally: Tally
+) -> bool:
+    """Send archives and count their frames; False where workers do nothing for long."""
+    for path in archives:
+        said = checked(
+            ImportOptions,
+            f"The metadata of {path.name}",
+            name=path.name.partition(".")[0][:64] or "import",
+            robot=options.robot,
+            session=options.session,
+            tags=options.tag,
+            parent_frame=options.parent_frame,
+            with_poses=not options.no_pose,
+            every=options.every,
+            T_base_sensor=options.base,
+            up=options.up,
+            priority=options.priority,
+            if_novel=options.if_novel,
+        )
+        with path.open("rb") as file:
+            job = client.import_archive(options.map, file, said)
+        if options.no_wait:
+            print(f"{path.name}: received; import {job.job_id} adds its frames")
+            continue
+        job, moves = _waited(client, path.name, job)
+        _count(client, options.map, job, tally)
+        if not moves:
+            return False
+        if job.error is not None:
+            tally.refuse(path.name, job.error)
+    return True
+
+
+def _waited(client: Client, name: str, job: Job) -> tuple[Job, bool]:
+    """An import once it is over, or when it has not moved for long."""
+    moved, seen = time.monotonic(), job.progress
+    with tqdm(desc=name, unit="frame", disable=None) as bar:
+        while not job.state.over:
+            [job] = client.wait([job.job_id], timeout_s=_PAUSE_S)
+            if job.progress is not None:
+                _show(bar, name, job.progress)
+            if job.progress != seen:
+                moved, seen = time.monotonic(), job.progress
+            elif time.monotonic() - moved > STALL_S:
+                if not is_starting(client):
+                    return job, False
+                moved = time.monotonic()
+    return job, True
+
+
+def _show(bar: tqdm[Any], name: str, progress: Progress) -> None:
+    """Let a bar show how far an import has come; of a map, in its phase."""
+    done, total = progress.done, progress.total
+    if progress.phase is not None:
+        steps = {"render": progress.rendered, "sign": progress.signed, "test": progress.tested}
+        done, total = steps.get(progress.phase) or 0, progress.views
+        if progress.phase == "test" and progress.total is not None and total is not None:
+            total = progress.total - 2 * total
+        bar.set_description(f"{name}: {_PHASES[progress.phase]}", refresh=False)
+    bar.total, bar.n = total, done
+    bar.refresh()
+
+
+def _count(client: Client, map_name: str, job: Job, tally: Tally) -> None:
+    from sceneprint_client.api import Added, FrameState
+
+    for item in client.import_items(map_name, job.job_id):
+        if item.frame_id is None or item.job_id is None:
+            tally.refuse(item.name, "refused" if item.problem is None else item.problem.detail)
+            continue
+        state = FrameState.RECEIVED
+        if item.status == 200:  # it may be over long since
+            try:
+                state = client.frame(map_name, item.frame_id).state
+            except UnknownFrame:  # deleted meanwhile
+                continue
+        added = Added(frame_id=item.frame_id, job_id=item.job_id, state=state, reason=None)
+        tally.count(item.name, added, item.status == 202)
+
+
+# Maps that are one file: `sceneprint upload --as-map`.
+
+#: Units of a metre by their names.
+_UNITS = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "ft": 1 / 0.3048}
+#: Bytes of a file of points that are too many for one scan.
+_SCAN_BYTES = 24 << 20
+#: Weak areas that are printed.
+_MOST_WEAK = 5
+
+
+def axis_or_up(text: str) -> Axis | list[float]:
+    """An axis of a file, or up in the axes of a sensor."""
+    axis = next((one for one in get_args(Axis) if one == text), None)
+    return up_of(text) if axis is None else axis
+
+
+def positive_number(text: str) -> float:
+    """A number above 0."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return number
+
+
+def units_of(text: str) -> float:
+    """Units of a metre: by name, or how many."""
+    return _UNITS[text] if text in _UNITS else positive_number(text)
+
+
+def camera_of(text: str) -> dict[str, float]:
+    """Six numbers of a camera."""
+    try:
+        return camera_fields(text)
+    except InvalidRequest as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def add_map_options(command: argparse.ArgumentParser) -> None:
+    """`--as-map`, and what is said of the file then."""
+    group = command.add_argument_group("a whole map in one file")
+    group.add_argument(
+        "--as-map",
+        action="store_true",
+        help="PATH is a cloud or mesh of a whole place (PCD, PLY, LAS, LAZ, OBJ, STL, glTF, E57): "
+        "views of it are rendered, and become the frames of the map. --up takes the axis of the "
+        "file that points up: x, y, z or, as in --up=-y, its opposite",
+    )
+    group.add_argument(
+        "--height",
+        type=positive_number,
+        action="append",
+        default=[],
+        metavar="M",
+        help="height of the robot's sensor above the floor, metres; repeatable (default: some "
+        "that are usual for such a sensor)",
+    )
+    group.add_argument(
+        "--units",
+        type=units_of,
+        metavar="N",
+        help="unit of the file: m, cm, mm, ft, or how many are a metre (default: as the file "
+        "says, else estimated)",
+    )
+    group.add_argument(
+        "--camera",
+        type=camera_of,
+        metavar="FX,FY,CX,CY,WIDTH,HEIGHT",
+        help="depth camera of the robot, pixels (default: a usual one)",
+    )
+
+
+def check_map_options(options: argparse.Namespace) -> None:
+    """See that options are of the kind of upload; InvalidRequest where they are not."""
+    if options.as_map:
+        folders = [str(path) for path in options.paths if path.is_dir()]
+        if folders:
+            raise DatasetError(
+                f"{folders[0]}: A map is one file, and this is a folder. Name the file, or leave "
+                "--as-map out to upload the frames in it."
+            )
+        return
+    for name in ("height", "units", "camera"):
+        if getattr(options, name):
+            raise InvalidRequest(
+                f"--{name} is for a map that is one file. Add --as-map, or leave it out.",
+                ((name, "without --as-map"),),
+            )
+    if isinstance(options.up, str):
+        raise InvalidRequest(
+            f"--up {options.up} is an axis of a file, for --as-map. Give three numbers: up in the "
+            "axes of the sensor.",
+            (("up", "an axis without --as-map"),),
+        )
+
+
+def import_maps(client: Client, options: argparse.Namespace) -> int:
+    """Send maps and say what became of each; returns 2 where one was not imported."""
+    code = 0
+    for path in options.paths:
+        said = checked(
+            ImportOptions, f"What is said of {path.name}", **{"as": "map"},
+            name=path.name[-64:].lstrip("."), robot=options.robot, session=options.session,
+            tags=options.tag, parent_frame=options.parent_frame, with_poses=not options.no_pose,
+            every=options.every, T_base_sensor=options.base, up=options.up,
+            heights=options.height, units_per_metre=options.units, camera=options.camera,
+            priority=options.priority, if_novel=options.if_novel,
+        )  # fmt: skip
+        job = client.import_map(options.map, path, said)
+        if options.no_wait:
+            print(f"{path.name}: received; import {job.job_id} renders its views")
+            continue
+        job, moves = _waited(client, path.name, job)
+        if not moves:
+            print(
+                f"{path.name}: import {job.job_id} has not moved for {STALL_S:.0f} s. Check that "
+                "workers are running; `sceneprint work` starts some.",
+                file=sys.stderr,
+            )
+            return 2
+        if job.result is None:
+            print(f"{path.name}: {job.error or job.state.sentence}", file=sys.stderr)
+            code = 2
+            continue
+        print("\n".join(lines_of(path.name, options.map, MapImportResult(**job.result))))
+    return code
+
+
+def lines_of(name: str, map_name: str, result: MapImportResult) -> list[str]:
+    """Say in sentences what became of a map that is one file."""
+    how = {"stated": "as you said", "file": "from the file", "estimated": "estimated"}
+    unit = next((u for u, n in _UNITS.items() if math.isclose(n, result.units_per_metre)), None)
+    unit = unit or f"{result.units_per_metre:g} per metre"
+    r = result
+    refused = f" {r.refused} views were refused." if r.refused else ""
+    lines = [
+        f"{name}: {r.views} views are in map {map_name} and see {r.seen:.0%} of its surface. Their "
+        f"poses lead to {r.parent_frame}.{refused}",
+        f"units: {unit} ({how.get(r.units_from, r.units_from)}); up: {_axis(r.up)} "
+        f"({how.get(r.up_from, r.up_from)})",
+    ]
+    if any(offset := (r.offset.x, r.offset.y, r.offset.z)):
+        lines.append(f"offset: {_numbers(*offset)} m; add it to a pose for the file's coordinates")
+    lines += r.notes
+    if r.coverage is not None:
+        lines.append(
+            f"A robot would be found in {r.coverage:.0%} of this place: of {r.tested} other views "
+            f"{r.found} were found, {r.ambiguous} ambiguous, {r.not_found} not found, {r.wrong} "
+            "wrong."
+        )
+    for area in r.weak[:_MOST_WEAK]:
+        at = _numbers(area.centre.x, area.centre.y, area.centre.z)
+        lines.append(
+            f"weak here: {at}, {area.width_m:g} m wide ({area.found} of {area.views} found)"
+        )
+    if len(r.weak) > _MOST_WEAK:
+        lines.append(f"and {len(r.weak) - _MOST_WEAK} more weak areas")
+    return lines
+
+
+def _axis(up: Direction) -> str:
+    """The axis that a direction is along, or its numbers."""
+    for axis, value in zip("xyz", (up.x, up.y, up.z), strict=True):
+        if abs(value) > 0.9999:
+            return axis if value > 0 else f"-{axis}"
+    return _numbers(up.x, up.y, up.z)
+
+
+def _numbers(x: float, y: float, z: float) -> str:
+    return f"{x:.2f}, {y:.2f}, {z:.2f}"
+
+
+def hint_at_maps(paths: list[Path]) -> None:
+    """Say of files of points that are too large for one scan how a map is uploaded."""
+    for path in paths:
+        if path.is_file() and is_cloud(path.name) and path.stat().st_size > _SCAN_BYTES:
+            print(
+                f"{path.name} is large for one scan. If it holds a whole place, upload it with "
+                "--as-map.",
+                file=sys.stderr,
+            )
