@@ -40,6 +40,7 @@ EDITED = [
     "docs/uncertainty.md",
     "docs/viewers.md",
     "docs/from_bag_to_pose.md",
+    "docs/whole_maps.md",
     "docs/model.md",
     "docs/paper.md",
     "examples/README.md",
