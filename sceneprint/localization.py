@@ -58,21 +58,14 @@ class AlternativePose:
     ----------
     T : (4, 4) T_parent_query
     support : matches from different viewpoints that vote for it
-    weight : of these votes: 1 for a strong match, 0.4 for a weak or an ambiguous one
     confidence : probability that it is right; None where the map was not asked
     evidence : what that was computed from; None where the map was not asked
     """
 
     T: Floats
     support: int
-    weight: float
     confidence: float | None
     evidence: PlaceEvidence | None
-
-    @property
-    def score(self) -> float | None:
-        """How well the map bears it out; None where it was not asked."""
-        return None if self.evidence is None else self.evidence.score
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,10 +105,9 @@ class PoseEstimate:
         return self.alternatives[0].confidence if self.alternatives else None
 
     @property
-    def rival_ratio(self) -> float | None:
-        """Score of the best other place, relative to that of the best pose; None likewise."""
-        best = self.alternatives[0].evidence if self.alternatives else None
-        return None if best is None else best.rival
+    def evidence(self) -> PlaceEvidence | None:
+        """What speaks for and against the best pose; None where the map was not asked."""
+        return self.alternatives[0].evidence if self.alternatives else None
 
 
 def localize(
@@ -284,7 +276,7 @@ def estimate_of(
             return _found(parent, place, places, "prior", confidence, p)
     worth = [i for i in order if judged[i] >= p.worth][: p.views]
     alternatives = tuple(
-        AlternativePose(one.T, one.support, one.weight, judged[i], one.evidence)
+        AlternativePose(one.T, one.support, judged[i], one.evidence)
         for i in worth
         for one in (places[i],)
     )
@@ -357,7 +349,7 @@ def _estimate_by_votes(
     if against is None:
         return _found(parent, best, places, "matches", None, p)
     alternatives = tuple(
-        AlternativePose(one.T, one.support, one.weight, None, None) for one in order[: p.views]
+        AlternativePose(one.T, one.support, None, None) for one in order[: p.views]
     )
     votes = sum(len(place.accepted) for place in places)
     return PoseEstimate("ambiguous", against, parent, None, None, None, None, alternatives, votes)
@@ -380,7 +372,7 @@ def _found(
     guided = sum(vote.match.validation.guided for vote in accepted)
     reason = _found_reason(average, len(accepted), guided, total, place.support, verified_by)
     strength: Strength = "strong" if place.strong else "weak"
-    itself = AlternativePose(average.T, place.support, place.weight, confidence, place.evidence)
+    itself = AlternativePose(average.T, place.support, confidence, place.evidence)
     return PoseEstimate(
         "found", reason, parent, average, covariance, strength, verified_by, (itself,), total,
         tuple(vote.match.index for vote in accepted), guided,

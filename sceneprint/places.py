@@ -127,7 +127,8 @@ class Place:
     ----------
     T : (4, 4) T_parent_query
     votes : of matches, those to believe most first
-    support, weight : of the votes from different viewpoints, as in AlternativePose
+    support : different viewpoints of the matches that vote
+    weight : of these votes, 1 for a strong match, less for a weak or an ambiguous one
     evidence : for its pose; None where the map was not asked
     """
 

@@ -106,9 +106,9 @@ def test_the_pose_of_a_match_leads_to_that_of_the_query(blank: Geometry) -> None
     np.testing.assert_allclose(found.average.T, turn @ shifted(2.0), atol=1e-12)
     assert (found.status, found.parent, found.votes, found.members) == ("found", "there", 1, (1,))
     assert found.reason == "one match gives the pose"
-    assert (found.rival_ratio, found.confidence, found.verified_by) == (None, None, "matches")
+    assert (found.evidence, found.confidence, found.verified_by) == (None, None, "matches")
     [itself] = found.alternatives
-    assert (itself.T.tolist(), itself.weight, itself.support) == (found.average.T.tolist(), 1.0, 1)
+    assert (itself.T.tolist(), itself.support) == (found.average.T.tolist(), 1)
 
 
 @pytest.mark.parametrize(
@@ -134,15 +134,15 @@ def test_a_pose_is_found_where_it_outweighs_every_other(
     else:
         assert found.average is None
         assert "none of their poses" in found.reason
-        told = [(one.weight, one.support, one.T[0, 3]) for one in found.alternatives]
-        assert told == [(here, here, pytest.approx(0.0)), (there, there, pytest.approx(5.0))]
+        told = [(one.support, one.T[0, 3]) for one in found.alternatives]
+        assert told == [(here, pytest.approx(0.0)), (there, pytest.approx(5.0))]
 
 
 def test_weak_and_ambiguous_matches_weigh_less_and_still_compete(blank: Geometry) -> None:
     weak = by_pairs(blank, seen_at(0.0, [0, 1, 2], "weak"))
     assert weak is not None
     assert (weak.status, weak.strength) == ("ambiguous", None)
-    assert weak.alternatives[0].weight == pytest.approx(1.2)
+    assert weak.alternatives[0].support == 3
     assert "weak" in weak.reason
     # strength is that of the winning place: a strong match elsewhere lends none
     mixed = by_pairs(blank, seen_at(0.0, [0, 1, 2, 3, 4, 5], "weak") + seen_at(5.0, [6]))
@@ -198,7 +198,7 @@ def test_a_copy_of_a_view_is_no_second_vote(blank: Geometry) -> None:
     for matches in ([*both], [*both, copy], [*both, copy, copy]):
         found = localize([QueryFrame(blank, matches)], rows)
         assert found is not None
-        assert (found.status, {one.weight for one in found.alternatives}) == ("ambiguous", {1.0})
+        assert (found.status, {one.support for one in found.alternatives}) == ("ambiguous", {1})
     other = localize([QueryFrame(blank, [*both, *seen_at(0.0, [2])])], rows)
     assert other is not None
     assert other.status == "found"
@@ -307,7 +307,7 @@ def test_a_cube_is_ambiguous_by_quarter_turns_until_a_prior_decides(
     box_views: tuple[list[Floats], list[Geometry]], signer: Signer
 ) -> None:
     found, T = box_query(box_views, signer)
-    assert (found.status, found.average, found.rival_ratio) == (
+    assert (found.status, found.average, found.evidence.rival) == (
         "ambiguous", None, pytest.approx(1.0, abs=0.1),
     )  # fmt: skip
     turns = [about_up(quarter * 90.0) @ T for quarter in range(4)]
@@ -493,8 +493,8 @@ def test_evidence_by_hand() -> None:
     assert (evidence.weight, evidence.strong, evidence.suggested) == (pytest.approx(2.4), 2, 4)
     assert (evidence.accepted, evidence.acceptance, evidence.similarity) == (3, 1.0, 0.7)
     assert (evidence.rival, evidence.rival_weight) == pytest.approx((10 / 40, 0.4))
-    assert (itself.weight, itself.support) == (pytest.approx(2.4), 3)
-    assert found.rival_ratio == pytest.approx(0.25)
+    assert itself.support == 3
+    assert found.evidence is evidence
 
 
 @pytest.mark.parametrize(
@@ -513,7 +513,8 @@ def test_a_pose_is_found_where_its_confidence_is_enough(
     found = judged(matches, [picture((40, SAME))], [picture((rival, SAME))])
     assert found.status == status
     assert found.confidence == pytest.approx(confidence, abs=1e-4)
-    assert found.rival_ratio == pytest.approx(rival / 40)
+    assert found.evidence is not None
+    assert found.evidence.rival == pytest.approx(rival / 40)
     if status == "found":
         assert (found.verified_by, at_place(0, found)) == ("matches", True)
         strict = replace(BY_HAND, confidence=0.995)
@@ -560,7 +561,7 @@ def test_a_pose_that_one_view_alone_suggests_is_not_sure() -> None:
     for matches, status in ((alone, "ambiguous"), ([*alone, other], "found")):
         found = judged(matches, [WHOLE] * 3)
         assert found.status == status
-        assert [(one.weight, one.support) for one in found.alternatives] == [(1.0, 1)]
+        assert [one.support for one in found.alternatives] == [1]
         assert status == "found" or "one view alone suggests this pose" in found.reason
 
 
@@ -631,7 +632,7 @@ def test_the_map_alone_may_decide_where_no_match_votes() -> None:
     assert (found.status, found.verified_by, found.strength) == ("found", "map", "weak")
     assert at_place(0, found)
     [itself] = found.alternatives
-    assert (itself.weight, itself.support, found.votes) == (0.0, 0, 0)
+    assert (itself.support, found.votes) == (0, 0)
     # what a caller asks of matches, a pose without the vote of one does not meet
     strict = replace(BY_HAND, voted_only=True)
     told = judged(suggested, [WHOLE] * 8, p=strict)
@@ -898,5 +899,5 @@ def test_what_was_not_compared_is_ambiguous(blank: Geometry) -> None:
     assert (told.status, told.average, told.strength, told.members) == ("ambiguous", None, None, ())
     [pose] = told.alternatives
     np.testing.assert_allclose(pose.T, shifted(4.0), atol=1e-12)
-    assert (pose.weight, pose.support) == (2.0, 2)
+    assert pose.support == 2
     assert unconfirmed(told) is told

@@ -336,7 +336,6 @@ def _create_queries() -> None:
         sa.Column("pose", sa.JSON()),
         sa.Column("confidence", sa.Float()),
         sa.Column("support", WHOLE),
-        sa.Column("rival_ratio", sa.Float()),
         sa.Column("alternatives", WHOLE, nullable=False),
         sa.Column("milliseconds", sa.Float(), nullable=False),
         sa.Column("kind", _string(8)),

@@ -368,7 +368,7 @@ def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
         head = "  one pose is supported, and not confirmed:"
     places = [
         f"  {_percent(one.confidence):>7}  {metres(one.pose)} m in "
-        f"{one_line(one.pose.parent_frame)}, weight {one.weight:.1f}, support {one.support}; "
+        f"{one_line(one.pose.parent_frame)}, support {one.support}; "
         f"{_evidence(one.evidence)}"
         for one in alternatives
     ]

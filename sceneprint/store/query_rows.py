@@ -57,7 +57,6 @@ class _Query:
     pose: Sequence[float] | None
     confidence: float | None
     support: int | None
-    rival_ratio: float | None
     alternatives: int
     milliseconds: float
     kind: Kind | None
@@ -79,7 +78,7 @@ class NewQuery(_Query):
     status, cause, reason : of the answer; or `failed`, the type of the error, and its text
     pose_parent, pose : x, y, z, qx, qy, qz, qw of T_parent_query where it was found
     confidence : of that pose, or of the best alternative
-    support, rival_ratio : of the pose that was found
+    support : of the pose that was found
     alternatives : number of poses that the evidence supports as well
     milliseconds : duration
     kind : of the frame, if it was read

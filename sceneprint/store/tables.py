@@ -422,7 +422,6 @@ queries = Table(
     Column("pose", JSON(none_as_null=True)),  # T_parent_query: x, y, z, qx, qy, qz, qw
     Column("confidence", Float),
     Column("support", WHOLE),
-    Column("rival_ratio", Float),
     Column("alternatives", WHOLE, nullable=False),
     Column("milliseconds", Float, nullable=False),
     Column("kind", _string(8)),

@@ -136,7 +136,7 @@ def test_an_ambiguous_place_is_told_with_its_alternatives(
     places = []
     for line, one in zip(located[2:], told["alternatives"], strict=True):
         place = re.fullmatch(
-            r" +(\S+) %  (\S+) (\S+) (\S+) m in hall, weight 0\.4, support 1; (\d+) planes? and "
+            r" +(\S+) %  (\S+) (\S+) (\S+) m in hall, support 1; (\d+) planes? and "
             r"(\d+) frames? of the map agree, (nothing|\d+%) is missing, .*",
             line,
         )

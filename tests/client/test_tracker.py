@@ -50,10 +50,10 @@ def answer(status: str, x: float = 0.0, **fields: Any) -> Localization:
         "status": status, "reason": f"{status}, told by a test", "map": "m",
         "pose": pose if found else None, "support": 3 * found, "votes": 3 * found,
         "spread_m": None, "spread_deg": None, "strength": "strong" if found else None,
-        "verified_by": "matches" if found else None, "rival_ratio": 0.0 if found else None,
+        "verified_by": "matches" if found else None,
         "best": None, "matches": [], "query_id": "q", "seed": 0, "model": "depth",
         "milliseconds": {},
-        "alternatives": [{"pose": pose, "confidence": 0.5, "weight": 1, "support": 1, "score": 0.5}]
+        "alternatives": [{"pose": pose, "confidence": 0.5, "support": 1}]
         if status == "ambiguous" else [],
         **fields,
     }  # fmt: skip

@@ -64,7 +64,7 @@ def row(number: int, **more: object) -> NewQuery:
     one = NewQuery(
         id=f"{number:032x}", at=time.time() + number, map="hall", maps=None, robot=None,
         session=None, status="not_found", cause="nothing_alike", reason="why", pose_parent=None,
-        pose=None, confidence=None, support=None, rival_ratio=None, alternatives=0,
+        pose=None, confidence=None, support=None, alternatives=0,
         milliseconds=12.5, kind="depth", frame_map=None, frame_id=None, key_id=None, listed=True,
     )  # fmt: skip
     return replace(one, **more)
@@ -131,7 +131,7 @@ def test_answers_and_failures_become_rows(full, uploads):
         id=answer.query_id, at=7.0, map="hall", maps=None, robot="spot", session="monday",
         key_id=None, status="found", cause=None, reason=answer.reason, pose_parent=one.room,
         pose=(t.x, t.y, t.z, r.x, r.y, r.z, r.w), confidence=answer.location.confidence,
-        support=answer.location.support, rival_ratio=answer.location.rival_ratio,
+        support=answer.location.support,
         alternatives=0, milliseconds=250.0, kind="depth", frame_map=None, frame_id=None,
         listed=True,
     )  # fmt: skip

@@ -61,7 +61,7 @@ class ScriptedLocalizer:
             "status": "found" if found else "not_found", "reason": "told by a test", "map": "m",
             "pose": pose, "support": 3 * found, "votes": 3 * found, "spread_m": None,
             "spread_deg": None, "strength": "strong" if found else None,
-            "verified_by": "matches" if found else None, "rival_ratio": 0.0 if found else None,
+            "verified_by": "matches" if found else None,
             "best": None, "matches": [], "query_id": "q", "seed": 0, "model": "depth",
             "milliseconds": {}, "alternatives": [],
         })  # fmt: skip

@@ -70,7 +70,7 @@ def test_each_query_leaves_a_record_of_what_came_of_it(house, shots, refused):
         "robot": "spot", "session": "monday", "key": "robot", "status": "found", "cause": None,
         "reason": answer["reason"], "support": answer["location"]["support"],
         "confidence": answer["location"]["confidence"],
-        "rival_ratio": answer["location"]["rival_ratio"], "alternatives": 0, "kind": "depth",
+        "alternatives": 0, "kind": "depth",
         "pose": {
             name: answer["location"]["pose"][name]
             for name in ("parent_frame", "translation", "rotation")

@@ -293,15 +293,9 @@ class Alternative(ApiRecord):
         default=None, description="What `confidence` was computed from; null likewise."
     )
     map: str | None = Field(default=None, description="Whose parent frame it is given in.")
-    weight: float = Field(
-        description="Of its votes, one for each viewpoint: 1 of a strong match, 0.4 of a weak or "
-        "an ambiguous one; 0 where the map alone suggests it."
-    )
-    support: int = Field(description="Matches from different viewpoints that vote for it.")
-    score: float | None = Field(
-        description="How far the map's frames bear it out: the share of the query's surface that "
-        "they show there, every plane counting alike, less for what they saw through; 1 at most. "
-        "Null where they were not asked."
+    support: int = Field(
+        description="Matches from different viewpoints that vote for it; 0 where the map alone "
+        "suggests it."
     )
 
 
@@ -332,12 +326,6 @@ class Location(ApiRecord):
         description="`matches`: a strong match votes for the pose. `map`: no strong one does, and "
         "the map's frames bear it out. `prior`: they bear several poses out, and this is the one "
         "that the prior expects.",
-    )
-    rival_ratio: float | None = Field(
-        default=None,
-        description="How far the map bears out the best pose of another place, as a share of the "
-        "best of all, as `evidence.rival`: 0 where nothing comes near, 1 where it is as good. Null "
-        "where the map's frames were not asked.",
     )
     spread_m: float
     spread_deg: float
@@ -722,10 +710,6 @@ class Localization(ApiRecord):
     verified_by: Verifier | None = Field(
         default=None,
         description="What decided, as in `location` of an answer; null unless `found`.",
-    )
-    rival_ratio: float | None = Field(
-        default=None,
-        description="How near another place comes, 0 to 1; null where the map was not asked.",
     )
     alternatives: list[Alternative] = Field(
         default=[],

@@ -78,7 +78,6 @@ class QueryRecord(ApiRecord):
         "null where the map was not asked."
     )
     support: int | None = Field(description="Number of matches that agree on `pose`.")
-    rival_ratio: float | None = Field(description="How near another place comes, 0 to 1.")
     alternatives: int = Field(
         description="Of `ambiguous`: number of poses that the evidence supports."
     )

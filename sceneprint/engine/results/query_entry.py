@@ -142,7 +142,7 @@ def query_row(sent: SentQuery, outcome: Answer | Exception, seconds: float) -> N
         id=uuid.uuid4().hex, at=round(sent.at, 6), map=sent.maps[0],
         maps=tuple(sent.maps) if several else None, robot=sent.robot, session=sent.session,
         status="failed", cause=None, reason="", pose_parent=None, pose=None, confidence=None,
-        support=None, rival_ratio=None, alternatives=0, milliseconds=round(1e3 * seconds, 2),
+        support=None, alternatives=0, milliseconds=round(1e3 * seconds, 2),
         kind=None, frame_map=None if frame is None else frame.map,
         frame_id=None if frame is None else frame.frame_id, key_id=sent.key_id,
         listed=sent.query.record,
@@ -166,7 +166,7 @@ def query_row(sent: SentQuery, outcome: Answer | Exception, seconds: float) -> N
     t, r = there.pose.translation, there.pose.rotation
     return replace(
         row, pose_parent=there.pose.parent_frame, pose=(t.x, t.y, t.z, r.x, r.y, r.z, r.w),
-        confidence=there.confidence, support=there.support, rival_ratio=there.rival_ratio,
+        confidence=there.confidence, support=there.support,
     )  # fmt: skip
 
 
@@ -193,9 +193,8 @@ def query_record(row: QueryRow, days: float, may_read: Callable[[str], bool]) ->
         maps=[one for one in row.searched if one == row.map or may_read(one)],
         robot=row.robot, session=row.session, key=row.key, status=row.status, cause=row.cause,
         reason=row.reason, pose=pose, confidence=row.confidence, support=row.support,
-        rival_ratio=row.rival_ratio, alternatives=row.alternatives,
-        milliseconds=row.milliseconds, kind=row.kind, frame=frame, stored=row.bytes > 0,
-        kept_at=when(row.kept_at),
+        alternatives=row.alternatives, milliseconds=row.milliseconds, kind=row.kind, frame=frame,
+        stored=row.bytes > 0, kept_at=when(row.kept_at),
         title=row.title if all(map(may_read, row.searched)) else None,
         expires_at=None if row.kept_at else when(row.at + DAY_S * days),
     )  # fmt: skip

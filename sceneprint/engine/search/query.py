@@ -550,7 +550,6 @@ def localization_of(answer: Answer) -> Localization:
         base=None if there is None else there.base,
         strength=strength,
         verified_by=None if there is None else there.verified_by,
-        rival_ratio=None if there is None else there.rival_ratio,
         alternatives=answer.alternatives,
         best=accepted[0] if accepted and status == "found" else None,
         matches=[one.frame_id for one in accepted],

@@ -145,13 +145,12 @@ def location_record(found: Candidates, estimate: PoseEstimate | None) -> ToldLoc
         pose=transform(average.T, parent, found.query_frame),
         map=found.maps[int(number)],
         confidence=estimate.confidence,
-        evidence=evidence_record(estimate.alternatives[0].evidence),
+        evidence=evidence_record(estimate.evidence),
         support=len(estimate.members),
         guided=estimate.guided,
         votes=estimate.votes,
         strength=estimate.strength or "weak",
         verified_by=estimate.verified_by or "matches",
-        rival_ratio=estimate.rival_ratio,
         spread_m=average.spread_m,
         spread_deg=math.degrees(average.spread_rad),
         uncertainty=uncertainty_record(estimate.covariance, PLACE_METHOD, found.covariance),
@@ -170,9 +169,7 @@ def alternative_records(found: Candidates, estimate: PoseEstimate | None) -> lis
             map=found.maps[int(number)],
             confidence=one.confidence,
             evidence=evidence_record(one.evidence),
-            weight=one.weight,
             support=one.support,
-            score=one.score,
         )
         for one in estimate.alternatives
     ]

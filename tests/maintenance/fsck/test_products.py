@@ -154,7 +154,7 @@ def query_of(letter: str, *, listed: bool = True) -> NewQuery:
     return NewQuery(
         id=letter * 32, at=time.time(), map="hall", maps=None, robot=None, session=None,
         status="found", cause=None, reason="", pose_parent=None, pose=None, confidence=None,
-        support=None, rival_ratio=None, alternatives=0, milliseconds=1.0, kind=None, frame_map=None,
+        support=None, alternatives=0, milliseconds=1.0, kind=None, frame_map=None,
         frame_id=None, key_id=None, listed=listed, bytes=9,
     )  # fmt: skip
 
