@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -30,9 +30,11 @@ from sceneprint.geometry.validation.confidence import (
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
     MapViews,
+    looks_ahead,
     view_separations,
 )
-from sceneprint.pipeline import PairMatch
+from sceneprint.geometry.validation.validation import PairValidation
+from sceneprint.pipeline import PairMatch, searched
 from sceneprint.places import (
     LocalizationParameters,
     Place,
@@ -85,6 +87,7 @@ class PoseEstimate:
     votes : accepted matches that have a pose in the parent frame
     members : rows of the matches that vote for the answer
     guided : how many of these were guided by the others
+    places : all that were judged
     """
 
     status: LocalizationStatus
@@ -98,6 +101,7 @@ class PoseEstimate:
     votes: int = 0
     members: tuple[int, ...] = ()
     guided: int = 0
+    places: tuple[Place, ...] = ()
 
     @property
     def confidence(self) -> float | None:
@@ -143,7 +147,85 @@ def localize(
     if not places:
         return None
     blind = all(frame.geometry.surface.camera is None for frame in frames)
-    return estimate_of(parent, places, prior, p, blind=blind)
+    estimate = _estimate_of(parent, places, prior, p, blind=blind)
+    return replace(estimate, places=tuple(places))
+
+
+class QueryDatabase(Protocol):
+    """What `decide` asks of a database for one query: a service of its store, or an evaluation."""
+
+    def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
+        """Return where the last of some frames was taken, by their matches; see `localize`."""
+
+    def search(self, frame: int, known: Mapping[int, PairValidation]) -> Sequence[PairMatch] | None:
+        """Return the matches of a frame's candidates, none of them guided.
+
+        Parameters
+        ----------
+        frame : number of the frame
+        known : validations of candidates, by row, that are not repeated
+
+        Returns
+        -------
+        matches : see `associate`; None where time is up
+        """
+
+    def posed(self, rows: Sequence[int]) -> Mapping[int, PosedFrame]:
+        """Return those of some rows that have a pose."""
+
+    def compare(self, rows: Sequence[int]) -> Sequence[PairMatch]:
+        """Return the matches of the last frame with some rows, none of them guided."""
+
+
+def decide(
+    frames: Sequence[QueryFrame], ranking: Ranking, database: QueryDatabase,
+    p: LocalizationParameters,
+) -> PoseEstimate | None:  # fmt: skip
+    """Return where the last frame of a query was taken, after validating what may change that.
+
+    Guided matches are no votes: where no pose is found with them, their frames are searched. And no
+    pose is found before frames elsewhere that look alike were compared; see `rival_rows`.
+
+    Parameters
+    ----------
+    frames : of the query, with the matches of their candidates
+    ranking : R of the last frame
+    database : see QueryDatabase
+    p : see LocalizationParameters
+
+    Returns
+    -------
+    estimate : or None where nothing suggests a pose
+    """
+    of_candidates = [frame.matches for frame in frames]
+    elsewhere: Sequence[PairMatch] = ()
+
+    def located() -> PoseEstimate | None:
+        every = [*of_candidates[:-1], [*of_candidates[-1], *elsewhere]]
+        return database.locate(
+            [replace(one, matches=own) for one, own in zip(frames, every, strict=True)]
+        )
+
+    def settled() -> PoseEstimate | None:
+        estimate = located()
+        if estimate is None or estimate.status == "found":
+            return estimate
+        again = [
+            None if known is None else database.search(number, known)
+            for number, known in enumerate(map(searched, of_candidates))
+        ]
+        if not any(again):
+            return estimate
+        of_candidates[:] = [new or old for new, old in zip(again, of_candidates, strict=True)]
+        return located()
+
+    estimate = settled()
+    tried = {match.index for match in of_candidates[-1]}
+    ahead = looks_ahead(frames[-1].geometry)
+    rows = rival_rows(estimate, ranking, tried, database.posed, ahead, p)
+    if rows:
+        elsewhere = database.compare(rows)
+    return settled() if elsewhere else estimate
 
 
 def views_of_rows(
@@ -221,6 +303,8 @@ def rival_rows(
     p = p or LocalizationParameters()
     if estimate is None or estimate.average is None or estimate.verified_by == "prior":
         return []
+    if not p.rivals:
+        return []
     order = ranking.indices.tolist()
     voting = [i for i, row in enumerate(order) if row in (estimate.members or tried)]
     if not voting:
@@ -249,7 +333,7 @@ def unconfirmed(estimate: PoseEstimate) -> PoseEstimate:
     )  # fmt: skip
 
 
-def estimate_of(
+def _estimate_of(
     parent: str, places: Sequence[Place], prior: PosePrior | None, p: LocalizationParameters, *,
     blind: bool = False,
 ) -> PoseEstimate:  # fmt: skip

@@ -31,6 +31,7 @@ from sceneprint.geometry.validation.map_verification import (
     starts_about,
 )
 from sceneprint.geometry.validation.validation import preferred
+from sceneprint.models.model import AnswerParameters
 from sceneprint.pipeline import PairMatch, answer_numbers
 from sceneprint.types import Floats, Geometry
 
@@ -52,6 +53,11 @@ class LocalizationParameters:
     rival_distance: float = 1.2  #: times that of the farthest match for the pose, at most
     map: MapParameters = field(default_factory=MapParameters)
     judgement: ConfidenceParameters = field(default_factory=ConfidenceParameters)
+
+    @classmethod
+    def of(cls, answer: AnswerParameters) -> LocalizationParameters:
+        """Return those of a model."""
+        return cls(map=answer.map, judgement=answer.confidence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,8 +168,7 @@ _NONE = np.empty((0, 4, 4))
 
 def parameters_of(frames: Sequence[QueryFrame]) -> LocalizationParameters:
     """Return the numbers of the model that made the artifacts of a query; see `answer_numbers`."""
-    answer = answer_numbers(frames[0].geometry)
-    return LocalizationParameters(map=answer.map, judgement=answer.confidence)
+    return LocalizationParameters.of(answer_numbers(frames[0].geometry))
 
 
 def judged_places(

@@ -16,7 +16,7 @@ from sceneprint.types import DepthFrame
 from sceneprint_client.api import Answer, Query
 
 #: What looks for frames of another place.
-RIVAL_ROWS = "sceneprint.engine.search.verification.rival_rows"
+RIVAL_ROWS = "sceneprint.localization.rival_rows"
 CLOCK = "sceneprint.engine.search.retrieval.time.perf_counter"
 #: From one room to its twin, metres.
 APART = 30.0

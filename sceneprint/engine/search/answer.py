@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -34,9 +34,10 @@ from sceneprint.engine.search.verification import (
     CANDIDATES,
     Validated,
     nearest_first,
+    numbers_of,
+    parent_key,
     placed,
     prior_of,
-    validate_elsewhere,
     validated,
 )
 from sceneprint.engine.serializers import query_sensor
@@ -49,13 +50,13 @@ from sceneprint.geometry.retrieval.ranking import (
     diversify,
     pairwise_distances,
 )
-from sceneprint.geometry.validation.validation import ValidationParameters
-from sceneprint.localization import PoseEstimate, unconfirmed
+from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
+from sceneprint.localization import PosedFrame, PoseEstimate, decide, unconfirmed
 from sceneprint.models import Model
-from sceneprint.pipeline import VERDICT_MATCHES, PairMatch, searched
+from sceneprint.pipeline import VERDICT_MATCHES, PairMatch
 from sceneprint.places import PosePrior, QueryFrame
 from sceneprint.store import Store
-from sceneprint.store.maps import frames_of
+from sceneprint.store.maps import frames_of, viewpoints_among
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Answer, AnswerStatus, Counts, FrameName, Match, OfMap, Query
@@ -143,99 +144,83 @@ def answer(
         clock.stage("earlier")
     estimate = None
     if asked.geometry is not None:
-        attempts = [*before, last]
+        database = _StoredDatabase(store, [*before, last], prior, model, query, deadline)
         poses = [*(one.T for one in earlier), np.eye(4)]
-        estimate, last = _decided(store, attempts, poses, prior, model, query, deadline)
+        frames = [
+            QueryFrame(one.asked.geometry, one.matches, T)
+            for one, T in zip(database.attempts, poses, strict=True)
+            if one.asked.geometry is not None
+        ]
+        estimate = decide(frames, last.searched.ranking, database, numbers_of(model, query))
+        last = database.attempts[-1]
+        if last.late and estimate is not None:
+            estimate = unconfirmed(estimate)
         clock.stage("locate")
     return _answer(store, places, model, last, estimate, query, deadline, clock, len(before))
 
 
-def _decided(
-    store: Store, attempts: list[_Attempt], poses: Sequence[Floats], prior: PosePrior | None,
-    model: Model, query: Query, deadline: Deadline,
-) -> tuple[PoseEstimate | None, _Attempt]:  # fmt: skip
-    """Where the last frame was taken, and it with all that was validated to decide that."""
+class _StoredDatabase:
+    """The store, as `decide` asks it for one query; `attempts` has what it validated for that."""
 
-    def decide() -> PoseEstimate | None:
-        return _placed(store, attempts, poses, prior, model, query)
+    def __init__(
+        self, store: Store, attempts: Sequence[_Attempt], prior: PosePrior | None, model: Model,
+        query: Query, deadline: Deadline,
+    ) -> None:  # fmt: skip
+        self.attempts = list(attempts)
+        self._store, self._prior, self._model = store, prior, model
+        self._query, self._deadline = query, deadline
 
-    def search_for_guided() -> PoseEstimate | None:
-        """Guided matches are no votes: what these would say may decide."""
-        p = model.parameters.validation
-        again = [_searched(store, one, query, deadline, p) for one in attempts]
-        if again == attempts:
-            return estimate
-        attempts[:] = again
-        return decide()
+    def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
+        rows = {number: row for one in self.attempts for number, row in one.rows.items()}
+        geometries = {n: g for one in self.attempts for n, g in one.tried.geometries.items()}
+        return placed(
+            self._store, self.attempts[-1].searched, geometries, rows, frames, self._prior,
+            self._model, self._query,
+        )  # fmt: skip
 
-    estimate = decide()
-    if estimate is not None and estimate.status != "found":
-        estimate = search_for_guided()
-    attempts[-1] = _with_rivals(store, attempts[-1], estimate, query, deadline, model)
-    if attempts[-1].rivals:
-        estimate = decide()
-        if estimate is not None and estimate.status != "found":
-            estimate = search_for_guided()
-    if attempts[-1].late and estimate is not None:
-        estimate = unconfirmed(estimate)
-    return estimate, attempts[-1]
+    def search(self, frame: int, known: Mapping[int, PairValidation]) -> Sequence[PairMatch] | None:
+        before = self.attempts[frame]
+        tried = self._validated(before, before.tried.chosen, known)
+        if tried.late:
+            return None
+        self.attempts[frame] = replace(
+            before,
+            tried=replace(tried, geometries=before.tried.geometries | tried.geometries),
+            matches=[one for one in tried.matches if one.index in before.rows],
+        )
+        return self.attempts[frame].matches
 
+    def posed(self, rows: Sequence[int]) -> Mapping[int, PosedFrame]:
+        with self._store.database.read() as connection:
+            known = viewpoints_among(connection, rows)
+        return {
+            one.number: PosedFrame(parent_key(one), one.pose, not one.is_cloud) for one in known
+        }
 
-def _with_rivals(
-    store: Store, last: _Attempt, estimate: PoseEstimate | None, query: Query, deadline: Deadline,
-    model: Model,
-) -> _Attempt:  # fmt: skip
-    """The last frame, with frames validated that look like it elsewhere."""
-    if last.asked.geometry is None:
-        return last
-    more = validate_elsewhere(
-        store, last.searched, last.tried, estimate, last.asked.geometry, query, deadline, model,
-        last.asked.up,
-    )  # fmt: skip
-    if more is None:
-        return last
-    with store.database.read() as connection:
-        rows = frames_of(connection, [one.index for one in more.matches])
-    return replace(
-        last,
-        tried=replace(last.tried, geometries=last.tried.geometries | more.geometries),
-        rows=last.rows | rows,
-        rivals=[one for one in more.matches if one.index in rows],
-        late=bool(more.late),
-    )
+    def compare(self, rows: Sequence[int]) -> Sequence[PairMatch]:
+        last = self.attempts[-1]
+        positions = np.flatnonzero(np.isin(last.searched.ranking.indices, rows)).tolist()
+        more = self._validated(last, positions, retry=False)
+        with self._store.database.read() as connection:
+            known = frames_of(connection, [one.index for one in more.matches])
+        self.attempts[-1] = replace(
+            last,
+            tried=replace(last.tried, geometries=last.tried.geometries | more.geometries),
+            rows=last.rows | known,
+            rivals=[one for one in more.matches if one.index in known],
+            late=bool(more.late),
+        )
+        return self.attempts[-1].rivals
 
-
-def _placed(
-    store: Store, attempts: Sequence[_Attempt], poses: Sequence[Floats], prior: PosePrior | None,
-    model: Model, query: Query,
-) -> PoseEstimate | None:  # fmt: skip
-    """Where the last frame of a query was taken, by those at poses T_query_sensor."""
-    frames = [
-        QueryFrame(one.asked.geometry, [*one.matches, *one.rivals], T)
-        for one, T in zip(attempts, poses, strict=True)
-        if one.asked.geometry is not None
-    ]
-    rows = {number: row for one in attempts for number, row in one.rows.items()}
-    geometries = {n: g for one in attempts for n, g in one.tried.geometries.items()}
-    return placed(store, attempts[-1].searched, geometries, rows, frames, prior, model, query)
-
-
-def _searched(
-    store: Store, attempt: _Attempt, query: Query, deadline: Deadline, p: ValidationParameters
-) -> _Attempt:
-    """An attempt whose guided matches are searched for; itself where it has none, or time is up."""
-    known, asked = searched(attempt.matches), attempt.asked
-    if known is None:
-        return attempt
-    tried = validated(
-        store, attempt.searched, attempt.tried.chosen, asked.geometry, query, deadline, p,
-        asked.up, known, guided=False,
-    )  # fmt: skip
-    if tried.late:
-        return attempt
-    matches = [one for one in tried.matches if one.index in attempt.rows]
-    tried = replace(tried, geometries=attempt.tried.geometries | tried.geometries)
-    return replace(attempt, tried=tried, matches=matches)
+    def _validated(
+        self, attempt: _Attempt, positions: Sequence[int],
+        known: Mapping[int, PairValidation] | None = None, *, retry: bool = True,
+    ) -> Validated:  # fmt: skip
+        return validated(
+            self._store, attempt.searched, positions, attempt.asked.geometry, self._query,
+            self._deadline, self._model.parameters.validation, attempt.asked.up, known,
+            guided=False, retry=retry,
+        )  # fmt: skip
 
 
 def _attempt(

@@ -24,10 +24,9 @@ from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
     MapViews,
-    looks_ahead,
 )
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
-from sceneprint.localization import PosedFrame, PoseEstimate, localize, rival_rows
+from sceneprint.localization import PoseEstimate, localize
 from sceneprint.models import Model
 from sceneprint.pipeline import VERDICT_MATCHES, PairMatch, associate
 from sceneprint.places import LocalizationParameters, PosePrior, QueryFrame
@@ -160,45 +159,6 @@ def validated(
     return Validated(chosen, matches, unreadable, untried, late, opened)
 
 
-def validate_elsewhere(
-    store: Store, searched: Searched, tried: Validated, estimate: PoseEstimate | None,
-    geometry: Geometry, query: Query, deadline: Deadline, model: Model, up: Floats | None,
-) -> Validated | None:  # fmt: skip
-    """Validate frames that look like the query and show another place than the one that is found.
-
-    Parameters
-    ----------
-    estimate : of `placed`, with the matches of `tried`
-    model : of the maps
-    store, searched, tried, geometry, query, deadline, up : see `validated`
-
-    Returns
-    -------
-    found : see `sceneprint.localization.rival_rows`; None where there are none, and in mode `paper`
-    """
-    if query.validation is not None and query.validation.mode == "paper":
-        return None
-
-    def posed(numbers: Sequence[int]) -> dict[int, PosedFrame]:
-        with store.database.read() as connection:
-            found = viewpoints_among(connection, numbers)
-        return {
-            one.number: PosedFrame(parent_key(one), one.pose, not one.is_cloud) for one in found
-        }
-
-    before = {match.index for match in tried.matches}
-    numbers = rival_rows(
-        estimate, searched.ranking, before, posed, looks_ahead(geometry), numbers_of(model, query)
-    )
-    if not numbers:
-        return None
-    chosen = np.flatnonzero(np.isin(searched.ranking.indices, numbers)).tolist()
-    return validated(
-        store, searched, chosen, geometry, query, deadline, model.parameters.validation, up,
-        guided=False, retry=False,
-    )  # fmt: skip
-
-
 #: Frames that are looked for about each pose that a candidate suggests: first close by, as a map
 #: may hold thousands, and farther off where that gives too few.
 _NEAR_FRAMES = 48
@@ -208,13 +168,13 @@ _MOST_PLACES = 24
 
 def numbers_of(model: Model, query: Query) -> LocalizationParameters:
     """Return the numbers of an answer: those of the model, and what a query asks of an answer."""
-    answer = model.answer
-    return LocalizationParameters(
-        confidence=query.confidence,
-        map=answer.map,
-        judgement=answer.confidence,
-        voted_only=query.validation is not None,
-    )
+    p = LocalizationParameters.of(model.answer)
+    p = replace(p, confidence=query.confidence, voted_only=query.validation is not None)
+    return replace(p, rivals=0) if _is_paper(query) else p
+
+
+def _is_paper(query: Query) -> bool:
+    return query.validation is not None and query.validation.mode == "paper"
 
 
 def placed(
@@ -245,9 +205,9 @@ def placed(
     own_p, agreement = numbers_of(model, query), model.parameters.validation.agreement
 
     def views_of(parent: str, at: Floats) -> MapViews:
-        known = [number for number in geometries if parents.get(number) == parent]
+        known = {number for number in geometries if parents.get(number) == parent}
         near = _near_frames(store, searched, parent, at, own_p.map)
-        numbers = [*known, *(number for number in near if number not in known)]
+        numbers = sorted({*known, *near})
         at_poses = [poses[n] if n in known else near[n].pose for n in numbers]
         ahead = [rows[n].cloud is None if n in known else not near[n].is_cloud for n in numbers]
 
@@ -261,10 +221,11 @@ def placed(
                 return None  # one frame of many: the others tell the poses apart
 
         stack = np.array(at_poses).reshape(-1, 4, 4)
-        return MapViews(stack, open_view, own_p.map, agreement, range(len(known)), ahead)
+        first = [i for i, number in enumerate(numbers) if number in known]
+        return MapViews(stack, open_view, own_p.map, agreement, first, ahead)
 
-    paper = query.validation is not None and query.validation.mode == "paper"
-    return localize(frames, poses, parents, None if paper else views_of, prior, own_p, agreement)
+    asks_map = None if _is_paper(query) else views_of
+    return localize(frames, poses, parents, asks_map, prior, own_p, agreement)
 
 
 def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PosePrior | None:

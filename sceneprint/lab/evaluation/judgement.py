@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,11 @@ from sceneprint.geometry.rigid import average_poses, inverse
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.confidence import confidences_of
 from sceneprint.geometry.validation.map_verification import MapParameters, looks_ahead
-from sceneprint.geometry.validation.validation import ValidationParameters, refined_at
+from sceneprint.geometry.validation.validation import (
+    PairValidation,
+    ValidationParameters,
+    refined_at,
+)
 from sceneprint.lab.evaluation.protocol import (
     PLACE_DEG,
     RIGHT,
@@ -44,22 +49,10 @@ from sceneprint.lab.evaluation.protocol import (
     pose_error,
     unwatched,
 )
-from sceneprint.localization import (
-    PosedFrame,
-    PoseEstimate,
-    estimate_of,
-    rival_rows,
-    views_of_rows,
-)
+from sceneprint.localization import PosedFrame, PoseEstimate, decide, localize, views_of_rows
 from sceneprint.models.model import AnswerParameters
-from sceneprint.pipeline import PairMatch, associate, searched, validate
-from sceneprint.places import (
-    LocalizationParameters,
-    Place,
-    PosePrior,
-    QueryFrame,
-    judged_places,
-)
+from sceneprint.pipeline import PairMatch, associate, validate
+from sceneprint.places import LocalizationParameters, PosePrior, QueryFrame
 from sceneprint.types import Bytes, Floats, Geometry
 
 
@@ -241,97 +234,98 @@ def judge(judging: Judge, task: QueryTask) -> Judged:
 def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -> JudgedAnswer:
     """Return the answer that a robot gets from the candidates of C, judged by the true pose.
 
-    What a service does with a query after the selection, in one place: validation until enough
-    are accepted, the pose of those, and how sure that is.
+    It is the one that a service gives: the same functions validate the candidates and decide.
 
     Parameters
     ----------
     judging, task : see there
     prior : what the robot believes of its pose, its parent a scene of the database
     """
-    allowed = set(task.allowed.tolist())
-
-    def open_geometry(row: int) -> Geometry | None:
-        return judging.geometry(judging.database[row].number) if row in allowed else None
-
     start = time.perf_counter()
-    poses = [frame.pose for frame in judging.database]
-    own_p = LocalizationParameters(
-        judging.confidence, map=judging.answer.map, judgement=judging.answer.confidence
-    )
-    # what a query may not find must not tell poses apart either: a scene of its own
-    scenes = [frame.scene if row in allowed else "" for row, frame in enumerate(judging.database)]
+    database = _Recording(judging, task, prior)
+    frame = QueryFrame(database.query, database.first_matches())
+    estimate = decide([frame], task.retrieved or database.selected, database, database.p)
+    spent = 1e3 * (time.perf_counter() - start)
+    if estimate is None:
+        return JudgedAnswer(milliseconds=spent)
+    return _judged_answer(estimate, task, database.p, spent)
 
-    def far(row: int) -> bool:
-        return prior is not None and not (
-            scenes[row] == prior.parent and prior.reaches(poses[row], own_p.map)
+
+class _Recording:
+    """The database of an evaluation, as `decide` asks it for one query."""
+
+    def __init__(self, judging: Judge, task: QueryTask, prior: PosePrior | None) -> None:
+        self._judging, self._task, self._prior = judging, task, prior
+        self._allowed = set(task.allowed.tolist())
+        self._poses = [frame.pose for frame in judging.database]
+        # what a query may not find must not tell poses apart either: a scene of its own
+        self._scenes = [
+            frame.scene if row in self._allowed else ""
+            for row, frame in enumerate(judging.database)
+        ]
+        self.query = judging.geometry(task.number)
+        p = replace(LocalizationParameters.of(judging.answer), confidence=judging.confidence)
+        asks_elsewhere = task.retrieved is not None and judging.mode == "full"
+        self.p = p if asks_elsewhere else replace(p, rivals=0)
+        self.selected = _ranking_of(judging, task, sorted(task.selection, key=self._is_far))
+
+    def first_matches(self) -> list[PairMatch]:
+        """Return the matches of C, some of them guided."""
+        return self._validated(
+            self.selected, pose_of=lambda row: (self._scenes[row], self._poses[row])
         )
 
-    n = len(task.selection)
-    selected = _ranking_of(judging, task, sorted(task.selection, key=far))
-    query = judging.geometry(task.number)
-    validating = partial(
-        associate, query, open_geometry=open_geometry,
-        seed=judging.seed, p=judging.p, mode=judging.mode, matching=judging.matching,
-    )  # fmt: skip
-
-    seen: list[Place] = []
-
-    def located(matches: list[PairMatch]) -> PoseEstimate | None:
+    def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
+        p, agreement = self.p, self._judging.p.agreement
+        ahead = [looks_ahead(self.query)] * len(self._poses)  # a recording has one sensor
         views_of = views_of_rows(
-            matches, poses, open_geometry, scenes, own_p.map, judging.p.agreement,
-            [looks_ahead(query)] * len(poses),  # a recording has one sensor
+            frames[-1].matches, self._poses, self._geometry, self._scenes, p.map, agreement, ahead
+        )
+        asks_map = views_of if self._judging.mode == "full" else None
+        return localize(frames, self._poses, self._scenes, asks_map, self._prior, p, agreement)
+
+    def search(self, frame: int, known: Mapping[int, PairValidation]) -> list[PairMatch]:  # noqa: ARG002
+        return self._validated(self.selected, known=known)
+
+    def posed(self, rows: Sequence[int]) -> dict[int, PosedFrame]:
+        return {
+            row: PosedFrame(self._scenes[row], self._poses[row], looks_ahead(seen))
+            for row in rows
+            if (seen := self._geometry(row)) is not None
+        }
+
+    def compare(self, rows: Sequence[int]) -> list[PairMatch]:
+        return self._validated(_ranking_of(self._judging, self._task, rows), retry=False)
+
+    def _validated(self, ranking: Ranking, **how: Any) -> list[PairMatch]:
+        judging = self._judging
+        return associate(
+            self.query, ranking, range(len(ranking)), self._geometry, seed=judging.seed,
+            p=judging.p, mode=judging.mode, matching=judging.matching, **how,
         )  # fmt: skip
-        parent, known_prior, seen[:] = judged_places(
-            [QueryFrame(query, matches)], poses, scenes,
-            views_of if judging.mode == "full" else None, prior, own_p, judging.p.agreement,
-        )  # fmt: skip
-        blind = query.surface.camera is None
-        return estimate_of(parent, seen, known_prior, own_p, blind=blind) if seen else None
 
-    matches = validating(selected, range(n), pose_of=lambda row: (scenes[row], poses[row]))
-    told = located(matches)
-    known = searched(matches)
-    if known is not None and told is not None and told.status != "found":
-        matches = validating(selected, range(n), known=known)
-        told = located(matches)
+    def _geometry(self, row: int) -> Geometry | None:
+        if row not in self._allowed:
+            return None
+        return self._judging.geometry(self._judging.database[row].number)
 
-    rivals: list[int] = []
-    if task.retrieved is not None and judging.mode == "full":
-        posed = partial(_posed_frames, open_geometry, poses, scenes)
-        tried = {match.index for match in matches}
-        rivals = rival_rows(told, task.retrieved, tried, posed, looks_ahead(query), own_p)
-    if rivals:
-        others = _ranking_of(judging, task, rivals)
-        told = located([*matches, *validating(others, range(len(rivals)), retry=False)])
-    spent = 1e3 * (time.perf_counter() - start)
-    if told is None:
-        return JudgedAnswer(milliseconds=spent)
-    return _judged_answer(told, seen, task, own_p, spent)
-
-
-def _posed_frames(
-    open_geometry: Callable[[int], Geometry | None], poses: Sequence[Floats],
-    scenes: Sequence[str], rows: Sequence[int],
-) -> dict[int, PosedFrame]:  # fmt: skip
-    """Return the frames of some rows that a query may find, as `rival_rows` asks for them."""
-    return {
-        row: PosedFrame(scenes[row], poses[row], looks_ahead(seen))
-        for row in rows
-        if (seen := open_geometry(row)) is not None
-    }
+    def _is_far(self, row: int) -> bool:
+        """Whether a prior expects no frame of this row."""
+        prior = self._prior
+        return prior is not None and not (
+            self._scenes[row] == prior.parent and prior.reaches(self._poses[row], self.p.map)
+        )
 
 
 def _judged_answer(
-    told: PoseEstimate, seen: Sequence[Place], task: QueryTask, p: LocalizationParameters,
-    spent: float,
-) -> JudgedAnswer:  # fmt: skip
+    told: PoseEstimate, task: QueryTask, p: LocalizationParameters, spent: float
+) -> JudgedAnswer:
     """Return an answer with the places that it was chosen from, judged by the true pose."""
 
     def error_of(T: Floats) -> Error:
         return pose_error(T, task.pose) if told.parent == task.scene else Error()
 
-    known = [(one, one.evidence) for one in seen if one.evidence is not None]
+    known = [(one, one.evidence) for one in told.places if one.evidence is not None]
     confidences = confidences_of([evidence for _, evidence in known], p.judgement)
     places = []
     for i in sorted(range(len(known)), key=lambda i: -confidences[i]):

@@ -1,0 +1,127 @@
+"""An evaluation gives the answers of a service: the same status, confidences and poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.geometry.rigid import difference
+from sceneprint.lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
+from sceneprint.lab.evaluation.protocol import JudgedAnswer
+from sceneprint.lab.evaluation.sites import signed
+from sceneprint.lab.synth import SynthRoom, synthesise_lookalike
+from sceneprint.pipeline import Signer
+from sceneprint.types import Floats
+from sceneprint_client.api import Answer, Query
+
+Asked = tuple[Answer, JudgedAnswer]
+
+
+@pytest.fixture
+def both(empty: Engine, work_off: Any, signer: Signer) -> Callable[..., list[Asked]]:
+    """Ask a service and an evaluation of the same frames."""
+
+    def ask(in_map: Sequence[Any], queries: Sequence[Any], candidates: int = 10) -> list[Asked]:
+        for one in in_map:
+            empty.add_frame("hall", one.data, one.meta)
+        work_off(empty)
+        shown, sent = ([replace(one.frame, pose=one.pose) for one in some]
+                       for some in (in_map, queries))  # fmt: skip
+        _, database, of_map = signed(shown, "room", signer, 0)
+        _, members, of_queries = signed(sent, "room", signer, len(database))
+        geometries = [read_geometry(write_geometry(one)) for one in (*of_map, *of_queries)]
+        model, n = signer.model, len(database)
+        judge = Judge(
+            geometries.__getitem__, "full", 0, model.parameters.validation, database=database,
+            answer=model.answer, unrelated_distance=model.unrelated_distance,
+        )  # fmt: skip
+        ranked = rank(
+            np.stack([one.signature for one in members]),
+            np.stack([one.signature for one in database]),
+            np.ones((len(members), n), np.bool_), metric=model.metric, candidates=candidates,
+        )  # fmt: skip
+        pairs = []
+        for one, query, r in zip(queries, members, ranked, strict=True):
+            among = tuple(Candidate(j, j, "room", database[j].pose, 0.0, 0.0) for j in r.selection)
+            task = QueryTask(
+                query.number, "room", query.pose, [], r.selection, among, np.arange(n), r.retrieved
+            )
+            meta = one.meta.model_copy(update={"pose": None})
+            how = Query(candidates=candidates, keep=False)
+            served = empty.queries.upload(["hall"], one.data, meta, how)
+            pairs.append((served, answer_of(judge, task)))
+            see_same(*pairs[-1], one.pose)
+        return pairs
+
+    return ask
+
+
+def see_same(served: Answer, evaluated: JudgedAnswer, truth: Floats) -> None:
+    """See that a service and an evaluation answer alike."""
+    assert served.status == evaluated.status
+    poses: list[Any] = list(served.alternatives)
+    if served.location is not None:
+        poses = [served.location]
+        assert served.location.strength == evaluated.strength
+        off = difference(np.array(served.location.pose.matrix), truth)
+        assert (evaluated.error.metres, evaluated.error.radians) == pytest.approx(off, abs=1e-6)
+    for pose, place in zip(poses, evaluated.places, strict=False):
+        assert pose.confidence == pytest.approx(place.confidence, abs=1e-6)
+        # an answer has three decimals
+        assert pose.evidence.model_dump() == pytest.approx(vars(place.evidence), abs=6e-4)
+
+
+def test_equal_offices_are_answered_alike(
+    both: Callable[..., list[Asked]], make_upload: Callable[..., Any]
+) -> None:
+    site = synthesise_lookalike("offices", 3, 0, queries=6)
+    in_map, queries = ([make_upload(frame, "room") for frame in some]
+                       for some in (site.map, site.queries))  # fmt: skip
+    answers = both(in_map, queries)
+    assert {served.status for served, _ in answers} == {"found", "ambiguous"}
+
+
+def test_guided_matches_that_are_searched_for_change_both_answers(
+    both: Callable[..., list[Asked]], make_upload: Callable[..., Any],
+    room_views: Callable[..., SynthRoom],
+) -> None:  # fmt: skip
+    """Two frames whose poses are 3 m off vote elsewhere, after others have guided the rest."""
+    path = room_views(21, 0, 48, along_path=True, step=3).frames
+    in_map = []
+    for i in (2, 6, 0, 10, 11):
+        pose = np.array(path[i].pose)
+        pose[0, 3] += 3.0 * (i >= 10)
+        in_map.append(make_upload(replace(path[i], pose=pose), "room"))
+    [(served, _)] = both(in_map, [make_upload(path[4], "room")])
+    assert served.status == "ambiguous"
+    assert {one.validation.search for one in served.matches} == {"correspondences"}
+
+
+def test_frames_elsewhere_are_compared_for_both_answers(
+    both: Callable[..., list[Asked]], make_upload: Callable[..., Any], uploads: Any
+) -> None:
+    """An equal room 30 m away fills the selection, so that it alone would be believed."""
+    rng = np.random.default_rng(5)
+
+    def again(one: Any, metres: float, noise: float = 0.0) -> Any:
+        depth, pose = one.frame.depth, np.array(one.pose)
+        noisy = depth + (depth > 0) * rng.normal(0.0, noise, depth.shape)
+        pose[0, 3] += metres
+        frame = replace(one.frame, depth=noisy.astype(np.float32), pose=pose)
+        return make_upload(frame, "room")
+
+    twins = [again(one, 30.0, 1e-3) for one in uploads[6:]]
+    other, own = (
+        [again(one, -30.0) for one in uploads[:6]],
+        [again(one, 0.0) for one in uploads[6:]],
+    )
+    query = own.pop(2)
+    [(served, _)] = both([*other, *own, *twins], [query], candidates=3)
+    assert served.status == "ambiguous"
+    assert any(one.selected is False for one in served.matches)
