@@ -41,9 +41,9 @@ _LAYER = 0.02
 #: Quantiles that the extent is measured between: a few stray points are no walls.
 _LOW, _HIGH = 0.01, 0.99
 #: How much more likely the usual axis is than any other, and its usual end than the other end.
-_USUAL, _USUAL_SIGN = 1.8, 0.3
+_USUAL, _USUAL_SIGN = 1.8, 0.6
 #: How much a place that is fuller at one end speaks for this direction, and for that end.
-_LEAN_GAIN, _LEAN_WEIGHT = 8.0, 4.0
+_LEAN_GAIN, _LEAN_WEIGHT = 8.0, 3.0
 #: Cosines to up of level surfaces, at most of walls; the ends of a place, shares of its height.
 _LEVEL, _UPRIGHT, _END = 0.97, 0.3, 0.08
 #: Least evidence for an end, and ratio of scores, for a clear answer.
@@ -114,9 +114,10 @@ def estimate_up(points: Floats32, triangles: Ints32 | None, usual: Floats) -> Up
     ]
     best = int(np.argmax(likely))
     others = [score for k, score in enumerate(scores) if k != best]
-    sign = leans[best] + _USUAL_SIGN * float(np.round(candidates[best] @ usual))
-    clear = abs(leans[best]) > _CLEAR_SIGN and scores[best] > _CLEAR * max(others, default=0.0)
-    return Upright(candidates[best] * (1.0 if sign >= 0 else -1.0), bool(clear))
+    total = leans[best] + _USUAL_SIGN * float(np.round(candidates[best] @ usual))
+    sign = 1.0 if total >= 0 else -1.0
+    clear = sign * leans[best] > _CLEAR_SIGN and scores[best] > _CLEAR * max(others, default=0.0)
+    return Upright(sign * candidates[best], bool(clear))
 
 
 #: Heights that a place has in metres at most, and in centimetres; and extents over the height, at
@@ -190,13 +191,19 @@ def _layers(pieces: Pieces, direction: Floats, thickness: float) -> float:
 
 
 def _furniture(pieces: Pieces, direction: Floats, low: float, height: float) -> float:
-    """How much more lies in the lower half, [-1.5, 1.5]: of what is no wall, and of level ends."""
+    """How much more lies in the lower half, [-1.75, 1.75].
+
+    Counted are pieces that are no wall, once more those that are level, and floor and ceiling a
+    little: furniture hides more of the floor, and cameras look down.
+    """
     places = (pieces.centres @ direction - low) / height
     cosines = np.abs(pieces.normals @ direction)
     level, other = cosines > _LEVEL, cosines > _UPRIGHT
     inside = np.abs(places - 0.5) < 0.5 - _END
-    return _balance(pieces.areas, other & inside, places) + 0.5 * _balance(
-        pieces.areas, level & ~inside, places
+    return (
+        _balance(pieces.areas, other & inside, places)
+        + 0.5 * _balance(pieces.areas, level & inside, places)
+        + 0.25 * _balance(pieces.areas, level & ~inside, places)
     )
 
 
