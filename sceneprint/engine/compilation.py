@@ -2,7 +2,8 @@
 
 A process that compiles answers nobody meanwhile. So kernels are compiled by others, which leave
 the machine code on disk: those of signing by one, those of validation by another, as neither
-needs the other's. Kernels of clouds are compiled when the first cloud comes.
+needs the other's. Kernels of clouds, and of views of a whole surface, are compiled when the first
+of these comes.
 
     python -m sceneprint.engine.compilation signing|validation|clouds FOLDER_OF_TABLES
 """
@@ -23,14 +24,14 @@ from sceneprint.formats.artifact import read_geometry
 from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES, cached_at, runs_here
 from sceneprint.geometry.registration import icp
 from sceneprint.geometry.signature import pair_features
-from sceneprint.geometry.surface import cloud
+from sceneprint.geometry.views import plan
 from sceneprint.models import PRESETS, read_model
 
 #: A kernel of each part that is among the last to be compiled: where it is, so are the others.
 _LAST = {
     "signing": pair_features._count,
     "validation": icp.refine_in_place,
-    "clouds": cloud._gather,
+    "clouds": plan._add,
 }
 #: What a service for depth images needs, and what it needs for clouds as well.
 DEPTH, ALL = ("signing", "validation"), ("signing", "validation", "clouds")
@@ -125,7 +126,12 @@ def _run(
 
 def _compile(part: str, cache_dir: Path) -> None:
     """Use every kernel of a part once."""
-    from sceneprint.engine.signers import warm_clouds, warm_signing, warm_validation
+    from sceneprint.engine.signers import (
+        warm_clouds,
+        warm_signing,
+        warm_validation,
+        warm_views,
+    )
     from sceneprint.pipeline import open_signer
 
     model = read_model(PRESETS[0])
@@ -140,6 +146,7 @@ def _compile(part: str, cache_dir: Path) -> None:
         warm_signing(signer)
     else:
         warm_clouds(signer, corner)
+        warm_views()
 
 
 def _report_kernels() -> None:

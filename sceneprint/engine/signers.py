@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,14 @@ from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.geometry.retrieval.ranking import distances, pairwise_distances
 from sceneprint.geometry.validation.inspection import patches_at, residuals
 from sceneprint.geometry.validation.validation import ValidationParameters
+from sceneprint.geometry.views import Renderer, choose_views, view_parameters
 from sceneprint.index import Tail, search
 from sceneprint.index.sketches import make_sketches
-from sceneprint.models import Model, parse_model
+from sceneprint.models import Model, parse_model, read_model
 from sceneprint.pipeline import Signer, open_signer, prepare, validate
 from sceneprint.store import Database
 from sceneprint.store.maps import model_content
-from sceneprint.types import Cloud, DepthFrame, Geometry, Intrinsics
+from sceneprint.types import Cloud, DepthFrame, Geometry, Intrinsics, ReferenceSurface
 
 #: Seconds that a request waits for kernels that are being compiled.
 KERNELS_S = 20.0
@@ -141,6 +143,23 @@ def warm_clouds(signer: Signer, geometry: Geometry) -> None:
     for has_viewpoint in (True, False):
         _, points = prepare(_cloud(_corner(), has_viewpoint=has_viewpoint), signer)
         validate(geometry, read_geometry(write_geometry(points)), p=p)
+
+
+def warm_views() -> None:
+    """Choose and render views of a small room: of its points, and of its triangles."""
+    model = read_model("depth").parameters
+    camera = view_parameters(model, Intrinsics(40, 30, 36, 36, 19.5, 14.5))
+    corners = np.array([[x, y, z] for x in (0, 3) for y in (0, 3) for z in (0, 2.5)], np.float32)
+    sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    faces = np.array([t for a, b, c, d in sides for t in ((c, b, a), (d, c, a))], np.int32)
+    grid = np.stack(np.meshgrid(*[np.arange(0.0, 3.01, 0.1)] * 3), axis=-1).reshape(-1, 3)
+    walls = grid[((grid < 0.05) | (grid > 2.95)).any(axis=1)].astype(np.float32)
+    up = np.array([0.0, 0.0, 1.0])
+    for points, triangles in ((corners, faces), (walls, None)):
+        surface = ReferenceSurface(points, triangles, np.zeros(3), up)
+        for parameters in (camera, replace(camera, camera=None, step=0.1)):
+            plan = choose_views(surface, parameters)
+            Renderer(surface, parameters).view(plan.poses[0])
 
 
 def _corner() -> DepthFrame:

@@ -260,6 +260,20 @@ def test_cameras_stand_in_the_room_at_their_heights(inwards: bool) -> None:
         assert T[2, 1] < 0
 
 
+def test_a_table_is_no_floor() -> None:
+    # walls alone, and a table as large as a third of the room
+    points, triangles = box(ROOM, inwards=True)
+    upright = np.ptp(points[triangles][..., 2], axis=1) > 0
+    table = np.array([[1, 1, 1], [5, 1, 1], [5, 4, 1], [1, 4, 1]], np.float32)
+    faces = np.concatenate([triangles[upright], np.array([[8, 9, 10], [8, 10, 11]], np.int32)])
+    surface = ReferenceSurface(np.concatenate([points, table]), faces, np.zeros(3), UP)
+    plan = choose_views(surface, depth_parameters())
+    assert plan.floor is None
+    heights = plan.poses[:, 2, 3]
+    assert heights.min() < 0.9
+    assert heights.max() > 1.5
+
+
 def test_scanners_stand_in_the_room_whose_cloud_has_no_sides() -> None:
     p = view_parameters(read_model("lidar").parameters)
     cloud = cloud_of_room(0.1)
@@ -325,11 +339,24 @@ def _seen(renderer: Renderer, poses: Floats, points: Floats) -> np.ndarray:
     return seen
 
 
+def test_stray_points_far_away_change_little() -> None:
+    cloud, p = cloud_of_room(0.1), replace(depth_parameters(), cell=0.2, spacing=1.0)
+    stray = np.array([[5e5, 0, 0], [0, -3e5, 2e5]], np.float32)
+    plan = choose_views(replace(cloud, points=np.concatenate([cloud.points, stray])), p)
+    places = plan.poses[:, :3, 3]
+    assert len(places) > 5
+    assert (places > 0).all()
+    assert (places < ROOM).all()
+
+
 def test_a_surface_without_free_space_has_no_views() -> None:
     points = np.random.default_rng(9).uniform(0, 0.2, (500, 3)).astype(np.float32)
     plan = choose_views(ReferenceSurface(points, None, np.zeros(3), UP), depth_parameters())
     assert plan.poses.shape == (0, 4, 4)
     assert plan.covered == 0.0
+    for triangles in (None, np.zeros((0, 3), np.int32)):
+        empty = ReferenceSurface(np.zeros((0, 3), np.float32), triangles, np.zeros(3), UP)
+        assert choose_views(empty, depth_parameters()).poses.shape == (0, 4, 4)
 
 
 def test_parameters_follow_the_model() -> None:

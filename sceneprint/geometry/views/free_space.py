@@ -28,8 +28,13 @@ _STEP = 0.15
 _STOREY = 2.0
 #: A floor fills at least this share of the cells around a column, the lowest and one above.
 _LEAST_FLOOR, _LEAST_STOREY = 0.12, 0.3
-#: Columns are so many times as wide as viewpoints are apart; columns and heights, at most.
-_COLUMN, _MOST_BINS = 2.0, 8_000_000
+#: A floor is none where more than this share of the surface lies below it: a table, say, in a room
+#: whose floor was not seen.
+_MOST_BELOW = 0.1
+#: Places of a grid, and columns times heights of another, at most.
+_MOST_COLUMNS, _MOST_BINS = 1_000_000, 8_000_000
+#: Heights that places are spread over, at most.
+_MOST_HEIGHTS = 50
 _MOST_STOREYS = 12
 
 
@@ -57,6 +62,14 @@ class Floors:
         return float(np.median(known)) if len(known) else None
 
 
+def extent_of(pieces: Surfels) -> tuple[Floats, Floats]:
+    """Return the low and the high corner of a surface, without stray points far from it."""
+    n = len(pieces.points)
+    stray = max(n // 2000, min(n // 100, 4))
+    ordered = np.sort(pieces.points.astype(np.float64), axis=0)
+    return ordered[stray], ordered[n - 1 - stray]
+
+
 def find_floors(pieces: Surfels, side: float) -> Floors:
     """Find the floors of a surface.
 
@@ -67,7 +80,8 @@ def find_floors(pieces: Surfels, side: float) -> Floors:
     """
     # either side up: a mesh may be inside out, and no place above a ceiling is free
     level = pieces.points[np.abs(pieces.normals[:, 2]) > _LEVEL].astype(np.float64)
-    low, high = pieces.points.min(axis=0), pieces.points.max(axis=0)
+    low, high = extent_of(pieces)
+    level = level[((level >= low) & (level <= high)).all(axis=1)]
     step = max(_STEP, float(high[2] - low[2]) / 2000.0)
     while True:
         shape = np.floor((high - low) / (side, side, step)).astype(np.int64) + 1
@@ -97,7 +111,13 @@ def find_floors(pieces: Surfels, side: float) -> Floors:
         storeys.append(np.where(exists, height, np.nan))
         base = np.where(exists, height, np.inf)
     heights = np.stack(storeys) if storeys else np.full((1, *shape[:2]), np.nan)
-    return Floors(low[:2].astype(np.float64), side, heights, level)
+    column = np.floor((pieces.points[:, :2] - low[:2]) / side).astype(np.int64)
+    column = np.clip(column, 0, shape[:2] - 1)
+    floor = heights[0][column[:, 0], column[:, 1]]
+    known = np.isfinite(floor)
+    if (pieces.points[known, 2] < floor[known] - 2 * _STEP).sum() > _MOST_BELOW * known.sum():
+        heights = np.full((1, *shape[:2]), np.nan)
+    return Floors(low[:2], side, heights, level)
 
 
 def _with_neighbours(values: Floats) -> Floats:
@@ -123,14 +143,16 @@ def candidate_places(floors: Floors, pieces: Surfels, p: ViewParameters, spacing
     p : see ViewParameters
     spacing : between places, metres
     """
-    low, high = pieces.points.min(axis=0), pieces.points.max(axis=0)
+    low, high = extent_of(pieces)
+    spacing = max(spacing, math.sqrt(float(np.prod((high - low)[:2])) / _MOST_COLUMNS))
     axes = [np.arange(a + spacing / 2, b, spacing) for a, b in zip(low[:2], high[:2], strict=True)]
     if any(len(axis) == 0 for axis in axes):
         return np.zeros((0, 3))
     flat = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     main = floors.lowest
     if main is None:
-        rise = np.arange(low[2] + p.clearance, high[2] - p.clearance, max(spacing, 0.5))
+        step = max(spacing, 0.4, float(high[2] - low[2]) / _MOST_HEIGHTS)
+        rise = np.arange(low[2] + p.clearance, high[2] - p.clearance, step)
         places = [np.column_stack([flat, np.full(len(flat), z)]) for z in rise]
         return np.concatenate(places) if places else np.zeros((0, 3))
     column = np.floor((flat - floors.low) / floors.side).astype(np.int64)

@@ -106,7 +106,7 @@ def view_parameters(
         nearest=nearest,
         farthest=farthest,
         heights=tuple(sorted(heights)) if heights is not None else usual,
-        spacing=farthest / 20.0 if seen else farthest / 40.0,
+        spacing=farthest / (25.0 if seen else 40.0),
         clearance=max(nearest, farthest / 100.0),
         grain=farthest / 600.0,
         cell=farthest / 100.0,

@@ -48,7 +48,7 @@ _TURNS, _PITCHES = 8, (-25.0, 10.0)
 #: What a view adds that is the first, or the second, to see something; later ones add nothing.
 _WORTH = np.array([1.0, 0.5, 0.0])
 #: Choosing ends once the best view adds less than this share of the first one's gain.
-_LEAST_GAIN = 0.05
+_LEAST_GAIN = 0.03
 #: Views that are none of the map, at most.
 _HELD_OUT = 60
 
@@ -86,6 +86,8 @@ def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewP
     -------
     plan : the same one for the same surface; without poses where there is no free space
     """
+    if not len(surface.points if surface.triangles is None else surface.triangles):
+        return ViewPlan(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), None, 0, 0.0)
     p, axes = parameters, level_axes(surface.up)
     pieces = surfels(surface, p.cell, _MOST_PIECES)
     level = replace(
@@ -107,7 +109,7 @@ def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewP
         p.elevation,
     )
     seen = [(place, lookout.look(place)) for place in places]
-    free = [(place, one) for place, one in seen if _is_free(one, p)]
+    free = [(place, one) for place, one in seen if _is_free(one, p, one_sided=level.one_sided)]
     free = _in_front(free, level, lookout, p)
     views = [(k, d) for k, (_, one) in enumerate(free) for d in _worth_seeing(one, p)]
     sights = [one for _, one in free]
@@ -153,13 +155,13 @@ def _turned(vectors: NDArray[np.float32], axes: Floats) -> NDArray[np.float32]:
     return turned
 
 
-def _is_free(one: Sight, p: ViewParameters) -> bool:
-    """Whether a place has room for the sensor, and something around it."""
+def _is_free(one: Sight, p: ViewParameters, *, one_sided: bool) -> bool:
+    """Whether a place has room for the sensor, and something beside it: not above a ceiling."""
     if one.nearest < p.clearance:
         return False
-    return p.camera is not None or (
-        bool(one.hit[0] >= _LEAST_AROUND) and one.beside >= _LEAST_BESIDE
-    )
+    if p.camera is None:
+        return bool(one.hit[0] >= _LEAST_AROUND) and one.beside >= _LEAST_BESIDE
+    return one_sided or one.beside >= _LEAST_BESIDE
 
 
 def _in_front(

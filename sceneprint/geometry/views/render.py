@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.views.parameters import ViewParameters
 from sceneprint.geometry.views.raster import draw_discs, draw_triangles, pinhole
-from sceneprint.geometry.views.samples import blocks_of, on_surface, thinned
+from sceneprint.geometry.views.samples import balls_of, blocks_of, on_surface, thinned
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, ReferenceSurface
 
 #: Radius of the disc that stands for a point, as a share of how far points are apart.
@@ -66,7 +66,8 @@ class Renderer:
 
     def __init__(self, surface: ReferenceSurface, parameters: ViewParameters) -> None:
         self._p = p = parameters
-        points = np.ascontiguousarray(surface.points, np.float32)
+        # kernels take arrays that may be written for others than those that may not
+        points = np.require(surface.points, np.float32, ["C", "W"])
         side = p.farthest * _BLOCK
         if surface.triangles is None:
             points = thinned(points, p.grain)
@@ -77,11 +78,11 @@ class Renderer:
             self._points, self._normals, self._radii = points[order], normals[order], radii[order]
             self._triangles: Ints32 | None = None
         else:
-            triangles = np.ascontiguousarray(surface.triangles, np.int32)
-            corners = points[triangles]
-            middles = corners.mean(axis=1, dtype=np.float32)
-            extents = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
-            order, self._blocks = blocks_of(middles, side, extents.astype(np.float32))
+            triangles = np.require(surface.triangles, np.int32, ["C", "W"])
+            middles = np.empty((len(triangles), 3), np.float32)
+            reach = np.empty(len(triangles), np.float32)
+            balls_of(points, triangles, middles, reach)
+            order, self._blocks = blocks_of(middles, side, reach)
             self._points, self._triangles = points, triangles[order]
         if p.camera is None:
             self._camera, self._faces = cube_faces(max(math.ceil(2.0 / p.step), 8))

@@ -22,8 +22,9 @@ _MOST_CELLS = 1 << 20
 #: A point's neighbours lie on a plane where the least of their variances is at most this share of
 #: the middle one.
 _FLAT = 0.15
-#: Samples of the triangles of a mesh, at most.
-_MOST_SAMPLES = 4_000_000
+#: Samples of the triangles of a mesh, at most about twice as many. Of a mesh of more triangles,
+#: those that one sample is enough for are not all sampled.
+_MOST_SAMPLES = 2_000_000
 
 
 def cell_keys(points: Floats32, cell: float) -> tuple[Ints64, Ints64]:
@@ -177,8 +178,7 @@ def surfels(surface: ReferenceSurface, cell: float, most: int) -> Surfels:
     most : of them
     """
     if surface.triangles is None:
-        points = np.ascontiguousarray(surface.points, np.float32)
-        points = thinned(points, cell / 6)
+        points = thinned(surface.points, cell / 6)
         points, normals, _ = on_surface(points, cell / 2)
     else:
         points, normals = _samples(surface.points, surface.triangles, cell / 2)
@@ -195,20 +195,24 @@ def surfels(surface: ReferenceSurface, cell: float, most: int) -> Surfels:
 
 
 @kernel
-def _count_samples(points: Floats32, triangles: Ints32, step: float) -> float:
+def _count_samples(points: Floats32, triangles: Ints32, step: float, every: int) -> float:
+    """How many samples `_sample` takes, or more."""
     total = 0.0
     for m in range(len(triangles)):
         a, b, c = points[triangles[m, 0]], points[triangles[m, 1]], points[triangles[m, 2]]
         one = np.ceil(np.sqrt(((b - a) ** 2).sum()) / step)
         other = np.ceil(np.sqrt(((c - a) ** 2).sum()) / step)
-        total += max(one, 1.0) * max(other, 1.0)
+        count = max(one, 1.0) * max(other, 1.0)
+        if count > 1.0 or m % every == 0:
+            total += count
     return total
 
 
 @kernel
 def _sample(
-    points: Floats32, triangles: Ints32, step: float, places: Floats32, normals: Floats32
-) -> int:
+    points: Floats32, triangles: Ints32, step: float, every: int, places: Floats32,
+    normals: Floats32,
+) -> int:  # fmt: skip
     """Points on a grid over each triangle, at least its centre, and its normal."""
     n = 0
     for m in range(len(triangles)):
@@ -220,6 +224,8 @@ def _sample(
             continue
         one = max(int(np.ceil(np.sqrt((u * u).sum()) / step)), 1)
         other = max(int(np.ceil(np.sqrt((v * v).sum()) / step)), 1)
+        if one * other == 1 and m % every != 0:
+            continue
         for i in range(one):
             for j in range(other):
                 s, t = (i + 1 / 3) / one, (j + 1 / 3) / other
@@ -234,16 +240,33 @@ def _sample(
 
 def _samples(points: Floats32, triangles: Ints32, step: float) -> tuple[Floats32, Floats32]:
     """Points on the triangles of a mesh about `step` apart, farther where they were too many."""
-    points = np.ascontiguousarray(points, np.float32)
-    triangles = np.ascontiguousarray(triangles, np.int32)
-    while (total := _count_samples(points, triangles, step)) > max(
-        _MOST_SAMPLES, 1.2 * len(triangles)
-    ):
+    points = np.require(points, np.float32, ["C", "W"])
+    triangles = np.require(triangles, np.int32, ["C", "W"])
+    every = max(len(triangles) // _MOST_SAMPLES, 1)
+    while (total := _count_samples(points, triangles, step, every)) > 2 * _MOST_SAMPLES:
         step *= 1.3
     places = np.empty((int(total), 3), np.float32)
     normals = np.empty((int(total), 3), np.float32)
-    n = _sample(points, triangles, step, places, normals)
+    n = _sample(points, triangles, step, every, places, normals)
     return places[:n], normals[:n]
+
+
+@kernel
+def balls_of(points: Floats32, triangles: Ints32, middles: Floats32, reach: Floats32) -> None:
+    """The mean of the corners of each triangle, and how far from it they are, at most."""
+    for m in range(len(triangles)):
+        for axis in range(3):
+            total = 0.0
+            for corner in range(3):
+                total += float(points[triangles[m, corner], axis])
+            middles[m, axis] = total / 3.0
+        most = 0.0
+        for corner in range(3):
+            square = 0.0
+            for axis in range(3):
+                square += (points[triangles[m, corner], axis] - middles[m, axis]) ** 2
+            most = max(most, square)
+        reach[m] = np.sqrt(most)
 
 
 @dataclass(frozen=True, eq=False)
