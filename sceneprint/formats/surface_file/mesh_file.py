@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import struct
 import warnings
 from collections.abc import Iterator
@@ -95,6 +96,7 @@ def _trimesh() -> ModuleType:
             "OBJ, STL and glTF need the package trimesh, which is not installed. Install it "
             "(pip install trimesh), or write the surface as PLY."
         ) from cause
+    logging.getLogger("trimesh").disabled = True  # of each broken file it writes a page
     module: ModuleType = trimesh
     return module
 
