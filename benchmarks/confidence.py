@@ -128,8 +128,9 @@ def main() -> None:
     sensor = sensor_of(options.preset)
     parameters = fit(samples, SHARES[sensor], lone=LONE[sensor])
     confidences = [c for one in samples for c in confidences_of(one.evidence, parameters)]
-    found = calibration(confidences, [right for one in samples for right in one.right])
-    print(f"{len(confidences)} poses; calibration error {found.error:.3f}, Brier {found.brier:.4f}")
+    measured = calibration(confidences, [right for one in samples for right in one.right])
+    error, brier = measured.error, measured.brier
+    print(f"{len(confidences)} poses; calibration error {error:.3f}, Brier {brier:.4f}")
     print(parameters)
     if options.out is not None:
         save_model(replace(model, answer=replace(model.answer, confidence=parameters)), options.out)

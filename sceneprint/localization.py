@@ -1,11 +1,11 @@
-"""Validated matches to where the query was taken: found, ambiguous, or not found.
+"""Decide where a query was taken by its validated matches: found, ambiguous, or not found.
 
 matches, poses, MapViews  --localize-->  PoseEstimate
 
 Accepted matches vote with their poses. These poses, and all others that candidates suggest, are
-judged on the frames of the map that would see the same surfaces. What speaks for and against each
-of them gives its confidence: the probability that it is right. The best one is `found` where its
-confidence reaches the one that the query asks for: all others together have no more than the rest.
+judged on the frames of the map that would see the same surfaces. The evidence for each of them
+gives its confidence: the probability that it is right. The best one is `found` where its confidence
+reaches the one that the query asks for. All others together have no more than the rest.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def localize(
 
 
 class QueryDatabase(Protocol):
-    """What `decide` asks of a database for one query: a service of its store, or an evaluation."""
+    """The frames that one query searches: in the store of a service, or those of an evaluation."""
 
     def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
         """Return where the last of some frames was taken, by their matches; see `localize`."""
@@ -237,7 +237,7 @@ def views_of_rows(
     overlap_p: OverlapParameters | None = None,
     ahead: Sequence[bool] | None = None,
 ) -> ViewsOf:
-    """Return what `localize` asks the map with, where all poses of a database are at hand.
+    """Return a function that gives `localize` the map's frames, where all poses are in memory.
 
     Parameters
     ----------
@@ -281,11 +281,11 @@ def rival_rows(
     query_ahead: bool,
     p: LocalizationParameters | None = None,
 ) -> list[int]:
-    """Frames that look like the query, but show another place than the one that is found.
+    """Return frames that look like the query, but show another place than the estimate.
 
-    Where two rooms are equal and were mapped from the same viewpoints, each signature is there
-    twice, and C keeps one of the two: all of C may be of the wrong room. So no pose is found
-    before frames elsewhere whose signatures are as near as those that vote were validated too.
+    Where two rooms are equal and were mapped from the same viewpoints, each signature is in the
+    database twice, and C has one of the two: all of C may be of the wrong room. So no pose is found
+    before frames of another place, with signatures as near as those that vote, were validated too.
 
     Parameters
     ----------
@@ -322,7 +322,7 @@ def rival_rows(
 
 
 def unconfirmed(estimate: PoseEstimate) -> PoseEstimate:
-    """A pose that was found, as ambiguous: frames that look alike elsewhere were not compared."""
+    """Return an estimate as ambiguous, because similar frames elsewhere were not compared."""
     if estimate.average is None:
         return estimate
     return replace(

@@ -62,7 +62,7 @@ class LocalizationParameters:
 
 @dataclass(frozen=True, eq=False)
 class QueryFrame:
-    """A frame of a query, and what came of its candidates.
+    """A frame of a query with the matches of its candidates.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class QueryFrame:
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """What a robot believes of its pose before it asks.
+    """The pose that a robot believes to have before the query.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ _CHI_SQUARE_6 = 22.458
 
 @dataclass(frozen=True, eq=False)
 class _Vote:
-    """A pose that a match speaks for, and from where: both (4, 4) in the parent frame."""
+    """A match's vote: the pose T and the viewpoint of the match, (4, 4) in the parent frame."""
 
     match: PairMatch
     T: Floats
@@ -185,7 +185,7 @@ def judged_places(
     Returns
     -------
     parent : frame in which poses are compared
-    prior : the one given; None where it is of another parent frame
+    prior : the parameter, or None where it is of another parent frame
     places : those with votes first, then by score
     """
     parent = _parent(frames, parents)
@@ -213,7 +213,7 @@ def judged_places(
 
 
 def _parent(frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None) -> str:
-    """The parent frame with most strong matches, of equals with most accepted, with most at all."""
+    """Return the parent frame with most strong matches; ties go to most accepted, then to most."""
     counts: dict[str, tuple[int, int, int]] = {}
     for frame in frames:
         for match in frame.matches:
@@ -230,7 +230,7 @@ def _parent(frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, 
 def _accepts(
     frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None, parent: str
 ) -> bool:
-    """Whether a match of a parent frame is accepted."""
+    """Return whether a match of a parent frame is accepted."""
     return any(
         match.validation.status == "accepted"
         and ("" if parents is None else parents[match.index]) == parent
@@ -263,7 +263,7 @@ def _suggested(
         (match, poses[match.index] @ match.validation.hypotheses @ inverse(frame.T))
         for frame in frames
         for match in frame.matches
-        # of a sensor that cannot have stood so
+        # a transform that contradicts `up` suggests no pose
         if len(match.validation.hypotheses) and not match.validation.contradicts_up
     ]
     most = max((len(hypotheses) for _, hypotheses in of_each), default=0)
@@ -284,7 +284,7 @@ def _votes(
     frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats],
     p: LocalizationParameters,
 ) -> list[_Vote]:  # fmt: skip
-    """Votes of accepted matches in the order of belief, then those of ambiguous ones."""
+    """Return the votes of accepted matches, best first, then those of ambiguous ones."""
     votes: list[_Vote] = []
     for frame in frames:
         first = preferred([match.validation for match in frame.matches])
@@ -359,7 +359,7 @@ def _place(
 def _weight(group: Sequence[_Vote], p: LocalizationParameters) -> tuple[int, float]:
     """Return how many viewpoints vote, and the weight of their first votes.
 
-    Neither a copy of a view nor what other matches gave is a vote of its own.
+    Neither a copy of a view nor a guided match is a vote of its own.
     """
     voting = [vote for vote in group if not vote.match.validation.guided]
     viewpoints = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)

@@ -1,4 +1,4 @@
-"""A query to its answer: R, C, C_vld, the pose of the query, and its status.
+"""Answer a query: R, C, C_vld, the pose of the query, and its status.
 
 signature, Geometry, Places  --answer-->  Answer
 PoseEstimate, matches, counts  --answer_status-->  Outcome
@@ -59,7 +59,7 @@ from sceneprint.store import Store
 from sceneprint.store.maps import frames_of, viewpoints_among
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats, Geometry
-from sceneprint_client.api import Answer, AnswerStatus, Counts, FrameName, Match, OfMap, Query
+from sceneprint_client.api import Answer, AnswerStatus, Counts, Match, OfMap, Query
 from sceneprint_client.api.query import Cause
 
 
@@ -80,29 +80,29 @@ class _Clock:
 class SequenceFrame:
     """An earlier frame of a query, and where its sensor was: T_query_sensor (4, 4), by odometry."""
 
-    asked: PreparedQuery
+    prepared: PreparedQuery
     T: Floats
 
 
 @dataclass(frozen=True, eq=False)
 class _Attempt:
-    """A frame of a query, and what came of its candidates.
+    """A frame of a query with its candidates and their matches.
 
     Parameters
     ----------
-    asked : the frame
+    prepared : the frame
     searched : its R
     selection : C, or None where it was not asked for
     among, scales : distances within R, and what C was selected by
     chosen : positions in R of the candidates: C, or the first of R
-    tried : what came of those candidates that the pose rests on, whatever `k` is
+    tried : validations of those candidates that the pose rests on, whatever `k` is
     rows : of the frames that are shown, by number
     matches : those that were tried and are still there
     rivals : the same of frames beyond `chosen`, which show another place than the one found
     late : whether the deadline came before the last of these
     """
 
-    asked: PreparedQuery
+    prepared: PreparedQuery
     searched: Searched
     selection: Selection | None
     among: Ints64 | None
@@ -116,40 +116,42 @@ class _Attempt:
 
 
 def answer(
-    store: Store, places: Sequence[SearchedMap], model: Model, asked: PreparedQuery, query: Query,
-    deadline: Deadline, earlier: Sequence[SequenceFrame] = (),
+    store: Store, places: Sequence[SearchedMap], model: Model, prepared: PreparedQuery,
+    query: Query, deadline: Deadline, earlier: Sequence[SequenceFrame] = (),
 ) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
-    """Ask maps; the answer, and the numbers of the frames of R.
+    """Return the answer of some maps to a query, and the numbers of the frames of R.
 
     Parameters
     ----------
     store : see Store
     places : the maps, one or more of one model
     model : of all of them
-    asked, query : what is sought, and how
+    prepared, query : the frame, and the options of the query
     deadline : see Deadline
-    earlier : frames of the same query: they vote for the pose of `asked`, which is answered for
+    earlier : earlier frames of the same sequence, which vote for the pose of `prepared`
 
     Raises
     ------
     UnknownFrame : there is none of the id that is to be explained.
     InvalidRequest, InvalidPose : the prior cannot be used.
     """
-    clock = _Clock({"prepare": round(asked.prepare_ms, 2)})
+    clock = _Clock({"prepare": round(prepared.prepare_ms, 2)})
     prior = prior_of(store, query, places)
     # the last frame first: a deadline costs votes of the earlier ones, and not its own
-    last = _attempt(store, places, model, asked, query, deadline, prior, clock)
-    before = [_attempt(store, places, model, one.asked, query, deadline, prior) for one in earlier]
+    last = _attempt(store, places, model, prepared, query, deadline, prior, clock)
+    before = [
+        _attempt(store, places, model, one.prepared, query, deadline, prior) for one in earlier
+    ]
     if before:
         clock.stage("earlier")
     estimate = None
-    if asked.geometry is not None:
+    if prepared.geometry is not None:
         database = _StoredDatabase(store, [*before, last], prior, model, query, deadline)
         poses = [*(one.T for one in earlier), np.eye(4)]
         frames = [
-            QueryFrame(one.asked.geometry, one.matches, T)
+            QueryFrame(one.prepared.geometry, one.matches, T)
             for one, T in zip(database.attempts, poses, strict=True)
-            if one.asked.geometry is not None
+            if one.prepared.geometry is not None
         ]
         estimate = decide(frames, last.searched.ranking, database, numbers_of(model, query))
         last = database.attempts[-1]
@@ -160,7 +162,7 @@ def answer(
 
 
 class _StoredDatabase:
-    """The store, as `decide` asks it for one query; `attempts` has what it validated for that."""
+    """The frames that one query searches; `attempts` has all that was validated for `decide`."""
 
     def __init__(
         self, store: Store, attempts: Sequence[_Attempt], prior: PosePrior | None, model: Model,
@@ -217,19 +219,19 @@ class _StoredDatabase:
         known: Mapping[int, PairValidation] | None = None, *, retry: bool = True,
     ) -> Validated:  # fmt: skip
         return validated(
-            self._store, attempt.searched, positions, attempt.asked.geometry, self._query,
-            self._deadline, self._model.parameters.validation, attempt.asked.up, known,
+            self._store, attempt.searched, positions, attempt.prepared.geometry, self._query,
+            self._deadline, self._model.parameters.validation, attempt.prepared.up, known,
             guided=False, retry=retry,
         )  # fmt: skip
 
 
 def _attempt(
-    store: Store, places: Sequence[SearchedMap], model: Model, asked: PreparedQuery, query: Query,
-    deadline: Deadline, prior: PosePrior | None, clock: _Clock | None = None,
+    store: Store, places: Sequence[SearchedMap], model: Model, prepared: PreparedQuery,
+    query: Query, deadline: Deadline, prior: PosePrior | None, clock: _Clock | None = None,
 ) -> _Attempt:  # fmt: skip
     """Look for one frame of a query, and validate its candidates."""
     clock = clock or _Clock({})
-    searched = search_maps(store, places, asked, query, model)
+    searched = search_maps(store, places, prepared, query, model)
     for place in places:
         if place.view.damaged:
             resign_frames(store, place.row, sorted(place.view.damaged), place.row.model_id)
@@ -245,13 +247,13 @@ def _attempt(
     if prior is not None:
         first = nearest_first(store, ranking, first, prior, model.answer.map)
     p = model.parameters.validation
-    tried = validated(store, searched, first, asked.geometry, query, deadline, p, asked.up)
+    tried = validated(store, searched, first, prepared.geometry, query, deadline, p, prepared.up)
     clock.stage("validate")
     shown = range(len(ranking)) if query.explain else chosen
     with store.database.read() as connection:
         rows = frames_of(connection, ranking.indices[list(shown)].tolist())
     matches = [one for one in tried.matches if one.index in rows]  # the rest was deleted meanwhile
-    return _Attempt(asked, searched, selection, among, scales, chosen, tried, rows, matches)
+    return _Attempt(prepared, searched, selection, among, scales, chosen, tried, rows, matches)
 
 
 def _answer(
@@ -259,44 +261,45 @@ def _answer(
     estimate: PoseEstimate | None, query: Query, deadline: Deadline, clock: _Clock, earlier: int,
 ) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
     """Return the answer to the frame that was asked for."""
-    asked, searched, p = last.asked, last.searched, model.parameters.validation
+    prepared, searched, p = last.prepared, last.searched, model.parameters.validation
     ranking, tried = searched.ranking, _all_tried(store, last, query, deadline, p)
     clock.stage("validate")
     # what was rejected elsewhere is no match of anyone's
     rivals_left = [one for one in last.rivals if one.validation.status != "rejected"]
     matches = [*(one for one in tried.matches if one.index in last.rows), *rivals_left]
     names = {place.row.number: place.row.name for place in places}
-    own = query_sensor(_name(asked), asked.kind, list(names.values()))
-    found = Candidates(
+    own = query_sensor(prepared.name, prepared.kind, list(names.values()))
+    candidates = Candidates(
         names, ranking, last.selection, last.rows, tried.unreadable, tried.untried, own,
-        p.covariance, asked.base,
+        p.covariance, prepared.base,
     )  # fmt: skip
     explanations = explained = None
     if query.explain:
         compared = replace(tried, matches=[*tried.matches, *last.rivals])
-        explanations = explain(found, compared, last.among, last.scales)
+        explanations = explain(candidates, compared, last.among, last.scales)
     if query.explain_frame is not None:
-        asking = ExplainedQuery(store, searched, asked, query, found, tried, model, deadline)
-        explained = why(asking, query.explain_frame)
+        whole = ExplainedQuery(store, searched, prepared, query, candidates, tried, model, deadline)
+        explained = why(whole, query.explain_frame)
     if query.explain or explained is not None:
         clock.stage("explain")
     clock.spent["total"] = round(sum(clock.spent.values()), 2)
-    counts = [_counts(searched, i, found, tried, matches) for i in range(len(places))]
+    counts = [_counts(searched, i, candidates, tried, matches) for i in range(len(places))]
     total = _sum(counts)
     deciding = [*last.matches, *rivals_left]
     accepted = [last.rows[m.index] for m in deciding if m.validation.status == "accepted"]
     posed = any(row.pose is not None for row in accepted)
     outcome = answer_status(
-        query, estimate, last.tried, deciding, total, asked.geometry, p, posed=posed
+        query, estimate, last.tried, deciding, total, prepared.geometry, p, posed=posed
     )
-    told = Answer(
+    others = alternative_records(candidates, estimate) if outcome.status == "ambiguous" else []
+    response = Answer(
         query_id=uuid.uuid4().hex,
         status=outcome.status,
         reason=outcome.reason,
         cause=outcome.cause,
-        matches=_listed_matches(found, last, tried, rivals_left, query.k),
-        location=location_record(found, estimate) if outcome.status == "found" else None,
-        alternatives=alternative_records(found, estimate) if outcome.status == "ambiguous" else [],
+        matches=_listed_matches(candidates, last, tried, rivals_left, query.k),
+        location=location_record(candidates, estimate) if outcome.status == "found" else None,
+        alternatives=others,
         seed=query.seed,
         model=model.label,
         index_generation=min(map(_generation, places)),
@@ -304,27 +307,27 @@ def _answer(
         counts=total,
         milliseconds=clock.spent,
         maps=[place.row.name for place in places],
-        frame=_name(asked),
-        kind=asked.kind,
+        frame=prepared.name,
+        kind=prepared.kind,
         frames=1 + earlier,
         per_map=_per_map(places, counts) if len(places) > 1 else None,
         deadline_reached=None if tried.late is None else tried.late or last.late,
         explanations=explanations,
         explained_frame=explained,
     )
-    return told, tuple(ranking.indices.tolist())
+    return response, tuple(ranking.indices.tolist())
 
 
 def _listed_matches(
-    found: Candidates, last: _Attempt, tried: Validated, elsewhere: Sequence[PairMatch], k: int
+    candidates: Candidates, last: _Attempt, tried: Validated, elsewhere: Sequence[PairMatch], k: int
 ) -> list[Match]:
     """Return the first `k` accepted candidates and the others, and those elsewhere, as JSON."""
     shown = listed([one for one in tried.matches if one.index in last.rows], k)
     hidden = {one.index for one in tried.matches} - {one.index for one in shown}
-    order = found.ranking.indices.tolist()
+    order = candidates.ranking.indices.tolist()
     chosen = [position for position in last.chosen if order[position] not in hidden]
     beyond = [order.index(one.index) for one in elsewhere]
-    return match_records(found, [*chosen, *beyond], [*shown, *elsewhere])
+    return match_records(candidates, [*chosen, *beyond], [*shown, *elsewhere])
 
 
 def _all_tried(
@@ -337,8 +340,8 @@ def _all_tried(
     if query.k > VERDICT_MATCHES and (rest or accepted == VERDICT_MATCHES) and not tried.late:
         known = {one.index: one.validation for one in tried.matches}
         return validated(
-            store, last.searched, [*tried.chosen, *rest], last.asked.geometry, query, deadline, p,
-            last.asked.up, known, k=query.k, retry=False,
+            store, last.searched, [*tried.chosen, *rest], last.prepared.geometry, query, deadline,
+            p, last.prepared.up, known, k=query.k, retry=False,
         )  # fmt: skip
     return replace(tried, chosen=last.chosen)
 
@@ -370,13 +373,17 @@ def _per_map(places: Sequence[SearchedMap], counts: Sequence[Counts]) -> dict[st
 
 
 def _counts(
-    searched: Searched, i: int, found: Candidates, tried: Validated, matches: Sequence[PairMatch]
+    searched: Searched,
+    i: int,
+    candidates: Candidates,
+    tried: Validated,
+    matches: Sequence[PairMatch],
 ) -> Counts:
-    """What each stage saw of one of the maps."""
+    """Return how many frames of one of the maps each stage saw."""
     part, hits = searched.parts[i], searched.hits[i]
     number = part.place.row.number
     statuses = [
-        one.validation.status for one in matches if found.rows[one.index].map_number == number
+        one.validation.status for one in matches if candidates.rows[one.index].map_number == number
     ]
     own = searched.owners == i
     return Counts(
@@ -384,7 +391,7 @@ def _counts(
         passed=part.passed,
         compared=hits.compared,
         ranked=int(own.sum()),
-        selected=0 if found.selection is None else int(own[list(tried.chosen)].sum()),
+        selected=0 if candidates.selection is None else int(own[list(tried.chosen)].sum()),
         validated=len(statuses),
         accepted=statuses.count("accepted"),
     )
@@ -397,12 +404,6 @@ def _sum(counts: Sequence[Counts]) -> Counts:
 
 def _generation(place: SearchedMap) -> int:
     return place.view.number
-
-
-def _name(asked: PreparedQuery) -> FrameName | None:
-    if asked.frame is None or asked.home is None:
-        return None
-    return FrameName(map=asked.home.name, frame_id=asked.frame[1])
 
 
 # What came of a query: its status, why, and where nothing was found, the likeliest cause.
@@ -426,7 +427,7 @@ def answer_status(
     query: Query, estimate: PoseEstimate | None, tried: Validated, matches: Sequence[PairMatch],
     counts: Counts, geometry: Geometry | None, p: ValidationParameters, *, posed: bool,
 ) -> Outcome:  # fmt: skip
-    """What came of a query.
+    """Return the status of an answer, with its reason and cause.
 
     Parameters
     ----------
@@ -455,11 +456,11 @@ def answer_status(
     if unsure is not None:
         return Outcome("ambiguous", f"the best fit is not unique: {unsure.validation.reason}")
     if tried.late:
-        told = (
+        explanation = (
             f"the deadline passed before a match was accepted: {counts.validated} of "
             f"{len(tried.chosen)} candidates were validated. Allow more time"
         )
-        return Outcome("unvalidated", told, "deadline")
+        return Outcome("unvalidated", explanation, "deadline")
     cause, reason = _likeliest_cause(tried, matches, counts, geometry, p)
     return Outcome("not_found", reason, cause)
 
@@ -468,7 +469,7 @@ def _likeliest_cause(
     tried: Validated, matches: Sequence[PairMatch], counts: Counts, geometry: Geometry | None,
     p: ValidationParameters,
 ) -> tuple[Cause, str]:  # fmt: skip
-    """Why nothing was found, and what to do next."""
+    """Return the likeliest cause that nothing was found, and what to do next."""
     if not counts.passed:
         if counts.map:
             return "no_frames", "no frame of the map passes the filter. Widen the filter"
@@ -492,7 +493,7 @@ def _likeliest_cause(
 def _cause_in_view(
     geometry: Geometry, tried: Validated, p: ValidationParameters
 ) -> tuple[Cause, str] | None:
-    """What in the frame itself speaks against finding it."""
+    """Return the cause that lies in the frame itself, and what to do next, or None."""
     if len(geometry.patches) < p.minimum_patches:
         return (
             "too_little_in_view",
@@ -526,5 +527,5 @@ def _cause_in_view(
 
 
 def _distance(geometry: Geometry) -> float:
-    """Median distance of the patches from the sensor, metres."""
+    """Return the median distance of the patches from the sensor, metres."""
     return float(np.median(np.linalg.norm(geometry.patches.means, axis=1)))

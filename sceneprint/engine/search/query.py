@@ -1,4 +1,4 @@
-"""Queries of an engine: signed with the maps' model, and answered wholly with it.
+"""Queries of an engine: sign the frame with the maps' model, and answer with that model.
 
 upload | stored frame, names of maps  -->  Answer
 """
@@ -49,7 +49,6 @@ from sceneprint_client.api import (
     Answer,
     Comparison,
     FrameMeta,
-    FrameName,
     Localization,
     NamedFrame,
     Query,
@@ -84,7 +83,7 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
         rows = find_maps(connection, maps)
     for _ in range(TRIES):
         try:
-            found = ask(rows)
+            result = ask(rows)
         except SceneprintError:
             now = _other_models(store, rows)
             if now is None:
@@ -93,7 +92,7 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
             # also where all went well: artifacts of the former model may have been missed
             now = _other_models(store, rows)
             if now is None:
-                return found
+                return result
         rows = now
     raise Busy(
         f"Map {', '.join(map(repr, maps))} kept changing its model during the query. Send the "
@@ -116,7 +115,7 @@ def check_model(one: str, other: str) -> None:
 
 
 def _other_models(store: Store, rows: Sequence[MapRow]) -> list[MapRow] | None:
-    """The maps where one of them has another model by now, or None."""
+    """Return the maps as they are now if one of them has another model, else None."""
     try:
         with store.database.read() as connection:
             now = find_maps(connection, [row.name for row in rows])
@@ -174,11 +173,12 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
 def _compared(a: PreparedQuery, b: PreparedQuery, signer: Signer, how: Comparison) -> Similarity:
     start = time.perf_counter()
     distance = distances(a.vector, b.vector[None], signer.model.metric)
-    made, T, p = None, None, signer.model.parameters.validation
+    validation, p = None, signer.model.parameters.validation
     if a.geometry is not None and b.geometry is not None:
         options = thresholds(how.validation, p)
-        found = validate(b.geometry, a.geometry, how.seed, *options, ups=(b.up, a.up))
-        made, T = found, found.T_match_query
+        validation = validate(b.geometry, a.geometry, how.seed, *options, ups=(b.up, a.up))
+    T = None if validation is None else validation.T_match_query
+    covariance = None if validation is None else validation.covariance
     spent = {
         "prepare": round(a.prepare_ms + b.prepare_ms, 2),
         "validate": round(1e3 * (time.perf_counter() - start), 2),
@@ -187,12 +187,10 @@ def _compared(a: PreparedQuery, b: PreparedQuery, signer: Signer, how: Compariso
         distance=int(distance[0]),
         similarity=float(similarity(distance, signer.model.unrelated_distance)[0]),
         model=signer.model.label,
-        a=_name(a),
-        b=_name(b),
-        validation=None if made is None else validation_record(made),
-        uncertainty=(
-            None if made is None else uncertainty_record(made.covariance, PAIR_METHOD, p.covariance)
-        ),
+        a=a.name,
+        b=b.name,
+        validation=None if validation is None else validation_record(validation),
+        uncertainty=uncertainty_record(covariance, PAIR_METHOD, p.covariance),
         transform=None if T is None else transform(T, *_cameras(a, b)),
         seed=how.seed,
         milliseconds={**spent, "total": round(sum(spent.values()), 2)},
@@ -200,35 +198,29 @@ def _compared(a: PreparedQuery, b: PreparedQuery, signer: Signer, how: Compariso
 
 
 def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Comparison) -> Signer:
-    """What signs the uploads: with the model of the stored frames, if there are any."""
+    """Return the signer of uploads: that of the stored frames' model, if there are any."""
     if not rows:
         return signers.of(read_model(how.model or PRESETS[0]))
     with store.database.read() as connection:
         names = model_names(connection)
-    told = [f"{row.name} has {model_label(names[row.model_id], row.model_id)}" for row in rows]
+    models = [f"{row.name} has {model_label(names[row.model_id], row.model_id)}" for row in rows]
     if len({row.model_id for row in rows}) > 1:
         raise InvalidRequest(
-            f"Frames of two models cannot be compared: map {' and map '.join(told)}. Compare "
+            f"Frames of two models cannot be compared: map {' and map '.join(models)}. Compare "
             "frames of maps that share a model, or upload one of them.",
-            (("frame_a", told[0]), ("frame_b", told[1])),
+            (("frame_a", models[0]), ("frame_b", models[1])),
         )
     if how.model is not None and read_model(how.model).id != rows[0].model_id:
         raise InvalidRequest(
-            f"The stored frame is signed with another model than {how.model!r}: map {told[0]}. "
+            f"The stored frame is signed with another model than {how.model!r}: map {models[0]}. "
             "Leave `model` out.",
-            (("model", f"map {told[0]}"),),
+            (("model", f"map {models[0]}"),),
         )
     return signers(rows[0].model_id)
 
 
-def _name(asked: PreparedQuery) -> FrameName | None:
-    if asked.frame is None or asked.home is None:
-        return None
-    return FrameName(map=asked.home.name, frame_id=asked.frame[1])
-
-
 def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
-    """What the coordinates of both sensors are called; of one id in two maps, a and b."""
+    """Return the names of both sensors' coordinates; `a` and `b` if their ids are equal."""
     ids = [x if one.frame is None else one.frame[1] for x, one in (("a", a), ("b", b))]
     if ids[0] == ids[1]:
         ids = ["a", "b"]
@@ -360,7 +352,7 @@ class Queries:
                     "not stored. Send the frame again."
                 )
             geometry = read_geometry(stored.geometry)
-        asked = PreparedQuery(
+        prepared = PreparedQuery(
             stored.model_id, stored.vector, geometry, check_taken(stored.taken, query), None, 0.0,
             base=stored.base, artifact=stored.geometry, kind=stored.answer.kind, up=stored.up,
         )  # fmt: skip
@@ -372,12 +364,12 @@ class Queries:
                         f"Map {row.name!r} has a different model than the query was signed with, "
                         "and the upload of the query is not stored. Send the frame again."
                     )
-            return self.answer(rows, asked, query, deadline, sent=sent)
+            return self.answer(rows, prepared, query, deadline, sent=sent)
 
         return self._steadily(maps, ask)
 
     def answer(
-        self, asked_of: Sequence[MapRow], asked: PreparedQuery, query: Query, deadline: Deadline,
+        self, asked_of: Sequence[MapRow], prepared: PreparedQuery, query: Query, deadline: Deadline,
         earlier: Sequence[SequenceFrame] = (), sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
         """Answer from the maps as they are now; ModelMismatch where one has switched meanwhile."""
@@ -390,18 +382,18 @@ class Queries:
                         f"Map {row.name!r} was deleted and created again during the query. Send "
                         "the query again."
                     )
-                check_model(asked.model_id, row.model_id)
+                check_model(prepared.model_id, row.model_id)
             views = [self._readers.view(connection, row) for row in rows]
         places = [SearchedMap(row, view) for row, view in zip(rows, views, strict=True)]
         for place in places:
-            check_model(place.view.model_id, asked.model_id)
-        model = self._signers(asked.model_id).model
-        found, ranked = answer(self._store, places, model, asked, query, deadline, earlier)
-        self._note(found, ranked, asked, query, deadline, sent)
-        return found
+            check_model(place.view.model_id, prepared.model_id)
+        model = self._signers(prepared.model_id).model
+        response, ranked = answer(self._store, places, model, prepared, query, deadline, earlier)
+        self._note(response, ranked, prepared, query, deadline, sent)
+        return response
 
     def _note(
-        self, found: Answer, ranked: Sequence[int], asked: PreparedQuery, query: Query,
+        self, response: Answer, ranked: Sequence[int], prepared: PreparedQuery, query: Query,
         deadline: Deadline, sent: SentQuery | None,
     ) -> None:  # fmt: skip
         """Have the log store an answer."""
@@ -409,17 +401,17 @@ class Queries:
         if not (listed or query.keep):
             return
         if sent is None:
-            sent = SentQuery(found.maps, query, frame=found.frame)
-        row = query_row(sent, found, time.perf_counter() - deadline.since)
+            sent = SentQuery(response.maps, query, frame=response.frame)
+        row = query_row(sent, response, time.perf_counter() - deadline.since)
         stored, shown = None, set[int]()
         if query.keep:
             stored = StoredAnswer(
-                found, query, asked.model_id, asked.vector, asked.artifact, tuple(ranked),
-                taken=asked.taken, base=asked.base, up=asked.up,
+                response, query, prepared.model_id, prepared.vector, prepared.artifact,
+                tuple(ranked), taken=prepared.taken, base=prepared.base, up=prepared.up,
             )  # fmt: skip
             # explanations show the whole ranking
-            shown = {ranked[one.rank - 1] for one in found.explanations or found.matches}
-            shown |= set() if asked.frame is None else {asked.frame[0]}
+            shown = {ranked[one.rank - 1] for one in response.explanations or response.matches}
+            shown |= set() if prepared.frame is None else {prepared.frame[0]}
         self._log.note(replace(row, listed=listed), stored, sorted(shown))
 
     def _steadily(self, maps: Sequence[str], ask: Callable[[list[MapRow]], Answer]) -> Answer:
@@ -434,7 +426,7 @@ class Queries:
     def maps_of(
         self, query: SeveralQuery, may_read: Callable[[str], bool] = lambda _: True
     ) -> list[str]:
-        """Names of the maps that a query asks, each once.
+        """Return the names of the maps that a query searches, each once.
 
         Parameters
         ----------
@@ -468,12 +460,12 @@ class Queries:
             return
         with self._store.database.read() as connection:
             names = model_names(connection)
-        told = {row.name: model_label(names[row.model_id], row.model_id) for row in rows}
-        which = ", ".join(f"{name} has {model}" for name, model in told.items())
+        models = {row.name: model_label(names[row.model_id], row.model_id) for row in rows}
+        which = ", ".join(f"{name} has {model}" for name, model in models.items())
         raise InvalidRequest(
             f"One query cannot search maps with different models: {which}. Query the maps of one "
             "model, or switch the others with `sceneprint reencode`.",
-            tuple((f"maps.{name}", f"has {model}") for name, model in told.items()),
+            tuple((f"maps.{name}", f"has {model}") for name, model in models.items()),
         )
 
 
@@ -498,7 +490,7 @@ def check_sequence(metas: Sequence[FrameMeta], query: Query) -> None:
 
 
 def _odometry(frame: PreparedQuery) -> Floats:
-    """T_odom_sensor of a frame of a sequence."""
+    """Return T_odom_sensor of a frame of a sequence."""
     if frame.pose is None:
         raise ValueError("a frame of a sequence without a pose")
     return frame.pose
@@ -519,7 +511,7 @@ def check_localizes(query: Query) -> None:
 
 
 def localization_of(answer: Answer) -> Localization:
-    """Where the query was taken, and how sure that is.
+    """Return the pose of the query with its confidence, as one record.
 
     Parameters
     ----------

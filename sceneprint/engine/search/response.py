@@ -1,4 +1,4 @@
-"""Matches as JSON, and why one frame is, or is not, among them.
+"""Write matches as JSON, and explain why a frame is, or is not, among them.
 
 Candidates, Validated  --match_records | explain-->  Match | Explanation of each
 frame id, Searched, Validated  --why-->  ExplainedFrame
@@ -44,7 +44,7 @@ from sceneprint.store import Store
 from sceneprint.store.maps import find_frame, geometry_blobs
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats
-from sceneprint_client.api import Alternative as ToldAlternative
+from sceneprint_client.api import Alternative as AlternativeRecord
 from sceneprint_client.api import (
     EvidenceRecord,
     ExplainedFrame,
@@ -54,16 +54,16 @@ from sceneprint_client.api import (
     Residual,
     Transform,
 )
-from sceneprint_client.api import Location as ToldLocation
-from sceneprint_client.api import Match as ToldMatch
-from sceneprint_client.api import Validation as ToldValidation
+from sceneprint_client.api import Location as LocationRecord
+from sceneprint_client.api import Match as MatchRecord
+from sceneprint_client.api import Validation as ValidationRecord
 from sceneprint_client.api.base import Vector
 from sceneprint_client.api.query import FreeDirection, Lost, Outcome, Stage, Uncertainty
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """What there is to tell about candidates.
+    """The candidates of a query, with all that their records say.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class Candidates:
     base: tuple[str, Floats] | None = None
 
     def base_of(self, T_parent_query: Floats | None, parent: str) -> Transform | None:
-        """Where the robot's base is, by where its camera is."""
+        """Return the pose of the robot's base, by that of its camera."""
         if self.base is None or T_parent_query is None:
             return None
         name, T_base_query = self.base
@@ -109,41 +109,41 @@ def listed(matches: Sequence[PairMatch], k: int) -> list[PairMatch]:
 
 
 def match_records(
-    found: Candidates, chosen: Sequence[int], matches: Sequence[PairMatch]
-) -> list[ToldMatch]:
-    """What was validated, in the order of belief, then the other candidates in the order of R.
+    candidates: Candidates, chosen: Sequence[int], matches: Sequence[PairMatch]
+) -> list[MatchRecord]:
+    """Return the matches, the most trusted first, then the other candidates in the order of R.
 
     Parameters
     ----------
-    found : see Found
+    candidates : see Candidates
     chosen : positions in R of the candidates
     matches : of `associate`
     """
-    position = {int(found.ranking.indices[i]): i for i in chosen}
+    position = {int(candidates.ranking.indices[i]): i for i in chosen}
     tried = {match.index: match.validation for match in matches}
     order = [*tried, *(number for number in position if number not in tried)]
-    told = []
+    records = []
     for number in order:
-        if number not in found.rows:
+        if number not in candidates.rows:
             continue
         if number in tried:
             validation = validation_record(tried[number])
-        elif number in found.unreadable:
-            validation = ToldValidation(status="skipped", reason=found.unreadable[number])
+        elif number in candidates.unreadable:
+            validation = ValidationRecord(status="skipped", reason=candidates.unreadable[number])
         else:
-            validation = ToldValidation(status="skipped", reason=found.untried)
-        told.append(_match(found, position[number], number, tried.get(number), validation))
-    return told
+            validation = ValidationRecord(status="skipped", reason=candidates.untried)
+        records.append(_match(candidates, position[number], number, tried.get(number), validation))
+    return records
 
 
-def location_record(found: Candidates, estimate: PoseEstimate | None) -> ToldLocation | None:
-    """The query's pose, where it was found."""
+def location_record(candidates: Candidates, estimate: PoseEstimate | None) -> LocationRecord | None:
+    """Return the query's pose, where it was found."""
     if estimate is None or estimate.average is None:
         return None
     average, (number, _, parent) = estimate.average, estimate.parent.partition(" ")
-    return ToldLocation(
-        pose=transform(average.T, parent, found.query_frame),
-        map=found.maps[int(number)],
+    return LocationRecord(
+        pose=transform(average.T, parent, candidates.query_frame),
+        map=candidates.maps[int(number)],
         confidence=estimate.confidence,
         evidence=evidence_record(estimate.evidence),
         support=len(estimate.members),
@@ -153,20 +153,22 @@ def location_record(found: Candidates, estimate: PoseEstimate | None) -> ToldLoc
         verified_by=estimate.verified_by or "matches",
         spread_m=average.spread_m,
         spread_deg=math.degrees(average.spread_rad),
-        uncertainty=uncertainty_record(estimate.covariance, PLACE_METHOD, found.covariance),
-        base=found.base_of(average.T, parent),
+        uncertainty=uncertainty_record(estimate.covariance, PLACE_METHOD, candidates.covariance),
+        base=candidates.base_of(average.T, parent),
     )
 
 
-def alternative_records(found: Candidates, estimate: PoseEstimate | None) -> list[ToldAlternative]:
-    """The poses that the evidence supports, where it does not decide."""
+def alternative_records(
+    candidates: Candidates, estimate: PoseEstimate | None
+) -> list[AlternativeRecord]:
+    """Return the poses that the evidence supports, where it does not decide."""
     if estimate is None:
         return []
     number, _, parent = estimate.parent.partition(" ")
     return [
-        ToldAlternative(
-            pose=transform(one.T, parent, found.query_frame),
-            map=found.maps[int(number)],
+        AlternativeRecord(
+            pose=transform(one.T, parent, candidates.query_frame),
+            map=candidates.maps[int(number)],
             confidence=one.confidence,
             evidence=evidence_record(one.evidence),
             support=one.support,
@@ -176,7 +178,7 @@ def alternative_records(found: Candidates, estimate: PoseEstimate | None) -> lis
 
 
 def evidence_record(evidence: PlaceEvidence | None) -> EvidenceRecord | None:
-    """Return as JSON what speaks for and against a pose; shares are rounded to a tenth of 1 %."""
+    """Return the evidence for a pose as JSON; shares are rounded to a tenth of 1 %."""
     if evidence is None:
         return None
     rounded = {name: round(value, 3) for name, value in asdict(evidence).items()}
@@ -184,57 +186,59 @@ def evidence_record(evidence: PlaceEvidence | None) -> EvidenceRecord | None:
 
 
 def _match(
-    found: Candidates,
+    candidates: Candidates,
     position: int,
     number: int,
     tried: PairValidation | None,
-    validation: ToldValidation,
-) -> ToldMatch:
-    row, gain = found.rows[number], None
+    validation: ValidationRecord,
+) -> MatchRecord:
+    row, gain = candidates.rows[number], None
     selected = None
-    if found.selection is not None:
-        places = found.selection.indices.tolist()
+    if candidates.selection is not None:
+        places = candidates.selection.indices.tolist()
         selected = position in places
-        gain = float(found.selection.gains[places.index(position)]) if selected else None
+        gain = float(candidates.selection.gains[places.index(position)]) if selected else None
     T = None if tried is None else tried.T_match_query
     in_map: Floats | None = None
     if T is not None and row.pose is not None and validation.status != "rejected":
         in_map = np.array(row.pose) @ T
-    return ToldMatch(
+    return MatchRecord(
         frame_id=row.id,
-        map=found.maps[row.map_number],
+        map=candidates.maps[row.map_number],
         robot=row.robot,
         session=row.session,
         name=row.name,
         sequence=row.sequence,
         rank=position + 1,
-        distance=int(found.ranking.distances[position]),
-        similarity=float(found.ranking.similarities[position]),
+        distance=int(candidates.ranking.distances[position]),
+        similarity=float(candidates.ranking.similarities[position]),
         selected=selected,
         diversity_gain=gain,
         validation=validation,
-        transform=None if T is None else transform(T, sensor_of(row), found.query_frame),
+        transform=None if T is None else transform(T, sensor_of(row), candidates.query_frame),
         predicted=(
             None
             if tried is None or tried.predicted is None
-            else transform(tried.predicted, sensor_of(row), found.query_frame)
+            else transform(tried.predicted, sensor_of(row), candidates.query_frame)
         ),
         pose_in_map=(
-            None if in_map is None else transform(in_map, str(row.pose_parent), found.query_frame)
+            None
+            if in_map is None
+            else transform(in_map, str(row.pose_parent), candidates.query_frame)
         ),
         uncertainty=(
             None
             if tried is None
-            else uncertainty_record(tried.covariance, PAIR_METHOD, found.covariance)
+            else uncertainty_record(tried.covariance, PAIR_METHOD, candidates.covariance)
         ),
-        base_in_map=found.base_of(in_map, str(row.pose_parent)),
+        base_in_map=candidates.base_of(in_map, str(row.pose_parent)),
     )
 
 
 def uncertainty_record(
     covariance: Floats | None, method: Method, p: CovarianceParameters
 ) -> Uncertainty | None:
-    """A covariance (6, 6) with the directions that it leaves free by the model's numbers."""
+    """Return a covariance (6, 6) as JSON, with the directions that it leaves free."""
     if covariance is None:
         return None
     free = [
@@ -253,12 +257,12 @@ def _vector(v: Floats) -> Vector:
     return Vector(x=x, y=y, z=z)
 
 
-def validation_record(v: PairValidation) -> ToldValidation:
-    """What came of an alignment."""
+def validation_record(v: PairValidation) -> ValidationRecord:
+    """Return the result of an alignment as JSON."""
     residual = None
     if math.isfinite(v.residual_m):
         residual = Residual(translation_m=v.residual_m, rotation_deg=math.degrees(v.residual_rad))
-    return ToldValidation(
+    return ValidationRecord(
         status=v.status,
         strength=v.strength,
         reason=v.reason,
@@ -278,30 +282,30 @@ def validation_record(v: PairValidation) -> ToldValidation:
 
 # Why each frame of a ranking came as far as it did.
 #
-# Found, Validated  --explain-->  Explanations
+# Candidates, Validated  --explain-->  Explanations
 
 
 def explain(
-    found: Candidates, tried: Validated, among: Ints64 | None, p: DiversityParameters | None
+    candidates: Candidates, tried: Validated, among: Ints64 | None, p: DiversityParameters | None
 ) -> list[Explanation]:
-    """How far each frame of R came, and why.
+    """Return for each frame of R the last stage that it reached, and why.
 
     Parameters
     ----------
-    found : with the rows of all of R
+    candidates : with the rows of all of R
     tried : what came of the candidates
     among : (R, R) distances within R; None where diversification was not asked for
     p : that the selection was made with
     """
     left = None
-    if among is not None and len(found.ranking):
+    if among is not None and len(candidates.ranking):
         left = remaining(among, np.asarray(tried.chosen, np.intp), p)
-    told = {match.index: validation_record(match.validation) for match in tried.matches}
-    return list(_each(found, tried, told, among, left))
+    records = {match.index: validation_record(match.validation) for match in tried.matches}
+    return list(_each(candidates, tried, records, among, left))
 
 
-def figures(v: ToldValidation) -> str:
-    """What a validation found, in one line: its reason, and the numbers it rests on."""
+def figures(v: ValidationRecord) -> str:
+    """Return a validation in one line: its reason, and the numbers it rests on."""
     if v.residual is None:
         return f"{v.status}: {v.reason}"
     share = v.free_space_violations
@@ -315,34 +319,34 @@ def figures(v: ToldValidation) -> str:
 
 
 def _each(
-    found: Candidates, tried: Validated, told: dict[int, ToldValidation], among: Ints64 | None,
-    left: np.ndarray | None,
+    candidates: Candidates, tried: Validated, records: dict[int, ValidationRecord],
+    among: Ints64 | None, left: np.ndarray | None,
 ) -> Iterator[Explanation]:  # fmt: skip
     chosen = set(tried.chosen)
-    for position, number in enumerate(found.ranking.indices.tolist()):
-        if number not in found.rows:  # deleted in the meantime
+    for position, number in enumerate(candidates.ranking.indices.tolist()):
+        if number not in candidates.rows:  # deleted in the meantime
             continue
         stage: Stage = "retrieve"
         outcome: Outcome = "not_selected"
-        if number in told:
-            stage, outcome = "validate", told[number].status
-            reason = figures(told[number])
+        if number in records:
+            stage, outcome = "validate", records[number].status
+            reason = figures(records[number])
         elif position in chosen:
-            stage = "retrieve" if found.selection is None else "diversify"
-            asked = tried.untried != NOT_ASKED
-            outcome = "skipped" if asked else "ranked"
+            stage = "retrieve" if candidates.selection is None else "diversify"
+            was_requested = tried.untried != NOT_ASKED
+            outcome = "skipped" if was_requested else "ranked"
             reason = tried.unreadable.get(number, tried.untried)
         elif among is not None and left is not None:
-            reason = _not_selected(found, tried, among, position, float(left[position]))
+            reason = _not_selected(candidates, tried, among, position, float(left[position]))
         else:
             reason = f"not among the first {len(chosen)} of the ranking, which were the candidates"
         yield Explanation(
-            frame_id=found.rows[number].id,
-            map=found.maps[found.rows[number].map_number],
-            name=found.rows[number].name,
+            frame_id=candidates.rows[number].id,
+            map=candidates.maps[candidates.rows[number].map_number],
+            name=candidates.rows[number].name,
             rank=position + 1,
-            distance=int(found.ranking.distances[position]),
-            similarity=float(found.ranking.similarities[position]),
+            distance=int(candidates.ranking.distances[position]),
+            similarity=float(candidates.ranking.similarities[position]),
             stage=stage,
             outcome=outcome,
             reason=reason,
@@ -350,12 +354,12 @@ def _each(
 
 
 def _not_selected(
-    found: Candidates, tried: Validated, among: Ints64, position: int, gain: float
+    candidates: Candidates, tried: Validated, among: Ints64, position: int, gain: float
 ) -> str:
-    """Whom of the selection it is like, and what it would have brought."""
+    """Return which selected frame a frame resembles, and the gain that it would have added."""
     own = among[position, list(tried.chosen)]
     nearest = tried.chosen[int(np.argmin(own))]
-    row = found.rows.get(int(found.ranking.indices[nearest]))
+    row = candidates.rows.get(int(candidates.ranking.indices[nearest]))
     name = "a frame deleted since" if row is None else f"frame {row.id}"
     if gain <= DUPLICATE:
         return f"a duplicate of the selected {name}"
@@ -367,28 +371,28 @@ def _not_selected(
 
 @dataclass(frozen=True, eq=False)
 class ExplainedQuery:
-    """A query that was answered, as far as one frame is asked about.
+    """A query that was answered, for the explanation of one frame.
 
     Parameters
     ----------
     store : see Store
-    searched, asked, query, found, tried : of the query
+    searched, prepared, query, candidates, tried : of the query
     model : of the maps
     deadline : no frame is validated for this after it
     """
 
     store: Store
     searched: retrieval.Searched
-    asked: retrieval.PreparedQuery
+    prepared: retrieval.PreparedQuery
     query: Query
-    found: Candidates
+    candidates: Candidates
     tried: Validated
     model: Model
     deadline: retrieval.Deadline
 
 
 def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
-    """Where a frame was lost, and what would have come of it.
+    """Explain at which stage a frame dropped out, and how it would align.
 
     Raises
     ------
@@ -405,8 +409,8 @@ def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
         )  # fmt: skip
     view, number = part.place.view, np.array([row.number], np.int64)
     stored = view.signatures(number)
-    distance = distances(asking.asked.vector, stored, view.metric)
-    rank = retrieval.rank_among_all(asking.searched, asking.asked, row.number, int(distance[0]))
+    distance = distances(asking.prepared.vector, stored, view.metric)
+    rank = retrieval.rank_among_all(asking.searched, asking.prepared, row.number, int(distance[0]))
     at = np.flatnonzero(asking.searched.ranking.indices == row.number).tolist()
     passes = part.among is None or row.number in part.among
     # an approximate index cannot be asked what it compared: what it should have ranked, it did not
@@ -437,7 +441,7 @@ def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
         validation=validation,
         transform=(
             None if T is None
-            else transform(T, sensor_of(row), asking.found.query_frame)
+            else transform(T, sensor_of(row), asking.candidates.query_frame)
         ),
         lost_at=lost,
         reason=reason,
@@ -445,8 +449,8 @@ def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
 
 
 def _locate_frame(asking: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapSearch, FrameRow]:
-    """The frame, and what is searched of its map: the first that has one which can be found."""
-    parts, own = asking.searched.parts, asking.asked.frame
+    """Return the frame, and the search of its map: the first with one that can be found."""
+    parts, own = asking.searched.parts, asking.prepared.frame
     held, missing = [], None
     with asking.store.database.read() as connection:
         for part in parts:
@@ -469,9 +473,9 @@ def _locate_frame(asking: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapS
 def _absent(
     asking: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
 ) -> tuple[Lost, str] | None:
-    """Why a frame is not searched at all."""
-    view, asked = part.place.view, asking.asked
-    if asked.frame is not None and asked.frame[0] == row.number:
+    """Return why a frame is not searched at all; None where it is."""
+    view, prepared = part.place.view, asking.prepared
+    if prepared.frame is not None and prepared.frame[0] == row.number:
         return "query", "it is the query itself, which queries exclude"
     if row.state != FrameState.INDEXED:
         return "state", f"it is {row.state}: {row.state.sentence}"
@@ -486,7 +490,7 @@ def _absent(
 def _lost(
     asking: ExplainedQuery, row: FrameRow, rank: int, passes: bool, ranked: bool, selected: bool
 ) -> tuple[Lost | None, str]:
-    """Where, and why in words."""
+    """Return the stage at which a frame dropped out, and why."""
     size, tried = len(asking.searched.ranking), asking.tried
     if not passes:
         return "filter", "it does not pass the filter"
@@ -498,13 +502,11 @@ def _lost(
             "with more `candidates`, or with `explain` to see which candidate it resembles"
         )
     status = {match.index: match.validation for match in tried.matches}.get(row.number)
-    if status is not None and row.number not in [
-        match.index for match in listed(tried.matches, asking.query.k)
-    ]:
-        told = figures(validation_record(status))
-        return (
-            "turn",
-            f"more than `k` matches are accepted, and others are listed before it; {told}",
+    shown = {match.index for match in listed(tried.matches, asking.query.k)}
+    if status is not None and row.number not in shown:
+        return "turn", (
+            "more than `k` matches are accepted, and others are listed before it; "
+            f"{figures(validation_record(status))}"
         )
     if status is not None and status.status == "accepted":
         return None, f"it is a match, {figures(validation_record(status))}"
@@ -519,16 +521,16 @@ def _lost(
 
 def _aligned(
     asking: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
-) -> tuple[ToldValidation | None, np.ndarray | None]:
-    """What aligning the query with a frame comes to, whether or not the query did."""
-    geometry = asking.asked.geometry
+) -> tuple[ValidationRecord | None, np.ndarray | None]:
+    """Return the alignment of the query with a frame, also where the query did not try it."""
+    geometry = asking.prepared.geometry
     if geometry is None:
         return None, None
     known: dict[int, PairValidation] = {one.index: one.validation for one in asking.tried.matches}
-    made = known.get(row.number)
-    if made is None:
+    aligned = known.get(row.number)
+    if aligned is None:
         if not asking.deadline.allows():
-            return ToldValidation(
+            return ValidationRecord(
                 status="skipped", reason="the deadline passed before it was validated"
             ), None
         model_id = part.place.row.model_id
@@ -537,13 +539,15 @@ def _aligned(
             ranked = asking.searched.ranking.indices.tolist()
             up = known_ups(connection, [*ranked, row.number]).get(row.number)
         if blob is None:
-            return ToldValidation(status="skipped", reason="it was deleted during the query"), None
+            return ValidationRecord(
+                status="skipped", reason="it was deleted during the query"
+            ), None
         try:
             own = asking.store.geometries.read(blob)
         except (DamagedBlob, UnreadableGeometry) as error:
-            return ToldValidation(status="skipped", reason=str(error)), None
+            return ValidationRecord(status="skipped", reason=str(error)), None
         query = asking.query
         p = asking.model.parameters.validation
         options = thresholds(query.validation, p)
-        made = validate(geometry, own, query.seed, *options, ups=(asking.asked.up, up))
-    return validation_record(made), made.T_match_query
+        aligned = validate(geometry, own, query.seed, *options, ups=(asking.prepared.up, up))
+    return validation_record(aligned), aligned.T_match_query

@@ -38,7 +38,7 @@ from sceneprint.store.maps import find_frame, find_map, geometry_blobs, list_map
 from sceneprint.store.signatures import stored_vector
 from sceneprint.store.tables import MapRow, maps
 from sceneprint.types import Bytes, Floats, Geometry
-from sceneprint_client.api import Filter, FrameMeta, Query
+from sceneprint_client.api import Filter, FrameMeta, FrameName, Query
 from sceneprint_client.api.frames import Kind
 
 # The readers of all maps.
@@ -166,6 +166,13 @@ class PreparedQuery:
     kind: Kind = "depth"
     up: Floats | None = None
     pose: Floats | None = None
+
+    @property
+    def name(self) -> FrameName | None:
+        """Map and id of the frame, if it is one of the map."""
+        if self.frame is None or self.home is None:
+            return None
+        return FrameName(map=self.home.name, frame_id=self.frame[1])
 
 
 def prepare_upload(

@@ -1,4 +1,4 @@
-"""Candidates of R to matches, and matches with the map's frames to where the query was taken.
+"""Validate candidates of R, and find the pose of the query by its matches and the map's frames.
 
 query Geometry, candidates  --validated-->  Validated  --placed-->  PoseEstimate
 
@@ -61,7 +61,7 @@ NOT_ASKED = "not requested"
 
 @dataclass(frozen=True, eq=False)
 class Validated:
-    """What came of the candidates.
+    """The candidates of a query with their validations.
 
     Parameters
     ----------
@@ -82,18 +82,16 @@ class Validated:
 
 
 def thresholds(
-    given: ValidationOptions | None, p: ValidationParameters
+    options: ValidationOptions | None, p: ValidationParameters
 ) -> tuple[ValidationParameters, Mode]:
-    """What a validation is done with, as `validate` takes it: the model's `p`, but for what was
-    given.
-    """
-    if given is None:
+    """Return the parameters and the mode of a validation: the model's `p` with the query's own."""
+    if options is None:
         return p, "full"
-    own = given.model_dump(exclude={"mode", "residual_deg"}, exclude_unset=True)
-    if "residual_deg" in given.model_fields_set:
-        own["residual_rad"] = math.radians(given.residual_deg)
+    own = options.model_dump(exclude={"mode", "residual_deg"}, exclude_unset=True)
+    if "residual_deg" in options.model_fields_set:
+        own["residual_rad"] = math.radians(options.residual_deg)
     own |= {also: own[name] for name in _ALSO_SET if name in own for also in _ALSO_SET[name]}
-    return replace(p, acceptance=replace(p.acceptance, **own)), given.mode
+    return replace(p, acceptance=replace(p.acceptance, **own)), options.mode
 
 
 def validated(
@@ -180,7 +178,7 @@ def _is_paper(query: Query) -> bool:
 def placed(
     store: Store, searched: Searched, geometries: Mapping[int, Geometry],
     rows: Mapping[int, FrameRow],
-    asked: Sequence[QueryFrame], prior: PosePrior | None, model: Model, query: Query,
+    query_frames: Sequence[QueryFrame], prior: PosePrior | None, model: Model, query: Query,
 ) -> PoseEstimate | None:  # fmt: skip
     """Return where the query was taken, by its matches and the frames of the map about the poses.
 
@@ -189,7 +187,7 @@ def placed(
     store, searched : see there
     geometries : of candidates, by number, as far as they are open
     rows : of the candidates, by number; those without a pose suggest none
-    asked : the query's frames with their matches
+    query_frames : frames of the query with their matches
     prior : what the robot believed before; its parent as `parent_key` writes it
     model : of the maps
     query : where it asks for anything of a match, a pose needs the vote of one; in mode `paper` the
@@ -201,7 +199,9 @@ def placed(
     """
     poses = {number: np.array(row.pose) for number, row in rows.items() if row.pose is not None}
     parents = {number: parent_key(rows[number]) for number in poses}
-    frames = [replace(one, matches=[m for m in one.matches if m.index in poses]) for one in asked]
+    frames = [
+        replace(one, matches=[m for m in one.matches if m.index in poses]) for one in query_frames
+    ]
     own_p, agreement = numbers_of(model, query), model.parameters.validation.agreement
 
     def views_of(parent: str, at: Floats) -> MapViews:
@@ -229,9 +229,9 @@ def placed(
 
 
 def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PosePrior | None:
-    """What the robot believed before; InvalidRequest or InvalidPose where it cannot be used."""
-    given = query.prior
-    if given is None:
+    """Return the prior of a query; InvalidRequest or InvalidPose where it cannot be used."""
+    prior = query.prior
+    if prior is None:
         return None
     if "validate" not in query.stages:
         raise InvalidRequest(
@@ -243,15 +243,15 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
             "A prior is a pose in one map. Ask that map alone, or leave `prior` out.",
             (("prior", "of several maps"),),
         )
-    covariance = _prior_covariance(given)
-    T = pose_matrix(given.pose, "The prior")
+    covariance = _prior_covariance(prior)
+    T = pose_matrix(prior.pose, "The prior")
     if np.abs(T[:3, 3]).max() > FARTHEST_PRIOR:
         raise InvalidRequest(
             f"The prior lies more than {FARTHEST_PRIOR:,.0f} m from the origin of its parent "
             "frame. Give the pose in metres, or leave `prior` out.",
             (("prior.pose", "too far off"),),
         )
-    row, name = places[0].row, str(given.pose.parent_frame)
+    row, name = places[0].row, str(prior.pose.parent_frame)
     with store.database.read() as connection:
         if not has_parent_frame(connection, row.number, name):
             raise InvalidRequest(
@@ -267,12 +267,12 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
 _LEAST_EIGENVALUE = 1e-12
 
 
-def _prior_covariance(given: Prior) -> Floats:
-    """The covariance (6, 6) of a prior; InvalidRequest where it is none."""
-    if given.covariance is None:
-        metres, radians = given.deviation_m, math.radians(given.deviation_deg)
+def _prior_covariance(prior: Prior) -> Floats:
+    """Return the covariance (6, 6) of a prior; InvalidRequest where it is not valid."""
+    if prior.covariance is None:
+        metres, radians = prior.deviation_m, math.radians(prior.deviation_deg)
         return np.diag(np.square([metres] * 3 + [radians] * 3))
-    covariance = np.array(given.covariance).reshape(6, 6)
+    covariance = np.array(prior.covariance).reshape(6, 6)
     variances = np.diag(covariance)
     if (variances > 0).all():
         deviations = np.sqrt(variances)
@@ -288,8 +288,11 @@ def _prior_covariance(given: Prior) -> Floats:
             )
         # no entry of a covariance is above the largest variance, and no product overflows then
         if np.abs(covariance).max() <= variances.max():
-            told = covariance / np.outer(deviations, deviations)
-            if np.allclose(told, told.T) and np.linalg.eigvalsh(told)[0] > _LEAST_EIGENVALUE:
+            correlation = covariance / np.outer(deviations, deviations)
+            if (
+                np.allclose(correlation, correlation.T)
+                and np.linalg.eigvalsh(correlation)[0] > _LEAST_EIGENVALUE
+            ):
                 return covariance
     raise InvalidRequest(
         "The covariance of the prior is not one: it must be symmetric with eigenvalues "
@@ -301,10 +304,10 @@ def _prior_covariance(given: Prior) -> Floats:
 def nearest_first(
     store: Store, ranking: Ranking, chosen: Sequence[int], prior: PosePrior, p: MapParameters
 ) -> list[int]:
-    """Candidates, positions in R, those that were taken near a prior first, else as they were."""
+    """Return candidates, as positions in R, those that were taken near a prior first."""
     with store.database.read() as connection:
-        found = viewpoints_among(connection, ranking.indices[list(chosen)].tolist())
-    posed = {one.number: one for one in found}
+        viewpoints = viewpoints_among(connection, ranking.indices[list(chosen)].tolist())
+    posed = {one.number: one for one in viewpoints}
 
     def far(position: int) -> bool:
         one = posed.get(int(ranking.indices[position]))
@@ -314,7 +317,7 @@ def nearest_first(
 
 
 def parent_key(row: FrameRow | FrameViewpoint) -> str:
-    """A parent frame by its map: another map may call its own the same."""
+    """Return a name of a parent frame that no other map has: the map's number and its own name."""
     return f"{row.map_number} {row.pose_parent}"
 
 
@@ -325,7 +328,7 @@ def _near_frames(
     number, _, name = parent.partition(" ")
     part = next(one for one in searched.parts if one.place.row.number == int(number))
     cells = np.unique(np.round(at[:, :3, 3] / p.cell), axis=0, return_index=True)[1]
-    found: dict[int, PlacedFrame] = {}
+    frames: dict[int, PlacedFrame] = {}
     with store.database.read() as connection:
         for centre in at[np.sort(cells)[:_MOST_PLACES], :3, 3].tolist():
             for within in (p.near, p.same_surfaces):
@@ -335,8 +338,8 @@ def _near_frames(
                 )  # fmt: skip
                 if len(near) == _NEAR_FRAMES:
                     break
-            found |= {one.number: one for one in near}
-    passing = set(found)
+            frames |= {one.number: one for one in near}
+    passing = set(frames)
     if part.among is not None:
-        passing = set(np.intersect1d(list(found), part.among).tolist())
-    return {n: one for n, one in found.items() if n in passing and n not in part.dead}
+        passing = set(np.intersect1d(list(frames), part.among).tolist())
+    return {n: one for n, one in frames.items() if n in passing and n not in part.dead}

@@ -1,4 +1,4 @@
-"""Sec. III-E, acceptance: what is known of a transform to whether it is believed, and its rivals.
+"""Sec. III-E, acceptance: decide by the evidence for a transform and its rivals to accept it.
 
     Evidence  --objection-->  why not        Evidence, ambiguity  --belief-->  how far
     Evidence, deviation  --sparse_evidence_suffices-->  whether little is enough
@@ -77,7 +77,7 @@ class AcceptanceParameters:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What speaks for and against a transform, before rivals are looked for.
+    """The evidence for and against a transform, before its rivals are searched.
 
     Parameters
     ----------
@@ -103,16 +103,16 @@ class Evidence:
     worst_violations: float = 0.0
 
     def total(self, p: AcceptanceParameters) -> float:
-        """For less against."""
+        """Return the overlap less the weighted violations."""
         return self.overlap - p.violation_weight * (self.violations or 0.0)
 
     def net(self, p: AcceptanceParameters) -> float:
-        """For less against, by planes."""
+        """Return the plane overlap less the weighted violations."""
         return self.plane_overlap - p.net_weight * (self.violations or 0.0)
 
 
 def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status, str] | None:
-    """Why not to accept, whatever the rivals: Sec. III-E. None where nothing speaks against it.
+    """Return why not to accept a transform, whatever its rivals, or None: Sec. III-E.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def sparse_evidence_suffices(
 def belief(
     e: Evidence, ambiguity: float, p: AcceptanceParameters
 ) -> tuple[Status, Strength | None, str]:
-    """How far to believe a transform that nothing but its rivals speaks against."""
+    """Return the status, strength and reason of a transform that has no objection but rivals."""
     most = min(p.ambiguous, p.ambiguous_share * e.plane_overlap)
     if e.violations is None:  # no rival is refuted by free space either
         most = p.blind_ambiguous_share * e.plane_overlap
@@ -220,7 +220,7 @@ def belief(
 
 
 def _two_digits(value: float) -> str:
-    """As people write it: 130, and never 1.3e+02."""
+    """Return a number with two digits and no exponent: 130, not 1.3e+02."""
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
@@ -250,10 +250,10 @@ class AmbiguityParameters:
 
 @cached_per_frame
 def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
-    """Motions that leave main planes of the patches in themselves.
+    """Return motions that map the main planes of the patches onto themselves.
 
-    Turns by 90, 180 and 270 degrees about the middle of each plane; and shifts along the direction
-    in which the two main families of planes both run, as a corridor does.
+    These are turns by 90, 180 and 270 degrees about the middle of each plane, and shifts along the
+    direction in which the two main families of planes both run, as a corridor does.
 
     Parameters
     ----------
@@ -266,7 +266,7 @@ def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
     """
     left = patches.areas.copy()
     normals, mass = np.ascontiguousarray(patches.normals.T), np.empty(len(patches))
-    found: list[Floats] = []
+    motions: list[Floats] = []
     axes: list[Floats] = []
     for _ in range(p.n_axes):
         _facing(normals, left, math.cos(p.same_direction), mass)
@@ -280,19 +280,19 @@ def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
         axis /= np.linalg.norm(axis)
         axes.append(axis)
         middles = _middles(patches, axis, np.where(across, left, 0.0), p)
-        found += _turns(axis, middles)
+        motions += _turns(axis, middles)
         left = np.where(across, 0.0, left)
     if len(axes) > 1:
         along = np.cross(axes[0], axes[1])
         length = float(np.linalg.norm(along))
         if length > p.least_crossing:
             steps = p.shift * np.arange(1, p.n_shifts + 1)
-            found += [_shift(along / length * s) for s in np.concatenate([steps, -steps])]
-    return np.array(found).reshape(-1, 4, 4)
+            motions += [_shift(along / length * s) for s in np.concatenate([steps, -steps])]
+    return np.array(motions).reshape(-1, 4, 4)
 
 
 def _middles(patches: Patches, axis: Floats, area: Floats, p: AmbiguityParameters) -> list[Floats]:
-    """Middles of the largest planes across an axis, of the patches that have an area."""
+    """Return the middles of the largest planes across an axis, of patches that have an area."""
     offsets, mass = (patches.means * axis).sum(axis=1), np.empty(len(patches))
     middles: list[Floats] = []
     for _ in range(p.n_planes):
@@ -308,9 +308,9 @@ def _middles(patches: Patches, axis: Floats, area: Floats, p: AmbiguityParameter
 
 @disjoint_kernel
 def _facing(normals: Floats, areas: Floats, cosine: float, mass: Floats) -> None:
-    """Area of the patches that face the way of each, or away from it; normals (3, P).
+    """Sum, for each patch, the areas of those that face its way or away from it; normals (3, P).
 
-    Each patch is added to all that it faces with, as this loop has no sum that must keep its order.
+    The inner loop runs over the sums, not over the terms of one sum, so that it vectorises.
     """
     x, y, z = normals[0], normals[1], normals[2]
     mass[:] = 0.0
@@ -323,7 +323,7 @@ def _facing(normals: Floats, areas: Floats, cosine: float, mass: Floats) -> None
 
 @disjoint_kernel
 def _level(offsets: Floats, areas: Floats, apart: float, mass: Floats) -> None:
-    """Area of the patches whose offset is near that of each; added up as in `_facing`."""
+    """Sum, for each patch, the areas of those with a near offset, as `_facing` does."""
     mass[:] = 0.0
     for j in range(len(areas)):
         offset, area = offsets[j], areas[j]
@@ -339,24 +339,24 @@ def _shift(by: Floats) -> Floats:
 
 
 def _turns(axis: Floats, middles: list[Floats]) -> list[Floats]:
-    """By a quarter, a half and three quarters about an axis through each of some points."""
+    """Return turns by 90, 180 and 270 degrees about an axis through each of some points."""
     x, y, z = axis
     cross, outer = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.outer(axis, axis)
     rotations = [
         cosine * np.eye(3) + sine * cross + (1 - cosine) * outer
         for cosine, sine in ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
     ]
-    found = []
+    turns = []
     for middle in middles:
         for R in rotations:
             turn = np.eye(4)
             turn[:3, :3], turn[:3, 3] = R, middle - R @ middle
-            found.append(turn)
-    return found
+            turns.append(turn)
+    return turns
 
 
 def far_from(T: Floats, others: Floats, p: AmbiguityParameters) -> Floats:
-    """Those of the others (n, 4, 4) that differ from T enough to be another answer."""
+    """Return those of the others (n, 4, 4) that differ from T enough to be rivals."""
     return others[~are_near(others, T, p.rival_m, p.rival_rad)]
 
 
@@ -381,7 +381,7 @@ def best_alternative(
     proposed: Floats, p: AmbiguityParameters, agreement_p: OverlapParameters,
     ups: Ups = NO_UPS, most_tilt: float = math.inf,
 ) -> Rival:  # fmt: skip
-    """How far the best rival of T explains the frames, and that rival: Sec. III-E.
+    """Return the best rival of T, and the share of the frames that it explains: Sec. III-E.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Confidence: the probability that a candidate pose is right, from what speaks for and against it.
+"""Confidence: the probability that a candidate pose is right, computed from its evidence.
 
     PlaceEvidence of every candidate  --confidences_of-->  P(right) of each, 1 at most together
     PlaceEvidence  --weakest_evidence-->  a sentence on what keeps it from being more
@@ -22,7 +22,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class PlaceEvidence:
-    """What speaks for and against a pose of the query.
+    """The evidence for and against a pose of the query.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class PlaceEvidence:
 
 @dataclass(frozen=True)
 class Penalty:
-    """What one kind of evidence takes from the logarithm of the odds, at its knots; 0 at the best.
+    """The reduction of the log odds by one kind of evidence, at its knots; 0 at the best knot.
 
     Parameters
     ----------
@@ -128,14 +128,14 @@ class ConfidenceParameters:
 
 
 def penalties_of(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, float]:
-    """Return what each kind of evidence takes from the logarithm of the odds: >= 0, by name."""
-    found = {}
+    """Return how much each kind of evidence reduces the log odds: >= 0, by name."""
+    penalties = {}
     for name, knots in KNOTS.items():
         values = getattr(p, name).values
         rising = knots[0] < knots[-1]
         xs, ys = (knots, values) if rising else (knots[::-1], values[::-1])
-        found[name] = float(np.interp(getattr(e, name), xs, ys))
-    return found
+        penalties[name] = float(np.interp(getattr(e, name), xs, ys))
+    return penalties
 
 
 def confidences_of(evidence: Sequence[PlaceEvidence], p: ConfidenceParameters) -> list[float]:
@@ -148,7 +148,7 @@ def confidences_of(evidence: Sequence[PlaceEvidence], p: ConfidenceParameters) -
 
     Returns
     -------
-    confidences : one for one; what they lack of 1 together is the probability that none is right
+    confidences : in the same order; 1 less their sum is the probability that none is right
     """
     odds = [math.exp(p.best - sum(penalties_of(e, p).values())) for e in evidence]
     whole = 1.0 + sum(odds)

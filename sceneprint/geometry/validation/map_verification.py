@@ -1,4 +1,4 @@
-"""Validation in the map: poses of a query compared on all frames that would see the same surfaces.
+"""Verification in the map: compare poses of a query on all frames that would see its surfaces.
 
     query, poses, MapViews  --compare_poses-->  ScoredPose, the best of each place first
 
@@ -67,7 +67,7 @@ class MapParameters:
 
 @dataclass(frozen=True, eq=False)
 class MapFrame:
-    """A posed frame as poses are scored on it.
+    """A frame with a pose, prepared for scoring other poses on it.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class MapFrame:
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose:
-    """A pose of the query, and how the map's frames bear it out.
+    """A pose of the query with its score on the map's frames.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ class MapViews:
         self._frames: dict[int, MapFrame | None] = {}
 
     def __getitem__(self, i: int) -> MapFrame | None:
-        """The i-th frame, or None where its artifact cannot be read."""
+        """Return the i-th frame, or None where its artifact cannot be read."""
         if i not in self._frames:
             geometry = self._open(i)
             self._frames[i] = None if geometry is None else map_frame(
@@ -160,7 +160,7 @@ class MapViews:
         return self._frames[i]
 
     def near(self, T: Floats, ahead: bool, among: NDArray[np.intp] | None = None) -> list[int]:
-        """The frames that most likely see what a sensor at T sees, nearest first.
+        """Return the frames that most likely see what a sensor at T sees, nearest first.
 
         Parameters
         ----------
@@ -181,7 +181,7 @@ class MapViews:
 def map_frame(
     geometry: Geometry, T: Floats, p: MapParameters, overlap_p: OverlapParameters
 ) -> MapFrame:
-    """A frame made ready to be compared with others of its parent frame.
+    """Return a frame prepared for comparison with others of its parent frame.
 
     Parameters
     ----------
@@ -194,8 +194,9 @@ def map_frame(
 
 
 def looks_ahead(geometry: Geometry) -> bool:
-    """Whether it is known where the sensor looks: along z, as depth cameras do. Clouds keep axes
-    of any kind, and many see all around.
+    """Return whether the sensor looks along z, as depth cameras do.
+
+    Clouds may have any axes, and many scanners see all around.
     """
     return isinstance(geometry.surface.camera, Intrinsics)
 
@@ -203,8 +204,9 @@ def looks_ahead(geometry: Geometry) -> bool:
 def view_separations(
     poses: Floats, look_ahead: NDArray[np.bool_], T: Floats, ahead: bool, p: MapParameters
 ) -> Floats:
-    """How far the views of sensors lie from that of a sensor at T: (n,), from 1 on too far to share
-    surfaces.
+    """Return how far the views of sensors are from that of a sensor at T: (n,).
+
+    Views at 1 or more are too far apart to share surfaces.
 
     Parameters
     ----------
@@ -227,7 +229,7 @@ def score_pose(
     frames: Sequence[MapFrame], T: Floats, views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters, among: NDArray[np.intp] | None = None,
 ) -> ScoredPose:  # fmt: skip
-    """How the map's frames bear a pose of the query out.
+    """Score a pose of the query on the map's frames.
 
     Parameters
     ----------
@@ -274,7 +276,7 @@ def score_pose(
 def map_noise(
     pose: ScoredPose, views: MapViews, p: MapParameters, overlap_p: OverlapParameters
 ) -> float:
-    """Violations that the frames that bear a pose out show among themselves: their median.
+    """Return the median violations among the map's frames that agree with a pose.
 
     Poses that drift and things that were moved let free space speak against right poses too.
 
@@ -283,22 +285,22 @@ def map_noise(
     pose : of `score_pose`
     views, p, overlap_p : see there
     """
-    found = []
+    noises = []
     agreeing = np.unique([i for _, i in pose.views])
     for _, i in pose.views[: p.n_noise]:
         view = views[i]
         if view is not None:
             alone = replace(view, T=np.eye(4))
             own = score_pose([alone], view.T, views, p, overlap_p, agreeing[agreeing != i])
-            found.append(own.violations + own.hidden)
-    return float(np.median(found)) if found else 0.0
+            noises.append(own.violations + own.hidden)
+    return float(np.median(noises)) if noises else 0.0
 
 
 def refined_pose(
     frames: Sequence[MapFrame], pose: ScoredPose, views: MapViews, p: MapParameters
 ) -> Floats | None:
-    """A pose refined on the views that share most with it, and averaged: (4, 4), or None."""
-    found = []
+    """Return a pose refined on the views that share most with it, and averaged: (4, 4), or None."""
+    refined = []
     for number, i in pose.views[: p.n_refining]:
         frame, view = frames[number], views[i]
         if view is None:
@@ -306,8 +308,8 @@ def refined_pose(
         start = inverse(view.T) @ pose.T @ frame.T
         T = refined_at(frame.geometry, view.geometry, start, p.refinement)
         if T is not None:
-            found.append(view.T @ T @ inverse(frame.T))
-    return average_poses(np.stack(found)).T if found else None
+            refined.append(view.T @ T @ inverse(frame.T))
+    return average_poses(np.stack(refined)).T if refined else None
 
 
 def starts_about(T: Floats, covariance: Floats, p: MapParameters) -> Floats:
@@ -331,13 +333,13 @@ def refined_starts(
     frames: Sequence[MapFrame], starts: Floats, views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> Floats:  # fmt: skip
-    """Where the map draws poses (n, 4, 4) that are believed beforehand: (m, 4, 4)."""
-    found = []
+    """Return poses of a prior (n, 4, 4) after refinement on the map: (m, 4, 4)."""
+    refined = []
     for start in starts:
         T = refined_pose(frames, score_pose(frames, start, views, p, overlap_p), views, p)
         if T is not None:
-            found.append(T)
-    return np.array(found).reshape(-1, 4, 4)
+            refined.append(T)
+    return np.array(refined).reshape(-1, 4, 4)
 
 
 def compare_poses(
@@ -401,12 +403,12 @@ def _refined_places(
 
 
 def _hopeful(places: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
-    """Those that may yet come near the best of them, which is the first."""
+    """Return the places whose score may still come near that of the first, which is the best."""
     return [one for one in places if one is places[0] or one.score >= p.hopeful * places[0].score]
 
 
 def best_of_places(scored: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
-    """The best pose of each place, best first; equals in the order they came."""
+    """Return the best pose of each place, best first; ties keep their order."""
     places: list[ScoredPose] = []
     for one in sorted(scored, key=lambda pose: -pose.score):
         if not places or not at_place(np.stack([other.T for other in places]), one.T, p).any():
@@ -415,16 +417,16 @@ def best_of_places(scored: list[ScoredPose], p: MapParameters) -> list[ScoredPos
 
 
 def same_place(a: Floats, b: Floats, p: MapParameters) -> bool:
-    """Whether two poses (4, 4) are one answer."""
+    """Return whether two poses (4, 4) are at one place."""
     return bool(at_place(a[None], b, p)[0])
 
 
 def at_place(poses: Floats, T: Floats, p: MapParameters) -> NDArray[np.bool_]:
-    """Which of some poses (n, 4, 4) are one answer with T: (n,)."""
+    """Return which of some poses (n, 4, 4) are at the place of T: (n,)."""
     return are_near(poses, T, p.place_m, p.place_rad)
 
 
 def different_views(viewpoints: Floats, p: MapParameters) -> list[int]:
-    """Indices of the first of some views (n, 4, 4) from each viewpoint."""
+    """Return the indices of the first of some views (n, 4, 4) from each viewpoint."""
     order = -np.arange(len(viewpoints), dtype=float)
     return distinct(viewpoints, order, p.same_m, p.same_rad, len(viewpoints))

@@ -1,4 +1,4 @@
-"""Sec. III-E, validation: two frames to a rigid transform, and whether to believe it.
+"""Sec. III-E, validation: align two frames by a rigid transform, and decide whether it is right.
 
     Geometry, Geometry, seed  --validate-->  Validation
     validations  --preferred-->  C_vld
@@ -105,7 +105,7 @@ class ValidationParameters:
 
 @dataclass(frozen=True, eq=False)
 class PairValidation:
-    """What came of aligning a query with a candidate match.
+    """The result of aligning a query with a candidate match.
 
     Parameters
     ----------
@@ -176,12 +176,12 @@ class PairValidation:
 
     @property
     def guided(self) -> bool:
-        """Whether other matches gave the transform: it is no evidence of its own for the pose."""
+        """Whether other matches predicted the transform, so that it is no vote of its own."""
         return self.predicted is not None
 
 
 def middle(a: Floats, b: Floats) -> Floats:
-    """The transform halfway between two that are near each other: (4, 4)."""
+    """Return the transform halfway between two that are near each other: (4, 4)."""
     result = np.eye(4)
     result[:3, :3] = nearest_rotation(a[:3, :3] + b[:3, :3])
     result[:3, 3] = (a[:3, 3] + b[:3, 3]) / 2
@@ -191,7 +191,7 @@ def middle(a: Floats, b: Floats) -> Floats:
 def refined_at(
     query: Geometry, match: Geometry, T_match_query: Floats, p: RefinementParameters | None = None
 ) -> Floats | None:
-    """Both directions refined from one given transform, and their middle.
+    """Refine a transform in both directions, and return the middle of the two.
 
     What is left of the error when the start was the truth is the sensors' and the reference
     poses', not that of the search.
@@ -258,8 +258,8 @@ def validate(
     back: Alignment | None
     if are_scans(query, match):
         rng = np.random.default_rng((seed, 0))
-        found = align_scans(a, b, rng, *numbers, other_axes=other_axes)
-        there, back = found or (None, None)
+        aligned = align_scans(a, b, rng, *numbers, other_axes=other_axes)
+        there, back = aligned or (None, None)
     else:
         there, back = both(
             lambda: align(a, b, np.random.default_rng((seed, 0)), *numbers),
@@ -313,14 +313,14 @@ def validate_guided(
     )
     if there is None or back is None:
         return None
-    found = _decided(a, b, there, back, seed, p, "full")
-    if found.status != "accepted" or found.T_match_query is None:
+    validation = _decided(a, b, there, back, seed, p, "full")
+    if validation.status != "accepted" or validation.T_match_query is None:
         return None
-    metres, radians = difference(found.T_match_query, T_match_query)
+    metres, radians = difference(validation.T_match_query, T_match_query)
     if metres > p.guided_m or radians > p.guided_rad:
         return None
     reason = "surfaces agree where other matches place the query"
-    return replace(found, reason=reason, predicted=T_match_query)
+    return replace(validation, reason=reason, predicted=T_match_query)
 
 
 def validate_without_up(
@@ -346,18 +346,23 @@ def validate_without_up(
     validation : or None where it adds nothing to what is known
     """
     p = p or ValidationParameters()
-    found = validate(query, match, seed, p)
-    if found.status != "accepted":
+    validation = validate(query, match, seed, p)
+    if validation.status != "accepted":
         return None
-    found = replace(found, ups=ups, tilt_rad=tilt_of(found.T_match_query, ups))
+    validation = replace(validation, ups=ups, tilt_rad=tilt_of(validation.T_match_query, ups))
     gravity = p.alignment.gravity
-    if found.tilt_rad is None or found.tilt_rad <= gravity.refined_tilt:
-        return found
-    if found.strength != "strong":
+    if validation.tilt_rad is None or validation.tilt_rad <= gravity.refined_tilt:
+        return validation
+    if validation.strength != "strong":
         return None
-    why = contradiction(found.tilt_rad, query, match, ups, gravity)
+    why = contradiction(validation.tilt_rad, query, match, ups, gravity)
     return replace(
-        found, status="rejected", strength=None, reason=why, covariance=None, contradicts_up=True
+        validation,
+        status="rejected",
+        strength=None,
+        reason=why,
+        covariance=None,
+        contradicts_up=True,
     )
 
 
@@ -426,12 +431,14 @@ def _decided(
     query: FrameSamples, match: FrameSamples, there: Alignment | None, back: Alignment | None,
     seed: int, p: ValidationParameters, mode: Mode,
 ) -> PairValidation:  # fmt: skip
-    residual, found = _estimates(there, back, p.acceptance)
+    residual, estimates = _estimates(there, back, p.acceptance)
     found_by = tuple(one for one in (there, back) if one is not None)
-    transforms = list(found.values())
+    transforms = list(estimates.values())
     seen = explained(query.planes, match.planes, np.stack(transforms), p.agreement)
     best = int(np.argmax(seen.share - p.alignment.rank_violations * seen.violations))
-    (directions, T), *others = sorted(found.items(), key=lambda one: one[1] is not transforms[best])
+    (directions, T), *others = sorted(
+        estimates.items(), key=lambda one: one[1] is not transforms[best]
+    )
     evidence = _evidence(query, match, found_by, T, residual, seen, best, p)
     one = _Proposal(T, directions, found_by, *evidence)
     verdict = _verdict(query, match, one, there, back, p, mode)
@@ -544,20 +551,20 @@ def _refined_both_ways(
 
 
 def _hypotheses(
-    there: Alignment | None, back: Alignment | None, found: Sequence[Floats],
+    there: Alignment | None, back: Alignment | None, estimates: Sequence[Floats],
     T_rival: Floats | None, each: int,
 ) -> Floats:  # fmt: skip
-    """What was found, the rival, and the next best of each direction: T_match_query (n, 4, 4)."""
-    told = [*found] if T_rival is None else [*found, T_rival]
+    """Return the estimates, the rival, and the next best of each direction: (n, 4, 4)."""
+    hypotheses = [*estimates] if T_rival is None else [*estimates, T_rival]
     if there is not None:
-        told += [*there.others[:each]]
+        hypotheses += [*there.others[:each]]
     if back is not None:
-        told += [*inverses(back.others[:each])]
-    return np.array(told)
+        hypotheses += [*inverses(back.others[:each])]
+    return np.array(hypotheses)
 
 
 def _tilted(tilt: float | None, p: ValidationParameters) -> tuple[Status, str] | None:
-    """The last refinement may have left what the search let pass."""
+    """Reject a transform that the last refinement tilted more than the search allows."""
     if tilt is None or tilt <= p.alignment.gravity.refined_tilt:
         return None
     return "rejected", f"it tilts by {math.degrees(tilt):.0f} deg against `up`"
@@ -566,9 +573,10 @@ def _tilted(tilt: float | None, p: ValidationParameters) -> tuple[Status, str] |
 def _estimates(
     there: Alignment | None, back: Alignment | None, p: AcceptanceParameters
 ) -> tuple[tuple[float, float], dict[tuple[Direction, ...], Floats]]:
-    """The residual of the two directions, metres and radians, and T_match_query by who found it.
+    """Return the residual of the two directions, and T_match_query by the directions that found it.
 
-    It is the one halfway between them where they agree; halfway between two places is neither.
+    Where the directions agree, the transform is halfway between them. Where they do not, each keeps
+    its own, as halfway between two places is neither.
     """
     if there is not None and back is not None:
         composed = there.T @ back.T  # reading R5: the residual transform T_Q^X T_X^Q itself
@@ -577,12 +585,12 @@ def _estimates(
         if metres <= p.residual_m and radians <= p.residual_rad:
             return (metres, radians), {(THERE, BACK): middle(there.T, inverse(back.T))}
         return (metres, radians), {(THERE,): there.T, (BACK,): inverse(back.T)}
-    found: dict[tuple[Direction, ...], Floats] = {}
+    by_direction: dict[tuple[Direction, ...], Floats] = {}
     if there is not None:
-        found[(THERE,)] = there.T
+        by_direction[(THERE,)] = there.T
     if back is not None:
-        found[(BACK,)] = inverse(back.T)
-    return (math.inf, math.inf), found
+        by_direction[(BACK,)] = inverse(back.T)
+    return (math.inf, math.inf), by_direction
 
 
 def _sees_around(frame: Geometry) -> bool:
@@ -594,9 +602,7 @@ def _evidence(
     query: FrameSamples, match: FrameSamples, found_by: Sequence[Alignment], T: Floats,
     residual: tuple[float, float], by_planes: Explained, k: int, p: ValidationParameters,
 ) -> tuple[Evidence, int]:  # fmt: skip
-    """What speaks for a transform, number k of those explained, and against it; how many points
-    agree under it.
-    """
+    """Return the evidence for transform `k` of those explained, and how many points agree."""
     of_query = overlap_counts(query.points, match.geometry.surface, T, p.agreement)
     of_match = overlap_counts(match.points, query.geometry.surface, inverse(T), p.agreement)
     inliers = of_query.inliers + of_match.inliers
@@ -626,7 +632,7 @@ _ERROR_PER_RADIAN = 0.04
 
 
 def preferred(validations: Sequence[PairValidation]) -> list[int]:
-    """Positions of the accepted: strong before weak, and of either the most precise first.
+    """Return the positions of accepted validations: strong before weak, each most precise first.
 
     The paper keeps the order of R. A weak match has a rival that explains the frames nearly as
     well, so a later strong one goes before it. Of cameras, that with the least expected error
@@ -648,10 +654,10 @@ def preferred(validations: Sequence[PairValidation]) -> list[int]:
 
 
 def expected_error(validation: PairValidation) -> float:
-    """Metres by which a transform of cameras is likely off.
+    """Return by how many metres a transform between cameras is likely off.
 
-    The deviation of its translation and an error that grows with the angle between the views,
-    added in quadrature; infinite where the covariance is not known.
+    It is the deviation of the translation and an error that grows with the angle between the views,
+    added in quadrature. It is infinite where the covariance is not known.
     """
     T, covariance = validation.T_match_query, validation.covariance
     if T is None or covariance is None:
@@ -661,6 +667,6 @@ def expected_error(validation: PairValidation) -> float:
 
 
 def _away(validation: PairValidation) -> float:
-    """Metres between the two sensors."""
+    """Return the distance between the two sensors, metres."""
     T = validation.T_match_query
     return 0.0 if T is None else float(np.linalg.norm(T[:3, 3]))

@@ -1,4 +1,4 @@
-"""A query validated against its candidates, and judged by the true poses.
+"""Validate a query against its candidates, and judge the results by the true poses.
 
 Task  --judge-->  Judged: pairs, averaged poses
 """
@@ -103,7 +103,7 @@ class QueryTask:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """What came of a task; fields as in Outcome."""
+    """The result of a task; fields as in QueryOutcome."""
 
     pairs: dict[int, ValidatedPair]
     average: Error
@@ -161,7 +161,7 @@ def open_judge(
 
 
 def voters(parents: Sequence[str], strong: Sequence[bool], most: int = 5) -> list[int]:
-    """Positions of the matches whose poses may be averaged: those of one parent frame.
+    """Return the positions of the matches whose poses may be averaged: those of one parent frame.
 
     The parent frame with most strong matches votes, and of equals the one with most matches; of
     these, the one whose match comes first.
@@ -186,7 +186,7 @@ def voters(parents: Sequence[str], strong: Sequence[bool], most: int = 5) -> lis
 
 
 def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
-    """The first accepted views of the scene with most accepted views, strong ones first.
+    """Return the first accepted views of the scene with most of them, strong ones first.
 
     Poses are comparable within one scene only; see `voters`.
 
@@ -252,7 +252,7 @@ def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -
 
 
 class _Recording:
-    """The database of an evaluation, as `decide` asks it for one query."""
+    """The frames of an evaluation that one query searches."""
 
     def __init__(self, judging: Judge, task: QueryTask, prior: PosePrior | None) -> None:
         self._judging, self._task, self._prior = judging, task, prior
@@ -310,7 +310,7 @@ class _Recording:
         return self._judging.geometry(self._judging.database[row].number)
 
     def _is_far(self, row: int) -> bool:
-        """Whether a prior expects no frame of this row."""
+        """Return whether a frame was taken too far from the prior to show the same."""
         prior = self._prior
         return prior is not None and not (
             self._scenes[row] == prior.parent and prior.reaches(self._poses[row], self.p.map)
@@ -318,14 +318,14 @@ class _Recording:
 
 
 def _judged_answer(
-    told: PoseEstimate, task: QueryTask, p: LocalizationParameters, spent: float
+    estimate: PoseEstimate, task: QueryTask, p: LocalizationParameters, spent: float
 ) -> JudgedAnswer:
     """Return an answer with the places that it was chosen from, judged by the true pose."""
 
     def error_of(T: Floats) -> Error:
-        return pose_error(T, task.pose) if told.parent == task.scene else Error()
+        return pose_error(T, task.pose) if estimate.parent == task.scene else Error()
 
-    known = [(one, one.evidence) for one in told.places if one.evidence is not None]
+    known = [(one, one.evidence) for one in estimate.places if one.evidence is not None]
     confidences = confidences_of([evidence for _, evidence in known], p.judgement)
     places = []
     for i in sorted(range(len(known)), key=lambda i: -confidences[i]):
@@ -335,8 +335,8 @@ def _judged_answer(
         places.append(JudgedPlace(evidence, confidences[i], error, right))
     # as far off as places are apart, so that a scan may be off by more than a depth image
     limits = RIGHT[0] * p.map.place_m / MapParameters.place_m, RIGHT[1]
-    error = Error() if told.average is None else error_of(told.average.T)
-    return JudgedAnswer(told.status, told.strength, error, spent, tuple(places), limits)
+    error = Error() if estimate.average is None else error_of(estimate.average.T)
+    return JudgedAnswer(estimate.status, estimate.strength, error, spent, tuple(places), limits)
 
 
 def _ranking_of(judging: Judge, task: QueryTask, rows: Sequence[int]) -> Ranking:
@@ -354,13 +354,13 @@ def _ranking_of(judging: Judge, task: QueryTask, rows: Sequence[int]) -> Ranking
 
 
 def true_transform(task: QueryTask, candidate: Candidate) -> Floats:
-    """T_match_query by the true poses."""
+    """Return T_match_query by the true poses."""
     T: Floats = inverse(candidate.pose) @ task.pose
     return T
 
 
 def validated(judging: Judge, task: QueryTask, candidate: Candidate) -> ValidatedPair:
-    """What validation makes of a query and one candidate, and how far off it is."""
+    """Return the validation of a query and one candidate, with its error."""
     query, match = judging.geometry(task.number), judging.geometry(candidate.number)
     start = time.perf_counter()
     validation = validate(query, match, judging.seed, judging.p, judging.mode, judging.matching)
@@ -380,7 +380,7 @@ def validated(judging: Judge, task: QueryTask, candidate: Candidate) -> Validate
 
 
 def refined_from_truth(judging: Judge, task: QueryTask, candidate: Candidate) -> Floats | None:
-    """Where refinement ends that is started at the true pose; see `refined_at`."""
+    """Return the transform that refinement reaches from the true pose; see `refined_at`."""
     query, match = judging.geometry(task.number), judging.geometry(candidate.number)
     return refined_at(query, match, true_transform(task, candidate), judging.p.alignment.fine)
 
@@ -388,7 +388,7 @@ def refined_from_truth(judging: Judge, task: QueryTask, candidate: Candidate) ->
 def _average(
     task: QueryTask, of: dict[int, Candidate], transforms: dict[int, Floats | None]
 ) -> Error:
-    """Error of the pose averaged over views of one scene; infinite without views."""
+    """Return the error of the pose averaged over views of one scene; infinite without views."""
     poses = [of[match].pose @ T for match, T in transforms.items() if T is not None]
     if not poses or any(of[match].scene != task.scene for match in transforms):
         return Error()
@@ -458,7 +458,7 @@ def rank(
     whole = len(database) ** 2 <= len(queries) * size**2
     among = pairwise_distances(database, metric) if whole and len(queries) else None
     rows = _rows(queries, database, metric)
-    found = []
+    rankings = []
     for i, (row, spent) in enumerate(watch(rows, "rank", len(queries))):
         start = time.perf_counter()
         index = np.flatnonzero(allowed[i])
@@ -475,12 +475,12 @@ def rank(
         selection = diversify(row[ranking], within, candidates)
         ms["diversify"] = 1e3 * (time.perf_counter() - start)
         chosen = ranking[selection.indices]
-        found.append(Ranked(ranking.tolist(), row[ranking], chosen.tolist(), ms))
-    return found
+        rankings.append(Ranked(ranking.tolist(), row[ranking], chosen.tolist(), ms))
+    return rankings
 
 
 def _rows(queries: Bytes, database: Bytes, metric: Metric) -> Iterable[tuple[Ints64, float]]:
-    """Distances of each query to the database, and the milliseconds they took."""
+    """Yield the distances of each query to the database, and the milliseconds they took."""
     for begin in range(0, len(queries), BLOCK):
         start = time.perf_counter()
         block = cross_distances(queries[begin : begin + BLOCK], database, metric)

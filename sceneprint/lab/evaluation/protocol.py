@@ -1,4 +1,4 @@
-"""Frames read, signed and laid aside, so that every later stage takes what it needs.
+"""Read, sign and store the frames of an evaluation, for every later stage to take what it needs.
 
 Protocol  --prepare_all-->  Member, ... and what could not be used; depth and geometry in a Store
 """
@@ -34,6 +34,7 @@ from sceneprint.geometry.validation.validation import (
     ValidationParameters,
     preferred,
 )
+from sceneprint.localization import LocalizationStatus
 from sceneprint.models import Model
 from sceneprint.models.model import AnswerParameters
 from sceneprint.pipeline import Signer, open_signer, prepare
@@ -62,8 +63,6 @@ RIGHT = (0.10, 10.0)
 PLACE_DEG = 10.0
 #: An answer beyond these is another place, not an inaccurate one.
 GROSS = (0.50, 15.0)
-
-AnswerStatus = Literal["found", "ambiguous", "not_found"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +156,7 @@ class JudgedPlace:
 
 @dataclass(frozen=True, eq=False)
 class JudgedAnswer:
-    """What a robot is told of a query, and how far off that is.
+    """The answer to a query, and its error.
 
     Parameters
     ----------
@@ -169,7 +168,7 @@ class JudgedAnswer:
     limits : metres and degrees to which a pose is to be right; those of a depth camera by default
     """
 
-    status: AnswerStatus = "not_found"
+    status: LocalizationStatus = "not_found"
     strength: Strength | None = None
     error: Error = Error()
     milliseconds: float = 0.0
@@ -228,11 +227,11 @@ class QueryOutcome:
     answer: JudgedAnswer = JudgedAnswer()
 
     def overlap_of(self, match: int) -> float:
-        """Overlap with a database frame, by the definition of retrieval."""
+        """Return the overlap with a database frame, by the definition of retrieval."""
         return float(self.overlap_mean[np.searchsorted(self.allowed, match)])
 
     def views(self, of: str) -> list[ValidatedPair]:
-        """The pairs of a row in the order in which it answers with them.
+        """Return the pairs of a row in the order in which it answers with them.
 
         Parameters
         ----------
@@ -244,7 +243,7 @@ class QueryOutcome:
         return pairs if of in ("R", "DR") else in_preferred_order(pairs)
 
     def tried(self) -> list[ValidatedPair]:
-        """All pairs of C as `associate` gives them: VDR's views, then the others as ranked."""
+        """Return all pairs of C in the order of `associate`: VDR's views, then the others."""
         first = self.views("VDR")
         return first + [pair for pair in self.views("DR") if not pair.accepted]
 
@@ -255,7 +254,7 @@ def in_preferred_order(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
 
 
 def pose_error(T: Floats, truth: Floats) -> Error:
-    """How far apart two (4, 4) rigid transforms between the same two frames are."""
+    """Return the difference of two (4, 4) rigid transforms between the same two frames."""
     return Error(*difference(T, truth))
 
 
@@ -329,7 +328,7 @@ class Overlaps:
 
 
 def view_of(frame: AnyFrame) -> AnyView:
-    """What overlap reads of a frame with a pose."""
+    """Return what the overlap of a frame with a pose is computed from."""
     if frame.pose is None:
         raise ValueError(f"{frame.name} has no pose")
     if isinstance(frame, Cloud):
@@ -392,16 +391,16 @@ def _shares(points: Floats, view: AnyView) -> tuple[float, float]:
 
 
 def overlap(a: AnyView, b: AnyView) -> tuple[float, float]:
-    """Overlap of two frames of one parent frame: (mean, least) as in `Overlaps`."""
+    """Return the overlap of two frames of one parent frame: (mean, least) as in `Overlaps`."""
     there, back = _shares(a.samples, b), _shares(b.samples, a)
     return (there[0] + back[0]) / 2, min(there[1], back[1])
 
 
 def overlaps(queries: Sequence[AnyView], database: Sequence[AnyView]) -> Overlaps:
-    """Overlap of every query with every database frame of the same parent frame."""
-    found = np.array([[overlap(q, d) for d in database] for q in queries], float)
-    found = found.reshape(len(queries), len(database), 2)
-    return Overlaps(found[..., 0], found[..., 1])
+    """Return the overlap of every query with every database frame of the same parent frame."""
+    shares = np.array([[overlap(q, d) for d in database] for q in queries], float)
+    shares = shares.reshape(len(queries), len(database), 2)
+    return Overlaps(shares[..., 0], shares[..., 1])
 
 
 # How far a sensor had come between two frames of one run.
@@ -410,7 +409,7 @@ def overlaps(queries: Sequence[AnyView], database: Sequence[AnyView]) -> Overlap
 
 
 def travelled(queries: Sequence[SignedFrame], database: Sequence[SignedFrame]) -> Floats:
-    """Metres of path from each database frame to each query.
+    """Return the metres of path from each database frame to each query.
 
     The path leads through the frames of a run that take part, straight from each to the next:
     with every tenth frame alone it is a little shorter than it was.
@@ -604,13 +603,13 @@ class EvaluationProtocol:
 
 
 def parse_ranges(text: str) -> Ranges:
-    """Ranges such as 0:600, 0:600:2, 650: or 0:25+50:75.
+    """Parse ranges such as 0:600, 0:600:2, 650: or 0:25+50:75.
 
     Raises
     ------
     DatasetError : it is none of these, a range is empty, or its step is 0.
     """
-    found = []
+    ranges = []
     for one in text.split("+"):
         match = _RANGE.fullmatch(one.strip())
         if match is None:
@@ -623,12 +622,12 @@ def parse_ranges(text: str) -> Ranges:
             raise DatasetError(
                 f"{text!r} holds no frame. STOP must exceed START, and STEP be 1 up."
             )
-        found.append(Range(start, stop, step))
-    return tuple(found)
+        ranges.append(Range(start, stop, step))
+    return tuple(ranges)
 
 
 def parse_part(text: str) -> PathRanges:
-    """A PATH, or PATH@db=RANGES,queries=RANGES with either of the two.
+    """Parse PATH, or PATH@db=RANGES,queries=RANGES with either of the two.
 
     Raises
     ------
@@ -659,7 +658,7 @@ def choose(
     shared: bool = False,
     find: Callable[[Path], tuple[Run, ...]] = find_sequences,
 ) -> EvaluationProtocol:
-    """Tell the frames of each path to the database or the queries; no frame is read.
+    """Assign the frames of each path to the database or the queries; no frame is read.
 
     A path's own ranges go before `database` and `queries`, and these before the split files of
     its scenes.
@@ -709,7 +708,7 @@ def choose(
 
 
 def every_frame(paths: Sequence[Path]) -> tuple[ProtocolFrame, ...]:
-    """All frames of all paths, in order, each as a query; no frame is read.
+    """Return all frames of all paths, in order, each as a query; no frame is read.
 
     Raises
     ------
@@ -803,7 +802,7 @@ class FrameStore:
     folder: Path
 
     def keep(self, number: int, frame: AnyFrame, geometry: Geometry) -> None:
-        """Lay a frame aside."""
+        """Store a frame."""
         (self.folder / f"{number}.geometry").write_bytes(write_geometry(geometry))
         if isinstance(frame, Cloud):
             seen = "seen" if frame.has_viewpoint else "fused"
@@ -815,7 +814,7 @@ class FrameStore:
         np.save(self.folder / f"{number}.camera.npy", camera)
 
     def frame(self, member: SignedFrame) -> AnyFrame:
-        """The depth image or cloud again, with the pose of the evaluation."""
+        """Read a stored depth image or cloud, with the pose of the evaluation."""
         for has_viewpoint, seen in ((True, "seen"), (False, "fused")):
             if (path := self.folder / f"{member.number}.{seen}.npy").exists():
                 return Cloud(np.load(path), has_viewpoint, member.name, member.pose)
@@ -825,7 +824,7 @@ class FrameStore:
         return DepthFrame(depth, camera, member.name, member.pose)
 
     def geometry(self, number: int) -> Geometry:
-        """What validation needs of the frame, as a service would load it."""
+        """Read the geometry of a frame, as a service would load it."""
         return read_geometry((self.folder / f"{number}.geometry").read_bytes())
 
 
@@ -876,7 +875,7 @@ def prepare_all(
     cache_dir: Path | None = None,
     watch: Watch = unwatched,
 ) -> Prepared:
-    """Read, sign and lay aside every frame.
+    """Read, sign and store every frame.
 
     A frame without a pose cannot be judged, and is left out; but a database frame of a scene
     that no query is of needs none, as it is wrong wherever it lies.
@@ -891,9 +890,9 @@ def prepare_all(
     cache_dir : of derived files of the model
     watch : told of each frame
     """
-    asked = {one.scene for one in chosen if one.is_for("query")}
+    scenes = {one.scene for one in chosen if one.is_for("query")}
     length = signer.model.level_length * levels if levels else None
-    tasks = [_Task(i, one, one.scene in asked, length) for i, one in enumerate(chosen)]
+    tasks = [_Task(i, one, one.scene in scenes, length) for i, one in enumerate(chosen)]
     # a process of its own opens the model itself: a table is too large to send
     own = signer if jobs == 1 else signer.model
     results = map_over(tasks, _prepare, partial(_open, own, cache_dir, store), jobs)

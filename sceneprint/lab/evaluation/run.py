@@ -1,4 +1,4 @@
-"""An evaluation: all frames signed, every query asked, and its answers judged.
+"""Evaluate a recording: sign all frames, answer every query, and judge the answers.
 
 EvaluationProtocol, Signer  --evaluate-->  Evaluation
 """
@@ -57,7 +57,7 @@ _TRIES = 200
 
 
 def plane_share(samples: Floats, off: float = OFF_PLANE) -> float:
-    """Share of samples in the plane that holds most; the same each time.
+    """Return the share of samples in the plane that holds most; the same each time.
 
     Found without normals and patches, so that the choice of frames owes nothing to the method
     that is judged on them.
@@ -97,7 +97,7 @@ BLOCK = 256
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """How to evaluate.
+    """The settings of an evaluation.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ class EvaluationSettings:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What came of every query.
+    """The outcomes of all queries.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def _check_used(protocol: EvaluationProtocol, prepared: Prepared) -> None:
 def _scenes(
     protocol: EvaluationProtocol, prepared: Prepared, settings: EvaluationSettings
 ) -> Iterator[tuple[str, NDArray[np.intp], NDArray[np.intp]]]:
-    """Scenes to be evaluated alone, with the numbers of their queries and database frames."""
+    """Yield the scenes to evaluate alone, with the numbers of their queries and database frames."""
     scenes = list(dict.fromkeys(q.scene for q in prepared.queries))
     if not protocol.split or len(scenes) < 2 or settings.absent:
         return
@@ -250,7 +250,7 @@ def _scenes(
 def _allowed(
     prepared: Prepared, truth: Overlaps, settings: EvaluationSettings
 ) -> NDArray[np.bool_]:
-    """Which database frames a query may find, (Q, N)."""
+    """Return which database frames a query may find, (Q, N)."""
     allowed = np.ones(truth.mean.shape, np.bool_)
     if settings.absent:
         scenes = [np.array([m.scene for m in of]) for of in (prepared.queries, prepared.database)]
@@ -263,7 +263,7 @@ def _allowed(
 
 
 def overlaps_of(prepared: Prepared, store: FrameStore, watch: Watch = unwatched) -> Overlaps:
-    """Overlap of every query with every database frame; 0 between scenes."""
+    """Return the overlap of every query with every database frame; 0 between scenes."""
     shape = len(prepared.queries), len(prepared.database)
     mean, least = np.zeros(shape), np.zeros(shape)
     steps = _steps(prepared, store)
@@ -278,7 +278,7 @@ def overlaps_of(prepared: Prepared, store: FrameStore, watch: Watch = unwatched)
 def _steps(
     prepared: Prepared, store: FrameStore
 ) -> Iterator[tuple[int, AnyView, int, list[AnyView]]]:
-    """Each query with each block of the database; two blocks are in memory at a time."""
+    """Yield each query with each block of the database; two blocks are in memory at a time."""
     for first in range(0, len(prepared.queries), BLOCK):
         own = [view_of(store.frame(m)) for m in prepared.queries[first : first + BLOCK]]
         for begin in range(0, len(prepared.database), BLOCK):

@@ -1,4 +1,4 @@
-"""Synthetic places asked as a robot would: a site is built, signed, and all its queries answered.
+"""Build synthetic sites, sign their frames, and answer all their queries as a service does.
 
 kind, seed, index  --ask_site-->  SiteAnswer, ...
 """
@@ -51,7 +51,7 @@ class SiteAnswer:
 
 @dataclass(frozen=True)
 class MapFlaws:
-    """What a map may lack of a perfect one.
+    """The flaws of a map: frames that are missing, and poses that drift.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def ask_site(
     shown, database, of_map = signed(frames, site.name, signer, 0)
     # of another place: a pose in its own frame is a pose in no map
     scene = site.name if site.same_frame else f"{site.name}, elsewhere"
-    sent, asked, of_queries = signed(site.queries, scene, signer, len(database))
+    sent, members, of_queries = signed(site.queries, scene, signer, len(database))
     geometries = [*of_map, *of_queries]
     judge = Judge(
         geometries.__getitem__, "full", 0, model.parameters.validation, database=database,
@@ -180,13 +180,13 @@ def ask_site(
     if confidence is not None:
         judge = replace(judge, confidence=confidence)
     ranked = rank(
-        np.stack([q.signature for q in asked]), np.stack([d.signature for d in database]),
-        np.ones((len(asked), len(database)), np.bool_), metric=model.metric,
+        np.stack([q.signature for q in members]), np.stack([d.signature for d in database]),
+        np.ones((len(members), len(database)), np.bool_), metric=model.metric,
         candidates=candidates,
     )  # fmt: skip
     able = _answerable(site, shown, sent)
     answers = []
-    for number, (query, one) in enumerate(zip(asked, ranked, strict=True)):
+    for number, (query, one) in enumerate(zip(members, ranked, strict=True)):
         among = tuple(
             Candidate(j, j, database[j].scene, database[j].pose, 0.0, 0.0) for j in one.selection
         )
