@@ -49,7 +49,7 @@ class Library:
             self._artifacts.append(write_geometry(geometry))
             self._poses.append(frame.pose)
 
-    def ask(self, query: FrameReference, k: int = 5) -> tuple[dict[str, float], Matches]:
+    def ask(self, query: FrameReference) -> tuple[dict[str, float], Matches]:
         """Milliseconds of each stage, and the accepted matches."""
         clock = Clock()
         frame = clock.run("decode", query.read)
@@ -59,9 +59,7 @@ class Library:
         )
         selection = clock.run("diversify", lambda: diversify(ranking, self._signatures))
         geometry = read_geometry(write_geometry(seen))  # as both have it
-        matching = partial(
-            associate, geometry, ranking, selection.indices.tolist(), self._geometry, k
-        )
+        matching = partial(associate, geometry, ranking, selection.indices.tolist(), self._geometry)
         matches = clock.run("validate", lambda: matching(pose_of=self._pose))
         found = clock.run("locate", lambda: self._locate(geometry, matches))
         known = searched(matches)
