@@ -234,3 +234,26 @@ def test_who_may_only_look_is_told_so(
     settle(page)
     assert page.locator("#frames > .tile").count() == 16
     expect(page.get_by_role("link", name="Upload frames")).to_have_count(0)
+
+
+def test_a_cloud_or_mesh_may_be_a_whole_map(
+    page: Page, station: Any, settle: Callable[[Page], None], axe: Callable[[Page], list[str]],
+    room_mesh: bytes,
+) -> None:  # fmt: skip
+    chooser = open_upload(page, station, "whole", settle)
+    chooser.set_input_files([named("room.ply", room_mesh), named("room.glb", b"glTF")])
+    expect(row(page, "room.ply").locator(".row-about")).to_contain_text("Point cloud")
+    expect(row(page, "room.glb").locator(".row-about")).to_contain_text("Whole map")
+    page.get_by_role("button", name="Remove room.glb").click()
+    page.get_by_role("checkbox", name="Whole map").check()
+    expect(row(page, "room.ply").locator(".row-about")).to_contain_text("Whole map")
+    assert axe(page) == []
+    page.get_by_role("button", name="Upload 1 file").click()
+    more = row(page, "room.ply").locator(".row-more")
+    expect(more).to_contain_text("A robot would be found in", timeout=300_000)
+    [job] = station.client.get("/v1/jobs", params={"kind": "import-map"}).json()["items"]
+    result = job["result"]
+    expect(more).to_contain_text(f"{result['views']} views are in the map")
+    expect(more).to_contain_text(f"Of {result['tested']} other views, {result['found']} were found")
+    [frame] = station.client.get("/v1/maps/whole/frames", params={"limit": 1}).json()["items"]
+    assert frame["tags"] == ["virtual"]

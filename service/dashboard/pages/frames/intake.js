@@ -86,10 +86,14 @@ export async function taken(files, signal) {
   if (frames.some((one) => one.path.includes("/"))) frames.sort((a, b) => NATURAL.compare(a.path, b.path));
   const found = frames.map((one) => ({
     ...one,
-    said: one.source.kind === "archive" ? {} : nearest(beside, one),
-    pose: one.source.kind === "archive" ? null : poses.get(`${folderOf(one.path)}/${stemOf(one.file.name)}`) ?? null,
+    said: isImport(one.source) ? {} : nearest(beside, one),
+    pose: isImport(one.source) ? null : poses.get(`${folderOf(one.path)}/${stemOf(one.file.name)}`) ?? null,
   }));
   return { found, fields, left, faults };
+}
+
+function isImport({ kind }) {
+  return kind === "archive" || kind === "map";
 }
 
 function nearest(beside, { path, source }) {

@@ -15,7 +15,8 @@ const ENDS_ALL = new Set([401, 403, 404, 507]);
 
 /** @typedef {import("./intake.js").Found & {id: number, state: string, share: number, label: {name: string, sequence?: number},
  *   frame_id: string | null, job: Object<string, any> | null, reason: string | null, problem: Error | null,
- *   isThere: boolean, tries: number, until: number, stop: AbortController | null}} Item
+ *   isThere: boolean, tries: number, until: number, stop: AbortController | null, isMap: boolean}} Item
+ *   isMap: whether it is a whole map, of which views are rendered
  *   state: ready, waiting, sending, sent, importing, imported, refused, cancelled, or a frame's */
 
 const queues = new Map();
@@ -51,7 +52,7 @@ export class Queue {
     for (const one of found) this.folders.add(folderOf(one.path));
     for (const [i, one] of found.entries()) {
       this.items.push({ ...one, label: labels[i], id: numbers += 1, state: "ready", share: 0, frame_id: null, job: null,
-        reason: null, problem: null, isThere: false, tries: 0, until: 0, stop: null });
+        reason: null, problem: null, isThere: false, tries: 0, until: 0, stop: null, isMap: one.source.kind === "map" });
     }
     this.tell(null);
   }
@@ -127,7 +128,7 @@ export class Queue {
     try {
       // else the network would be blamed for it, and it asked again and again
       await item.file.slice(0, 1).arrayBuffer().catch(() => { throw new Error("The file can no longer be read: it was changed, moved or removed. Choose it again."); });
-      if (item.source.kind === "archive") await this.sendArchive(item);
+      if (item.source.kind === "archive" || item.isMap) await this.sendImport(item);
       else await this.sendFrame(item);
     } catch (error) {
       this.refused(item, error);
@@ -167,11 +168,14 @@ export class Queue {
     return { ...own, ...item.said, session, parent_frame: parent };
   }
 
-  async sendArchive(item) {
+  async sendImport(item) {
     const own = this.given;
+    const stem = stemOf(item.file.name.replace(/\.tar\.\w+$/, ".tar"));
+    // a map's format may be told by the ending of its name alone
+    const name = item.isMap ? item.file.name.slice(-64) : stem.slice(0, 64);
     const params = { robot: own.robot.trim(), session: own.session.trim(), parent_frame: own.parent_frame.trim(),
       tags: own.tags.split(",").map((one) => one.trim()).filter(Boolean).join(","),
-      name: stemOf(item.file.name.replace(/\.tar\.\w+$/, ".tar")).replace(/^\.+/, "").slice(0, 64) || "import" };
+      name: name.replace(/^\.+/, "") || "import", as: item.isMap ? "map" : "frames" };
     const { data } = await send("POST", at("maps", this.map, "imports"), {
       body: item.file, type: "application/octet-stream", params, signal: item.stop.signal,
       onprogress: (share) => this.change(item, { share }),

@@ -1,6 +1,6 @@
 // The files of a queue as rows: how far each one is, and why it was refused in the API's words.
 import { h, put } from "../lib/dom.js";
-import { bytes, count, seconds, shortId } from "../lib/format.js";
+import { bytes, count, percent, seconds, shortId } from "../lib/format.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { badge, isPending } from "./badge.js";
@@ -13,7 +13,8 @@ const IN_GROUP = {
 };
 // as many rows as anybody reads; more are a click away, and 5,000 files cost no more than 100
 const STEP = 100;
-const KIND = { depth: "Depth image", cloud: "Point cloud", archive: "Archive" };
+const KIND = { depth: "Depth image", cloud: "Point cloud", archive: "Archive", map: "Whole map" };
+const PHASES = { read: "Reading the file", choose: "Choosing viewpoints", render: "Rendering views", sign: "Signing views", test: "Looking up other views" };
 
 /** Which of the groups an item is in. @param {string} state */
 export function groupOf(state) {
@@ -88,10 +89,10 @@ function rowOf(queue, item) {
   let drawn = null;
   function show() {
     if (item.state === "sending" && drawn === "sending") { /** @type {HTMLProgressElement} */ (row.querySelector("progress")).value = item.share; return; }
+    put(about, aboutOf(item)); // a cloud may have been marked as a map
     if (item.state === drawn && item.state !== "importing" && item.state !== "waiting") return;
     drawn = item.state;
     row.dataset.state = item.state;
-    put(about, aboutOf(item));
     put(state, stateOf(item));
     const had = action.contains(document.activeElement);
     put(action, actionOf(queue, item));
@@ -104,7 +105,7 @@ function rowOf(queue, item) {
 }
 
 function aboutOf(item) {
-  const said = [KIND[item.source.kind], bytes(item.file.size)];
+  const said = [KIND[item.isMap ? "map" : item.source.kind], bytes(item.file.size)];
   if (item.source.width) said.push(`${item.source.width} × ${item.source.height}`);
   if (Object.keys(item.said).length) said.push(item.source.kind === "cloud" ? "clouds.json" : "intrinsics.json");
   if (item.pose) said.push("pose");
@@ -119,9 +120,10 @@ function stateOf(item) {
   if (state === "refused") return h("span", { class: "badge", dataset: { kind: "bad" } }, "refused");
   if (state === "cancelled") return badge("cancelled");
   if (state === "importing") {
-    const { done, total } = item.job.progress ?? {};
+    const { done, total, phase } = item.job.progress ?? {};
+    const words = phase ? PHASES[phase] : total ? `${count(done)} of ${count(total)} frames` : "Waiting for a worker";
     return [h("progress", { max: 1, value: total ? done / total : null, "aria-label": `${item.file.name}, imported` }),
-      h("span", { class: "muted number" }, total ? `${count(done)} of ${count(total)} frames` : "Waiting for a worker")];
+      h("span", { class: "muted number" }, words)];
   }
   if (state === "imported") return h("span", { class: "badge", dataset: { kind: "good" } }, "imported");
   return badge(state);
@@ -131,16 +133,23 @@ function actionOf(queue, item) {
   const name = item.file.name;
   const button = (text, told) => h("button", { class: "button quiet", type: "button", "aria-label": `${text} ${name}`, onClick: told }, text);
   const group = groupOf(item.state);
-  if (item.state === "ready") return button("Remove", () => queue.remove([item]));
+  if (item.state === "ready") return [wholeOf(queue, item), button("Remove", () => queue.remove([item]))];
   if (["waiting", "sending", "importing"].includes(item.state)) return button("Cancel", () => queue.cancel(item));
   if (item.frame_id) return h("a", { class: "mono", href: link("maps", queue.map, "frames", item.frame_id) }, shortId(item.frame_id));
   if (group === "refused" && !item.job) return button("Retry", () => queue.again([item]));
   return item.job ? h("a", { href: link("operations", "jobs", item.job.job_id) }, "Job") : null;
 }
 
+/** Whether a cloud is one scan or a whole map: nothing in the file tells. */
+function wholeOf(queue, item) {
+  return item.source.kind === "cloud" && h("label", { class: "source-check row-whole" },
+    h("input", { type: "checkbox", checked: item.isMap, onChange: (event) => queue.change(item, { isMap: event.target.checked }) }),
+    h("span", {}, "Whole map"));
+}
+
 function reasonOf(item) {
   const { problem, state } = item;
-  if (state === "imported") return importOf(item);
+  if (state === "imported") return item.isMap ? mapOf(item) : importOf(item);
   if (problem) {
     const rest = Math.max(0, (item.until - Date.now()) / 1000);
     return [
@@ -162,5 +171,22 @@ function importOf(item) {
     h("p", {}, `Frames: ${parts.join(", ")}.`),
     faults.length > 0 && h("details", {}, h("summary", {}, `Rejected files${faults.length < refused ? ", the first of them" : ""}`),
       h("ul", {}, faults.slice(0, STEP).map((one) => h("li", {}, h("strong", {}, one.name), coded(` ${one.problem.detail}`))))),
+  ];
+}
+
+/** What became of a whole map, and how good it is. */
+function mapOf(item) {
+  const told = item.job.result ?? {};
+  const weak = told.weak ?? [];
+  const at = ({ x, y, z }) => [x, y, z].map((value) => value.toFixed(1)).join(", ");
+  return [
+    h("p", {}, `${count(told.views)} views are in the map and see ${percent(told.seen)} of its surface.`,
+      told.refused > 0 && ` ${count(told.refused)} were refused.`),
+    told.coverage !== null && h("p", {}, h("strong", {}, `A robot would be found in ${percent(told.coverage)} of this place. `),
+      `Of ${count(told.tested)} other views, ${count(told.found)} were found, ${count(told.ambiguous)} ambiguous, ${count(told.not_found)} not found, ${count(told.wrong)} wrong.`),
+    h("p", {}, `Units: ${told.units_per_metre} per metre (${told.units_from}). Up: ${at(told.up)} (${told.up_from}).`),
+    (told.notes ?? []).map((note) => h("p", {}, note)),
+    weak.length > 0 && h("details", {}, h("summary", {}, "Weak here"),
+      h("ul", {}, weak.map((area) => h("li", {}, `${at(area.centre)} m, ${area.width_m} m wide: ${count(area.found)} of ${count(area.views)} found`)))),
   ];
 }

@@ -106,8 +106,8 @@ export async function render(root, { params, signal, title, actions }) {
     put(retry, `Retry ${count(untaken)}`);
     cancel.hidden = !(queue.running && busy);
     tidy.hidden = !queue.items.some((one) => groupOf(one.state) === "done");
-    const words = { indexed: "indexed", redundant: "not needed", imported: "archives imported", received: "waiting for a worker", signing: "being signed",
-      importing: "archives being imported", sending: "being sent", waiting: "in the queue", ready: "ready", refused: "refused", cancelled: "cancelled" };
+    const words = { indexed: "indexed", redundant: "not needed", imported: "imported", received: "waiting for a worker", signing: "being signed",
+      importing: "being imported", sending: "being sent", waiting: "in the queue", ready: "ready", refused: "refused", cancelled: "cancelled" };
     const parts = Object.keys(words).filter((one) => states[one]).map((one) => `${count(states[one])} ${words[one]}`);
     const sending = busy > 0 && queue.running;
     if (status.textContent !== parts.join(" · ")) put(status, parts.join(" · "));
@@ -158,8 +158,8 @@ function dropZone(take) {
     onChange: (event) => { take(chosen(event.target.files)); event.target.value = ""; } });
   const [files, folder] = [pick({ accept: ACCEPT, name: "files" }), pick({ webkitdirectory: true, name: "folder" })];
   const zone = h("div", { class: "drop" }, files, folder,
-    h("strong", {}, "Drop frames, folders or archives here"),
-    h("p", { class: "muted" }, "Depth images (16-bit PNG, NPY), point clouds (PLY, PCD, NPY, LAS, KITTI .bin), zip and tar. An intrinsics.json, clouds.json or NAME.pose.txt beside them is read."),
+    h("strong", {}, "Drop frames, folders, archives or a whole map here"),
+    h("p", { class: "muted" }, "Depth images (16-bit PNG, NPY), point clouds (PLY, PCD, NPY, LAS, KITTI .bin), zip and tar. A mesh (OBJ, STL, glTF), or a cloud marked as a whole map, becomes the map. An intrinsics.json, clouds.json or NAME.pose.txt beside them is read."),
     h("div", { class: "toolbar" },
       h("button", { class: "button", type: "button", onClick: () => files.click() }, "Choose files"),
       h("button", { class: "button", type: "button", onClick: () => folder.click() }, "Choose a folder")));
