@@ -1,4 +1,5 @@
 """docs/from_bag_to_pose.md: its commands are run in a fresh folder, and say what the page says.
+Those of docs/whole_maps.md are run, too.
 
 With SCENEPRINT_UPDATE_GOLDEN=1 the page has from then on what they said.
 """
@@ -16,7 +17,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGE = ROOT / "docs/from_bag_to_pose.md"
+PAGE, WHOLE_MAPS = ROOT / "docs/from_bag_to_pose.md", ROOT / "docs/whole_maps.md"
 BLOCK = re.compile(r"(?<=^```console\n)(.*?)(?=^```$)", re.DOTALL | re.MULTILINE)
 #: Where the reader of the page is, and the service.
 HERE, URL = "/home/robot/sceneprint", "http://127.0.0.1:8008"
@@ -119,3 +120,19 @@ def test_the_page_says_what_happens(said: Callable[[str, int], list[str]]) -> No
                 assert alike(line, other), (command, line, other)
     tracked = [line for block in blocks for _, lines in block for line in lines]
     assert "tracking on 12 of 12 frames, first fix after 0 s" in tracked
+
+
+@pytest.mark.thorough
+def test_a_map_in_one_file_leads_to_a_pose(said: Callable[[str, int], list[str]]) -> None:
+    (commands,) = transcripts(WHOLE_MAPS.read_text(encoding="utf-8"))
+    assert len(commands) == 5
+    for command, expected in commands:
+        lines = said(command, 2 if " serve" in command else 0)
+        if " localize " in command:  # which of the matches agree may be another
+            assert lines[0].startswith("site-000/scan-000003: found ")
+            place = [float(one) for one in lines[1].split()[1:4]]
+            assert place == pytest.approx([4.436, 13.913, 0.854], abs=0.1)
+            continue
+        lines = [line for line in lines if not line.startswith("weak here: ")]
+        assert [NUMBER.sub("#", line) for line in lines] \
+            == [NUMBER.sub("#", line) for line in expected]  # fmt: skip

@@ -90,7 +90,7 @@ def import_archives(
         if options.no_wait:
             print(f"{path.name}: received; import {job.job_id} adds its frames")
             continue
-        job, moves = _waited(client, path.name, job)
+        job, moves = _waited(client, options.map, path.name, job)
         _count(client, options.map, job, tally)
         if not moves:
             return False
@@ -99,15 +99,18 @@ def import_archives(
     return True
 
 
-def _waited(client: Client, name: str, job: Job) -> tuple[Job, bool]:
-    """An import once it is over, or when it has not moved for long."""
+def _waited(client: Client, map_name: str, name: str, job: Job) -> tuple[Job, bool]:
+    """An import once it is over, or when no worker has moved it for long."""
+    from sceneprint_client.api import JobState
+
     moved, seen = time.monotonic(), job.progress
     with tqdm(desc=name, unit="frame", disable=None) as bar:
         while not job.state.over:
-            [job] = client.wait([job.job_id], timeout_s=_PAUSE_S)
+            client.wait([job.job_id], timeout_s=_PAUSE_S)
+            job = client.import_job(map_name, job.job_id)
             if job.progress is not None:
                 _show(bar, name, job.progress)
-            if job.progress != seen:
+            if job.progress != seen or job.state == JobState.RUNNING:
                 moved, seen = time.monotonic(), job.progress
             elif time.monotonic() - moved > STALL_S:
                 if not is_starting(client):
@@ -260,7 +263,7 @@ def import_maps(client: Client, options: argparse.Namespace) -> int:
         if options.no_wait:
             print(f"{path.name}: received; import {job.job_id} renders its views")
             continue
-        job, moves = _waited(client, path.name, job)
+        job, moves = _waited(client, options.map, path.name, job)
         if not moves:
             print(
                 f"{path.name}: import {job.job_id} has not moved for {STALL_S:.0f} s. Check that "

@@ -89,7 +89,7 @@ def chosen(chosen_folder: Path, tmp_path: Path, make_engine: Callable[..., Engin
 def test_a_room_becomes_a_map_in_which_it_is_found(
     chosen: Engine, due_now: Callable[..., None]
 ) -> None:
-    phases = list[str]()
+    phases, signed = list[str](), list[int | None]()
     state = None
     while state != JobState.SUCCEEDED:
         work = chosen.claim("test")
@@ -101,7 +101,9 @@ def test_a_room_becomes_a_map_in_which_it_is_found(
             assert state in (JobState.QUEUED, JobState.SUCCEEDED)
             job_id = work.job.id
             phases.append(work.progress["phase"])
-        else:
+        else:  # progress does not wait for the next slice
+            now = chosen.imports.get("hall", job_id).progress
+            signed.append(None if now is None else now.signed)
             state = None
     assert list(dict.fromkeys(phases)) == ["render", "sign", "test"]
     done = chosen.imports.get("hall", job_id)
@@ -121,6 +123,7 @@ def test_a_room_becomes_a_map_in_which_it_is_found(
     assert result.tested == result.found + result.wrong + result.ambiguous + result.not_found > 0
     assert result.wrong == 0
     assert result.coverage == result.found / result.tested
+    assert signed == list(range(1, len(frames) + 1))
     assert progress.views == progress.rendered == progress.signed == len(frames) + result.refused
     assert (progress.tested, progress.done) == (result.tested, progress.total)
     # neither the file nor what was read of it is left

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection
+from sqlalchemy import Connection, func, select
 
 from sceneprint import errors
 from sceneprint.engine.ingest.uploads import Upload, Uploads, item_of
@@ -41,9 +42,9 @@ from sceneprint.store.deletion import make_room
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map, living_map, model_content
 from sceneprint.store.opaque_ids import row_of
-from sceneprint.store.tables import ARCHIVE, MapRow
+from sceneprint.store.tables import ARCHIVE, JobRow, MapRow, frames
 from sceneprint.types import Intrinsics
-from sceneprint_client.api import Job, Page
+from sceneprint_client.api import FrameState, Job, Page
 from sceneprint_client.api.base import GivenDirection
 from sceneprint_client.api.frames import ImportItem, ImportOptions
 from sceneprint_client.files import HEAD
@@ -178,6 +179,8 @@ KIND, MAP_KIND = "import", "import-map"
 TIDY_S = 5.0
 #: How much more a compressed tar may hold than the largest archive that is taken.
 _UNPACKED = 4
+#: Frames that one statement names.
+_IDS_AT_ONCE = 500
 #: Pixels along the longer side of a rendered view, at most.
 _MOST_PIXELS = 640
 
@@ -250,6 +253,21 @@ class Receiver:
         for piece in pieces:
             self._reserve(len(piece))
             self._blob.write(piece)
+
+
+def states_of_import(connection: Connection, job: JobRow) -> Counter[str]:
+    """Return how many frames that an import added are in each state."""
+    items = queue.items_of(connection, job.number)
+    ids = [item["frame_id"] for item in items if item["frame_id"] is not None]
+    found = Counter[str]()
+    for start in range(0, len(ids), _IDS_AT_ONCE):
+        own = frames.c.id.in_(ids[start : start + _IDS_AT_ONCE])
+        asked = select(frames.c.state, func.count()).where(
+            frames.c.map_number == job.map_number, own
+        )
+        for state, count in connection.execute(asked.group_by(frames.c.state)):
+            found[state] += count
+    return found
 
 
 def view_parameters_of(model: ModelParameters, options: ImportOptions) -> ViewParameters:
@@ -371,13 +389,23 @@ class Imports:
         return job, again
 
     def get(self, map_name: str, job_id: str) -> Job:
-        """An import of a map; UnknownMap or UnknownJob where there is none."""
+        """An import of a map; UnknownMap or UnknownJob where there is none.
+
+        While the views of a map are signed, its progress counts those that are by now.
+        """
         with self._store.database.read() as connection:
             find_map(connection, map_name)
         job = get_job(self._store, job_id)
         if job.kind not in (KIND, MAP_KIND) or job.map != map_name:
             raise queue.unknown_job(job_id)
-        return job
+        now = job.progress
+        if now is None or now.phase not in ("render", "sign") or now.rendered is None:
+            return job
+        with self._store.database.read() as connection:
+            states = states_of_import(connection, queue.find_job(connection, job_id))
+        signed = now.rendered - states[FrameState.RECEIVED] - states[FrameState.SIGNING]
+        progress = now.model_copy(update={"signed": signed, "done": now.rendered + signed})
+        return job.model_copy(update={"progress": progress})
 
     def items(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100

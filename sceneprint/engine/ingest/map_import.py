@@ -20,10 +20,14 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection
 
 from sceneprint.decoders.surface_decoder import SurfaceLimits, read_surface_confined
-from sceneprint.engine.ingest.archive_import import import_item, view_parameters_of
+from sceneprint.engine.ingest.archive_import import (
+    import_item,
+    states_of_import,
+    view_parameters_of,
+)
 from sceneprint.engine.ingest.uploads import Upload, Uploads
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult
 from sceneprint.engine.maps.map_coverage import outcome_of
@@ -46,7 +50,7 @@ from sceneprint.store import Store, queue
 from sceneprint.store.database_errors import unusable
 from sceneprint.store.frame_queries import PathFrame
 from sceneprint.store.maps import living_map, use_of
-from sceneprint.store.tables import ARCHIVE, MapRow, frames
+from sceneprint.store.tables import ARCHIVE, MapRow
 from sceneprint.types import Floats, Floats32, Intrinsics, ReferenceSurface
 from sceneprint_client.api import Answer, Filter, FrameMeta, FrameState, Query
 from sceneprint_client.api.base import (
@@ -63,8 +67,8 @@ from sceneprint_client.api.frames import VIRTUAL, ImportOptions, MapImportResult
 _AT_ONCE = 16
 #: Seconds between two looks whether all views are signed.
 _PAUSE_S = 1.0
-#: Stored units of a metre in rendered depth images.
-_DEPTH_SCALE = 1000.0
+#: Stored units of a metre in rendered depth images, at most, and of the farthest point.
+_DEPTH_SCALE, _FARTHEST = 1000.0, 65_000
 #: Most areas that a result names as weak.
 _MOST_WEAK = 20
 
@@ -163,14 +167,13 @@ class _Views:
         seen, camera = self._renderer.view(pose), self._p.camera
         if not isinstance(camera, Intrinsics):
             return _View(_npy(seen), FrameMeta())
-        samples = np.clip(np.round(seen * _DEPTH_SCALE), 0, 65534).astype(np.uint16)
+        scale = min(_DEPTH_SCALE, _FARTHEST / self._p.farthest)
+        samples = np.round(seen * scale).astype(np.uint16)
         intrinsics = CameraIntrinsics(
             width=camera.width, height=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx,
             cy=camera.cy,
         )  # fmt: skip
-        return _View(
-            encode_png(samples), FrameMeta(intrinsics=intrinsics, depth_scale=_DEPTH_SCALE)
-        )
+        return _View(encode_png(samples), FrameMeta(intrinsics=intrinsics, depth_scale=scale))
 
 
 def _npy(points: Floats32) -> bytes:
@@ -375,19 +378,8 @@ class MapImporter:
             )
 
     def _states(self, task: LongJob) -> Counter[str]:
-        """How many views of the map are in each state."""
-        found = Counter[str]()
         with self._store.database.read() as connection:
-            items = queue.items_of(connection, task.job.number)
-            ids = [item["frame_id"] for item in items if item["frame_id"] is not None]
-            for start in range(0, len(ids), 500):
-                asked = select(frames.c.state, func.count()).where(
-                    frames.c.map_number == task.of_map.number,
-                    frames.c.id.in_(ids[start : start + 500]),
-                )
-                for state, count in connection.execute(asked.group_by(frames.c.state)):
-                    found[state] += count
-        return found
+            return states_of_import(connection, task.job)
 
     def _outcome(self, row: MapRow, views: _Views, pose: Floats, options: ImportOptions) -> str:
         """What a robot would be answered whose sensor is at a pose; one core does it."""
