@@ -43,7 +43,7 @@ def packed(uploads: Any) -> bytes:
 
 
 def begun(engine: Engine, data: bytes, map_name: str = "hall") -> Job:
-    with engine.imports.receive(map_name) as receiver:
+    with engine.imports.receive(map_name, ImportOptions()) as receiver:
         receiver.write(data)
         archive = receiver.end()
     return engine.imports.begin(map_name, archive, ImportOptions())[0]
@@ -121,7 +121,10 @@ def test_nothing_is_left_of_an_archive_that_was_refused(empty: Engine, uploads: 
     before = sorted(empty.store.blobs.digests())
     with pytest.raises(UnknownMap):
         begun(empty, packed(uploads[:1]), "nowhere")
-    with pytest.raises(OSError, match="gone"), empty.imports.receive("hall") as receiver:  # noqa: PT012
+    with (  # noqa: PT012
+        pytest.raises(OSError, match="gone"),
+        empty.imports.receive("hall", ImportOptions()) as receiver,
+    ):
         receiver.write(packed(uploads[:1])[:3000])
         raise ConnectionError("gone")
     assert sorted(empty.store.blobs.digests()) == before
@@ -215,7 +218,10 @@ def test_archives_take_no_more_disk_than_the_quota_of_their_map(
     cancel(empty.store, job.job_id)
     assert (bytes_on_disk(empty), counted(empty)) == (0, 0)  # at once, without any upkeep
     with ExitStack() as open_ones:
-        receivers = [open_ones.enter_context(empty.imports.receive("hall")) for _ in range(3)]
+        receivers = [
+            open_ones.enter_context(empty.imports.receive("hall", ImportOptions()))
+            for _ in range(3)
+        ]
         refused = 0
         for i, receiver in enumerate(receivers):
             try:
@@ -239,7 +245,9 @@ def test_two_services_do_not_share_the_room_of_one_archive(
     edit_map(empty.store, "hall", {"quota_bytes": QUOTA})
     with ExitStack() as both:
         engines = (empty, make_engine())
-        receivers = [both.enter_context(one.imports.receive("hall")) for one in engines]
+        receivers = [
+            both.enter_context(one.imports.receive("hall", ImportOptions())) for one in engines
+        ]
         files = []
         for i, receiver in enumerate(receivers):
             receiver.write(zeros(5, f"service-{i}"))
@@ -287,11 +295,11 @@ def test_the_archive_of_an_import_whose_worker_died_goes_at_the_next_upkeep(
 def test_an_archive_that_was_swept_before_its_job_was_there_is_not_acknowledged(
     empty: Engine, uploads: Any
 ) -> None:
-    with empty.imports.receive("hall") as receiver:
+    with empty.imports.receive("hall", ImportOptions()) as receiver:
         receiver.write(packed(uploads[:1]))
         archive = receiver.end()
     collect_blobs(empty.store, [archive.blob])  # an import of the same archive ends at this moment
-    with pytest.raises(Conflict, match="Send the archive again"):
+    with pytest.raises(Conflict, match="Send the file again"):
         empty.imports.begin("hall", archive, ImportOptions())
     assert list(list_jobs(empty.store).items) == []
 

@@ -109,7 +109,7 @@ def test_an_archive_is_read_where_it_lies(
             info = tarfile.TarInfo(name)
             info.size = len(data)
             archive.addfile(info, io.BytesIO(data))
-    with one.imports.receive("hall") as receiver:
+    with one.imports.receive("hall", ImportOptions()) as receiver:
         receiver.write(made.getvalue())
         file = receiver.end()
     job = one.imports.begin("hall", file, ImportOptions())[0]
