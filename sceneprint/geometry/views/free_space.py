@@ -30,7 +30,7 @@ _STOREY = 2.0
 _LEAST_FLOOR, _LEAST_STOREY = 0.12, 0.3
 #: A floor is none where more than this share of the surface lies below it: a table, say, in a room
 #: whose floor was not seen.
-_MOST_BELOW = 0.1
+_MOST_BELOW = 0.07
 #: Places of a grid, and columns times heights of another, at most.
 _MOST_COLUMNS, _MOST_BINS = 1_000_000, 8_000_000
 #: Heights that places are spread over, at most.
@@ -114,9 +114,10 @@ def find_floors(pieces: Surfels, side: float) -> Floors:
     column = np.floor((pieces.points[:, :2] - low[:2]) / side).astype(np.int64)
     column = np.clip(column, 0, shape[:2] - 1)
     floor = heights[0][column[:, 0], column[:, 1]]
-    known = np.isfinite(floor)
-    if (pieces.points[known, 2] < floor[known] - 2 * _STEP).sum() > _MOST_BELOW * known.sum():
-        heights = np.full((1, *shape[:2]), np.nan)
+    if np.isfinite(floor).any():
+        floor = np.where(np.isfinite(floor), floor, np.nanmedian(floor))
+        if (pieces.points[:, 2] < floor - 2 * _STEP).mean() > _MOST_BELOW:
+            heights = np.full((1, *shape[:2]), np.nan)
     return Floors(low[:2], side, heights, level)
 
 

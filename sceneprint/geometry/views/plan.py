@@ -48,7 +48,7 @@ _TURNS, _PITCHES = 8, (-25.0, 10.0)
 #: What a view adds that is the first, or the second, to see something; later ones add nothing.
 _WORTH = np.array([1.0, 0.5, 0.0])
 #: Choosing ends once the best view adds less than this share of the first one's gain.
-_LEAST_GAIN = 0.03
+_LEAST_GAIN = 0.01
 #: Views that are none of the map, at most.
 _HELD_OUT = 60
 
