@@ -330,7 +330,7 @@ _NAMES = {
     "VR": "VR   validated of R",
     "DR": "DR   diverse frames",
     "VDR": "VDR  validated of DR",
-    "pose_average": "pose average of VDR",
+    "pose_average": "pose of the answer",
 }
 
 
