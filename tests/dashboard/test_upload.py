@@ -247,12 +247,15 @@ def test_a_cloud_or_mesh_may_be_a_whole_map(
     page.get_by_role("button", name="Remove room.glb").click()
     page.get_by_role("checkbox", name="Whole map").check()
     expect(row(page, "room.ply").locator(".row-about")).to_contain_text("Whole map")
+    page.locator("summary", has_text="Whole maps").click()
+    page.locator("select[name=map_up]").select_option("z")
     assert axe(page) == []
     page.get_by_role("button", name="Upload 1 file").click()
     more = row(page, "room.ply").locator(".row-more")
     expect(more).to_contain_text("A robot would be found in", timeout=300_000)
     [job] = station.client.get("/v1/jobs", params={"kind": "import-map"}).json()["items"]
     result = job["result"]
+    assert result["up_from"] == "stated"
     expect(more).to_contain_text(f"{result['views']} views are in the map")
     expect(more).to_contain_text(f"Of {result['tested']} other views, {result['found']} were found")
     [frame] = station.client.get("/v1/maps/whole/frames", params={"limit": 1}).json()["items"]

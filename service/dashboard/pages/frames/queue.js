@@ -5,6 +5,7 @@ import { isPending } from "./badge.js";
 import { folderOf, labelsOf, namesOf } from "./intake.js";
 import { poseOf, stemOf } from "./kinds.js";
 import { formOf, settings } from "./source.js";
+import { mapParams } from "./wholemap.js";
 
 const AT_ONCE = 3;
 const TRIES = 6; // where nothing answers, or too much is asked
@@ -175,7 +176,7 @@ export class Queue {
     const name = item.isMap ? item.file.name.slice(-64) : stem.slice(0, 64);
     const params = { robot: own.robot.trim(), session: own.session.trim(), parent_frame: own.parent_frame.trim(),
       tags: own.tags.split(",").map((one) => one.trim()).filter(Boolean).join(","),
-      name: name.replace(/^\.+/, "") || "import", as: item.isMap ? "map" : "frames" };
+      name: name.replace(/^\.+/, "") || "import", ...(item.isMap ? mapParams(own) : {}) };
     const { data } = await send("POST", at("maps", this.map, "imports"), {
       body: item.file, type: "application/octet-stream", params, signal: item.stop.signal,
       onprogress: (share) => this.change(item, { share }),

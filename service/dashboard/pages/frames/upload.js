@@ -11,6 +11,7 @@ import { ACCEPT } from "./kinds.js";
 import { queueOf } from "./queue.js";
 import { groupOf, rowsOf } from "./rows.js";
 import { cameraFields, hasCamera, remember } from "./source.js";
+import { mapFields } from "./wholemap.js";
 
 const ALOUD_MS = 5000;
 
@@ -41,7 +42,7 @@ export async function render(root, { params, signal, title, actions }) {
   const place = dropZone((files) => take(files));
   put(root, h("div", { class: "upload" },
     h("div", { class: "upload-main" }, place, note, bar, aloud, said, rows),
-    h("aside", { class: "card upload-said", "aria-label": "Metadata of the files" }, whoFields(queue.given), fields)));
+    h("aside", { class: "card upload-said", "aria-label": "Metadata of the files" }, whoFields(queue.given), fields, mapFields(queue.given))));
   actions(h("a", { class: "button", href: link("maps", params.map) }, "To the frames"));
 
   async function take(files) {
