@@ -63,7 +63,7 @@ def test_healthz_is_answered_before_there_is_an_application_and_as_by_it(
         assert (early.status_code, early.json()) == (200, {"status": "ok", "version": __version__})
         assert (head.status_code, head.content) == (200, b"")
         others = [
-            client.get("/readyz"),
+            client.get("/v1/maps"),
             client.get("/healthz", headers={"Host": "rebound.example"}),
             client.get("/healthz", headers={"Origin": "http://elsewhere.example"}),
         ]
