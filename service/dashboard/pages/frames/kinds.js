@@ -12,7 +12,7 @@ const SUFFIXES = {
   ".png": "depth", ".npy": "depth", ".ply": "cloud", ".pcd": "cloud", ".las": "cloud",
   ".laz": "cloud", ".bin": "cloud", ".cdr": "cloud", ".zip": "archive", ".tar": "archive", ".tgz": "archive",
   ".gz": "archive", ".tbz2": "archive", ".bz2": "archive", ".txz": "archive", ".xz": "archive",
-  ".obj": "map", ".stl": "map", ".glb": "map", ".gltf": "map", // a mesh is a map that comes whole
+  ".obj": "map", ".stl": "map", ".glb": "map", ".gltf": "map", ".e57": "map", // a mesh is a map that comes whole
 };
 /** What a file picker offers. */
 export const ACCEPT = [...Object.keys(SUFFIXES), ".json", ".txt"].join(",");
@@ -44,7 +44,7 @@ function byHead(head) {
   if (/^ply[\n\r ]/.test(text(0, 4))) return { kind: "cloud", format: "ply" };
   if (text(0, 4) === "LASF") return { kind: "cloud", format: "las" };
   if (/^(#.*\n)*\s*(VERSION|FIELDS)\b/.test(text(0, HEAD))) return { kind: "cloud", format: "pcd" };
-  if (text(0, 4) === "glTF") return { kind: "map" };
+  if (text(0, 4) === "glTF" || text(0, 8) === "ASTM-E57") return { kind: "map" };
   const packed = text(0, 2) === "PK" || text(0, 3) === "BZh" || text(257, 262) === "ustar"
     || (head[0] === 0x1f && head[1] === 0x8b) || text(1, 5) === "7zXZ" && head[0] === 0xfd;
   return packed ? { kind: "archive" } : null;
