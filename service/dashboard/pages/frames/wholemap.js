@@ -14,12 +14,12 @@ export function mapFields(given) {
   const write = (name) => (event) => { given[name] = event.target.value; remember(given); };
   const choice = (name, label, options) => h("label", { class: "field" }, h("span", {}, label),
     h("select", { name, onChange: write(name) }, options.map(([value, text]) => h("option", { value, selected: given[name] === value }, text))));
-  return h("details", {},
+  return h("div", { class: "source-fields" }, h("details", {},
     h("summary", {}, "Whole maps"),
     h("div", { class: "source-row" },
       choice("map_up", "Up", UPS), choice("map_units", "Unit", UNITS),
       h("label", { class: "field" }, h("span", {}, "Sensor heights", h("small", { class: "muted" }, " m above the floor")),
-        h("input", { type: "text", name: "map_heights", autocomplete: "off", placeholder: "those of the model", value: given.map_heights, onInput: write("map_heights") }))));
+        h("input", { type: "text", name: "map_heights", autocomplete: "off", placeholder: "those of the model", value: given.map_heights, onInput: write("map_heights") })))));
 }
 
 /**
