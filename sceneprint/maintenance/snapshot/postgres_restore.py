@@ -10,6 +10,7 @@ again.
 from __future__ import annotations
 
 import sqlite3
+import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
@@ -49,6 +50,8 @@ from sceneprint.store.tables import metadata, secrets
 #: What a database of which nobody has made use holds: its secret, what a service counts, who may
 #: write, and where a scrub stands.
 _OF_ITSELF = ("secrets", "samples", "schema_range", "scrubs")
+#: Seconds after which a server lists no connection that was closed before.
+_NOTICED_S = 5.0
 
 
 def copy_into(connection: Connection, file: sqlite3.Connection) -> None:
@@ -200,17 +203,30 @@ def _check_folder(settings: Settings) -> None:
 
 
 def _check_target(database: Database) -> None:
-    """See that the database holds nothing, and that nobody has it open, as far as it can tell."""
+    """See that the database holds nothing, and that nobody has it open, as far as it can tell.
+
+    A connection that was closed is listed until the server has noticed, so it looks for a while.
+    """
     with database.read() as connection:
         check_empty(connection)
-        others = connection.exec_driver_sql(
-            "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database()"
-            " AND application_name = 'sceneprint' AND pid <> pg_backend_pid()"
-        ).scalar_one()
-    if others:
-        raise SnapshotError(
-            f"{database.shown} is in use: {others} connections of sceneprint. Stop its services "
-            "and workers, and try again."
+    end = time.monotonic() + _NOTICED_S
+    while others := _connections_of(database):
+        if time.monotonic() >= end:
+            raise SnapshotError(
+                f"{database.shown} is in use: {others} connections of sceneprint. Stop its "
+                "services and workers, and try again."
+            )
+        time.sleep(0.1)
+
+
+def _connections_of(database: Database) -> int:
+    """Return how many other connections of sceneprint the server lists."""
+    with database.read() as connection:
+        return int(
+            connection.exec_driver_sql(
+                "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database()"
+                " AND application_name = 'sceneprint' AND pid <> pg_backend_pid()"
+            ).scalar_one()
         )
 
 
