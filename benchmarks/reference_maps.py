@@ -24,9 +24,8 @@ from sceneprint.formats.dataset import find_sequences
 from sceneprint.fusion import FusionParameters, fuse
 from sceneprint.geometry.rigid import moved
 from sceneprint.geometry.views import Renderer, ViewParameters, choose_views, view_parameters
-from sceneprint.lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
 from sceneprint.lab.evaluation.protocol import JudgedAnswer
-from sceneprint.lab.evaluation.sites import signed
+from sceneprint.lab.evaluation.sites import answers_of, signed
 from sceneprint.lab.synth.dataset import (
     premises_and_rng,
     room_and_rng,
@@ -128,27 +127,11 @@ def views(place: Place, p: ViewParameters) -> tuple[list[AnyFrame], str]:
 
 
 def answers(place: Place, frames: Sequence[AnyFrame], signer: Signer) -> list[JudgedAnswer]:
-    """Answer all queries on a map of some frames, as a service does."""
-    model = signer.model
+    """Answer all queries on a map of some frames; those that show nothing are not found."""
     _, database, of_map = signed(frames, "map", signer, 0)
-    _, asked, of_queries = signed(place.queries, "map", signer, len(database))
-    geometries = [*of_map, *of_queries]
-    judge = Judge(
-        geometries.__getitem__, "full", 0, model.parameters.validation, database=database,
-        answer=model.answer, unrelated_distance=model.unrelated_distance,
-    )  # fmt: skip
-    ranked = rank(
-        np.stack([q.signature for q in asked]), np.stack([d.signature for d in database]),
-        np.ones((len(asked), len(database)), np.bool_), metric=model.metric,
-    )  # fmt: skip
-    rows, found = np.arange(len(database)), []
-    for query, one in zip(asked, ranked, strict=True):
-        among = tuple(Candidate(j, j, "map", database[j].pose, 0.0, 0.0) for j in one.selection)
-        task = QueryTask(
-            query.number, "map", query.pose, [], one.selection, among, rows, one.retrieved
-        )
-        found.append(answer_of(judge, task))
-    return found + [JudgedAnswer()] * (len(place.queries) - len(asked))
+    _, queries, of_queries = signed(place.queries, "map", signer, len(database))
+    found = answers_of(signer, database, queries, [*of_map, *of_queries])
+    return found + [JudgedAnswer()] * (len(place.queries) - len(queries))
 
 
 def signing_seconds(frames: Sequence[AnyFrame], signer: Signer) -> float:

@@ -148,6 +148,17 @@ def _at_least(text: str, least: int) -> int:
     return number
 
 
+def positive_number(text: str) -> float:
+    """Return a number above 0."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:  # false for NaN as well
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return number
+
+
 def metres(text: str) -> float:
     """A positive distance."""
     try:

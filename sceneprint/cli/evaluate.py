@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
-from sceneprint.cli import positive, whole_number
+from sceneprint.cli import positive, positive_number, whole_number
 from sceneprint.cli.bag import add_recording_options, sequences_at
 from sceneprint.cli.options import add_judging_options, add_model_options, open_for
 from sceneprint.errors import DatasetError
@@ -100,7 +100,7 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--gap-m",
-        type=_metres,
+        type=positive_number,
         metavar="METRES",
         help="use each frame as query and as database frame (--db and --queries may overlap, "
         "and default to all frames); a query finds only frames taken more than this distance of "
@@ -108,7 +108,7 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--within",
-        type=_metres,
+        type=positive_number,
         metavar="METRES",
         help="recall: count a frame as the query's place if its pose is this near (default: if "
         "the two overlap by half)",
@@ -169,17 +169,6 @@ def _share(text: str) -> float:
     if not 0 < share <= 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a share above 0, up to 1")
     return share
-
-
-def _metres(text: str) -> float:
-    """A finite number above 0."""
-    try:
-        metres = float(text)
-    except ValueError:
-        metres = -1.0
-    if not 0 < metres < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of metres above 0")
-    return metres
 
 
 def run_evaluate(options: argparse.Namespace) -> int:

@@ -1,7 +1,7 @@
 """Files that `sceneprint upload` sends whole: archives of sequences, and maps that are one file.
 
 files  --import_archives-->  frames, counted
-files  --import_maps-->  views of each, and where a robot would be found
+files  --import_maps-->  views of each, and where other views are found
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from tqdm import tqdm
 
+from sceneprint.cli import positive_number
 from sceneprint.cli.options import up_of
 from sceneprint.errors import Busy, DatasetError, InvalidRequest, UnknownFrame
 from sceneprint.formats.archive import is_archive
@@ -34,13 +35,23 @@ STALL_S = 120.0
 
 
 def is_starting(client: Client) -> bool:
-    """Whether the service still compiles kernels, so that its workers have not begun."""
+    """Return whether the service still compiles kernels, so that no worker has begun."""
     try:
         client.status()
     except Busy:
         print("the service compiles its kernels, once after an installation", file=sys.stderr)
         return True
     return False
+
+
+def _options_of(options: argparse.Namespace, file: str, **more: Any) -> ImportOptions:
+    """Return the options of the import of a file; InvalidRequest where they do not fit it."""
+    return checked(
+        ImportOptions, f"The metadata of {file}", robot=options.robot, session=options.session,
+        tags=options.tag, parent_frame=options.parent_frame, with_poses=not options.no_pose,
+        every=options.every, T_base_sensor=options.base, up=options.up, priority=options.priority,
+        if_novel=options.if_novel, **more,
+    )  # fmt: skip
 
 
 # Archives given to `sceneprint upload`: sent whole, and waited for until all frames are taken.
@@ -55,7 +66,7 @@ _HEAD, _PAUSE_S = 512, 2.0
 
 
 def is_archive_file(path: Path) -> bool:
-    """Whether a path is a file that begins as an archive does, and is no capture of Record3D."""
+    """Return whether a path is a file that begins as an archive does, and no export with frames."""
     try:
         if not path.is_file() or is_export(path):
             return False
@@ -70,21 +81,7 @@ def import_archives(
 ) -> bool:
     """Send archives and count their frames; False where workers do nothing for long."""
     for path in archives:
-        said = checked(
-            ImportOptions,
-            f"The metadata of {path.name}",
-            name=path.name.partition(".")[0][:64] or "import",
-            robot=options.robot,
-            session=options.session,
-            tags=options.tag,
-            parent_frame=options.parent_frame,
-            with_poses=not options.no_pose,
-            every=options.every,
-            T_base_sensor=options.base,
-            up=options.up,
-            priority=options.priority,
-            if_novel=options.if_novel,
-        )
+        said = _options_of(options, path.name, name=path.name.partition(".")[0][:64] or "import")
         with path.open("rb") as file:
             job = client.import_archive(options.map, file, said)
         if options.no_wait:
@@ -100,7 +97,7 @@ def import_archives(
 
 
 def _waited(client: Client, map_name: str, name: str, job: Job) -> tuple[Job, bool]:
-    """An import once it is over, or when no worker has moved it for long."""
+    """Return an import once it is over, or once it has not moved for long, and whether it moves."""
     from sceneprint_client.api import JobState
 
     moved, seen = time.monotonic(), job.progress
@@ -160,29 +157,18 @@ _MOST_WEAK = 5
 
 
 def axis_or_up(text: str) -> Axis | list[float]:
-    """An axis of a file, or up in the axes of a sensor."""
+    """Return an axis of a file, or up in the axes of a sensor."""
     axis = next((one for one in get_args(Axis) if one == text), None)
     return up_of(text) if axis is None else axis
 
 
-def positive_number(text: str) -> float:
-    """A number above 0."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not 0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
-    return number
-
-
 def units_of(text: str) -> float:
-    """Units of a metre: by name, or how many."""
+    """Return how many units a metre has, stated by their name or number."""
     return _UNITS[text] if text in _UNITS else positive_number(text)
 
 
 def camera_of(text: str) -> dict[str, float]:
-    """Six numbers of a camera."""
+    """Return the fields of a camera that is written as six numbers."""
     try:
         return camera_fields(text)
     except InvalidRequest as error:
@@ -190,7 +176,7 @@ def camera_of(text: str) -> dict[str, float]:
 
 
 def add_map_options(command: argparse.ArgumentParser) -> None:
-    """`--as-map`, and what is said of the file then."""
+    """Add `--as-map`, and the options that describe the file."""
     group = command.add_argument_group("a whole map in one file")
     group.add_argument(
         "--as-map",
@@ -251,13 +237,9 @@ def import_maps(client: Client, options: argparse.Namespace) -> int:
     """Send maps and say what became of each; returns 2 where one was not imported."""
     code = 0
     for path in options.paths:
-        said = checked(
-            ImportOptions, f"What is said of {path.name}", **{"as": "map"},
-            name=path.name[-64:].lstrip("."), robot=options.robot, session=options.session,
-            tags=options.tag, parent_frame=options.parent_frame, with_poses=not options.no_pose,
-            every=options.every, T_base_sensor=options.base, up=options.up,
+        said = _options_of(
+            options, path.name, **{"as": "map"}, name=path.name[-64:].lstrip("."),
             heights=options.height, units_per_metre=options.units, camera=options.camera,
-            priority=options.priority, if_novel=options.if_novel,
         )  # fmt: skip
         job = client.import_map(options.map, path, said)
         if options.no_wait:
@@ -297,9 +279,9 @@ def lines_of(name: str, map_name: str, result: MapImportResult) -> list[str]:
     lines += r.notes
     if r.coverage is not None:
         lines.append(
-            f"A robot would be found in {r.coverage:.0%} of this place: of {r.tested} other views "
-            f"{r.found} were found, {r.ambiguous} ambiguous, {r.not_found} not found, {r.wrong} "
-            "wrong."
+            f"Of {r.tested} other views of this file {r.coverage:.0%} are found in the map: "
+            f"{r.found} found, {r.ambiguous} ambiguous, {r.not_found} not found, {r.wrong} wrong. "
+            "Real frames are found less often: try some."
         )
     for area in r.weak[:_MOST_WEAK]:
         at = _numbers(area.centre.x, area.centre.y, area.centre.z)
@@ -312,7 +294,7 @@ def lines_of(name: str, map_name: str, result: MapImportResult) -> list[str]:
 
 
 def _axis(up: Direction) -> str:
-    """The axis that a direction is along, or its numbers."""
+    """Return the axis that a direction is along, or its numbers."""
     for axis, value in zip("xyz", (up.x, up.y, up.z), strict=True):
         if abs(value) > 0.9999:
             return axis if value > 0 else f"-{axis}"

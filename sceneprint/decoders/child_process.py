@@ -9,7 +9,6 @@ one. Nothing is pickled: the parent checks every reply.
 
 from __future__ import annotations
 
-import io
 import json
 import mmap
 import os
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from sceneprint.decoders.sandbox import close_process, die_with_parent
 from sceneprint.errors import SceneprintError
-from sceneprint.formats.depth_file import decode_samples, encode_png
+from sceneprint.formats.depth_file import decode_samples, encode_npy, encode_png
 from sceneprint.formats.points import pcd, ply, rows
 from sceneprint.formats.points.cloud import read_points
 from sceneprint.geometry.kernel import Kernel
@@ -149,7 +148,7 @@ def load_decoders(kernels: bool) -> None:
 def _images() -> list[bytes]:
     found = [encode_png(np.ones((2, 2), np.uint16))]
     found.append(bytes(12) + found[0])  # compressedDepth
-    return found + [_npy(np.ones((2, 2), kind)) for kind in ("f2", "f4", "f8", "u2")]
+    return found + [encode_npy(np.ones((2, 2), kind)) for kind in ("f2", "f4", "f8", "u2")]
 
 
 def array_samples() -> list[tuple[bytes, Any]]:
@@ -161,7 +160,8 @@ def array_samples() -> list[tuple[bytes, Any]]:
     struct.pack_into("<HI", header, 94, 227, 227)
     struct.pack_into("<BHI", header, 104, 0, 20, 12)
     struct.pack_into("<6d", header, 131, 1, 1, 1, 0, 0, 0)
-    return [(_npy(points), "npy"), (bytes(16 * 12), "kitti"), (bytes(header) + bytes(240), "las")]
+    las = bytes(header) + bytes(240)
+    return [(encode_npy(points), "npy"), (bytes(16 * 12), "kitti"), (las, "las")]
 
 
 def text_samples() -> list[tuple[bytes, Any]]:
@@ -195,12 +195,6 @@ def text_samples() -> list[tuple[bytes, Any]]:
         found.append((begin + vertex + listed + end + lists, "ply"))
         found.append((begin + other + vertex + end + before + body, "ply"))
     return found
-
-
-def _npy(array: NDArray[Any]) -> bytes:
-    out = io.BytesIO()
-    np.save(out, array)
-    return out.getvalue()
 
 
 if __name__ == "__main__":

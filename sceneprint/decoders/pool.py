@@ -154,7 +154,7 @@ class DecoderProcess:
     def result(
         self, reply: dict[str, Any], checked: Callable[[DecoderProcess, dict[str, Any]], Any]
     ) -> Any:
-        """What a reply says.
+        """Return the content of a reply.
 
         Parameters
         ----------

@@ -41,7 +41,7 @@ _MOST_NOTES, _LONGEST_NOTE = 20, 1000
 
 @dataclass(frozen=True)
 class SurfaceLimits:
-    """What the reading of a file may take.
+    """Limits of the reading of one file.
 
     Parameters
     ----------
@@ -113,9 +113,10 @@ def _read(file: int, name: str, options: SurfaceOptions, limits: SurfaceLimits) 
 
 
 def _checked(process: DecoderProcess, reply: dict[str, Any]) -> ReadSurface:
-    """The result of a reply; any error is a lie of the process."""
-    n, m, given = reply["points"], reply["triangles"], reply["given"]
-    _check(_is_whole(n, 1, MOST_VERTICES) and _is_whole(given, n, MOST_FILE_POINTS), "points")
+    """Return the result of a reply; an error means that the process is not to be trusted."""
+    n, m, file_points = reply["points"], reply["triangles"], reply["file_points"]
+    _check(_is_whole(n, 1, MOST_VERTICES), "points")
+    _check(_is_whole(file_points, n, MOST_FILE_POINTS), "points of the file")
     points: Floats32 = process.array_of("<f4", (n, 3))
     far = 2 * FARTHEST_M + FAR_M
     _check(bool(points.min() >= -far and points.max() <= far), "points beyond reach")
@@ -133,7 +134,8 @@ def _checked(process: DecoderProcess, reply: dict[str, Any]) -> ReadSurface:
     _check(isinstance(notes, list) and len(notes) <= _MOST_NOTES, "notes")
     return ReadSurface(
         ReferenceSurface(points, triangles, offset, up), reply["units"], reply["up_from"],
-        tuple(str(one)[:_LONGEST_NOTE] for one in notes), float(units), given, voxel,
+        tuple(str(one)[:_LONGEST_NOTE] for one in notes), float(units), file_points,
+        voxel,
     )  # fmt: skip
 
 

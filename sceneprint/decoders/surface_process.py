@@ -52,7 +52,8 @@ def _main() -> None:
             "points": len(points), "triangles": None if triangles is None else len(triangles),
             "offset": read.surface.offset.tolist(), "up": read.surface.up.tolist(),
             "units": read.units, "up_from": read.up_from, "notes": list(read.notes),
-            "units_per_metre": read.units_per_metre, "given": read.given, "voxel": read.voxel,
+            "units_per_metre": read.units_per_metre, "file_points": read.file_points,
+            "voxel": read.voxel,
         }  # fmt: skip
         return reply, (points,) if triangles is None else (points, triangles)
 
@@ -70,11 +71,11 @@ def _load(form: SurfaceFormat) -> None:
     ElementTree.fromstring("<a/>")
     for data, one in (*array_samples(), *text_samples(), *mesh_samples()):
         if one == form:
-            with suppress(SceneprintError):  # what is not installed; points that are no mesh
+            with suppress(SceneprintError):  # a reader is not installed, or a sample is no mesh
                 read_surface(data, "", None, form)
     for module in (rows, pcd, ply, ply_faces):
         for kernel in vars(module).values():
-            # what was not compiled by now never is: a clean error
+            # a kernel that no sample needed would have to be compiled: it raises an error instead
             if isinstance(kernel, Kernel) and kernel.compiler.signatures:
                 kernel.compiler.disable_compile()
 

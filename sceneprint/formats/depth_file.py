@@ -186,6 +186,13 @@ def _samples(header: bytes, rows: bytes) -> NDArray[np.uint16]:
     return np.array(samples, dtype=np.uint16)  # some versions of Pillow give int32
 
 
+def encode_npy(array: NDArray[Any]) -> bytes:
+    """Return the bytes of an NPY file with an array."""
+    file = io.BytesIO()
+    np.save(file, np.ascontiguousarray(array), allow_pickle=False)
+    return file.getvalue()
+
+
 def encode_png(samples: NDArray[np.uint16]) -> bytes:
     """Return a 16-bit greyscale PNG of the samples (H, W), in a sixth of Pillow's time.
 

@@ -287,15 +287,8 @@ TYPES = (
 #: Bytes that are written at once.
 _CHUNK = 1 << 20
 _TEXTS = (
-    "as",
-    "name",
-    "robot",
-    "session",
-    "parent_frame",
-    "every",
-    "with_poses",
-    "units_per_metre",
-)
+    "as", "name", "robot", "session", "parent_frame", "every", "with_poses", "units_per_metre",
+)  # fmt: skip
 _PARAMETERS = (
     *_TEXTS, "tags", "base", "base_frame", "up", "heights", "camera", "priority", "if_novel",
 )  # fmt: skip
@@ -359,7 +352,7 @@ async def add_import(
 
     With `as=map` the body is one cloud or mesh of a whole place (PCD, PLY, LAS, LAZ, OBJ, STL, glTF
     or E57), and `name` the name of its file. A worker renders views of it, adds them as frames with
-    poses, and looks others up to see where a robot would be found: `result` of the job has this
+    poses, and looks other views up in the map: `result` of the job says how many it found
     (MapImportResult).
     """
     if media_type(request) not in TYPES:

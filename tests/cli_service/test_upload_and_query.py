@@ -344,7 +344,7 @@ def test_a_map_that_is_one_file_is_uploaded_as_a_map(
     )
     assert how == "units: m (as you said); up: z (as you said)"
     assert re.search(
-        r"^A robot would be found in \d+% of this place: of \d+ other views ", done.stdout, re.M
+        r"^Of \d+ other views of this file \d+% are found in the map: ", done.stdout, re.M
     )
     with Client(service_url) as client:
         frames = list(client.frames("mesh"))

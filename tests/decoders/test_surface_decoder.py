@@ -45,7 +45,7 @@ def assert_equal(here: ReadSurface, there: ReadSurface) -> None:
             assert a is b
         else:
             assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
-    names = ("units", "up_from", "notes", "units_per_metre", "given", "voxel")
+    names = ("units", "up_from", "notes", "units_per_metre", "file_points", "voxel")
     assert [getattr(here, name) for name in names] == [getattr(there, name) for name in names]
 
 
@@ -114,7 +114,7 @@ def test_memory_and_time_are_limited(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "lie",
     [
-        {"points": 0}, {"points": 10**9}, {"points": 2.0}, {"given": 1}, {"triangles": 10**9},
+        {"points": 0}, {"points": 10**9}, {"points": 2.0}, {"file_points": 1}, {"triangles": 10**9},
         {"triangles": 400}, {"up": [0, 0, 2]}, {"offset": [0, 0, float("nan")]}, {"offset": [1]},
         {"units": "guessed"}, {"units_per_metre": -1}, {"notes": "x" * 30}, {"voxel": -1.0},
     ],
@@ -123,7 +123,7 @@ def test_a_reply_that_lies_is_no_result(
     tmp_path: Path, lie: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truth = {
-        "points": 12, "triangles": None, "given": 12, "offset": [0, 0, 0], "up": [0, 0, 1],
+        "points": 12, "triangles": None, "file_points": 12, "offset": [0, 0, 0], "up": [0, 0, 1],
         "units": "file", "up_from": "file", "notes": [], "units_per_metre": 1.0, "voxel": None,
     }  # fmt: skip
     path = tmp_path / "upload"

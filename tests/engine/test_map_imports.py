@@ -150,6 +150,18 @@ def test_a_slice_that_was_lost_adds_nothing_twice(
     assert [one.name for one in chosen.list_frames("hall", limit=1000).items] == names
 
 
+def test_the_same_view_in_two_sessions_is_two_frames(
+    chosen: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_import, "_AT_ONCE", 2)
+    task = claimed(chosen)
+    data = {**task.job.data, "session": "annex"}
+    other = replace(task, job=replace(task.job, data=data))
+    added = [slice_of(chosen, one, lambda: True).items for one in (task, other)]
+    assert [one["status"] for items in added for one in items] == [202] * 4
+    assert len({one["frame_id"] for items in added for one in items}) == 4
+
+
 class Between:
     """An end of a slice that is not reached, and what happens when it is looked for."""
 

@@ -82,7 +82,7 @@ def test_clouds_by_open3d(with_open3d: None, tmp_path: Path, form: str) -> None:
     read = read_surface(file.read_bytes(), file.name)
     np.testing.assert_allclose(read.surface.points, path(), atol=MILLIMETRE)
     assert read.surface.triangles is None
-    assert (read.units, read.units_per_metre, read.given) == ("estimated", 1.0, N)
+    assert (read.units, read.units_per_metre, read.file_points) == ("estimated", 1.0, N)
     assert read.up_from == "estimated"
     np.testing.assert_array_equal(read.surface.offset, 0.0)
 
@@ -120,7 +120,7 @@ def test_scans_by_libe57_are_one_cloud(tmp_path: Path) -> None:
     expected = np.concatenate([np.stack([-y, x, z], axis=1) + place for place in places])
     there = read.surface.points.astype(np.float64) + read.surface.offset
     np.testing.assert_allclose(there, expected, atol=MILLIMETRE)
-    assert (read.units, read.given) == ("file", 2 * N)
+    assert (read.units, read.file_points) == ("file", 2 * N)
 
 
 def test_rows_of_numpy_and_what_is_missing() -> None:

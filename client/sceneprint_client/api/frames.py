@@ -144,7 +144,7 @@ _OF_MAP = ("heights", "units_per_metre", "camera")
 
 
 class ImportOptions(Given):
-    """What an import takes its file for, and metadata of all frames that it adds."""
+    """Options of an import: how its file is read, and metadata of the frames that it adds."""
 
     as_: Literal["frames", "map"] = Field(
         default="frames",
@@ -250,7 +250,7 @@ class WeakArea(ApiRecord):
 
 
 class MapImportResult(ApiRecord):
-    """What became of a map that came as one file: `result` of its job."""
+    """Result of the import of a whole map: `result` of its job."""
 
     points: int
     triangles: int = Field(description="0 of a cloud.")
@@ -274,8 +274,8 @@ class MapImportResult(ApiRecord):
     ambiguous: int
     not_found: int
     coverage: float | None = Field(
-        description="`found` / `tested`: the share of the place where a robot would be found; null "
-        "where nothing was looked up."
+        description="`found` / `tested`, an upper bound of the share of real frames that are "
+        "found; null where nothing was looked up."
     )
     weak: list[WeakArea] = Field(
         description="Where fewer than half of the tested views were found, the worst first."

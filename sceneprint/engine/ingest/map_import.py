@@ -10,7 +10,6 @@ the map until the job is over.
 from __future__ import annotations
 
 import hashlib
-import io
 import shutil
 import tempfile
 from collections import Counter
@@ -43,7 +42,7 @@ from sceneprint.errors import (
     QuotaExceeded,
     UnreadableCloud,
 )
-from sceneprint.formats.depth_file import encode_png
+from sceneprint.formats.depth_file import encode_npy, encode_png
 from sceneprint.formats.surface_file import SurfaceOptions
 from sceneprint.geometry.views import Renderer, ViewParameters, choose_views
 from sceneprint.store import Store, queue
@@ -51,7 +50,7 @@ from sceneprint.store.database_errors import unusable
 from sceneprint.store.frame_queries import PathFrame
 from sceneprint.store.maps import living_map, use_of
 from sceneprint.store.tables import ARCHIVE, MapRow
-from sceneprint.types import Floats, Floats32, Intrinsics, ReferenceSurface
+from sceneprint.types import Floats, Intrinsics, ReferenceSurface
 from sceneprint_client.api import Answer, Filter, FrameMeta, FrameState, Query
 from sceneprint_client.api.base import (
     CameraIntrinsics,
@@ -166,7 +165,7 @@ class _Views:
         """Return a view as a robot without any knowledge of its pose would send it."""
         seen, camera = self._renderer.view(pose), self._p.camera
         if not isinstance(camera, Intrinsics):
-            return _View(_npy(seen), FrameMeta())
+            return _View(encode_npy(seen), FrameMeta())
         scale = min(_DEPTH_SCALE, _FARTHEST / self._p.farthest)
         samples = np.round(seen * scale).astype(np.uint16)
         intrinsics = CameraIntrinsics(
@@ -174,12 +173,6 @@ class _Views:
             cy=camera.cy,
         )  # fmt: skip
         return _View(encode_png(samples), FrameMeta(intrinsics=intrinsics, depth_scale=scale))
-
-
-def _npy(points: Floats32) -> bytes:
-    out = io.BytesIO()
-    npy.write_array(out, points, allow_pickle=False)
-    return out.getvalue()
 
 
 def names_of(options: ImportOptions) -> tuple[str, str]:

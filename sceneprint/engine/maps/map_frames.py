@@ -6,7 +6,6 @@ Each is read in one transaction, and a part at a time.
 from __future__ import annotations
 
 import base64
-import io
 import json
 import math
 from collections.abc import Callable, Iterable
@@ -22,6 +21,7 @@ from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
+from sceneprint.formats.depth_file import encode_npy
 from sceneprint.formats.export import points_of, write_ply
 from sceneprint.geometry.rigid import moved
 from sceneprint.pictures import depth_view, normals_view, onto, patches_view, picture, vista_of
@@ -394,10 +394,8 @@ def level_of(patches: Patches) -> PatchLevel:
 
 
 def npy_of(vector: bytes) -> bytes:
-    """Bytes as an NPY file of uint8."""
-    buffer = io.BytesIO()
-    np.save(buffer, np.frombuffer(vector, np.uint8), allow_pickle=False)
-    return buffer.getvalue()
+    """Return bytes as an NPY file of uint8."""
+    return encode_npy(np.frombuffer(vector, np.uint8))
 
 
 # What a frame is made of, out of the store: cloud, picture, patches, signature, upload.

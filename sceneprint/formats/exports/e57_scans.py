@@ -17,6 +17,7 @@ import numpy as np
 
 from sceneprint.errors import DatasetError, UnreadableCloud
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
+from sceneprint.formats.depth_file import encode_npy
 from sceneprint.formats.points.cloud import FEWEST_POINTS, MOST_POINTS, thinned
 from sceneprint.formats.points.e57 import E57Scan, read_e57, with_viewpoint
 from sceneprint_client.files import naming
@@ -62,9 +63,7 @@ class E57Source:
         points = points[:n]
         if n > MOST_POINTS:
             points, _ = thinned(points, MOST_POINTS)
-        file = io.BytesIO()
-        np.save(file, points, allow_pickle=False)
-        return file.getvalue()
+        return encode_npy(points)
 
 
 @contextmanager

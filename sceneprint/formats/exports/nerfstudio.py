@@ -12,7 +12,6 @@ the frame of the original reconstruction.
 
 from __future__ import annotations
 
-import io
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -22,7 +21,7 @@ import numpy as np
 
 from sceneprint.errors import DatasetError, SceneprintError, UnreadableFrame
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
-from sceneprint.formats.depth_file import decode_npy
+from sceneprint.formats.depth_file import decode_npy, encode_npy
 from sceneprint.formats.exports.opengl import (
     Lens,
     depth_camera,
@@ -72,11 +71,9 @@ class ScaledNpy:
         samples = decode_npy(data)
         if samples.dtype == np.uint16:  # these are scaled by the camera's depth scale
             return data
-        file = io.BytesIO()
         with np.errstate(all="ignore"):  # what overflows is missing
             metres = (samples * np.float32(self.metres)).astype(np.float32)
-        np.save(file, metres, allow_pickle=False)
-        return file.getvalue()
+        return encode_npy(metres)
 
 
 def nerfstudio_sequence(folder: Path, name: str) -> FrameSequence:

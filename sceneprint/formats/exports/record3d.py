@@ -32,6 +32,7 @@ from sceneprint.errors import (
     UnreadableFrame,
 )
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
+from sceneprint.formats.depth_file import encode_npy
 from sceneprint.formats.exports.opengl import (
     Lens,
     depth_camera,
@@ -90,10 +91,7 @@ class LzfseDepth:
         with naming(str(self.capture / self.name)):
             # what does not shrink is stored as it is: a little larger
             samples = _inflated(_content(self.capture, self.name, size + 65_536), size)
-        file = io.BytesIO()
-        depth = np.frombuffer(samples, "<f4").reshape(self.height, self.width)
-        np.save(file, depth, allow_pickle=False)
-        return file.getvalue()
+        return encode_npy(np.frombuffer(samples, "<f4").reshape(self.height, self.width))
 
 
 def _inflated(packed: bytes, size: int) -> bytes:

@@ -8,7 +8,6 @@ it is opened read-only, nothing in its schema is run, and what a query may read 
 
 from __future__ import annotations
 
-import io
 import math
 import re
 import sqlite3
@@ -24,7 +23,7 @@ import numpy as np
 
 from sceneprint.errors import DatasetError, InvalidIntrinsics
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
-from sceneprint.formats.depth_file import encode_png
+from sceneprint.formats.depth_file import encode_npy, encode_png
 from sceneprint.formats.exports.rtabmap_blobs import (
     DEPTH_HEAD,
     BrokenBlob,
@@ -39,7 +38,7 @@ from sceneprint.formats.exports.rtabmap_blobs import (
     scan_points,
     transform,
 )
-from sceneprint.types import Floats, Floats32, Intrinsics
+from sceneprint.types import Floats, Intrinsics
 from sceneprint_client.api.base import GivenBase
 from sceneprint_client.errors import printable
 from sceneprint_client.sidecars import Camera, CloudSource
@@ -116,7 +115,7 @@ class RtabmapDepth:
         part = np.s_[:, self.camera * width : (self.camera + 1) * width]
         if samples.dtype == np.uint16:
             return encode_png(samples[part].astype(np.uint16))
-        return _npy(samples[part].astype(np.float32))
+        return encode_npy(samples[part].astype(np.float32))
 
 
 @dataclass(frozen=True)
@@ -142,13 +141,7 @@ class RtabmapScan:
         DatasetError : the database cannot be read.
         UnreadableCloud : the scan is damaged, or has no heights.
         """
-        return _npy(scan_points(_value(self.path, "scan", self.node), self.form))
-
-
-def _npy(array: Floats32) -> bytes:
-    file = io.BytesIO()
-    np.save(file, np.ascontiguousarray(array), allow_pickle=False)
-    return file.getvalue()
+        return encode_npy(scan_points(_value(self.path, "scan", self.node), self.form))
 
 
 def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, ...]:

@@ -9,7 +9,6 @@ PointCloud2  --cloud_file-->  bytes of an NPY file (N, 3)
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sceneprint.errors import (
     DatasetError,
@@ -27,7 +25,7 @@ from sceneprint.errors import (
     UnreadableFrame,
 )
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
-from sceneprint.formats.depth_file import decode_png, encode_png, inverse_depth
+from sceneprint.formats.depth_file import decode_png, encode_npy, encode_png, inverse_depth
 from sceneprint.formats.recording.bag import (
     CAMERA,
     COMPRESSED,
@@ -119,21 +117,14 @@ def depth_file(message: Any, *, compressed: bool) -> bytes:
         found = compressed_depth(message)
         if found.inverse is None:
             return found.png
-        return _npy_file(inverse_depth(decode_png(found.png), *found.inverse))
+        return encode_npy(inverse_depth(decode_png(found.png), *found.inverse))
     samples = depth_samples(message)
-    return _npy_file(samples) if samples.dtype.kind == "f" else encode_png(samples)
+    return encode_npy(samples) if samples.dtype.kind == "f" else encode_png(samples)
 
 
 def cloud_file(message: Any) -> bytes:
     """Return the bytes of an NPY file with the points of a PointCloud2; see `cloud_points`."""
-    return _npy_file(cloud_points(message))
-
-
-def _npy_file(samples: NDArray[Any]) -> bytes:
-    """Bytes of an NPY file."""
-    file = io.BytesIO()
-    np.save(file, np.ascontiguousarray(samples))
-    return file.getvalue()
+    return encode_npy(cloud_points(message))
 
 
 # Which topics, at which poses.

@@ -41,7 +41,7 @@ class RawSurface:
     points : (N, 3) float32, relative to `origin`; rows that are not finite only in a mesh
     origin : (3,) float64
     triangles : (M, 3) int64 or int32 indices, not checked yet; None for a cloud
-    given : points of the file, missing ones too
+    file_points : points of the file, missing ones too
     voxel : edge of the voxels that a cloud was thinned to, units of the file; None if it was not
     units_per_metre : that the file states, or None
     up : (3,) that the file states, or None
@@ -52,7 +52,7 @@ class RawSurface:
     points: Floats32
     origin: Floats
     triangles: Ints32 | None
-    given: int
+    file_points: int
     voxel: float | None
     units_per_metre: float | None
     up: Floats | None

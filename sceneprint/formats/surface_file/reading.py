@@ -35,10 +35,10 @@ from sceneprint.formats.surface_file.raw_surface import (
 )
 from sceneprint.geometry.surface.upright import estimate_units, estimate_up
 from sceneprint.types import Floats, Floats32, Ints32, ReferenceSurface
+from sceneprint_client.api.frames import Axis
 from sceneprint_client.files import HEAD, format_of, naming
 
 SurfaceFormat = Literal["pcd", "ply", "las", "npy", "e57", "obj", "stl", "glb", "gltf"]
-Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 #: Where units or up come from: the options, the file, or the shape of the surface.
 Source = Literal["stated", "file", "estimated"]
 
@@ -100,7 +100,7 @@ class ReadSurface:
     up_from : where up comes from
     notes : sentences for the user: what was estimated, left out or thinned
     units_per_metre : of the file's coordinates
-    given : points of the file, missing ones too
+    file_points : points of the file, missing ones too
     voxel : edge of the voxels that a cloud was thinned to, metres; None if it was not
     """
 
@@ -109,7 +109,7 @@ class ReadSurface:
     up_from: Source
     notes: tuple[str, ...]
     units_per_metre: float
-    given: int
+    file_points: int
     voxel: float | None
 
 
@@ -255,11 +255,11 @@ def _in_metres(raw: RawSurface, options: SurfaceOptions) -> ReadSurface:
     voxel = None if raw.voxel is None else raw.voxel / units
     if voxel is not None:
         notes.append(
-            f"The {raw.given} points were thinned to {len(points)}, one to a voxel of "
+            f"The {raw.file_points} points were thinned to {len(points)}, one to a voxel of "
             f"{100 * voxel:.3g} cm."
         )
     surface = ReferenceSurface(points, triangles, offset, up)
-    return ReadSurface(surface, units_from, up_from, tuple(notes), units, raw.given, voxel)
+    return ReadSurface(surface, units_from, up_from, tuple(notes), units, raw.file_points, voxel)
 
 
 def _up(
@@ -302,7 +302,7 @@ def _units(
 def _cleaned(raw: RawSurface, notes: list[str]) -> tuple[Floats32, Ints32 | None]:
     """Points and triangles without what is missing."""
     if raw.triangles is None:
-        missing = raw.given - len(raw.points)
+        missing = raw.file_points - len(raw.points)
         if missing and raw.voxel is None:
             notes.append(f"{missing} missing points were left out.")
         if len(raw.points) < FEWEST_POINTS:

@@ -160,8 +160,8 @@ def ask_site(
     confidence : least of a pose that is found; default: that of LocalizationParameters
     """
     kind, index, queries = work
-    model, of_scans = signer.model, _is_of_scans(signer.model)
-    rng = np.random.default_rng([seed, index, kinds_of(model).index(kind)])
+    of_scans = _is_of_scans(signer.model)
+    rng = np.random.default_rng([seed, index, kinds_of(signer.model).index(kind)])
     site: LookalikeSite[AnyFrame] = (
         synthesise_lookalike_survey(kind, seed, index, queries=queries)
         if of_scans
@@ -171,8 +171,38 @@ def ask_site(
     shown, database, of_map = signed(frames, site.name, signer, 0)
     # of another place: a pose in its own frame is a pose in no map
     scene = site.name if site.same_frame else f"{site.name}, elsewhere"
-    sent, members, of_queries = signed(site.queries, scene, signer, len(database))
-    geometries = [*of_map, *of_queries]
+    sent, queries_signed, of_queries = signed(site.queries, scene, signer, len(database))
+    priors = [
+        None if prior is None else prior_about(query.pose, site.name, *prior, rng)
+        for query in queries_signed
+    ]
+    answers = answers_of(
+        signer, database, queries_signed, [*of_map, *of_queries], candidates, priors, confidence
+    )
+    able = _answerable(site, shown, sent)
+    return [
+        SiteAnswer(site.name, kind, number, able[number], answer)
+        for number, answer in enumerate(answers)
+    ]
+
+
+def answers_of(
+    signer: Signer, database: Sequence[SignedFrame], queries: Sequence[SignedFrame],
+    geometries: Sequence[Geometry], candidates: int = 10,
+    priors: Sequence[PosePrior | None] | None = None, confidence: float | None = None,
+) -> list[JudgedAnswer]:  # fmt: skip
+    """Answer queries on a map of some frames, as a service does.
+
+    Parameters
+    ----------
+    signer : its model answers
+    database, queries : numbered from 0, the queries after the database; see `signed`
+    geometries : of both, by number
+    candidates : size of C
+    priors : of each query; None: it has none
+    confidence : see `ask_site`
+    """
+    model = signer.model
     judge = Judge(
         geometries.__getitem__, "full", 0, model.parameters.validation, database=database,
         answer=model.answer, unrelated_distance=model.unrelated_distance,
@@ -180,23 +210,22 @@ def ask_site(
     if confidence is not None:
         judge = replace(judge, confidence=confidence)
     ranked = rank(
-        np.stack([q.signature for q in members]), np.stack([d.signature for d in database]),
-        np.ones((len(members), len(database)), np.bool_), metric=model.metric,
+        np.stack([query.signature for query in queries]),
+        np.stack([frame.signature for frame in database]),
+        np.ones((len(queries), len(database)), np.bool_), metric=model.metric,
         candidates=candidates,
     )  # fmt: skip
-    able = _answerable(site, shown, sent)
-    answers = []
-    for number, (query, one) in enumerate(zip(members, ranked, strict=True)):
+    rows, answers = np.arange(len(database)), []
+    for query, ranking, prior in zip(queries, ranked, priors or [None] * len(queries), strict=True):
         among = tuple(
-            Candidate(j, j, database[j].scene, database[j].pose, 0.0, 0.0) for j in one.selection
+            Candidate(j, j, database[j].scene, database[j].pose, 0.0, 0.0)
+            for j in ranking.selection
         )
-        rows = np.arange(len(database))
         task = QueryTask(
-            query.number, scene, query.pose, [], one.selection, among, rows, one.retrieved
+            query.number, query.scene, query.pose, [], ranking.selection, among, rows,
+            ranking.retrieved,
         )  # fmt: skip
-        believed = None if prior is None else prior_about(query.pose, site.name, *prior, rng)
-        answer = answer_of(judge, task, believed)
-        answers.append(SiteAnswer(site.name, kind, number, able[number], answer))
+        answers.append(answer_of(judge, task, prior))
     return answers
 
 

@@ -182,8 +182,8 @@ function mapOf(item) {
   return [
     h("p", {}, `${count(told.views)} views are in the map and see ${percent(told.seen)} of its surface.`,
       told.refused > 0 && ` ${count(told.refused)} were refused.`),
-    told.coverage !== null && h("p", {}, h("strong", {}, `A robot would be found in ${percent(told.coverage)} of this place. `),
-      `Of ${count(told.tested)} other views, ${count(told.found)} were found, ${count(told.ambiguous)} ambiguous, ${count(told.not_found)} not found, ${count(told.wrong)} wrong.`),
+    told.coverage !== null && h("p", {}, h("strong", {}, `Of ${count(told.tested)} other views of this file, ${percent(told.coverage)} are found in the map. `),
+      `${count(told.found)} were found, ${count(told.ambiguous)} ambiguous, ${count(told.not_found)} not found, ${count(told.wrong)} wrong. Real frames are found less often: try some.`),
     h("p", {}, `Units: ${told.units_per_metre} per metre (${told.units_from}). Up: ${at(told.up)} (${told.up_from}).`),
     (told.notes ?? []).map((note) => h("p", {}, note)),
     weak.length > 0 && h("details", {}, h("summary", {}, "Weak here"),
