@@ -148,19 +148,40 @@ def find_frame_file(file: Path) -> FrameFile:
         what it cannot.
     InvalidIntrinsics : the intrinsics.json describes no camera.
     """
-    folder, points = file.parent, is_cloud(file.name) or _is_npy_of_points(file)
-    stem = file.stem if points else file.name.removesuffix(".depth.png")
-    beside = folder / f"{stem}.pose.txt"
-    pose = beside if beside.is_file() else None
-    if points:
+    folder, number = file.parent, seven_scenes_number(file.name)
+    stem = file.name.removesuffix(".depth.png") if SEVEN_SCENES.fullmatch(file.name) else file.stem
+    name, pose = f"{folder.name}/{stem}", find_pose_file(folder, stem)
+    if is_cloud(file.name) or _is_npy_of_points(file):
         source = find_cloud_source(folder)
-        return FrameFile(f"{folder.name}/{stem}", file, None, pose_source=pose, cloud=source)
-    camera = find_camera(folder)
-    if SEVEN_SCENES.fullmatch(file.name):
-        number = seven_scenes_number(file.name)
-        return FrameFile(f"{folder.name}/{stem}", file, camera, pose_source=pose, sequence=number)
+        return FrameFile(name, file, None, pose_source=pose, cloud=source)
     # what is named outright is taken, whatever its name; its content decides
-    return FrameFile(f"{folder.name}/{file.stem}", file, camera)
+    return FrameFile(name, file, find_camera(folder), pose_source=pose, sequence=number)
+
+
+#: Folders that hold the poses of the frames beside them.
+POSE_FOLDERS = ("pose", "poses")
+NO_POSE_FILE = "no NAME.pose.txt is beside them, nor NAME.txt in a folder pose"
+
+
+def find_pose_file(folder: Path, stem: str) -> Path | None:
+    """Return the file of a frame's pose, or None.
+
+    It is NAME.pose.txt beside the frame, or NAME.txt in a folder `pose` or `poses`. That lies in
+    the frame's folder, or beside it if the folder is called depth (ScanNet). Of `depth_NAME` it
+    may be called `pose_NAME.txt` too.
+
+    Parameters
+    ----------
+    folder : of the frame
+    stem : name of the frame's file without suffix: NAME, NAME.depth or depth_NAME
+    """
+    name = stem.removesuffix(".depth")
+    renamed = [f"{name.replace('depth', 'pose')}.txt"] if "depth" in name else []
+    beside = [f"{name}.pose.txt", *renamed]
+    listed, found = [f"{name}.txt", *beside], [folder / one for one in beside]
+    for place in [folder, folder.parent] if "depth" in folder.name.lower() else [folder]:
+        found += [place / below / one for below in POSE_FOLDERS for one in listed]
+    return next((one for one in found if one.is_file()), None)
 
 
 def _is_npy_of_points(file: Path) -> bool:

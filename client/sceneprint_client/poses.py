@@ -90,8 +90,9 @@ class SensorTrajectory:
 
 
 def interpolate(
-    trajectory: SensorTrajectory, stamps: Sequence[float], *, longest_gap: float = 0.1
-) -> list[Floats | None]:
+    trajectory: SensorTrajectory, stamps: Sequence[float], *, longest_gap: float = 0.1,
+    tolerance: float = 0.0,
+) -> list[Floats | None]:  # fmt: skip
     """Return the poses at the stamps: positions linear, rotations by slerp.
 
     Parameters
@@ -99,11 +100,12 @@ def interpolate(
     trajectory : N poses
     stamps : M seconds, in any order
     longest_gap : seconds between two poses beyond which nothing between them is known
+    tolerance : seconds from a pose within which it stands where nothing is interpolated
 
     Returns
     -------
     poses : M times T_parent_sensor (4, 4), or None before the first pose, after the last,
-        and within a longer gap
+        and within a longer gap, unless a pose is as near as the tolerance
     """
     times = np.asarray(stamps, dtype=np.float64)
     t, last = trajectory.stamps, len(trajectory.stamps) - 1
@@ -111,6 +113,10 @@ def interpolate(
     before = np.where(t[after] == times, after, np.maximum(after - 1, 0))
     span = t[after] - t[before]
     known = (t[before] <= times) & (times <= t[after]) & (span <= longest_gap)
+    near = np.where(t[after] - times < times - t[before], after, before)
+    alone = ~known & (np.abs(t[near] - times) <= tolerance)
+    before, after = np.where(alone, near, before), np.where(alone, near, after)
+    known, span = known | alone, t[after] - t[before]
     w = np.where(span > 0.0, times - t[before], 0.0) / np.where(span > 0.0, span, 1.0)
 
     positions = trajectory.positions[before]

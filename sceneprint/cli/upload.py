@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
@@ -321,6 +322,9 @@ def run_upload(options: argparse.Namespace) -> int:
         finally:  # what was received stays, however the run ended
             counted = tally.new + tally.there + tally.refused
             tally.report(max(len(found), counted), time.perf_counter() - start)
+            # exports say it in their notes
+            if own := [one for one in found if not one[0].layout.is_export]:
+                print(pose_line(own, tally, with_pose=not options.no_pose))
             for sequence in sequences:
                 tell(sequence)
             hint_at_maps(paths)
@@ -332,6 +336,23 @@ def run_upload(options: argparse.Namespace) -> int:
                     file=sys.stderr,
                 )
     return 2 if tally.errors or stalled else 0
+
+
+def pose_line(
+    found: list[tuple[FrameSequence, FrameReference]], tally: Tally, *, with_pose: bool
+) -> str:
+    """Say of how many frames the poses were sent, and why not of the others."""
+    lost = {name for name, _ in tally.errors}
+    without: Counter[str] = Counter()
+    for sequence, frame in found:
+        if not with_pose:
+            without["--no-pose"] += 1
+        elif frame.pose_source is None:
+            without[sequence.unposed] += 1
+        elif frame.name in lost:
+            without["not indexed"] += 1
+    line = f"poses of {len(found) - without.total()} of {len(found)} frames"
+    return "; ".join([line, *(f"{n} without: {why}" for why, n in without.items() if why)])
 
 
 def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSequence]:

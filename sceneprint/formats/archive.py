@@ -35,12 +35,14 @@ from pathlib import Path
 from typing import IO, Any, BinaryIO, Literal, Protocol, cast
 
 from sceneprint.errors import DatasetError, SceneprintError, UnreadableArchive
+from sceneprint.formats.dataset.frame_names import is_beside_depth, is_image
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence
-from sceneprint.formats.dataset.sequences import find_each, is_of_colour
+from sceneprint.formats.dataset.sequences import find_each
 from sceneprint.formats.exports.nerfstudio import TRANSFORMS, ScaledNpy
 from sceneprint.formats.exports.polycam import CAMERAS
 from sceneprint.formats.exports.record3d import DEPTH_SUFFIX, FRAMES
 from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, MAXIMUM_IMAGE_BYTES, is_cloud
+from sceneprint_client.frame_files import POSE_FOLDERS
 from sceneprint_client.sidecars import CLOUDS_FILE, INTRINSICS_FILE
 
 # Members of a tar or a zip, by the standard library behind guards.
@@ -451,6 +453,7 @@ DEFAULT_NAME = "import"
 _LISTS = ("depth.txt", "groundtruth.txt", TRANSFORMS)
 _TEXTS = (INTRINSICS_FILE, CLOUDS_FILE, "TrainSplit.txt", "TestSplit.txt")
 _MAXIMUM_LIST, _MAXIMUM_TEXT, _MAXIMUM_TEXTS = 1 << 26, 1 << 16, 1 << 27  #: bytes; of all of them
+_POSE = re.compile(r".+[._-]pose\.txt|pose[._-].+\.txt")
 _HEAD_BYTES = 1024  #: of an image, which tell its size
 _PARENTS = ("0", "1", "2", "3", "4")  #: a camera is looked for above the frames: not beyond these
 
@@ -679,12 +682,14 @@ def _wanted(parts: tuple[str, ...]) -> Wanted | None:
     *folders, name = parts
     hidden = any(part.startswith(".") or part == "__MACOSX" for part in parts)
     # the first folder may be what the packed folder was called
-    if hidden or any(is_of_colour(folder) for folder in folders[1:]):
+    if hidden or any(is_beside_depth(folder) for folder in folders[1:]):
         return None
-    if name in _TEXTS or name in _LISTS or name.endswith(".pose.txt") or _is_of_export(parts):
+    is_pose = _POSE.fullmatch(name) is not None or (
+        name.endswith(".txt") and folders[-1:] in ([one] for one in POSE_FOLDERS)
+    )
+    if name in _TEXTS or name in _LISTS or is_pose or _is_of_export(parts):
         return "text"
-    lowered = name.lower()
-    if lowered.endswith((".png", ".npy")) and not lowered.endswith(".color.png"):
+    if is_image(name) and not name.lower().endswith(".color.png"):
         return "image"
     if is_cloud(name):
         return "image"

@@ -35,7 +35,8 @@ def house(service_url: str, rooms: Path) -> str:
         [sys.executable, "-m", "sceneprint", *arguments], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    first, second = done.stdout.splitlines()
+    first, second, third = done.stdout.splitlines()
+    assert third == "poses of 6 of 6 frames"
     assert re.fullmatch(r"created map house with model depth-[0-9a-f]{12}", first)
     assert second.startswith(
         "6 frames: 6 received, 0 already there; 6 indexed, 0 rejected, 0 failed; "
@@ -79,7 +80,12 @@ def test_bad_frames_stop_no_others(
     write_depth_png(folder / "frame-000003.depth.png", wall, 1000.0)
     (folder / "frame-000002.pose.txt").write_text("no pose")
     done = sceneprint("upload", "mixed", folder, "--tag", "a", "--tag", "b", expect=2)
-    assert done.stdout.splitlines()[-1].startswith(
+    *_, counts, poses = done.stdout.splitlines()
+    assert poses == (
+        "poses of 1 of 4 frames; 2 without: not indexed; 1 without: no NAME.pose.txt is beside "
+        "them, nor NAME.txt in a folder pose"
+    )
+    assert counts.startswith(
         "4 frames: 2 received, 0 already there, 2 refused; 1 indexed, 1 rejected, 0 failed; "
     )
     lines = done.stderr.splitlines()
@@ -92,6 +98,7 @@ def test_bad_frames_stop_no_others(
     without = sceneprint("upload", "mixed", folder, "--no-pose", "--session", "s", expect=2)
     assert "3 refused" in without.stdout  # among them the two that are there with a pose or tags
     assert "1 indexed" in without.stdout  # the one whose pose is none
+    assert "\nposes of 0 of 4 frames; 4 without: --no-pose\n" in without.stdout
 
 
 def test_upload_without_waiting(sceneprint: Run, service_url: str, rooms: Path) -> None:

@@ -12,7 +12,9 @@ from sceneprint.formats.dataset import (
     find_sequences,
     write_depth_png,
     write_intrinsics,
+    write_pose,
 )
+from sceneprint.formats.dataset.frame_names import is_beside_depth
 from sceneprint.formats.dataset.sequences import natural
 from sceneprint.types import Intrinsics
 
@@ -54,9 +56,90 @@ def test_tum(tmp_path: Path) -> None:
     np.testing.assert_array_equal(between.read().depth, DEPTH)  # at 5000 units a metre
 
 
+def test_tum_stamps_that_differ_by_rounding_or_a_millisecond(tmp_path: Path) -> None:
+    folder = tum(tmp_path / "desk")
+    rows = "9.501 1 0 0 0 0 0 1\n10.019999 2 0 0 0 0 0 1\n10.9 3 0 0 0 0 0 1\n"
+    (folder / "groundtruth.txt").write_text(rows)
+    (sequence,) = find_sequences(folder)
+    assert [None if f.pose is None else f.pose[0, 3] for f in sequence.frames] == [1, 2, None]
+    assert (
+        sequence.unposed == "groundtruth.txt has no pose within 20 ms of them (nearest: 0.4 s away)"
+    )
+
+
 def test_tum_without_poses(tmp_path: Path) -> None:
     (tum(tmp_path / "desk") / "groundtruth.txt").unlink()
-    assert [f.pose for f in find_sequences(tmp_path)[0].frames] == [None] * 3
+    (sequence,) = find_sequences(tmp_path)
+    assert [f.pose for f in sequence.frames] == [None] * 3
+    assert sequence.unposed == "there is no groundtruth.txt"
+
+
+@pytest.mark.parametrize(
+    ("image", "pose"),
+    [
+        ("000001.png", "000001.pose.txt"),
+        ("000001.depth.png", "000001.pose.txt"),
+        ("depth_000001.png", "pose_000001.txt"),
+        ("depth/20.png", "pose/20.txt"),  # ScanNet
+        ("depth/frame_20.npy", "poses/frame_20.pose.txt"),
+        ("20.npy", "poses/20.txt"),
+    ],
+)
+def test_poses_beside_plain_images(image: str, pose: str, tmp_path: Path) -> None:
+    file = tmp_path / "scene" / image
+    for name in (image, pose):
+        (tmp_path / "scene" / name).parent.mkdir(parents=True, exist_ok=True)
+    other = file.with_stem(file.stem + "9")
+    for one in (file, other):
+        if one.suffix == ".npy":
+            np.save(one, DEPTH)
+        else:
+            write_depth_png(one, DEPTH, 1000.0)
+    write_pose(tmp_path / "scene" / pose, pose_at(3.0))
+    write_intrinsics(tmp_path / "scene", CAMERA)
+    (sequence,) = find_sequences(tmp_path / "scene")
+    poses = {frame.path.name: frame.pose for frame in sequence.frames}
+    np.testing.assert_array_equal(poses[file.name], pose_at(3.0))
+    assert poses[other.name] is None
+    assert sequence.unposed.startswith("no NAME.pose.txt is beside them")
+    (alone,) = find_sequences(file)  # as when it is named by itself
+    np.testing.assert_array_equal(alone.frames[0].pose, pose_at(3.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "is_beside"),
+    [
+        ("ir", True), ("IRImages", True), ("left_ir", True), ("infra1", True), ("confidence", True),
+        ("depthIR", True), ("depth_confidence", True), ("label-filt", True), ("rgb", True),
+        ("color_aligned_to_depth", True), ("colour", True), ("x_RGB.png", True),
+        ("rgb_depth_0001.png", True), ("depth", False), ("aligned_depth_to_color", False),
+        ("depth_to_infra1", False), ("rgbd_depth_0001.png", False), ("stairs", False),
+        ("rgbd_dataset_freiburg1_xyz", False), ("first_floor", False), ("rgb-d_0001.png", False),
+        ("color_aligned_depth", False), ("depth_registered", False), ("unmasked", False),
+    ],
+)  # fmt: skip
+def test_names_of_what_lies_beside_depth(name: str, *, is_beside: bool) -> None:
+    assert is_beside_depth(name) is is_beside
+
+
+def test_what_is_left_out_is_named(tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    for folder in ("depth", "ir", "aligned_depth_to_color"):
+        (scene / folder).mkdir(parents=True)
+        write_depth_png(scene / folder / "0.png", DEPTH, 1000.0)
+    write_intrinsics(scene, CAMERA)
+    write_depth_png(scene / "depth" / "confidence_0.png", DEPTH, 1000.0)
+    found = find_sequences(scene)
+    assert [s.name for s in found] == ["aligned_depth_to_color", "depth"]
+    assert [f.path.name for s in found for f in s.frames] == ["0.png", "0.png"]
+    assert found[0].note.startswith("left out: scene/ir, scene/depth/confidence_0.png (images of ")
+    assert found[1].note == ""
+    (asked,) = find_sequences(scene / "ir")
+    assert len(asked.frames) == 1
+    for image in scene.glob("*depth*/?.png"):
+        image.unlink()
+    with pytest.raises(DatasetError, match=r"left out: scene/ir, .*confidence_0\.png"):
+        find_sequences(scene)
 
 
 @pytest.mark.parametrize(

@@ -158,6 +158,16 @@ def test_nothing_is_made_up() -> None:
     assert interpolate(trajectory, []) == []
 
 
+def test_a_near_pose_stands_where_nothing_is_interpolated() -> None:
+    one = np.tile([0.0, 0.0, 0.0, 1.0], (3, 1))
+    positions = np.array([[1.0, 0, 0], [2.0, 0, 0], [4.0, 0, 0]])
+    trajectory = SensorTrajectory(np.array([1.0, 1.03, 2.0]), positions, one)
+    stamps = [0.97, 0.985, 1.015, 1.049, 1.06, 1.981, 1.9999999, 2.019, 2.021, math.nan]
+    poses = interpolate(trajectory, stamps, tolerance=0.02)
+    found = [None if pose is None else round(pose[0, 3], 9) for pose in poses]
+    assert found == [None, 1.0, 1.5, 2.0, None, 4.0, 4.0, 4.0, None, None]
+
+
 def test_trajectory_files(tmp_path: Path) -> None:
     path = tmp_path / "groundtruth.txt"
     path.write_text("# a\n\n2.5 4 5 6 0 0 0.7071 0.7071\n1.5 1 2 3 0 0 0 1\n1.5 9 9 9 0 0 0 1\n")

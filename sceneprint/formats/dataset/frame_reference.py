@@ -100,10 +100,9 @@ class Layout(Enum):
     SEVEN_SCENES = "7-Scenes"
     #: `depth.txt` lists time stamps and files, `groundtruth.txt` poses at other stamps.
     TUM = "TUM RGB-D"
-    #: Depth files of any name, PNG or NPY, in natural order; no poses.
+    #: Depth files of any name, PNG or NPY, in natural order; poses as `find_pose_file` finds them.
     PLAIN = "plain"
-    #: Files of points (PLY, PCD, KITTI .bin, LAS, LAZ) of any name, each with `NAME.pose.txt`
-    #: where its pose is known.
+    #: Files of points (PLY, PCD, KITTI .bin, LAS, LAZ) of any name; poses likewise.
     CLOUDS = "clouds"
     #: Messages of a recording of ROS; poses of its transforms.
     RECORDING = "recording"
@@ -185,6 +184,7 @@ class FrameSequence:
     split : what the scene's authors use it for, or None where they do not say
     frames : at least one
     note : what was left out on the way, for people; empty where nothing was
+    unposed : why frames have no pose, for people; empty where all have one, and where `note` tells
     """
 
     name: str
@@ -194,6 +194,7 @@ class FrameSequence:
     split: Split | None
     frames: tuple[FrameReference, ...]
     note: str = ""
+    unposed: str = ""
 
     @property
     def place(self) -> Path:

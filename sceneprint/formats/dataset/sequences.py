@@ -21,6 +21,12 @@ import numpy as np
 
 from sceneprint.atomic_files import write_whole
 from sceneprint.errors import DatasetError, SceneprintError
+from sceneprint.formats.dataset.frame_names import (
+    WHAT_IS_LEFT_OUT,
+    is_beside_depth,
+    is_depth,
+    is_image,
+)
 from sceneprint.formats.dataset.frame_reference import (
     FrameReference,
     FrameSequence,
@@ -30,8 +36,20 @@ from sceneprint.formats.dataset.frame_reference import (
 )
 from sceneprint.types import Floats, Floats32
 from sceneprint_client.files import RECORDING_SUFFIXES, data_lines, is_cloud, read_text
-from sceneprint_client.frame_files import SEVEN_SCENES, find_frame_file, seven_scenes_number
-from sceneprint_client.poses import interpolate, quaternion_of, rigid_transform
+from sceneprint_client.frame_files import (
+    NO_POSE_FILE,
+    SEVEN_SCENES,
+    find_frame_file,
+    find_pose_file,
+    seven_scenes_number,
+)
+from sceneprint_client.poses import (
+    TOLERANCE_S,
+    SensorTrajectory,
+    interpolate,
+    quaternion_of,
+    rigid_transform,
+)
 from sceneprint_client.sidecars import (
     CLOUDS_FILE,
     INTRINSICS_FILE,
@@ -92,15 +110,15 @@ def layout_of(files: list[str]) -> Layout | None:
         return Layout.TUM
     if CLOUDS_FILE in files and any(map(_may_be_cloud, files)):
         return Layout.CLOUDS
-    if any(map(_is_depth, files)):
+    if any(map(is_depth, files)):
         return Layout.PLAIN
     return Layout.CLOUDS if any(map(is_cloud, files)) else None
 
 
 def references(
     folder: Path, files: list[str], layout: Layout, name: str, camera: Camera | None = None
-) -> tuple[FrameReference, ...]:
-    """Return the frames of a folder.
+) -> tuple[tuple[FrameReference, ...], str]:
+    """Return the frames of a folder, and why some have no pose.
 
     Parameters
     ----------
@@ -117,10 +135,11 @@ def references(
     InvalidIntrinsics : intrinsics.json describes no camera.
     InvalidPose : groundtruth.txt holds a line that is no pose.
     """
+    unposed = NO_POSE_FILE
     if layout is Layout.SEVEN_SCENES:
         frames = _seven_scenes(folder, files, name, camera)
     elif layout is Layout.TUM:
-        frames = _tum(folder, files, name)
+        frames, unposed = _tum(folder, files, name)
     elif layout is Layout.CLOUDS:
         frames = _clouds(folder, files, name)
     else:
@@ -133,7 +152,9 @@ def references(
                 f"{first[frame.name].name}. Rename or remove one of them."
             )
         first[frame.name] = frame.path
-    return tuple(_numbered(folder, frame, i) for i, frame in enumerate(frames))
+    if all(frame.pose_source is not None for frame in frames):
+        unposed = ""
+    return tuple(_numbered(folder, frame, i) for i, frame in enumerate(frames)), unposed
 
 
 def _numbered(folder: Path, frame: FrameReference, place: int) -> FrameReference:
@@ -156,50 +177,64 @@ def _seven_scenes(
     except DatasetError:
         if camera is None:
             raise
-    present, frames = set(files), []
+    frames = []
     for file in files:
         if SEVEN_SCENES.fullmatch(file):
             stem = file.removesuffix(".depth.png")
-            pose = folder / f"{stem}.pose.txt" if f"{stem}.pose.txt" in present else None
+            pose = find_pose_file(folder, stem)
             frames.append(FrameReference(f"{name}/{stem}", folder / file, camera, pose_source=pose))
     return tuple(frames)
 
 
 def _plain(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
     camera = find_camera(folder)
-    return tuple(
-        FrameReference(f"{name}/{Path(file).stem}", folder / file, camera)
-        for file in files
-        if _is_depth(file)
-    )
+    frames = []
+    for file in filter(is_depth, files):
+        stem = Path(file).stem
+        pose = find_pose_file(folder, stem)
+        frames.append(FrameReference(f"{name}/{stem}", folder / file, camera, pose_source=pose))
+    return tuple(frames)
 
 
 def _clouds(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
-    source, present = find_cloud_source(folder), set(files)
+    source = find_cloud_source(folder)
     # beside clouds.json a .npy is of points
-    wanted = _may_be_cloud if CLOUDS_FILE in present else is_cloud
+    wanted = _may_be_cloud if CLOUDS_FILE in files else is_cloud
     frames = []
     for file in filter(wanted, files):
         stem = Path(file).stem
-        pose = folder / f"{stem}.pose.txt" if f"{stem}.pose.txt" in present else None
+        pose = find_pose_file(folder, stem)
         frames.append(
             FrameReference(f"{name}/{stem}", folder / file, None, pose_source=pose, cloud=source)
         )
     return tuple(frames)
 
 
-def _tum(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
+def _tum(folder: Path, files: list[str], name: str) -> tuple[tuple[FrameReference, ...], str]:
     camera = find_camera(folder)
     listed = sorted(_depth_list(folder / _DEPTH_LIST))
     stamps = [stamp for stamp, _ in listed]
+    poses: list[Floats | None] = [None] * len(stamps)
+    unposed = f"there is no {_TRAJECTORY}"
     if _TRAJECTORY in files:
-        poses = interpolate(read_trajectory(folder / _TRAJECTORY), stamps)
-    else:
-        poses = [None] * len(stamps)
+        trajectory = read_trajectory(folder / _TRAJECTORY)
+        poses = interpolate(trajectory, stamps, tolerance=TOLERANCE_S)
+        alone = [stamp for stamp, pose in zip(stamps, poses, strict=True) if pose is None]
+        unposed = (
+            f"{_TRAJECTORY} has no pose within {1000 * TOLERANCE_S:.0f} ms of them "
+            f"(nearest: {_least_distance(trajectory, alone):.3g} s away)"
+        )
     return tuple(
         FrameReference(f"{name}/{Path(file).stem}", folder / file, camera, stamp, pose)
         for (stamp, file), pose in zip(listed, poses, strict=True)
-    )
+    ), unposed
+
+
+def _least_distance(trajectory: SensorTrajectory, stamps: list[float]) -> float:
+    """Return the smallest time between one of the stamps and a pose, seconds."""
+    after = np.searchsorted(trajectory.stamps, stamps)
+    around = np.clip([after - 1, after], 0, len(trajectory.stamps) - 1)
+    return float(np.abs(trajectory.stamps[around] - stamps).min(initial=math.inf))
 
 
 def _depth_list(path: Path) -> list[tuple[float, str]]:
@@ -241,25 +276,16 @@ def _may_be_cloud(file: str) -> bool:
     return is_cloud(file) or file.lower().endswith(".npy")
 
 
-def _is_depth(file: str) -> bool:
-    lowered = file.lower()
-    return (
-        lowered.endswith((".png", ".npy"))
-        and not lowered.endswith(".color.png")
-        and "rgb" not in lowered
-    )
-
-
 _DEPTH = 4  #: folders below the one given that are looked into
 _MAXIMUM_FOLDERS = 10_000  #: that are looked into; more is no data set but a disk
 _MAXIMUM_SPLIT_BYTES = 65_536
+_MOST_NAMES = 5  #: of what was left out, in a note
 _SEQUENCE_FOLDER = re.compile(r"seq-?(\d+)", re.IGNORECASE | re.ASCII)
 _SPLIT_LINE = re.compile(r"(?:sequence|seq)[\s_-]*(\d{1,9})", re.IGNORECASE | re.ASCII)
 _SPLIT_FILES: tuple[tuple[str, Split], ...] = (
     ("TrainSplit.txt", "train"),
     ("TestSplit.txt", "test"),
 )
-_COLOUR_FOLDERS = ("rgb", "color", "colour")
 
 
 def find_sequences(
@@ -268,13 +294,14 @@ def find_sequences(
     """Return the sequences at a path or up to 4 folders below it; no frame is read.
 
     Understood are a 7-Scenes sequence or scene (with TrainSplit.txt, TestSplit.txt), a TUM
-    RGB-D folder, a folder of depth images (PNG or NPY; `*.color.png` and `*rgb*` are left
-    out), a folder of point clouds (PLY, PCD, KITTI .bin, LAS, LAZ; NPY beside a clouds.json),
-    one depth image or cloud, and folders of these. Clouds in a folder seq-01 that such a split
-    file names are a sequence of a 7-Scenes scene as well. A sequence is named by its place below
-    the path, or by its own folder where that is the path. A recording of ROS (.mcap, .db3, .bag,
-    a rosbag2 folder) is one sequence, named after it; so is each of a folder of recordings. Files
-    and folders of other systems (RTAB-Map, E57, Polycam, Record3D, nerfstudio) are sequences too.
+    RGB-D folder, a folder of depth images (PNG or NPY), a folder of point clouds (PLY, PCD, KITTI
+    .bin, LAS, LAZ; NPY beside a clouds.json), one depth image or cloud, and folders of these. Files
+    and folders whose names say colour, infrared, confidence or labels are left out, and a note
+    names them. Clouds in a folder seq-01 that such a split file names are a sequence of a 7-Scenes
+    scene as well. A sequence is named by its place below the path, or by its own folder where that
+    is the path. A recording of ROS (.mcap, .db3, .bag, a rosbag2 folder) is one sequence, named
+    after it; so is each of a folder of recordings. Files and folders of other systems (RTAB-Map,
+    E57, Polycam, Record3D, nerfstudio) are sequences too.
 
     Parameters
     ----------
@@ -306,13 +333,16 @@ def find_sequences(
         return exports.file_sequences(root) if exports.is_export(root) else (_single(root),)
     if not root.is_dir():
         raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
-    walked = list(_walk(root))
+    left_out: list[Path] = []
+    walked = list(_walk(root, left_out))
     if any(layout is Layout.RECORDING for _, _, layout in walked):
         return _recordings(root, walked, recording or ros.RecordingOptions())
     found = tuple(each for one in walked for each in _sequences_in(*one, root, camera))
+    note = _note_of(left_out, root)
     if not found:
         raise DatasetError(
-            f"{path}: There is no depth image or cloud here or up to {_DEPTH} folders below. Name "
+            f"{path}: There is no depth image or cloud here or up to {_DEPTH} folders below"
+            f"{note and f' ({note})'}. Name "
             "a 7-Scenes scene or sequence (frame-000000.depth.png), a TUM RGB-D folder "
             "(depth.txt), a folder of 16-bit PNG or float NPY depth images, one of PLY, PCD, "
             "KITTI .bin, LAS or LAZ clouds, one such file, recordings of ROS (.mcap, .db3 or "
@@ -320,7 +350,16 @@ def find_sequences(
             "Polycam, Record3D or nerfstudio."
         )
     _check_parent_frames(found)
-    return found
+    return (replace(found[0], note="; ".join(filter(None, (found[0].note, note)))), *found[1:])
+
+
+def _note_of(left_out: list[Path], root: Path) -> str:
+    """Say which files and folders were left out by their names, a few of them by name."""
+    if not left_out:
+        return ""
+    names = [one.relative_to(root.parent).as_posix() for one in left_out]
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return f"left out: {', '.join(names[:_MOST_NAMES])}{more} ({WHAT_IS_LEFT_OUT})"
 
 
 def find_recordings(path: Path) -> list[Path]:
@@ -405,10 +444,15 @@ def find_each(
     return sequences, tuple(refused)
 
 
-def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
+def _walk(
+    root: Path, left_out: list[Path] | None = None
+) -> Iterator[tuple[Path, list[str], Layout]]:
     """Yield the folders that are sequences, depth first in natural order; those that hold
     recordings of ROS, with their names; and files that other systems wrote, which have no names.
+
+    Images and folders that are passed over for their names are added to `left_out`.
     """
+    beside = [] if left_out is None else left_out
     from sceneprint.formats import exports
 
     seen: set[Path] = set()  # resolved: a symlink back up is not entered twice
@@ -442,14 +486,16 @@ def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
             layout is Layout.CLOUDS
             and ("depth" in folders or _is_above_images(folder, files, folders, depth))
         )
+        if layout in (Layout.PLAIN, None):
+            beside += [folder / one for one in files if is_image(one) and is_beside_depth(one)]
         if layout is not None and not (layout in (Layout.PLAIN, Layout.CLOUDS) and scene):
             yield folder, files, layout
         elif depth < _DEPTH:
+            beside += [folder / name for name in folders if is_beside_depth(name)]
             exported = [folder / one for one in files if exports.is_export(folder / one)]
             yield from ((path, [], Layout.E57) for path in exported)
-            waiting += [
-                (folder / name, depth + 1) for name in reversed(folders) if not is_of_colour(name)
-            ]
+            entered = [name for name in reversed(folders) if not is_beside_depth(name)]
+            waiting += [(folder / name, depth + 1) for name in entered]
 
 
 def _recordings_in(folder: Path, files: list[str], folders: list[str]) -> list[str]:
@@ -472,7 +518,7 @@ def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: 
     while waiting and looked < _MAXIMUM_FOLDERS:
         below, deep = waiting.pop()
         looked += 1
-        if deep > _DEPTH or is_of_colour(below.name):
+        if deep > _DEPTH or is_beside_depth(below.name):
             continue
         try:
             own, deeper = list_folder(below)
@@ -487,12 +533,6 @@ def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: 
     return False
 
 
-def is_of_colour(folder: str) -> bool:
-    """Whether a folder of that name is left out; rgbd_dataset_freiburg1_xyz is none of them."""
-    name = folder.lower().replace("rgbd", "")
-    return any(colour in name for colour in _COLOUR_FOLDERS)
-
-
 def _sequences_in(
     path: Path, files: list[str], layout: Layout, root: Path, camera: Camera | None = None
 ) -> tuple[FrameSequence, ...]:
@@ -500,36 +540,33 @@ def _sequences_in(
     from sceneprint.formats import exports
 
     if not layout.is_export:
-        return (_sequence(path, files, layout, _name(path, root), camera),)
+        name = _name(path, root)
+        frames, unposed = references(path, files, layout, name, camera)
+        return (_sequence_of(path, layout, name, frames, unposed),)
     if path.is_file():
         return exports.file_sequences(path, _name(path.with_suffix(""), root))
     return (exports.folder_sequence(path, layout, _name(path, root)),)
 
 
-def _sequence(
-    folder: Path, files: list[str], layout: Layout, name: str, camera: Camera | None = None
-) -> FrameSequence:
-    return _sequence_of(folder, layout, name, references(folder, files, layout, name, camera))
-
-
 def _sequence_of(
-    folder: Path, layout: Layout, name: str, frames: tuple[FrameReference, ...]
+    folder: Path, layout: Layout, name: str, frames: tuple[FrameReference, ...], unposed: str
 ) -> FrameSequence:
     seven, clouds = layout is Layout.SEVEN_SCENES, layout is Layout.CLOUDS
     split = _split(folder) if seven or clouds else None
     # clouds are a sequence of a scene only where a split file of the scene says so
-    if split or (seven and _SEQUENCE_FOLDER.fullmatch(folder.name)):
-        return FrameSequence(name, folder, layout, folder.parent.name, split, frames)
-    return FrameSequence(name, folder, layout, name, None, frames)
+    in_scene = split or (seven and _SEQUENCE_FOLDER.fullmatch(folder.name))
+    parent_frame = folder.parent.name if in_scene else name
+    return FrameSequence(name, folder, layout, parent_frame, split, frames, unposed=unposed)
 
 
 def _single(file: Path) -> FrameSequence:
     """Return a sequence of one frame."""
     folder, frame = file.parent, FrameReference(**vars(find_frame_file(file)))
+    unposed = NO_POSE_FILE if frame.pose_source is None else ""
     if frame.camera is not None and SEVEN_SCENES.fullmatch(file.name):
-        return _sequence_of(folder, Layout.SEVEN_SCENES, folder.name, (frame,))
+        return _sequence_of(folder, Layout.SEVEN_SCENES, folder.name, (frame,), unposed)
     layout = Layout.PLAIN if frame.cloud is None else Layout.CLOUDS
-    return FrameSequence(folder.name, folder, layout, folder.name, None, (frame,))
+    return FrameSequence(folder.name, folder, layout, folder.name, None, (frame,), unposed=unposed)
 
 
 def _split(folder: Path) -> Split | None:
