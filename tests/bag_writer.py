@@ -82,11 +82,13 @@ class BagWriter:
     # What robots record.
 
     def transforms(
-        self, t: float, edges: dict[tuple[str, str], Floats], topic: str = "/tf"
-    ) -> None:
+        self, t: float, edges: dict[tuple[str, str], Floats], topic: str = "/tf", *,
+        length: float = 1.0,
+    ) -> None:  # fmt: skip
+        """Transforms, whose quaternions have this length."""
         made = []
         for (parent, child), T in edges.items():
-            x, y, z, w = quaternion_of(T[:3, :3])
+            x, y, z, w = quaternion_of(T[:3, :3]) * length
             tx, ty, tz = T[:3, 3]
             made.append(
                 self.make(

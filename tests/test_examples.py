@@ -121,7 +121,7 @@ def test_a_bag_becomes_live_poses(
         "live_from_bag.py", "office", drives / "later", "--truth", drives / "later.tum",
         "--data", tmp_path,
     ).splitlines()  # fmt: skip
-    assert told[0].startswith("8 of 8 frames of /camera/depth/image_raw taken, poses in odom")
+    assert told[0].startswith("8 of 8 frames of /camera/depth/image_raw taken, poses of 8 of 8")
     live = [line for line in told if "tracking  mapping/map <- odom:" in line]
     assert len(live) >= 7
     off = [float(line.rpartition("off by ")[2].removesuffix(" cm")) for line in live]

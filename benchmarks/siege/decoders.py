@@ -330,7 +330,7 @@ def _archive_reader() -> Read:
 
 def _message_reader() -> Read:
     from sceneprint.formats.recording.bag import _stated
-    from sceneprint.formats.recording.selection import cloud_file, depth_file
+    from sceneprint.formats.recording.topics import cloud_file, depth_file
 
     types, kinds = _types(), [kind for kind, _ in _messages()]
 

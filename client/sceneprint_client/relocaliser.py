@@ -23,8 +23,6 @@ from sceneprint_client.poses import (
     WINDOW_S,
     Accelerations,
     Floats,
-    TransformTree,
-    frame_name,
     quaternion_of,
 )
 from sceneprint_client.ros_messages import (
@@ -40,6 +38,7 @@ from sceneprint_client.ros_messages import (
 )
 from sceneprint_client.tracker import AsyncTracker, State, Tracker
 from sceneprint_client.tracker_core import inverse, shifted_covariance
+from sceneprint_client.transforms import TransformTree, frame_name
 
 if TYPE_CHECKING:
     from sceneprint_client.http import FrameInput

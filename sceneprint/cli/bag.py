@@ -140,7 +140,7 @@ def run_bag(options: argparse.Namespace) -> int:
         with recording_options(options) as recording:
             outlines.append(bag_outline(path, recording))
         print("\n".join(_lines(path, outlines[-1])))
-    return 1 if any(one.sequence is None for one in outlines) else 0
+    return 0 if all(one.sequences for one in outlines) else 1
 
 
 def _lines(path: Path, outline: BagOutline) -> list[str]:
@@ -164,9 +164,9 @@ def _lines(path: Path, outline: BagOutline) -> list[str]:
             f"  {one_line(one.name):{width}}  {one_line(one.type):{kinds}}  {one.count:8}  "
             f"{rate:>9}  {uses}".rstrip()
         )
-    if outline.sequence is None:
+    if not outline.sequences:
         return [*lines, f"nothing would be taken: {one_line(outline.problem)}"]
-    return [*lines, *_taken(outline.sequence)]
+    return [*lines, *(line for sequence in outline.sequences for line in _taken(sequence))]
 
 
 def _span(outline: BagOutline) -> str:
@@ -184,7 +184,7 @@ def _span(outline: BagOutline) -> str:
 def _taken(sequence: FrameSequence) -> list[str]:
     """What would be taken, a line each."""
     first = sequence.frames[0]
-    lines = [sequence.note]
+    lines = [sequence.note] if sequence.note else []
     if first.camera is not None:
         k = first.camera.intrinsics
         lens = f", distortion {' '.join(f'{d:g}' for d in k.distortion)}" if k.distortion else ""

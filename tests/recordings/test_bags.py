@@ -211,8 +211,9 @@ def test_interpolation_by_hand(tmp_path: Path, ros: SimpleNamespace, depth: Samp
     np.testing.assert_allclose(poses[0.985][:3, 3], (1.3, 0, 0.5), atol=1e-9)
     np.testing.assert_allclose(poses[2.015][:3, 3], (4.3, 0, 0.5), atol=1e-9)
     assert sequence.note == (
-        "4 of 7 frames of /camera/depth/image_raw taken, poses in odom; left out: 3 without a "
-        "transform at their time"
+        "4 of 7 frames of /camera/depth/image_raw taken, poses of 4 of 7 frames in odom; 3 "
+        "without: no sample of odom -> base_link within 20 ms (nearest 0.03 s); left out: 3 "
+        "without a pose"
     )
 
 
@@ -265,7 +266,7 @@ def test_without_poses_frames_are_taken_by_time(
     assert [f.name[-2:] for f in sequence.frames] == ["00", "05", "10", "15"]
     assert sequence.frames[0].pose is None
     assert sequence.parent_frame == "run"
-    assert "no poses" in sequence.note
+    assert "poses of 0 of 20 frames; 20 without: no transforms lead from camera" in sequence.note
     assert len(only(path, RecordingOptions(keyframe_s=0)).frames) == 20
 
 
@@ -532,7 +533,7 @@ def test_several_topics_are_listed(tmp_path: Path, ros: SimpleNamespace, depth: 
     outline = bag_outline(path, RecordingOptions())
     assert [one.topic.name for one in outline.frames] == ["/camera/depth/image_raw", "/points"]
     assert "--topic" in outline.problem
-    assert outline.sequence is None
+    assert outline.sequences == ()
 
 
 def test_a_bag_without_frames(tmp_path: Path, ros: SimpleNamespace) -> None:

@@ -155,8 +155,8 @@ def test_uploading_again_changes_nothing(
     done = sceneprint("upload", "bag", recording, "--keyframe-m", 0)
     assert done.stdout.startswith(f"{FRAMES} frames: 0 received, {FRAMES} already there; ")
     assert done.stderr == (
-        f"{recording}: {FRAMES} of {FRAMES} frames of /camera/depth/image_raw taken, poses in "
-        "odom\n"
+        f"{recording}: {FRAMES} of {FRAMES} frames of /camera/depth/image_raw taken, poses of "
+        f"{FRAMES} of {FRAMES} frames in odom\n"
     )
 
 
@@ -195,7 +195,7 @@ def test_each_bag_of_a_folder_is_a_session(sceneprint: Run, bags: Path, service_
     done = sceneprint("localize", "days", bags, *options, "--frame", 0)
     assert done.stdout.startswith("first/000000: found")
     done = sceneprint("bag", "info", bags, *options)
-    assert done.stdout.count(" frames of /camera/depth/image_raw taken, poses in odom") == 2
+    assert done.stdout.count(" frames of /camera/depth/image_raw taken, poses of ") == 2
 
 
 def test_a_folder_of_bags_is_signed_and_evaluated(
@@ -243,7 +243,7 @@ def test_what_a_bag_holds(sceneprint: Run, recording: Path) -> None:
         "/camera/depth/image_raw sensor_msgs/msg/Image 8 5.7 Hz 16UC1, taken",
         "/tf tf2_msgs/msg/TFMessage 8 5.7 Hz",
         "/tf_static tf2_msgs/msg/TFMessage 1",
-        "8 of 8 frames of /camera/depth/image_raw taken, poses in odom",
+        "8 of 8 frames of /camera/depth/image_raw taken, poses of 8 of 8 frames in odom",
         table[5],
         "poses: in lab/odom",
         "mounting: at 0.210 -0.050 0.930 m in base_link",

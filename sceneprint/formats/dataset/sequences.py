@@ -44,7 +44,6 @@ from sceneprint_client.frame_files import (
     seven_scenes_number,
 )
 from sceneprint_client.poses import (
-    TOLERANCE_S,
     SensorTrajectory,
     interpolate,
     quaternion_of,
@@ -57,6 +56,7 @@ from sceneprint_client.sidecars import (
     find_camera,
     find_cloud_source,
 )
+from sceneprint_client.transforms import TOLERANCE_S
 
 if TYPE_CHECKING:
     from sceneprint.formats.recording import RecordingOptions
@@ -328,7 +328,7 @@ def find_sequences(
     from sceneprint.formats import recording as ros  # what it takes, only bags need
 
     if ros.is_recording(root) and root.exists():
-        return (ros.recording_sequence(root, recording or ros.RecordingOptions()),)
+        return ros.recording_sequences(root, recording or ros.RecordingOptions())
     if root.is_file():
         return exports.file_sequences(root) if exports.is_export(root) else (_single(root),)
     if not root.is_dir():
@@ -386,9 +386,9 @@ def _recordings(
 
     Raises
     ------
-    DatasetError : as `recording_sequence`; other frames are there too, or two have one name.
+    DatasetError : as `recording_sequences`; other frames are there too, or two have one name.
     """
-    from sceneprint.formats.recording import recording_name, recording_sequence
+    from sceneprint.formats.recording import recording_name, recording_sequences
 
     bags = _bags(walked)
     other = next((one for one in walked if one[2] is not Layout.RECORDING), None)
@@ -407,7 +407,11 @@ def _recordings(
                 "Rename or remove one of them."
             )
         first[name] = bag
-    return tuple(recording_sequence(bag, options, name) for name, bag in first.items())
+    return tuple(
+        sequence
+        for name, bag in first.items()
+        for sequence in recording_sequences(bag, options, name)
+    )
 
 
 def find_each(

@@ -1,6 +1,6 @@
 """Recordings of ROS: bags with depth or points, cameras and transforms, as sequences of frames.
 
-path  --recording_sequence-->  FrameSequence
+path  --recording_sequences-->  FrameSequence, ...
 
 Only `bag.py` imports rosbags, and only when a bag is opened.
 """
@@ -11,7 +11,7 @@ from sceneprint.formats.recording.selection import (
     RecordingOptions,
     bag_outline,
     recording_name,
-    recording_sequence,
+    recording_sequences,
 )
 
 __all__ = [
@@ -21,5 +21,5 @@ __all__ = [
     "bag_outline",
     "is_recording",
     "recording_name",
-    "recording_sequence",
+    "recording_sequences",
 ]

@@ -1,7 +1,6 @@
 """The files of ROS: MCAP, rosbag2 folders and databases, ROS 1 bags. The boundary to rosbags.
 
 path  --Bag-->  topics, raw messages; raw message  --Bag.decode-->  its fields
-Bag, topics  --scan_bag-->  BagScan: transforms, odometry, IMU, the camera, the times of frames
 
 rosbags raises whatever its parsers meet in a damaged file, so every call into it is made within
 `_stated`, and what it decompresses is limited.
@@ -13,24 +12,16 @@ import bz2
 import struct
 import threading
 import weakref
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.errors import DatasetError, MissingDependency, SceneprintError
 from sceneprint_client.errors import printable
-from sceneprint_client.files import RECORDING_SUFFIXES, naming
-from sceneprint_client.poses import MOST_SAMPLES, Accelerations, TransformTree, frame_name
-from sceneprint_client.ros_messages import (
-    is_calibrated,
-    pose_row,
-    stamp_of,
-    transform_row,
-    vector_row,
-)
+from sceneprint_client.files import RECORDING_SUFFIXES
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -215,7 +206,7 @@ class Bag:
         else:
             order = "<" if head[1] & 1 else ">"
             seconds, nanoseconds = struct.unpack_from(f"{order}iI", head, 4)
-        if seconds <= 0 or nanoseconds >= 1_000_000_000:
+        if seconds < 0 or not (seconds or nanoseconds) or nanoseconds >= 1_000_000_000:
             return message.log_ns
         return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
@@ -342,143 +333,3 @@ def _inflate(stream: Any, data: bytes, most: int) -> bytes:
     if len(found) > most or not stream.eof:
         raise ValueError(f"a chunk does not end within {most} bytes")
     return found
-
-
-# One pass over a bag.
-
-#: What to call when so many of all messages have been read.
-Progress = Callable[[int, int], None]
-#: Most messages of one topic of frames.
-MOST_FRAMES = 2_000_000
-
-
-@dataclass(eq=False)
-class BagScan:
-    """What one pass over a bag gives.
-
-    Parameters
-    ----------
-    tree : transforms, and odometry where no transform says the same
-    imus : measurements by the frame of the IMU
-    info : the first CameraInfo that is calibrated, or None
-    stamps_ns : when each frame was measured, in the order in which they were recorded
-    places : when each was recorded, and which of those with that time it is
-    damaged : messages that did not decode, and were passed over
-    """
-
-    tree: TransformTree = field(default_factory=TransformTree)
-    imus: dict[str, Accelerations] = field(default_factory=dict)
-    info: Any = None
-    stamps_ns: list[int] = field(default_factory=list)
-    places: list[tuple[int, int]] = field(default_factory=list)
-    damaged: int = 0
-
-
-@dataclass(frozen=True)
-class _Odometry:
-    """A pose of a robot in the frame of its odometry."""
-
-    parent: str
-    child: str
-    stamp_ns: int
-    sample: list[float]
-
-
-def scan_bag(
-    bag: Bag, frames: BagTopic | None, camera: BagTopic | None, progress: Progress | None
-) -> BagScan:
-    """Read what moves, and when the frames were measured; their samples are not decoded.
-
-    Parameters
-    ----------
-    bag : to read
-    frames : the topic of the frames, or None
-    camera : the topic of their camera, or None
-    progress : what to call now and then
-
-    Raises
-    ------
-    DatasetError : the bag is damaged, or too long.
-    """
-    kinds = {
-        one.name: one.type for one in bag.of_type(TRANSFORMS, OLD_TRANSFORMS, ODOMETRY, IMU)
-    } | ({} if camera is None else {camera.name: camera.type})
-    names = [*kinds, *([] if frames is None else [frames.name])]
-    total = sum(one.count for one in bag.topics if one.name in names)
-    scan, odometry = BagScan(), dict[str, list[_Odometry]]()
-    for done, message in enumerate(bag.messages(names)):
-        if progress is not None and done % 64 == 0:
-            progress(done, total)
-        with naming(str(bag.path)):
-            if frames is not None and message.topic == frames.name:
-                _count_frame(scan, bag, message)
-            else:
-                _take(scan, odometry, bag, message, kinds[message.topic])
-    if progress is not None:
-        progress(total, total)
-    _add_odometry(scan.tree, odometry)
-    return scan
-
-
-def _count_frame(scan: BagScan, bag: Bag, message: RawMessage) -> None:
-    same = bool(scan.places) and scan.places[-1][0] == message.log_ns
-    scan.places.append((message.log_ns, scan.places[-1][1] + 1 if same else 0))
-    scan.stamps_ns.append(bag.stamp_ns(message))
-    if len(scan.places) > MOST_FRAMES:
-        raise DatasetError(f"There are more than {MOST_FRAMES} frames. Cut the bag into parts.")
-
-
-def _take(
-    scan: BagScan, odometry: dict[str, list[_Odometry]], bag: Bag, message: RawMessage, kind: str
-) -> None:
-    """Keep what a message says that is not of a frame."""
-    if kind == CAMERA and scan.info is not None:
-        return
-    try:
-        fields = bag.decode(message, kind)
-    except DatasetError:
-        scan.damaged += 1
-        return
-    if kind == CAMERA:
-        scan.info = fields if is_calibrated(fields) else None
-    elif kind == IMU:
-        if float(fields.linear_acceleration_covariance[0]) < 0:  # it has no accelerometer
-            return
-        measured = scan.imus.setdefault(frame_name(fields.header.frame_id), Accelerations())
-        measured.add(
-            bag.stamp_ns(message),
-            vector_row(fields.linear_acceleration),
-            vector_row(fields.angular_velocity),
-        )
-    elif kind == ODOMETRY:
-        parent, child = frame_name(fields.header.frame_id), frame_name(fields.child_frame_id)
-        known = odometry.setdefault(message.topic, [])
-        if parent and child and len(known) < MOST_SAMPLES:
-            known.append(
-                _Odometry(parent, child, bag.stamp_ns(message), pose_row(fields.pose.pose))
-            )
-    else:
-        _take_transforms(scan.tree, message, fields)
-
-
-def _take_transforms(tree: TransformTree, message: RawMessage, fields: Any) -> None:
-    fixed = message.topic.rpartition("/")[2] == "tf_static"
-    for one in fields.transforms:
-        tree.add(
-            str(one.header.frame_id), str(one.child_frame_id),
-            stamp_of(one.header), transform_row(one.transform), fixed=fixed,
-        )  # fmt: skip
-
-
-def _add_odometry(tree: TransformTree, odometry: dict[str, list[_Odometry]]) -> None:
-    """Where tf does not say the same; of several topics of one edge, that with most messages."""
-    edges: dict[tuple[str, str], list[_Odometry]] = {}
-    for topic in sorted(odometry, key=lambda name: len(odometry[name])):
-        for one in odometry[topic][:1]:
-            edges[one.parent, one.child] = odometry[topic]
-    for (parent, child), samples in edges.items():
-        if tree.has_edge(parent, child):
-            continue
-        for one in samples:
-            if (one.parent, one.child) == (parent, child):
-                tree.add(parent, child, one.stamp_ns, one.sample, fixed=False)

@@ -1,59 +1,39 @@
-"""What of a bag becomes frames: which topics, at which poses, and which of the messages.
+"""What of a bag becomes frames: which of the messages, at which poses.
 
-path, RecordingOptions  --recording_sequence-->  FrameSequence
+path, RecordingOptions  --recording_sequences-->  FrameSequence of each part
 Bag  --bag_outline-->  BagOutline: what would be taken, for `sceneprint bag info`
 stamps, poses  --keyframes-->  places of those far enough from the last, or long enough after it
-Image | CompressedImage  --depth_file-->  bytes of a PNG or NPY file
-PointCloud2  --cloud_file-->  bytes of an NPY file (N, 3)
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from sceneprint.errors import (
-    DatasetError,
-    FrameError,
-    InvalidIntrinsics,
-    UnreadableCloud,
-    UnreadableFrame,
-)
+from sceneprint.errors import DatasetError, InvalidIntrinsics
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
-from sceneprint.formats.depth_file import decode_png, encode_npy, encode_png, inverse_depth
-from sceneprint.formats.recording.bag import (
-    CAMERA,
-    COMPRESSED,
-    IMAGE,
-    POINTS,
-    Bag,
-    BagScan,
-    BagTopic,
-    Progress,
-    scan_bag,
-    shared_bag,
+from sceneprint.formats.recording.bag import CAMERA, Bag, BagTopic
+from sceneprint.formats.recording.scan import BagPart, BagScan, Progress, scan_bag
+from sceneprint.formats.recording.topics import (
+    BagSource,
+    FrameTopic,
+    camera_topic,
+    choose_topic,
+    frame_topics,
+    listed,
 )
 from sceneprint.types import Floats
 from sceneprint_client.api.base import GivenBase, checked
 from sceneprint_client.errors import printable
 from sceneprint_client.files import naming
-from sceneprint_client.poses import frame_name
-from sceneprint_client.ros_messages import (
-    DEPTH_SCALE,
-    camera_intrinsics,
-    cloud_points,
-    compressed_depth,
-    depth_samples,
-    image_encoding,
-    is_rectified,
-    topic_without_transport,
-)
+from sceneprint_client.ros_messages import DEPTH_SCALE, camera_intrinsics
 from sceneprint_client.sidecars import Camera, CloudSource, find_camera
+from sceneprint_client.transforms import FASTEST, TOLERANCE_S, UnknownTransform, frame_name
 
 # Which frames are taken: far enough from the last one, or long enough after it.
 
@@ -94,40 +74,7 @@ def _relative_motion(a: Floats, b: Floats) -> tuple[float, float]:
     return float(np.linalg.norm(b[:3, 3] - a[:3, 3])), math.atan2(sine, cosine)
 
 
-# Messages of ROS as the bytes of a frame.
-
-
-def depth_file(message: Any, *, compressed: bool) -> bytes:
-    """Return the bytes of a PNG or NPY file with the samples of a depth image.
-
-    Parameters
-    ----------
-    message : sensor_msgs Image, or CompressedImage of compressed_depth_image_transport
-    compressed : which of them
-
-    Returns
-    -------
-    data : a 16-bit PNG of millimetres, or an NPY array of float32 metres
-
-    Raises
-    ------
-    UnreadableFrame : the message is of another encoding, or its sizes contradict each other.
-    """
-    if compressed:
-        found = compressed_depth(message)
-        if found.inverse is None:
-            return found.png
-        return encode_npy(inverse_depth(decode_png(found.png), *found.inverse))
-    samples = depth_samples(message)
-    return encode_npy(samples) if samples.dtype.kind == "f" else encode_png(samples)
-
-
-def cloud_file(message: Any) -> bytes:
-    """Return the bytes of an NPY file with the points of a PointCloud2; see `cloud_points`."""
-    return encode_npy(cloud_points(message))
-
-
-# Which topics, at which poses.
+# At which poses.
 
 
 @dataclass(frozen=True)
@@ -154,206 +101,12 @@ class RecordingOptions:
     progress: Progress | None = None
 
 
-@dataclass(frozen=True)
-class FrameTopic:
-    """A topic whose messages are frames.
-
-    Parameters
-    ----------
-    topic : name, type and number of messages
-    encoding : of a depth image, such as "16UC1"; None of points
-    frame : the sensor's, of its first message
-    """
-
-    topic: BagTopic
-    encoding: str | None
-    frame: str
-
-    @property
-    def is_compressed(self) -> bool:
-        """Whether its messages are compressed images."""
-        return self.topic.type == COMPRESSED
-
-    @property
-    def is_rectified(self) -> bool:
-        """Whether its images have been rectified, by the name that ROS gives them."""
-        return is_rectified(self.topic.name)
-
-
-@dataclass(frozen=True, eq=False)
-class BagSource:
-    """One message of a bag: where the bytes of a frame come from.
-
-    Parameters
-    ----------
-    bag : where it is
-    topic : of it
-    log_ns, occurrence : when it was recorded, and which of those with that time it is
-    """
-
-    bag: Bag
-    topic: BagTopic
-    log_ns: int
-    occurrence: int
-
-    def read_bytes(self) -> bytes:
-        """The message as the bytes of a PNG or NPY file.
-
-        Raises
-        ------
-        UnreadableFrame, UnreadableCloud : it holds no depth, or is damaged.
-        DatasetError : the bag is damaged there.
-        """
-        message = self.bag.at(self.topic.name, self.log_ns, self.occurrence)
-        is_cloud = self.topic.type == POINTS
-        with naming(f"{self.bag.path}, {self.topic.name} at {self.log_ns} ns"):
-            try:
-                fields = self.bag.decode(message, self.topic.type)
-            except DatasetError as cause:  # of this message alone
-                error: type[FrameError] = UnreadableCloud if is_cloud else UnreadableFrame
-                raise error("The message is damaged. Record it again.") from cause
-            if is_cloud:
-                return cloud_file(fields)
-            return depth_file(fields, compressed=self.topic.type == COMPRESSED)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _source_in, (self.bag.path, self.topic, self.log_ns, self.occurrence)
-
-
-def _source_in(path: Path, topic: BagTopic, log_ns: int, occurrence: int) -> BagSource:
-    """A source that came from another process: its bag is opened here."""
-    return BagSource(shared_bag(path), topic, log_ns, occurrence)
-
-
-# Topics.
-
-
-def frame_topics(bag: Bag) -> list[FrameTopic]:
-    """Topics of depth images and of points, each judged by its first message.
-
-    Of an image that is there raw and compressed, the raw one is given.
-    """
-    found = []
-    for topic in bag.of_type(IMAGE, COMPRESSED, POINTS):
-        one = _frame_topic(bag, topic)
-        if one is not None:
-            found.append(one)
-    raw = {one.topic.name for one in found if not one.is_compressed}
-    return [
-        one
-        for one in found
-        if not (one.is_compressed and topic_without_transport(one.topic.name) in raw)
-    ]
-
-
-def _frame_topic(bag: Bag, topic: BagTopic) -> FrameTopic | None:
-    """A topic by its first message; None where it has no depth."""
-    try:
-        message = bag.first(topic.name)
-        fields = None if message is None else bag.decode(message, topic.type)
-    except DatasetError:  # a damaged one is no candidate; whoever names it learns why
-        return None
-    if fields is None:
-        return None
-    encoding = None
-    if topic.type != POINTS:
-        encoding = image_encoding(fields, compressed=topic.type == COMPRESSED)
-        if encoding is None:
-            return None
-    return FrameTopic(topic, encoding, frame_name(str(fields.header.frame_id)))
-
-
-def choose_topic(bag: Bag, wanted: str | None) -> FrameTopic:
-    """The topic whose messages are the frames.
-
-    Raises
-    ------
-    DatasetError : there is none, or several and none is named.
-    """
-    candidates = frame_topics(bag)
-    if wanted is not None:
-        named = [one for one in bag.topics if one.name == wanted]
-        if not named:
-            raise DatasetError(
-                f"{bag.path}: There is no topic {wanted!r:.100}. Choose one of "
-                f"{_listed(one.topic for one in candidates)}; `sceneprint bag info` lists all."
-            )
-        found = next((one for one in candidates if one.topic.name == wanted), None)
-        if found is None and named[0].type in (IMAGE, COMPRESSED, POINTS):
-            found = _frame_topic(bag, named[0])
-        if found is None:
-            raise DatasetError(
-                f"{bag.path}: The topic {printable(wanted)} ({printable(named[0].type)}, "
-                f"{named[0].count} messages) has no depth images (16UC1, mono16, 32FC1, or PNG of "
-                "compressedDepth) and no points. Choose one of "
-                f"{_listed(one.topic for one in candidates)}."
-            )
-        return found
-    if not candidates:
-        raise DatasetError(
-            f"{bag.path}: There is no topic of depth images (16UC1, mono16, 32FC1, or PNG of "
-            "compressedDepth) or of points (PointCloud2). `sceneprint bag info` lists what is "
-            "there."
-        )
-    if len(candidates) > 1:
-        raise DatasetError(
-            f"{bag.path}: {len(candidates)} topics can be taken: "
-            f"{_listed(one.topic for one in candidates)}. Choose one with --topic."
-        )
-    return candidates[0]
-
-
-def camera_topic(bag: Bag, frames: FrameTopic, wanted: str | None) -> BagTopic | None:
-    """The topic of the camera of depth images: beside theirs, else the only one of their frame.
-
-    Raises
-    ------
-    DatasetError : the one that is named is none, or several fit.
-    """
-    known = bag.of_type(CAMERA)
-    if wanted is not None:
-        found = next((one for one in known if one.name == wanted), None)
-        if found is None:
-            raise DatasetError(
-                f"{bag.path}: There is no topic {wanted!r:.100} of CameraInfo. Choose one of "
-                f"{_listed(known)} with --camera-info."
-            )
-        return found
-    beside = topic_without_transport(frames.topic.name).rpartition("/")[0] + "/camera_info"
-    for one in known:
-        if one.name == beside:
-            return one
-    fitting = [one for one in known if _frame_of(bag, one) == frames.frame]
-    if len(fitting) > 1:
-        raise DatasetError(
-            f"{bag.path}: The camera of {frames.topic.name} may be that of {_listed(fitting)}. "
-            "Choose one with --camera-info."
-        )
-    return fitting[0] if fitting else None
-
-
-def _frame_of(bag: Bag, topic: BagTopic) -> str | None:
-    """The frame of a topic's first message."""
-    try:
-        message = bag.first(topic.name)
-        fields = None if message is None else bag.decode(message, topic.type)
-    except DatasetError:
-        return None
-    return None if fields is None else frame_name(str(fields.header.frame_id))
-
-
-def _listed(topics: Iterable[BagTopic]) -> str:
-    """Names for people."""
-    names = [f"{one.name} ({one.type.rpartition('/')[2]}, {one.count} messages)" for one in topics]
-    return printable(", ".join(names[:20])) or "none"
-
-
 # Frames.
 
 
-def recording_sequence(
+def recording_sequences(
     path: Path, options: RecordingOptions, name: str | None = None
-) -> FrameSequence:
+) -> tuple[FrameSequence, ...]:
     """Return the frames of a recording that are taken; their samples are read when asked for.
 
     Parameters
@@ -364,7 +117,8 @@ def recording_sequence(
 
     Returns
     -------
-    sequence : its `note` says what was left out, and why
+    sequences : one, or one for each part with frames where stamps go back; the `note` of the first
+        says what was taken and left out of all, and why
 
     Raises
     ------
@@ -379,19 +133,28 @@ def recording_sequence(
     scan = scan_bag(bag, frames.topic, info, options.progress)
     camera = None if frames.encoding is None else _camera(bag, frames, info, scan)
     name = recording_name(path) if name is None else name
-    motion = _motion(bag, scan, frames, options)
-    references = [
-        _reference(bag, frames, scan, camera, motion, name, place) for place in motion.taken
-    ]
-    return FrameSequence(
-        name,
-        path,
-        Layout.RECORDING,
-        f"{name}/{motion.world}" if motion.world else name,
-        None,
-        tuple(references),
-        note=_note(frames, scan, motion),
-    )
+    motions = _motions(bag, scan, frames, options)
+    note = _note(frames, scan, motions)
+    if not any(motion.taken for motion in motions):
+        raise DatasetError(
+            f"{path}: {note}. Record transforms of one publisher, or choose another frame with "
+            "--pose-frame."
+        )
+    sequences: list[FrameSequence] = []
+    for number, motion in enumerate(motions, 1):
+        part = name if len(motions) == 1 else f"{name}.part{number}"
+        references = [
+            _reference(bag, frames, scan, camera, motion, part, place) for place in motion.taken
+        ]
+        if references:
+            parent = f"{part}/{motion.world}" if motion.world else part
+            sequences.append(
+                FrameSequence(
+                    part, path, Layout.RECORDING, parent, None, tuple(references),
+                    note="" if sequences else note,
+                )
+            )  # fmt: skip
+    return tuple(sequences)
 
 
 def recording_name(path: Path) -> str:
@@ -401,7 +164,7 @@ def recording_name(path: Path) -> str:
 
 @dataclass(eq=False)
 class _Motion:
-    """Where the sensor was, by the place of each frame.
+    """Where the sensor was in one part of a recording, by the place of each frame.
 
     Parameters
     ----------
@@ -410,70 +173,129 @@ class _Motion:
     poses, mountings : T_world_sensor and T_base_sensor of each frame, where known
     ups : up in the sensor's axes of each frame, where known
     taken : places of the keyframes
-    unknown : how many frames have no pose at their time
+    unknown : of the frames without a pose, why
+    remarks : what else is to be said of transforms above the sensor
     """
 
     world: str | None
-    base: str | None
-    poses: list[Floats | None]
-    mountings: list[Floats | None]
-    ups: list[Floats | None]
-    taken: list[int]
-    unknown: int
+    base: str | None = None
+    poses: dict[int, Floats] = field(default_factory=dict)
+    mountings: dict[int, Floats] = field(default_factory=dict)
+    ups: dict[int, Floats] = field(default_factory=dict)
+    taken: list[int] = field(default_factory=list)
+    unknown: dict[int, UnknownTransform] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+    @property
+    def is_disputed(self) -> bool:
+        """Whether transforms contradict each other."""
+        return any(why.nearest_s is None for why in self.unknown.values())
 
 
-def _motion(bag: Bag, scan: BagScan, frames: FrameTopic, options: RecordingOptions) -> _Motion:
-    stamps, tree = scan.stamps_ns, scan.tree
-    world = frame_name(options.pose_frame or "") or tree.world_of(frames.frame)
-    if options.pose_frame is not None and tree.path(options.pose_frame, frames.frame) is None:
+def _motions(
+    bag: Bag, scan: BagScan, frames: FrameTopic, options: RecordingOptions
+) -> list[_Motion]:
+    """Of each part that has frames."""
+    parts = [
+        (part, range(part.first, end))
+        for part, end in zip(scan.parts, scan.ends, strict=True)
+        if end > part.first
+    ]
+    wanted = options.pose_frame
+    trees = [part.tree for part, _ in parts]
+    if wanted is not None and all(tree.path(wanted, frames.frame) is None for tree in trees):
+        above = dict.fromkeys(one for tree in trees for one in tree.ancestors(frames.frame)[1:])
         raise DatasetError(
             f"{bag.path}: No transforms lead from {frames.frame or 'the sensor'} to "
-            f"{options.pose_frame!r:.100}. Frames above it are "
-            f"{', '.join(tree.ancestors(frames.frame)[1:]) or 'none'}."
+            f"{wanted!r:.100}. Frames above it are {', '.join(above) or 'none'}."
         )
-    poses: list[Floats | None] = [None] * len(stamps)
+    motions = [_motion(part, places, scan, frames, wanted) for part, places in parts]
+    with_poses = any(motion.poses for motion in motions)
+    if not with_poses and any(motion.is_disputed for motion in motions):
+        return motions  # frames without poses would hide that the transforms are wrong
+    for (part, places), motion in zip(parts, motions, strict=True):
+        _choose(motion, part, places, scan, frames.frame, options, with_poses=with_poses)
+    return motions
+
+
+def _motion(
+    part: BagPart, places: range, scan: BagScan, frames: FrameTopic, wanted: str | None
+) -> _Motion:
+    """Poses and mountings of one part."""
+    tree, sensor = part.tree, frames.frame
+    stamps = [scan.stamps_ns[place] for place in places]
+    world = frame_name(wanted or "") or tree.world_of(sensor)
+    motion = _Motion(world, tree.base_of(sensor, world))
+    above = set(tree.ancestors(sensor))
+    for (parent, child), (reason, count) in sorted(tree.passed_over.items()):
+        if child in above:
+            times = "" if count == 1 else f"{count} times "
+            motion.remarks.append(f"{parent} -> {child} is passed over {times}as {reason}")
+    for (parent, child), length in sorted(tree.normalised.items()):
+        if child in above:
+            motion.remarks.append(
+                f"{parent} -> {child} is normalised, as its quaternion has the length {length:.3g}"
+            )
     if world is not None:
-        poses = tree.poses(world, frames.frame, stamps)
-    known = [place for place, pose in enumerate(poses) if pose is not None]
-    unknown = len(poses) - len(known) if world is not None else 0
-    order = sorted(known or range(len(stamps)), key=lambda place: stamps[place])
+        for place, found in zip(places, tree.lookup(world, sensor, stamps), strict=True):
+            if isinstance(found, UnknownTransform):
+                motion.unknown[place] = found
+            else:
+                motion.poses[place] = found
+    if motion.base is not None:
+        mountings = tree.poses(motion.base, sensor, stamps)
+        motion.mountings = {
+            place: T for place, T in zip(places, mountings, strict=True) if T is not None
+        }
+    return motion
+
+
+def _choose(
+    motion: _Motion, part: BagPart, places: range, scan: BagScan, sensor: str,
+    options: RecordingOptions, *, with_poses: bool,
+) -> None:  # fmt: skip
+    """Choose the keyframes of one part: among frames with poses where the recording has any, else
+    by time.
+    """
+    stamps, poses = scan.stamps_ns, motion.poses
+    if not with_poses:
+        motion.world = None
+    order = sorted(poses if with_poses else places, key=lambda place: stamps[place])
     chosen = keyframes(
         [stamps[place] for place in order],
-        [pose for place in order if (pose := poses[place]) is not None] if known else None,
+        [poses[place] for place in order] if with_poses else None,
         options.keyframe_m,
         math.radians(options.keyframe_deg),
         options.keyframe_s,
     )
-    base = tree.base_of(frames.frame, world)
-    mountings: list[Floats | None] = [None] * len(stamps)
-    if base is not None:
-        mountings = tree.poses(base, frames.frame, stamps)
-    taken = [order[place] for place in chosen]
-    ups = _ups(scan, frames.frame, taken)
-    return _Motion(world if known else None, base, poses, mountings, ups, taken, unknown)
+    motion.taken = [order[place] for place in chosen]
+    motion.ups = _ups(part, sensor, motion.taken, stamps)
 
 
-def _ups(scan: BagScan, sensor: str, taken: list[int]) -> list[Floats | None]:
+def _ups(
+    part: BagPart, sensor: str, taken: list[int], stamps_ns: Sequence[int]
+) -> dict[int, Floats]:
     """Up in the sensor's axes of the frames taken, of the IMU with most measurements that does not
     move against the sensor.
     """
-    ups: list[Floats | None] = [None] * len(scan.stamps_ns)
-    for imu in sorted(scan.imus, key=lambda name: (-len(scan.imus[name]), name)):
-        T_sensor_imu = scan.tree.fixed_transform(sensor, imu)
+    for imu in sorted(part.imus, key=lambda name: (-len(part.imus[name]), name)):
+        T_sensor_imu = part.tree.fixed_transform(sensor, imu)
         if T_sensor_imu is None:
             continue
-        found = scan.imus[imu].up_at([scan.stamps_ns[place] for place in taken])
-        for place, up in zip(taken, found, strict=True):
-            ups[place] = None if up is None else T_sensor_imu[:3, :3] @ up
-        break
-    return ups
+        found = part.imus[imu].up_at([stamps_ns[place] for place in taken])
+        return {
+            place: T_sensor_imu[:3, :3] @ up
+            for place, up in zip(taken, found, strict=True)
+            if up is not None
+        }
+    return {}
 
 
 def _reference(
     bag: Bag, frames: FrameTopic, scan: BagScan, camera: Camera | None, motion: _Motion, name: str,
     place: int,
 ) -> FrameReference:  # fmt: skip
-    up, T_base_sensor, base = motion.ups[place], motion.mountings[place], None
+    up, T_base_sensor, base = motion.ups.get(place), motion.mountings.get(place), None
     direction = None if up is None else (float(up[0]), float(up[1]), float(up[2]))
     if T_base_sensor is not None:
         base = checked(
@@ -485,7 +307,7 @@ def _reference(
         bag.path / f"{place:06d}",
         None if camera is None else replace(camera, up=direction or camera.up),
         scan.stamps_ns[place] * 1e-9,
-        motion.poses[place],
+        motion.poses.get(place),
         CloudSource(up=direction) if camera is None else None,
         source=BagSource(bag, frames.topic, *scan.places[place]),
         base=base,
@@ -507,7 +329,7 @@ def _camera(bag: Bag, frames: FrameTopic, topic: BagTopic | None, scan: BagScan)
     try:
         return find_camera(bag.path.parent)
     except DatasetError as cause:
-        known = _listed(bag.of_type(CAMERA))
+        known = listed(bag.of_type(CAMERA))
         said = "is not calibrated" if topic is not None else "is unknown"
         raise DatasetError(
             f"{bag.path}: The camera of {frames.topic.name} {said}; topics of CameraInfo are "
@@ -516,24 +338,59 @@ def _camera(bag: Bag, frames: FrameTopic, topic: BagTopic | None, scan: BagScan)
         ) from cause
 
 
-def _note(frames: FrameTopic, scan: BagScan, motion: _Motion) -> str:
+def _note(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
     """What was taken and what was left out, for people."""
-    total, taken = len(scan.stamps_ns), len(motion.taken)
-    between = total - taken - (motion.unknown if motion.world else 0)
+    total, taken = len(scan.stamps_ns), sum(len(motion.taken) for motion in motions)
+    poses = sum(len(motion.poses) for motion in motions)
+    worlds = sorted({motion.world for motion in motions if motion.poses and motion.world})
+    told = (
+        f"{taken} of {total} frames of {printable(frames.topic.name)} taken, poses of {poses} of "
+        f"{total} frames{' in ' if worlds else ''}{', '.join(worlds)}"
+    )
+    if poses < total:
+        told += f"; {total - poses} without: {_reasons(frames, motions)}"
+    without = total - poses if poses or not taken else 0
     left = [
         f"{count} {reason}"
         for count, reason in (
-            (between, "between keyframes"),
-            (motion.unknown if motion.world else 0, "without a transform at their time"),
+            (total - taken - without, "between keyframes"),
+            (without, "without a pose"),
             (scan.damaged, "damaged messages of other topics"),
         )
         if count
     ]
-    where = f"poses in {motion.world}" if motion.world else "no poses"
-    if motion.unknown and motion.world is None:
-        where = "no poses, as no transform is known at the time of any frame"
-    told = f"{taken} of {total} frames of {printable(frames.topic.name)} taken, {where}"
-    return f"{told}; left out: {', '.join(left)}" if left else told
+    if left:
+        told += f"; left out: {', '.join(left)}"
+    if len(motions) > 1:
+        told += f"; split into {len(motions)} parts, as stamps go back"
+    remarks = dict.fromkeys(one for motion in motions for one in motion.remarks)
+    return printable("; ".join([told, *list(remarks)[:5]]))
+
+
+def _reasons(frames: FrameTopic, motions: list[_Motion]) -> str:
+    """Why frames have no poses, by transforms, the most frequent first."""
+    whys = [why for motion in motions for why in motion.unknown.values()]
+    found = []
+    for (transform, disputed), count in Counter(
+        (why.transform, why.nearest_s is None) for why in whys
+    ).most_common(3):
+        if disputed:
+            reason = (
+                f"samples of {transform} contradict each other (two publishers, or {FASTEST:g} m/s)"
+            )
+        else:
+            nearest = min(
+                why.nearest_s for why in whys
+                if why.transform == transform and why.nearest_s is not None
+            )  # fmt: skip
+            within = f"within {TOLERANCE_S * 1e3:g} ms (nearest {nearest:.2g} s)"
+            reason = f"no sample of {transform}{f' {within}' if math.isfinite(nearest) else ''}"
+        found.append(reason if len(whys) == count else f"{reason}: {count}")
+    if not found:
+        return (
+            f"no transforms lead from {frames.frame or 'their frame'} to a frame in which it moves"
+        )
+    return ", ".join(found)
 
 
 # What a bag holds, for people.
@@ -550,7 +407,7 @@ class BagOutline:
     topics : all of them
     frames : the topics that can be taken
     chosen : the one that would be taken, or None
-    sequence : the frames that would be taken, or None
+    sequences : the frames that would be taken; none where nothing would be
     problem : why nothing would be taken; empty where something would
     """
 
@@ -561,7 +418,7 @@ class BagOutline:
     frames: tuple[FrameTopic, ...]
     chosen: FrameTopic | None
     camera: str | None
-    sequence: FrameSequence | None
+    sequences: tuple[FrameSequence, ...]
     problem: str
 
 
@@ -576,18 +433,19 @@ def bag_outline(path: Path, options: RecordingOptions) -> BagOutline:
     bag = Bag(path)
     try:
         frames = tuple(frame_topics(bag))
-        chosen, camera, sequence, problem = None, None, None, ""
+        chosen, camera, problem = None, None, ""
+        sequences: tuple[FrameSequence, ...] = ()
         try:
             chosen = choose_topic(bag, options.topic)
             if chosen.encoding is not None:
                 topic = camera_topic(bag, chosen, options.camera_info)
                 camera = None if topic is None else topic.name
-            sequence = recording_sequence(path, options)
+            sequences = recording_sequences(path, options)
         except (DatasetError, InvalidIntrinsics) as error:
             problem = str(error)
         kind = "ROS 1" if bag.is_ros1 else "ROS 2"
         return BagOutline(
-            kind, bag.start_ns, bag.end_ns, bag.topics, frames, chosen, camera, sequence, problem
+            kind, bag.start_ns, bag.end_ns, bag.topics, frames, chosen, camera, sequences, problem
         )
     finally:
         bag.close()

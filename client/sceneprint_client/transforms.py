@@ -1,0 +1,445 @@
+"""Frames of a robot over time: tf, tf_static and odometry.
+
+TransformTree.add ...  --TransformTree.lookup-->  T_parent_child at M stamps, or why it is unknown
+stamps (N,), samples (N, 7)  --contradictions-->  which of them cannot be one motion
+
+tf calls the outer frame the parent: a transform takes coordinates of the child to the parent's.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint_client.errors import DatasetError, printable
+from sceneprint_client.poses import (
+    Floats,
+    SensorTrajectory,
+    first_since,
+    interpolate,
+    rotation_of,
+)
+
+#: Seconds between two samples of a transform beyond which nothing between them is known.
+LONGEST_GAP_S = 0.5
+#: Seconds before the first sample of a transform, or after its last, for which that one stands.
+TOLERANCE_S = 0.02
+#: Most samples of moving transforms: hours at the rate of any odometry.
+MOST_SAMPLES = 5_000_000
+#: How far the length of a recorded quaternion may be from 1: of a unit quaternion, and of one that
+#: is normalised.
+_UNIT, _NEAR_UNIT = 1e-2, 0.1
+#: Farthest believable translation, metres.
+_FARTHEST_M = 1e7
+#: Names of a robot's base, as REP 105 and practice have them, the first that is there counts.
+BASES = ("base_link", "base_footprint", "base")
+#: Names of frames that poses lead to, as REP 105 has them, the first that is there counts.
+WORLDS = ("map", "odom", "world")
+
+
+#: Motion beyond which two samples contradict each other, metres (or radians) per second, ...
+FASTEST = 50.0
+#: ... and by which they may differ besides, metres or radians.
+_JITTER = 0.1
+#: A jump, metres or radians, and a change of motion, per second^2, that samples of one motion do
+#: not show; a jump that is taken back within so many seconds is of two publishers.
+_JUMP, _HARDEST, _BACK_S = 0.5, 10.0, 2.0
+
+
+class UnknownTransform(NamedTuple):
+    """Why a transform is not known at a time.
+
+    Parameters
+    ----------
+    transform : such as "odom -> base_link"
+    nearest_s : seconds to its nearest sample; None where its samples contradict each other
+    """
+
+    transform: str
+    nearest_s: float | None
+
+
+@dataclass(eq=False)
+class _Edge:
+    """Samples of one transform; a fixed one has one sample and no stamp."""
+
+    fixed: bool
+    stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    samples: array[float] = field(default_factory=lambda: array("d"))  # 7 each: x y z, x y z w
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether it never moved, as fixed joints that are published again and again."""
+        rows = np.frombuffer(self.samples, np.float64).reshape(-1, 7)
+        return self.fixed or bool((np.ptp(rows, axis=0) < 1e-9).all())
+
+
+class TransformTree:
+    """Transforms between named frames over time."""
+
+    def __init__(self) -> None:
+        self._edges: dict[str, dict[str, _Edge]] = {}  # by child, then by parent
+        self._count = 0
+        self._origin_ns: int | None = None
+        #: Transforms (parent, child) of which samples were passed over: the reason, and how many.
+        self.passed_over: dict[tuple[str, str], tuple[str, int]] = {}
+        #: Transforms whose quaternions were normalised: the length of the last one.
+        self.normalised: dict[tuple[str, str], float] = {}
+
+    def add(
+        self, parent: str, child: str, stamp_ns: int, sample: Sequence[float], *, fixed: bool
+    ) -> bool:
+        """Take a transform; one that is no rigid transform is passed over, and noted.
+
+        Parameters
+        ----------
+        parent, child : names; a leading slash, as ROS 1 wrote it, is no part of them
+        stamp_ns : when; not looked at of a fixed one
+        sample : x y z in metres, and a unit quaternion x y z w: T_parent_child
+        fixed : whether it holds at all times; the last one counts
+
+        Returns
+        -------
+        taken : whether it was
+
+        Raises
+        ------
+        DatasetError : there are more than 5 million; `forget` makes room.
+        """
+        parent, child = frame_name(parent), frame_name(child)
+        row = np.asarray(sample, np.float64)
+        length = float(np.linalg.norm(row[3:]))
+        far = float(np.abs(row[:3]).max())
+        if parent == child:
+            return False
+        if not (abs(length - 1.0) < _NEAR_UNIT and far < _FARTHEST_M):
+            self.pass_over(
+                parent, child,
+                f"its quaternion has the length {length:.3g}" if far < _FARTHEST_M
+                else f"its translation is {far:.3g} m",
+            )  # fmt: skip
+            return False
+        if abs(length - 1.0) >= _UNIT:
+            self.normalised[parent, child] = length
+        self._count += 1
+        if self._count > MOST_SAMPLES:
+            raise DatasetError(
+                f"There are more than {MOST_SAMPLES} transforms. Cut the recording into parts."
+            )
+        row[3:] /= length
+        edges = self._edges.setdefault(child, {})
+        edge = edges.get(parent)
+        if edge is None or (fixed and not edge.fixed):
+            edge = edges[parent] = _Edge(fixed)
+        if edge.fixed:
+            edge.samples = array("d", row)
+            return True
+        edge.stamps_ns.append(stamp_ns)
+        edge.samples.extend(row)
+        if self._origin_ns is None:
+            self._origin_ns = stamp_ns
+        return True
+
+    def pass_over(self, parent: str, child: str, reason: str) -> None:
+        """Note that a sample of a transform was not taken, and why."""
+        _, count = self.passed_over.get((parent, child), ("", 0))
+        self.passed_over[parent, child] = reason, count + 1
+
+    def remove(self, parent: str, child: str) -> None:
+        """Drop a transform."""
+        edge = self._edges.get(child, {}).pop(parent, None)
+        self._count -= 0 if edge is None else len(edge.stamps_ns)
+
+    def samples(self, parent: str, child: str) -> Floats:
+        """The samples (N, 7) of a transform in the order in which they came."""
+        edge = self._edges.get(frame_name(child), {}).get(frame_name(parent))
+        rows = np.frombuffer(b"" if edge is None else edge.samples.tobytes(), np.float64)
+        return rows.reshape(-1, 7)
+
+    def forget_moving(self) -> None:
+        """Drop all that may move, as where the clock jumped."""
+        for edges in self._edges.values():
+            for parent in [name for name, edge in edges.items() if not edge.fixed]:
+                self._count -= len(edges.pop(parent).stamps_ns)
+        self._origin_ns = None
+
+    def forget(self, span_ns: int) -> None:
+        """Drop samples of moving transforms that came before those of so long until the latest."""
+        for edges in self._edges.values():
+            for edge in edges.values():
+                if not edge.fixed:
+                    old = first_since(edge.stamps_ns, span_ns)
+                    del edge.stamps_ns[:old], edge.samples[: 7 * old]
+                    self._count -= old
+
+    def frames(self) -> list[str]:
+        """Names of all frames."""
+        parents = {one for edges in self._edges.values() for one in edges}
+        return sorted(parents | self._edges.keys())
+
+    def has_edge(self, parent: str, child: str) -> bool:
+        """Whether a transform between these two is known."""
+        return frame_name(parent) in self._edges.get(frame_name(child), {})
+
+    def ancestors(self, child: str, *, constant: bool = False) -> list[str]:
+        """Frames above one, nearest first, itself at the beginning.
+
+        Of several parents that with the most samples is taken.
+
+        Parameters
+        ----------
+        child : the name
+        constant : stop below the first transform that moves
+        """
+        found = [frame_name(child)]
+        while True:
+            edges = self._edges.get(found[-1], {})
+            known = {
+                parent: edge
+                for parent, edge in edges.items()
+                if parent not in found and (not constant or self._holds_still(parent, found[-1]))
+            }
+            if not known:
+                return found
+            found.append(max(known, key=lambda name: (len(known[name].samples), name)))
+
+    def path(self, ancestor: str, child: str) -> list[str] | None:
+        """Frames from a child up to an ancestor, both included; None where it is none."""
+        ancestor, child = frame_name(ancestor), frame_name(child)
+        came: dict[str, str] = {child: ""}
+        waiting = [child]
+        while waiting and ancestor not in came:
+            below = waiting.pop(0)
+            for parent in sorted(self._edges.get(below, {})):
+                if parent not in came:
+                    came[parent] = below
+                    waiting.append(parent)
+        if ancestor not in came:
+            return None
+        up = [ancestor]
+        while up[-1] != child:
+            up.append(came[up[-1]])
+        return up[::-1]
+
+    def base_of(self, sensor: str, world: str | None) -> str | None:
+        """The frame of the robot that carries a sensor; None where nothing tells.
+
+        It is `base_link` or its like above the sensor; else the last frame above it to which the
+        sensor does not move.
+
+        Parameters
+        ----------
+        sensor : its frame
+        world : what poses lead to; where given, the base lies below it
+        """
+        up = self.ancestors(sensor) if world is None else self.path(world, sensor) or []
+        up = up if world is None else up[:-1]
+        for name in BASES:
+            for one in up:
+                if one.rpartition("/")[2] == name:
+                    return one
+        if world is None:
+            return None
+        still = [one for one in self.ancestors(sensor, constant=True) if one in up]
+        return still[-1] if still and still[-1] != frame_name(sensor) else None
+
+    def world_of(self, sensor: str) -> str | None:
+        """The frame that poses of a sensor lead to; None where nothing above it moves.
+
+        It is `map`, else `odom`, else the topmost.
+        """
+        up = self.ancestors(sensor)
+        moves = [
+            not self._holds_still(parent, child)
+            for child, parent in pairwise(up)
+        ]  # fmt: skip
+        named: list[str] = []
+        for world in WORLDS:
+            for one in self.frames():
+                path = self.path(one, sensor) if one.rpartition("/")[2] == world else None
+                if path is not None and len(path) > 1:
+                    named.append(one)
+        if named:
+            return named[0]
+        return up[-1] if any(moves) else None
+
+    def fixed_transform(self, target: str, source: str) -> Floats | None:
+        """T_target_source (4, 4) between frames that do not move against each other, or None."""
+        ups = [self.ancestors(one, constant=True) for one in (target, source)]
+        common = next((one for one in ups[1] if one in ups[0]), None)
+        if common is None:
+            return None
+        (T_common_target,) = self.poses(common, target, [0])
+        (T_common_source,) = self.poses(common, source, [0])
+        if T_common_target is None or T_common_source is None:
+            return None
+        found: Floats = np.linalg.inv(T_common_target) @ T_common_source
+        return found
+
+    def poses(self, parent: str, child: str, stamps_ns: Sequence[int]) -> list[Floats | None]:
+        """As `lookup`, with None where a transform on the way is not known."""
+        found = self.lookup(parent, child, stamps_ns)
+        return [None if isinstance(one, UnknownTransform) else one for one in found]
+
+    def lookup(
+        self, parent: str, child: str, stamps_ns: Sequence[int]
+    ) -> list[Floats | UnknownTransform]:
+        """T_parent_child (4, 4) at each stamp, positions linear and rotations by slerp.
+
+        Parameters
+        ----------
+        parent : the child itself, or a frame above it
+        child : a frame
+        stamps_ns : M times, in any order
+
+        Returns
+        -------
+        found : of M stamps; the first transform on the way that is not known at that time, where
+            its samples on either side are more than `LONGEST_GAP_S` apart and none lies within
+            `TOLERANCE_S`, or where they contradict each other
+        """
+        path = self.path(parent, child)
+        if path is None:
+            nowhere = UnknownTransform(f"{frame_name(parent)} -> {frame_name(child)}", float("inf"))
+            return [nowhere] * len(stamps_ns)
+        found: list[Floats | UnknownTransform] = [np.eye(4) for _ in stamps_ns]
+        for below, above in pairwise(path):
+            steps = self._samples_at(above, below, stamps_ns)
+            found = [
+                T if isinstance(T, UnknownTransform)
+                else step if isinstance(step, UnknownTransform)
+                else step @ T
+                for T, step in zip(found, steps, strict=True)
+            ]  # fmt: skip
+        return found
+
+    def _holds_still(self, parent: str, child: str) -> bool:
+        """Whether a transform is fixed: one that never moved counts, but for that of a base, which
+        may have stood still.
+        """
+        edge = self._edges[child][parent]
+        names = {parent.rpartition("/")[2], child.rpartition("/")[2]}
+        is_of_base = not names.isdisjoint(WORLDS) or child.rpartition("/")[2] in BASES
+        return edge.fixed or (edge.is_constant and not is_of_base)
+
+    def _samples_at(
+        self, parent: str, child: str, stamps_ns: Sequence[int]
+    ) -> Sequence[Floats | UnknownTransform]:
+        """One transform at the stamps."""
+        edge = self._edges[child][parent]
+        rows = np.frombuffer(edge.samples, np.float64).reshape(-1, 7)
+        if self._holds_still(parent, child):
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = rotation_of(rows[-1, 3:]), rows[-1, :3]
+            return [T] * len(stamps_ns)
+        origin = self._origin_ns or 0
+        recorded: NDArray[np.int64] = np.frombuffer(edge.stamps_ns, np.int64)
+        order = np.argsort(recorded, kind="stable")
+        # seconds since a time of the recording: exact to nanoseconds for a hundred days
+        times: Floats = (recorded[order] - origin).astype(np.float64) * 1e-9
+        rows = rows[order]
+        asked = (np.asarray(stamps_ns, np.int64) - origin) * 1e-9
+        before = np.maximum(np.searchsorted(times, asked, "right") - 1, 0)
+        after = np.minimum(np.searchsorted(times, asked), len(times) - 1)
+        off = np.abs(times[before] - asked), np.abs(times[after] - asked)
+        nearest = times[np.where(off[0] <= off[1], before, after)]
+        between = (times[before] <= asked) & (asked <= times[after])
+        between &= times[after] - times[before] <= LONGEST_GAP_S
+        distance = np.minimum(*off)
+        doubted = _between_doubts(*contradictions(times, rows), before, after)
+
+        _, first = np.unique(times, return_index=True)
+        trajectory = SensorTrajectory(times[first], rows[first, :3], rows[first, 3:])
+        asked = np.where(between, asked, nearest)
+        known = between | (distance <= TOLERANCE_S)
+        name = f"{parent} -> {child}"
+        return [
+            UnknownTransform(name, None) if doubt and ok
+            else pose if ok and pose is not None
+            else UnknownTransform(name, float(seconds))
+            for pose, ok, doubt, seconds in zip(
+                interpolate(trajectory, asked.tolist(), longest_gap=LONGEST_GAP_S),
+                known, doubted, distance, strict=True,
+            )
+        ]  # fmt: skip
+
+
+def contradictions(
+    times: Floats, rows: Floats
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:  # fmt: skip
+    """Find samples of one transform that cannot be of one motion.
+
+    Parameters
+    ----------
+    times : (N,) seconds, in order; two samples may have one time
+    rows : (N, 7) x y z metres, and unit quaternions x y z w
+
+    Returns
+    -------
+    too_fast : (N - 1,) pairs of neighbours that imply more than `FASTEST`
+    disputed : (N,) samples from a jump to the jump back, as of two publishers
+    """
+    disputed = np.zeros(len(times), np.bool_)
+    gap = np.diff(times)
+    steps = _steps(rows[:-1], rows[1:])
+    reach = motion(rows[:-1], rows[1:])
+    too_fast = reach > _JITTER + FASTEST * gap
+    # a jump differs from the motion on both sides of it
+    rate = steps / np.maximum(gap, 1e-3)[:, None]
+    change = np.full(len(gap), np.inf if len(gap) > 1 else 0.0)
+    for k, neighbour in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
+        off = np.linalg.norm(steps[k] - rate[neighbour] * gap[k, None], axis=1)
+        change[k] = np.minimum(change[k], off)
+    jumps = np.flatnonzero((reach > _JUMP) & (change > _JUMP + _HARDEST * gap**2)).tolist()
+    for out, back in pairwise(jumps):
+        left = np.linalg.norm(steps[out] + steps[back])
+        if times[back + 1] - times[out] <= _BACK_S and left < 0.5 * min(reach[out], reach[back]):
+            disputed[out : back + 2] = True
+    return too_fast, disputed
+
+
+def motion(rows: Floats, others: Floats) -> Floats:
+    """How far samples (M, 7) lie from others: metres, where a radian counts as one."""
+    found: Floats = np.linalg.norm(_steps(rows, others), axis=1)
+    return found
+
+
+def _steps(rows: Floats, others: Floats) -> Floats:
+    """From samples to others (M, 6): translations, and rotations in the axes of the first, whose
+    length is 2 sin of half the angle.
+    """
+    x, y, z, w = rows[:, 3:].T * np.array([[-1.0], [-1.0], [-1.0], [1.0]])
+    a, b, c, d = others[:, 3:].T
+    turn = np.stack(
+        [
+            w * a + x * d + y * c - z * b,
+            w * b - x * c + y * d + z * a,
+            w * c + x * b - y * a + z * d,
+        ],
+        axis=1,
+    )
+    real = w * d - x * a - y * b - z * c
+    turn[real < 0.0] *= -1.0  # q and -q are one rotation
+    return np.hstack([others[:, :3] - rows[:, :3], 2.0 * turn])
+
+
+def _between_doubts(
+    too_fast: NDArray[np.bool_], disputed: NDArray[np.bool_], before: NDArray[np.intp],
+    after: NDArray[np.intp],
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Whether the samples on either side of M times contradict each other."""
+    low, high = np.minimum(before, after), np.maximum(before, after)
+    sums = np.concatenate([[0], np.cumsum(too_fast)])
+    found: NDArray[np.bool_] = (sums[high] > sums[low]) | disputed[low] | disputed[high]
+    return found
+
+
+def frame_name(name: str) -> str:
+    """A frame's name without the leading slash of ROS 1, in one line of printable characters."""
+    return printable(name.lstrip("/"))

@@ -1,0 +1,309 @@
+"""One pass over a bag: what moves, the camera, and the times of the frames.
+
+Bag, topics  --scan_bag-->  BagScan
+stamps in the order of recording  -->  BagPart, ...: between them the clock was set back
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from sceneprint.errors import DatasetError
+from sceneprint.formats.recording.bag import (
+    CAMERA,
+    IMU,
+    ODOMETRY,
+    OLD_TRANSFORMS,
+    TRANSFORMS,
+    Bag,
+    BagTopic,
+    RawMessage,
+)
+from sceneprint_client.files import naming
+from sceneprint_client.poses import Accelerations
+from sceneprint_client.ros_messages import (
+    is_calibrated,
+    pose_row,
+    stamp_of,
+    transform_row,
+    vector_row,
+)
+from sceneprint_client.transforms import MOST_SAMPLES, TransformTree, frame_name, motion
+
+#: What to call when so many of all messages have been read.
+Progress = Callable[[int, int], None]
+#: Most messages of one topic of frames.
+MOST_FRAMES = 2_000_000
+
+
+#: Seconds that stamps of one source may be out of order; farther back, the clock was set back.
+_OUT_OF_ORDER_S = 0.1
+#: Times that a source goes back and at once forward again before its clock is not believed: it is
+#: several publishers, each with a delay of its own.
+_MOST_FLIPS = 8
+#: Most parts of one recording.
+MOST_PARTS = 1000
+#: Metres and radians by which what is fixed may differ from itself, and how many values are kept.
+_FIXED, _MOST_FIXED = 0.1, 100
+
+
+@dataclass(eq=False)
+class BagPart:
+    """What was recorded while no stamps went back.
+
+    Parameters
+    ----------
+    first : number of its first frame
+    tree : transforms, and odometry where no transform says the same
+    imus : measurements by the frame of the IMU
+    odometry : by topic
+    """
+
+    first: int
+    tree: TransformTree = field(default_factory=TransformTree)
+    imus: dict[str, Accelerations] = field(default_factory=dict)
+    odometry: dict[str, list[_Odometry]] = field(default_factory=dict)
+
+
+@dataclass(eq=False)
+class BagScan:
+    """What one pass over a bag gives.
+
+    Parameters
+    ----------
+    parts : at least one, in order
+    info : the first CameraInfo that is calibrated, or None
+    stamps_ns : when each frame was measured, in the order in which they were recorded
+    places : when each was recorded, and which of those with that time it is
+    damaged : messages that did not decode, and were passed over
+    fixed : values of the transforms that hold at all times; the last one counts
+    """
+
+    parts: list[BagPart] = field(default_factory=lambda: [BagPart(0)])
+    info: Any = None
+    stamps_ns: list[int] = field(default_factory=list)
+    places: list[tuple[int, int]] = field(default_factory=list)
+    damaged: int = 0
+    fixed: dict[tuple[str, str], list[list[float]]] = field(default_factory=dict)
+
+    @property
+    def ends(self) -> list[int]:
+        """Number of the frame after the last one of each part."""
+        return [*(part.first for part in self.parts[1:]), len(self.stamps_ns)]
+
+
+@dataclass(frozen=True)
+class _Odometry:
+    """A pose of a robot in the frame of its odometry."""
+
+    parent: str
+    child: str
+    stamp_ns: int
+    sample: list[float]
+
+
+class _SeveralClocks(Exception):
+    """A source whose stamps go back and forth."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__(source)
+        self.source = source
+
+
+@dataclass(eq=False)
+class _Clocks:
+    """The latest stamps of sources within a part: topics, and transforms of tf.
+
+    Parameters
+    ----------
+    ignored : sources that say nothing about the clock
+    """
+
+    ignored: set[str]
+    latest: dict[str, int] = field(default_factory=dict)
+    _last: dict[str, int] = field(default_factory=dict)
+    _back: dict[str, int] = field(default_factory=dict)
+    _flips: dict[str, int] = field(default_factory=dict)
+
+    def goes_back(self, source: str, stamp_ns: int) -> bool:
+        """Take a stamp; whether it says that the clock was set back.
+
+        Raises
+        ------
+        _SeveralClocks : the source goes back and forth.
+        """
+        if stamp_ns <= 0 or source in self.ignored:
+            return False
+        last = self._last.get(source, stamp_ns)
+        self._last[source] = stamp_ns
+        if source in self._back and stamp_ns - last >= 0.5 * self._back[source]:
+            del self._back[source]
+            self._flips[source] = self._flips.get(source, 0) + 1
+            if self._flips[source] >= _MOST_FLIPS:
+                raise _SeveralClocks(source)
+        latest = self.latest.get(source, stamp_ns)
+        if latest - stamp_ns <= _OUT_OF_ORDER_S * 1e9:
+            self.latest[source] = max(latest, stamp_ns)
+            return False
+        self._back[source] = latest - stamp_ns
+        self.latest = {source: stamp_ns}
+        return True
+
+
+def scan_bag(
+    bag: Bag, frames: BagTopic | None, camera: BagTopic | None, progress: Progress | None
+) -> BagScan:
+    """Read what moves, and when the frames were measured; their samples are not decoded.
+
+    Parameters
+    ----------
+    bag : to read
+    frames : the topic of the frames, or None
+    camera : the topic of their camera, or None
+    progress : what to call now and then
+
+    Raises
+    ------
+    DatasetError : the bag is damaged, or too long.
+    """
+    ignored = set[str]()
+    while True:
+        scanner = _Scanner(bag, frames, camera, _Clocks(ignored))
+        try:
+            return scanner.scan(progress)
+        except _SeveralClocks as found:
+            ignored.add(found.source)
+
+
+class _Scanner:
+    """One pass over a bag; parameters as of `scan_bag`."""
+
+    def __init__(
+        self, bag: Bag, frames: BagTopic | None, camera: BagTopic | None, clocks: _Clocks
+    ) -> None:
+        self._bag, self._frames, self._clocks = bag, frames, clocks
+        self._kinds = {
+            one.name: one.type for one in bag.of_type(TRANSFORMS, OLD_TRANSFORMS, ODOMETRY, IMU)
+        } | ({} if camera is None else {camera.name: camera.type})
+        self._scan = BagScan()
+
+    def scan(self, progress: Progress | None) -> BagScan:
+        """Read all; raises as `scan_bag`, and _SeveralClocks."""
+        scan, frames = self._scan, self._frames
+        names = [*self._kinds, *([] if frames is None else [frames.name])]
+        total = sum(one.count for one in self._bag.topics if one.name in names)
+        for done, message in enumerate(self._bag.messages(names)):
+            if progress is not None and done % 64 == 0:
+                progress(done, total)
+            with naming(str(self._bag.path)):
+                if frames is not None and message.topic == frames.name:
+                    self._count_frame(message)
+                else:
+                    self._take(message, self._kinds[message.topic])
+        if progress is not None:
+            progress(total, total)
+        for part in scan.parts:
+            _add_odometry(part.tree, part.odometry)
+            _add_fixed(part.tree, scan.fixed)
+        return scan
+
+    def _part_at(self, source: str, stamp_ns: int) -> BagPart:
+        """The part to which a stamp belongs: a new one where the source goes back."""
+        parts = self._scan.parts
+        if self._clocks.goes_back(source, stamp_ns):
+            if len(parts) == MOST_PARTS:
+                raise DatasetError(
+                    f"The stamps go back more than {MOST_PARTS} times, last in {source}. Cut the "
+                    "bag into parts."
+                )
+            parts.append(BagPart(len(self._scan.stamps_ns)))
+        return parts[-1]
+
+    def _count_frame(self, message: RawMessage) -> None:
+        scan = self._scan
+        stamp = self._bag.stamp_ns(message)
+        self._part_at(message.topic, stamp)
+        same = bool(scan.places) and scan.places[-1][0] == message.log_ns
+        scan.places.append((message.log_ns, scan.places[-1][1] + 1 if same else 0))
+        scan.stamps_ns.append(stamp)
+        if len(scan.places) > MOST_FRAMES:
+            raise DatasetError(f"There are more than {MOST_FRAMES} frames. Cut the bag into parts.")
+
+    def _take(self, message: RawMessage, kind: str) -> None:
+        """Keep what a message says that is not of a frame."""
+        scan, bag = self._scan, self._bag
+        if kind == CAMERA and scan.info is not None:
+            return
+        try:
+            fields = bag.decode(message, kind)
+        except DatasetError:
+            scan.damaged += 1
+            return
+        if kind == CAMERA:
+            scan.info = fields if is_calibrated(fields) else None
+        elif kind == IMU:
+            if float(fields.linear_acceleration_covariance[0]) < 0:  # it has no accelerometer
+                return
+            imus = scan.parts[-1].imus
+            imus.setdefault(frame_name(fields.header.frame_id), Accelerations()).add(
+                bag.stamp_ns(message),
+                vector_row(fields.linear_acceleration),
+                vector_row(fields.angular_velocity),
+            )
+        elif kind == ODOMETRY:
+            parent, child = frame_name(fields.header.frame_id), frame_name(fields.child_frame_id)
+            stamp = bag.stamp_ns(message)
+            known = self._part_at(message.topic, stamp).odometry.setdefault(message.topic, [])
+            if parent and child and len(known) < MOST_SAMPLES:
+                known.append(_Odometry(parent, child, stamp, pose_row(fields.pose.pose)))
+        else:
+            self._take_transforms(message, fields)
+
+    def _take_transforms(self, message: RawMessage, fields: Any) -> None:
+        fixed = message.topic.rpartition("/")[2] == "tf_static"
+        for one in fields.transforms:
+            parent, child = str(one.header.frame_id), str(one.child_frame_id)
+            row, stamp = transform_row(one.transform), stamp_of(one.header)
+            if not fixed:
+                part = self._part_at(f"{message.topic} ({parent} -> {child})", stamp)
+                part.tree.add(parent, child, stamp, row, fixed=False)
+                continue
+            rows = self._scan.fixed.setdefault((frame_name(parent), frame_name(child)), [])
+            if row not in rows and len(rows) < _MOST_FIXED:
+                rows.append(row)
+
+
+def _add_fixed(tree: TransformTree, fixed: dict[tuple[str, str], list[list[float]]]) -> None:
+    """Add transforms that hold at all times, but for those that contradict themselves or tf."""
+    for (parent, child), rows in fixed.items():
+        moving = tree.samples(parent, child)
+        known = [
+            tree.samples(parent, child)
+            for row in rows
+            if tree.add(parent, child, 0, row, fixed=True)
+        ]
+        if not known:
+            continue
+        apart = motion(np.vstack([moving, *known]), known[-1])
+        if apart.max() > _FIXED:
+            tree.remove(parent, child)
+            reason = f"it is fixed, and has values that differ by {apart.max():.2g} m or rad"
+            tree.pass_over(parent, child, reason)
+
+
+def _add_odometry(tree: TransformTree, odometry: dict[str, list[_Odometry]]) -> None:
+    """Where tf does not say the same; of several topics of one edge, that with most messages."""
+    edges: dict[tuple[str, str], list[_Odometry]] = {}
+    for topic in sorted(odometry, key=lambda name: len(odometry[name])):
+        for one in odometry[topic][:1]:
+            edges[one.parent, one.child] = odometry[topic]
+    for (parent, child), samples in edges.items():
+        if tree.has_edge(parent, child):
+            continue
+        for one in samples:
+            if (one.parent, one.child) == (parent, child):
+                tree.add(parent, child, one.stamp_ns, one.sample, fixed=False)

@@ -1,0 +1,189 @@
+"""Recordings whose clock or transforms go wrong: nothing wrong is taken, and the note says why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import DatasetError
+from sceneprint.formats.dataset import FrameSequence, find_sequences
+from sceneprint.formats.recording import RecordingOptions
+
+ALL = RecordingOptions(keyframe_m=0, keyframe_s=0)
+IMAGE = np.full((60, 80), 2000, np.uint16)
+MOUNTING = {("base_link", "camera"): np.eye(4)}
+
+
+def sequences(
+    ros: SimpleNamespace, folder: Path, fill: Callable[[Any], None], **how: Any
+) -> tuple[FrameSequence, ...]:
+    def with_camera(writer: Any) -> None:
+        writer.camera_info(0.0)
+        fill(writer)
+
+    return find_sequences(ros.write(folder, with_camera, **how), ALL)
+
+
+def positions(sequence: FrameSequence) -> list[list[float]]:
+    return [[round(float(x), 6) for x in one.pose[:3, 3]] for one in sequence.frames]
+
+
+@pytest.mark.parametrize("container", ["mcap", "ros1"])
+@pytest.mark.parametrize("source", ["odometry", "tf"])
+def test_a_clock_that_is_set_back_splits_a_recording(
+    source: str, container: str, tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    """A simulation is reset twice; each run drives along x, ten metres beside the one before."""
+
+    def fill(writer: Any) -> None:
+        writer.transforms(0.0, MOUNTING, "/tf_static")
+        for run, last in enumerate((4, 3, 6)):
+            writer.late = 60.0 * run
+            for i in range(last):
+                T = ros.transform(float(i), 10.0 * run, 0)
+                if source == "tf":
+                    writer.transforms(1 + 0.5 * i, {("odom", "base_link"): T})
+                else:
+                    writer.odometry(1 + 0.5 * i, T)
+                writer.image(1.2 + 0.5 * i, IMAGE)
+
+    found = sequences(ros, tmp_path, fill, container=container)
+    assert [one.name for one in found] == ["run.part1", "run.part2", "run.part3"]
+    assert [one.parent_frame for one in found] == [f"run.part{i}/odom" for i in (1, 2, 3)]
+    # the last frame of each run lies after its last sample, and not before those of the next run
+    assert [positions(one) for one in found] == [
+        [[0.4 + i, 10.0 * run, 0.0] for i in range(last - 1)] for run, last in enumerate((4, 3, 6))
+    ]
+    assert [one.name for one in found[1].frames] == ["run.part2/000004", "run.part2/000005"]
+    assert found[0].note == (
+        "10 of 13 frames of /camera/depth/image_raw taken, poses of 10 of 13 frames in odom; 3 "
+        "without: no sample of odom -> base_link within 20 ms (nearest 0.2 s); left out: 3 without "
+        "a pose; split into 3 parts, as stamps go back"
+    )
+
+
+def test_stamps_that_are_out_of_order_by_little_split_nothing(
+    tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.transforms(0.0, MOUNTING, "/tf_static")
+        for i in (0, 1, 3, 2, 4):
+            t = 1 + 0.05 * i
+            writer.late = 1.0 + 0.1 * len(writer.connections) - t
+            writer.transforms(t, {("odom", "base_link"): ros.transform(0.1 * i, 0, 0)})
+            writer.image(t, IMAGE)
+
+    (found,) = sequences(ros, tmp_path, fill)
+    assert sorted(positions(found)) == [[round(0.1 * i, 6), 0, 0] for i in range(5)]
+
+
+def test_two_publishers_with_delays_of_their_own_split_nothing(
+    tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    """Both say the same; the stamps of one are a second ahead."""
+
+    def fill(writer: Any) -> None:
+        writer.transforms(0.0, MOUNTING, "/tf_static")
+        for i in range(40):
+            for ahead in (0.0, 1.0):
+                t = 0.1 * i + ahead
+                writer.late = -ahead
+                writer.transforms(t, {("odom", "base_link"): ros.transform(t, 0, 0)})
+            writer.late = 0.0
+            writer.image(0.1 * i, IMAGE)
+
+    (found,) = sequences(ros, tmp_path, fill)
+    assert positions(found) == [[round(0.1 * i, 6), 0, 0] for i in range(40)]
+
+
+@pytest.mark.parametrize(
+    ("period", "order"), [(0.1, "AB"), (0.1, "AABB"), (0.02, "BAAAA"), (0.4, "AB")]
+)
+def test_two_publishers_that_contradict_each_other(
+    period: float, order: str, tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.transforms(0.0, MOUNTING, "/tf_static")
+        for i in range(36):
+            t, who = period * i, order[i % len(order)]
+            T = ros.transform(0.2 * t, 0.0 if who == "A" else 8.0, 0)
+            writer.transforms(t, {("odom", "base_link"): T})
+            if i:
+                writer.image(t - 0.3 * period, IMAGE)
+
+    with pytest.raises(DatasetError) as caught:
+        sequences(ros, tmp_path, fill)
+    assert (
+        "0 of 35 frames of /camera/depth/image_raw taken, poses of 0 of 35 frames; 35 without: "
+        "samples of odom -> base_link contradict each other (two publishers, or 50 m/s)"
+    ) in str(caught.value)
+    assert str(caught.value).endswith("choose another frame with --pose-frame.")
+
+
+def test_frames_within_a_jump_are_left_out(tmp_path: Path, ros: SimpleNamespace) -> None:
+    """20 m within 0.1 s; before and after it the robot drives at 5 m/s, stops and turns back."""
+    x = [0, 0.5, 1, 1.5, 21.5, 22, 22.4, 22.5, 22.4, 22, 21.5]
+
+    def fill(writer: Any) -> None:
+        writer.transforms(0.0, MOUNTING, "/tf_static")
+        for i, one in enumerate(x):
+            writer.transforms(0.1 * i, {("odom", "base_link"): ros.transform(one, 0, 0)})
+            if i:
+                writer.image(0.1 * i - 0.05, IMAGE)
+
+    (found,) = sequences(ros, tmp_path, fill)
+    middle = [[round((a + b) / 2, 6), 0, 0] for a, b in pairwise(x)]
+    assert positions(found) == [*middle[:3], *middle[4:]]
+    assert "1 without: samples of odom -> base_link contradict each other" in found.note
+    assert "left out: 1 without a pose" in found.note
+
+
+@pytest.mark.parametrize("length", [0.0, 0.5, 1.02, float("nan")])
+def test_quaternions_that_are_not_of_length_1(
+    length: float, tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static", length=length)
+        for i in range(3):
+            writer.odometry(0.1 * i, ros.transform(float(i), 0, 0))
+            writer.image(0.1 * i, IMAGE)
+
+    (found,) = sequences(ros, tmp_path, fill)
+    if length == 1.02:
+        assert found.note.endswith(
+            "base_link -> camera is normalised, as its quaternion has the length 1.02"
+        )
+        expected = ros.transform(2, 0, 0) @ ros.camera
+        np.testing.assert_allclose(found.frames[2].pose, expected, atol=1e-9)
+    else:
+        assert [one.pose for one in found.frames] == [None] * 3
+        assert found.note.endswith(
+            "poses of 0 of 3 frames; 3 without: no transforms lead from camera to a frame in which "
+            "it moves; base_link -> camera is passed over as its quaternion has the length "
+            f"{length:.3g}"
+        )
+
+
+@pytest.mark.parametrize("other", ["/tf_static", "/tf"])
+def test_a_fixed_transform_with_two_values_is_passed_over(
+    other: str, tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.transforms(0.0, {("base_link", "camera"): ros.transform(0, 0, 1)}, "/tf_static")
+        writer.transforms(0.0, {("base_link", "camera"): ros.transform(0, 0, 1.3)}, other)
+        for i in range(3):
+            writer.odometry(0.1 * i, ros.transform(float(i), 0, 0))
+            writer.image(0.1 * i, IMAGE)
+
+    (found,) = sequences(ros, tmp_path, fill)
+    assert [one.pose for one in found.frames] == [None] * 3
+    assert found.note.endswith(
+        "base_link -> camera is passed over as it is fixed, and has values that differ by 0.3 m or "
+        "rad"
+    )
