@@ -20,6 +20,7 @@ from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidIntrinsics, UnreadableFrame, UselessFrame
+from sceneprint.formats.depth_plausibility import check_depth
 from sceneprint.geometry.surface.camera import ray_to_axis, undistort
 from sceneprint.types import MAXIMUM_SAMPLES, DepthFrame, Floats, Floats32, Intrinsics
 from sceneprint_client.files import (
@@ -446,10 +447,12 @@ def decode_frame(
 
     Raises
     ------
-    UnreadableFrame : neither PNG nor NPY; and as `decode_png`, `decode_npy` and `make_frame`.
+    UnreadableFrame : neither PNG nor NPY; and as `decode_png`, `decode_npy`, `check_depth` and
+        `make_frame`.
     """
     with naming(name):
         samples = (samples_of or decode_samples)(data)
+        check_depth(samples, depth_scale)
         frame = make_frame(
             samples, intrinsics, depth_scale=depth_scale, along_ray=along_ray, pose=pose
         )

@@ -1,0 +1,136 @@
+"""Whether stored samples are depth, by how smooth they are along the rows.
+
+samples (H, W), stored units per metre  --check_depth-->  nothing, or UnreadableFrame
+
+Neighbouring samples of depth are near each other; those of swapped bytes, rotated bits and noisy
+infrared images are not. Measured on all 1,622 real depth images at hand (redkitchen of 7-Scenes,
+fr1_rpy of TUM, studyroom2 of SUN3D, a RealSense) and 60 of synthetic rooms:
+
+    share of differing neighbours that are nearer with their bytes swapped: refused above .9
+        depth 0 to .009, at an eighth of the size to .023; with swapped bytes .991 to 1
+    median bend (`_bend`): refused above .05
+        depth .0002 to .0103, at an eighth of the size to .014; with 2 % of noise .035
+        rotated right by 3 bits .25 to 6.8, infrared (synthetic) .087 to .090
+    share of multiples of 8: refused above .8
+        depth .13; rotated left by 3 bits .8 to 1
+
+An infrared image as smooth as depth, such as a photograph without noise, is not recognised.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import UnreadableFrame
+
+_ROWS = 40  #: rows that are looked at
+_PAIRS, _BENDS = 500, 4000  #: fewest of them that tell something
+_LEAST_SHARE = 0.1  #: of samples with neighbours on both sides; fewer are a sparse image
+_LEAST_VARYING = 0.25  #: of these that differ from a neighbour; of fewer, edges would decide
+_SWAPPED = 0.9  #: share of differing neighbours that would be nearer with their bytes swapped
+_ROUGH, _SMOOTH = 0.05, 0.025  #: median bends: too rough for depth, and smooth once bits are back
+_SHIFTED = 0.8  #: share of samples that are multiples of 8; of depth it is an eighth
+
+Rows = NDArray[Any]
+
+
+def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
+    """Refuse samples that are no depth, or depth whose bytes or bits are in another order.
+
+    Takes 0.6 ms for 640 x 480.
+
+    Parameters
+    ----------
+    samples : (H, W) uint16 in stored units, or floating in metres
+    depth_scale : stored units per metre
+
+    Raises
+    ------
+    UnreadableFrame : they are not; says what to do.
+    """
+    rows = samples[:: max(1, len(samples) // _ROWS)]
+    is_whole = rows.dtype == np.uint16
+    if is_whole and depth_scale < 8000 and _is_shifted(rows):
+        raise UnreadableFrame(
+            "The samples are multiples of 8: this is depth whose bits were rotated left by 3, as "
+            "in SUN3D and SUN RGB-D. Write d >> 3 | d << 13 of each uint16 sample d, or set "
+            f"depth_scale to {8 * depth_scale:g}."
+        )
+    is_rough = _bend(rows) > _ROUGH
+    if not is_rough and not (is_whole and _is_swapped(rows)):
+        return
+    bits = _rotation(rows) if is_whole else None
+    if bits == 8 or (bits is None and not is_rough):
+        raise UnreadableFrame(
+            "The samples are in the wrong byte order: with bytes swapped, neighbours are near "
+            "each other. PNG stores the high byte first. Write samples.byteswap()."
+        )
+    if bits is not None:
+        raise UnreadableFrame(
+            "The bits of the samples are rotated: rotated back, neighbours are near each other. "
+            f"Write d << {bits} | d >> {16 - bits} of each uint16 sample d."
+        )
+    raise UnreadableFrame(
+        "This is no depth: neighbouring samples differ as in infrared or confidence images. Send "
+        "the depth image of the sensor, or, if this is one, average its noise first."
+    )
+
+
+def _rotation(rows: Rows) -> int | None:
+    """Return by how many bits samples are to be rotated left to be smooth; None where none does.
+
+    Twice the depth is as smooth as depth: the one of the smallest samples is meant.
+    """
+    turned = [(bits, rows << bits | rows >> 16 - bits) for bits in range(1, 16)]
+    smooth = [(float(one.mean()), bits) for bits, one in turned if 0.0 < _bend(one) < _SMOOTH]
+    return min(smooth)[1] if smooth else None
+
+
+def _is_swapped(rows: Rows) -> bool:
+    """Return whether most neighbours would be nearer with their bytes swapped."""
+    a, b = rows[:, :-1], rows[:, 1:]
+    differ = _valid(a) & _valid(b) & (a != b)
+    a, b = a[differ], b[differ]
+    if len(a) < _PAIRS or not (a & 255).any():  # 8-bit depth in the high bytes
+        return False
+    nearer = np.abs(_signed(a.byteswap()) - _signed(b.byteswap())) < np.abs(_signed(a) - _signed(b))
+    return float(nearer.mean()) > _SWAPPED
+
+
+def _is_shifted(rows: Rows) -> bool:
+    """Return whether samples are multiples of 8, and of nothing more."""
+    taken = rows[_valid(rows)]
+    if len(taken) < _PAIRS or float((taken & 7 == 0).mean()) < _SHIFTED:
+        return False
+    return len(np.unique(taken)) > 64 and 0.25 < float((taken & 8 != 0).mean()) < 0.75
+
+
+def _bend(rows: Rows) -> float:
+    """Return how far samples are from the mean of their neighbours: the median of
+    |a - 2 b + c| / min(a, b, c) over three samples in a row that are not all the same.
+    """
+    valid = _valid(rows)
+    whole = valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:]
+    with np.errstate(all="ignore"):  # damaged floats overflow
+        a, b, c = (rows[:, k : k - 2 or None][whole].astype(np.float32) for k in range(3))
+        varying = (a != b) | (b != c)
+        a, b, c = a[varying], b[varying], c[varying]
+        enough = len(a) >= max(_BENDS, _LEAST_VARYING * len(varying))
+        if not enough or len(varying) < _LEAST_SHARE * whole.size:
+            return 0.0
+        return float(np.median(np.abs(a - 2.0 * b + c) / np.minimum(np.minimum(a, b), c)))
+
+
+def _valid(rows: Rows) -> NDArray[np.bool_]:
+    """Return which samples are not missing."""
+    if rows.dtype == np.uint16:
+        return (rows > 0) & (rows < 65_535)
+    with np.errstate(invalid="ignore"):
+        return np.isfinite(rows) & (rows > 0.0)
+
+
+def _signed(samples: Rows) -> NDArray[np.int32]:
+    return samples.astype(np.int32)
