@@ -190,14 +190,18 @@ class BagWriter:
         topic: str = "/camera/depth/image_raw/compressedDepth", *, a: float = 0.0, b: float = 0.0,
         form: str | None = None, frame: str = "camera",
     ) -> None:  # fmt: skip
-        """An image of compressed_depth_image_transport: a header of 12 bytes before the PNG."""
+        """An image of compressed_depth_image_transport: a header of 12 bytes before the PNG; of
+        another form the PNG alone.
+        """
         file = io.BytesIO()
         Image.fromarray(np.asarray(samples, np.uint16)).save(file, "PNG")
-        data = struct.pack("<iff", 0, a, b) + file.getvalue()
+        form = f"{encoding}; compressedDepth" if form is None else form
+        head = struct.pack("<iff", 0, a, b) if "compressedDepth" in form else b""
+        data = head + file.getvalue()
         message = self.make(
             "sensor_msgs/msg/CompressedImage",
             header=self.header(t, frame),
-            format=f"{encoding}; compressedDepth" if form is None else form,
+            format=form,
             data=np.frombuffer(data, np.uint8),
         )  # fmt: skip
         self.write(topic, "sensor_msgs/msg/CompressedImage", t, message)

@@ -39,6 +39,8 @@ DEPTH_SCALE = 1000.0
 TRANSPORT_BYTES = 12
 #: Bytes within which the PNG begins.
 _MOST_BEFORE_PNG = 64
+#: Bytes of a PNG up to its depth and colours.
+_PNG_HEAD = 26
 
 
 def image_encoding(message: Any, *, compressed: bool) -> str | None:
@@ -52,9 +54,12 @@ def image_encoding(message: Any, *, compressed: bool) -> str | None:
     if not compressed:
         return str(message.encoding) if message.encoding in ENCODINGS else None
     told = str(message.format)
-    if "compressedDepth" not in told:
-        return None
     encoding = told.partition(";")[0].strip()
+    if "compressedDepth" not in told:  # a PNG of 16 bits and one channel is depth, others are not
+        head = bytes(memoryview(message.data)[:_PNG_HEAD])
+        is_deep = head.startswith(PNG_SIGNATURE) and head[24:26] == b"\x10\x00"
+        known = encoding if encoding in ENCODINGS else "16UC1"
+        return known if is_deep and known != "32FC1" else None
     return encoding if encoding in ENCODINGS else None
 
 
@@ -98,32 +103,44 @@ def _samples(message: Any, kind: np.dtype[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(rows).view(kind)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CompressedDepth:
-    """An image of compressed_depth_image_transport.
+    """A compressed depth image.
 
     Parameters
     ----------
-    png : its samples, 16 bits each
+    png : its samples, 16 bits each; empty where they are not compressed as PNG
+    samples : (H, W) of another compression; None of a PNG
     inverse : a and b of a 32FC1 image, where z = a / (v - b) metres; None of 16UC1 millimetres
     """
 
     png: bytes
+    samples: NDArray[np.uint16] | None
     inverse: tuple[float, float] | None
 
-    def body(self) -> bytes:
-        """The bytes that a service takes as a frame: a PNG, after its header where that matters."""
+    def body(self) -> bytes | NDArray[Any]:
+        """What a service takes as a frame: a PNG, after its header where that matters, or an array
+        of millimetres or metres.
+        """
+        if self.samples is not None:
+            if self.inverse is None:
+                return self.samples
+            a, b = self.inverse
+            with np.errstate(all="ignore"):
+                metres = (a / (self.samples - b)).astype(np.float32)
+            return np.where((self.samples > 0) & (metres > 0), metres, np.float32(0))
         if self.inverse is None:
             return self.png
         return struct.pack("<iff", 0, *self.inverse) + self.png
 
 
 def compressed_depth(message: Any) -> CompressedDepth:
-    """Return the PNG of a compressed depth image, and how its samples stand for metres.
+    """Return the samples of a compressed depth image, and how they stand for metres.
 
     Parameters
     ----------
-    message : sensor_msgs CompressedImage
+    message : sensor_msgs CompressedImage of compressed_depth_image_transport (PNG or RVL), or of a
+        PNG of 16 bits
 
     Raises
     ------
@@ -132,14 +149,18 @@ def compressed_depth(message: Any) -> CompressedDepth:
     encoding = image_encoding(message, compressed=True)
     data = bytes(memoryview(message.data))
     at = data.find(PNG_SIGNATURE, 0, _MOST_BEFORE_PNG)
-    if encoding is None or at < 0:
+    is_rvl = "rvl" in str(message.format).partition("compressedDepth")[2].lower()
+    if encoding is None or (at < 0 and not is_rvl):
         raise UnreadableFrame(
-            f"The image has the format {message.format!r:.60}, and of compressed depth only PNG of "
-            "16UC1 and 32FC1 is read. Record the raw topic, or set the transport's format to png."
+            f"The image has the format {message.format!r:.60}, and of compressed depth only PNG "
+            "and RVL of 16UC1 and 32FC1 are read. Record the raw topic, or set the transport's "
+            "format to png."
         )
+    samples = rvl_samples(data[TRANSPORT_BYTES:]) if is_rvl else None
+    png = b"" if is_rvl else data[at:]
     if encoding != "32FC1":
-        return CompressedDepth(data[at:], None)
-    if at < TRANSPORT_BYTES:
+        return CompressedDepth(png, samples, None)
+    if not is_rvl and at < TRANSPORT_BYTES:
         raise UnreadableFrame(
             "The image of 32FC1 lacks the 12 bytes that say how its depth is stored. Record it "
             "again."
@@ -150,7 +171,51 @@ def compressed_depth(message: Any) -> CompressedDepth:
             f"The image stores inverse depth by a = {a:g} and b = {b:g}, and these are no such "
             "numbers. Record it again."
         )
-    return CompressedDepth(data[at:], (a, b))
+    return CompressedDepth(png, samples, (a, b))
+
+
+def rvl_samples(data: bytes) -> NDArray[np.uint16]:
+    """Return the samples (H, W) of an image compressed by RVL, after its width and height.
+
+    Runs of zeros and of values alternate. A value is the difference to the one before, zigzag
+    coded; all numbers are of groups of three bits, the lowest first, with a bit for "more follow",
+    in words of 32 bits from the top (Wilson, Fast Lossless Depth Image Compression, 2017).
+
+    Raises
+    ------
+    UnreadableFrame : the data ends early, or the sizes are none.
+    """
+    broken = UnreadableFrame("The image compressed by RVL is damaged. Record it again.")
+    width, height = struct.unpack_from("<II", data) if len(data) >= 8 else (0, 0)
+    if not 0 < width * height <= MAXIMUM_SAMPLES:
+        raise broken
+    words = np.frombuffer(data[8 : 8 + (len(data) - 8) // 4 * 4], "<u4").astype(">u4")
+    packed = words.view(np.uint8)
+    nibbles = np.stack([packed >> 4, packed & 15], axis=1).reshape(-1).astype(np.int64)
+    ends = np.flatnonzero(nibbles < 8)
+    if not len(ends):
+        raise broken
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    place = np.arange(ends[-1] + 1) - np.repeat(starts, ends - starts + 1)
+    parts = (nibbles[: ends[-1] + 1] & 7) << np.minimum(3 * place, 60)
+    numbers = np.add.reduceat(parts, starts)
+    samples = np.zeros(width * height, np.int64)
+    done, at, last = 0, 0, 0
+    while done < len(samples):
+        if at + 2 > len(numbers):
+            raise broken
+        zeros, values = int(numbers[at]), int(numbers[at + 1])
+        done, at = done + zeros, at + 2
+        if zeros < 0 or values < 0 or done + values > len(samples) or at + values > len(numbers):
+            raise broken
+        if values:
+            coded = numbers[at : at + values]
+            samples[done : done + values] = last + np.cumsum((coded >> 1) ^ -(coded & 1))
+            done, at = done + values, at + values
+            last = int(samples[done - 1])
+        elif not zeros:
+            raise broken
+    return samples.astype(np.uint16).reshape(height, width)
 
 
 # Cameras.

@@ -36,6 +36,12 @@ def add_recording_options(command: argparse.ArgumentParser) -> None:
         help="topic of the depth images' camera (default: the one beside them)",
     )
     group.add_argument(
+        "--depth-scale",
+        type=_above_zero,
+        metavar="UNITS",
+        help="stored units per metre of 16-bit depth images (default: 1000, millimetres)",
+    )
+    group.add_argument(
         "--pose-frame",
         metavar="FRAME",
         help="frame that poses lead to (default: map, else odom, else the topmost frame)",
@@ -73,6 +79,13 @@ def _from_zero(text: str) -> float:
     return number
 
 
+def _above_zero(text: str) -> float:
+    number = _from_zero(text)
+    if number == 0:
+        raise argparse.ArgumentTypeError("0 units per metre are no scale")
+    return number
+
+
 @contextmanager
 def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]:
     """What to take of recordings, with a bar while they are read."""
@@ -89,6 +102,7 @@ def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]
             keyframe_m=options.keyframe_m,
             keyframe_deg=options.keyframe_deg,
             keyframe_s=options.keyframe_s,
+            depth_scale=options.depth_scale,
             progress=progress,
         )
 
@@ -166,7 +180,8 @@ def _lines(path: Path, outline: BagOutline) -> list[str]:
         )
     if not outline.sequences:
         return [*lines, f"nothing would be taken: {one_line(outline.problem)}"]
-    return [*lines, *(line for sequence in outline.sequences for line in _taken(sequence))]
+    lines += [line for sequence in outline.sequences for line in _taken(sequence)]
+    return lines if outline.depth is None else [*lines, str(outline.depth)]
 
 
 def _span(outline: BagOutline) -> str:

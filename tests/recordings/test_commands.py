@@ -248,7 +248,9 @@ def test_what_a_bag_holds(sceneprint: Run, recording: Path) -> None:
         "poses: in lab/odom",
         "mounting: at 0.210 -0.050 0.930 m in base_link",
         "up: of 0 of 8 frames",
+        table[9],
     ]
+    assert re.fullmatch(r"depth: \S+ to \S+ m, median \S+ m", table[9])
     assert table[5].startswith("camera: 640 x 480, fx ")
 
 

@@ -286,6 +286,7 @@ def _types(*, ros1: bool) -> Typestore:
             "Run: pip install 'sceneprint[ros]'"
         ) from cause
     _limit_decompression()
+    _read_without_profile()
     types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     if TRANSFORMS not in types.fielddefs:
         types.register(get_types_from_msg(_TRANSFORMS_FIELDS, TRANSFORMS))
@@ -307,6 +308,52 @@ def _limit_decompression() -> None:
         bz2.BZ2Decompressor(), data, MAXIMUM_CHUNK_BYTES
     )
     ros1.decompressors["lz4"] = lambda data: _inflate(_lz4(), data, MAXIMUM_CHUNK_BYTES)
+
+
+def _read_without_profile() -> None:
+    """Let MCAP files be read whose header has no profile; their schemas say what they hold."""
+    from rosbags.rosbag2 import reader
+    from rosbags.rosbag2.storage_mcap import McapReader
+
+    class ProfiledReader(McapReader):
+        """An MCAP file whose empty profile reads as "ros2"."""
+
+        def _open(self) -> None:
+            opened, self.bio = self.bio, _Profiled(self.bio)  # type: ignore[assignment]
+            try:
+                super()._open()
+            except KeyError as cause:
+                raise ValueError(
+                    f"its messages are of {cause}, and only those of ROS 2 are read from MCAP"
+                ) from cause
+            finally:
+                self.bio = opened
+
+    reader.DirectoryReader.STORAGE_PLUGINS["mcap"] = ProfiledReader  # type: ignore[index]
+    reader.Reader.STORAGE_PLUGINS[".mcap"] = ProfiledReader  # type: ignore[index]
+
+
+class _Profiled:
+    """A file of MCAP whose header, after 9 bytes, reads as one with a profile."""
+
+    def __init__(self, file: Any) -> None:
+        self._file, self._more = file, 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+    def read(self, size: int = -1) -> bytes:
+        """Content from here on."""
+        place = self._file.tell()
+        data: bytes = self._file.read(size - self._more if place == 17 else size)
+        if place == 9 and self._file.read(4) == bytes(4):  # a profile of no characters
+            self._more = len(b"ros2")
+            data = struct.pack("<Q", struct.unpack("<Q", data)[0] + self._more)
+        if place == 9:
+            self._file.seek(17)
+        if place == 17 and self._more:
+            data = struct.pack("<I", self._more) + b"ros2" + data[4:]
+        return data
 
 
 def _zstd() -> Any:

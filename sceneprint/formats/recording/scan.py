@@ -6,7 +6,8 @@ stamps in the order of recording  -->  BagPart, ...: between them the clock was 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from array import array
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -32,7 +33,13 @@ from sceneprint_client.ros_messages import (
     transform_row,
     vector_row,
 )
-from sceneprint_client.transforms import MOST_SAMPLES, TransformTree, frame_name, motion
+from sceneprint_client.transforms import (
+    MOST_SAMPLES,
+    TOLERANCE_S,
+    TransformTree,
+    frame_name,
+    motion,
+)
 
 #: What to call when so many of all messages have been read.
 Progress = Callable[[int, int], None]
@@ -45,8 +52,8 @@ _OUT_OF_ORDER_S = 0.1
 #: Times that a source goes back and at once forward again before its clock is not believed: it is
 #: several publishers, each with a delay of its own.
 _MOST_FLIPS = 8
-#: Most parts of one recording.
-MOST_PARTS = 1000
+#: Most parts of one recording, and most contents of its CameraInfo.
+MOST_PARTS, MOST_INFOS = 1000, 100_000
 #: Metres and radians by which what is fixed may differ from itself, and how many values are kept.
 _FIXED, _MOST_FIXED = 0.1, 100
 
@@ -61,12 +68,30 @@ class BagPart:
     tree : transforms, and odometry where no transform says the same
     imus : measurements by the frame of the IMU
     odometry : by topic
+    info_stamps_ns, infos : when each calibrated CameraInfo was measured, and its number in the scan
     """
 
     first: int
     tree: TransformTree = field(default_factory=TransformTree)
     imus: dict[str, Accelerations] = field(default_factory=dict)
     odometry: dict[str, list[_Odometry]] = field(default_factory=dict)
+    info_stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    infos: array[int] = field(default_factory=lambda: array("q"))
+
+    def info_at(self, stamps_ns: Sequence[int]) -> list[int]:
+        """Number of the CameraInfo of each stamp: of the same one, else the nearest within 20 ms,
+        else the last one before it, else the first.
+        """
+        times = np.frombuffer(self.info_stamps_ns, np.int64)
+        order = np.argsort(times, kind="stable")
+        times, infos = times[order], np.frombuffer(self.infos, np.int64)[order]
+        asked = np.asarray(stamps_ns, np.int64)
+        before = np.maximum(np.searchsorted(times, asked, "right") - 1, 0)
+        after = np.minimum(before + 1, len(times) - 1)
+        ahead = times[after] - asked
+        is_after = (ahead < np.abs(asked - times[before])) & (ahead <= TOLERANCE_S * 1e9)
+        found: list[int] = infos[np.where(is_after & (ahead >= 0), after, before)].tolist()
+        return found
 
 
 @dataclass(eq=False)
@@ -76,7 +101,7 @@ class BagScan:
     Parameters
     ----------
     parts : at least one, in order
-    info : the first CameraInfo that is calibrated, or None
+    infos : the calibrated CameraInfo, each content once
     stamps_ns : when each frame was measured, in the order in which they were recorded
     places : when each was recorded, and which of those with that time it is
     damaged : messages that did not decode, and were passed over
@@ -84,7 +109,7 @@ class BagScan:
     """
 
     parts: list[BagPart] = field(default_factory=lambda: [BagPart(0)])
-    info: Any = None
+    infos: list[Any] = field(default_factory=list)
     stamps_ns: list[int] = field(default_factory=list)
     places: list[tuple[int, int]] = field(default_factory=list)
     damaged: int = 0
@@ -190,6 +215,7 @@ class _Scanner:
             one.name: one.type for one in bag.of_type(TRANSFORMS, OLD_TRANSFORMS, ODOMETRY, IMU)
         } | ({} if camera is None else {camera.name: camera.type})
         self._scan = BagScan()
+        self._info_numbers: dict[bytes, int] = {}  # by the bytes after the stamp; -1: none
 
     def scan(self, progress: Progress | None) -> BagScan:
         """Read all; raises as `scan_bag`, and _SeveralClocks."""
@@ -236,7 +262,8 @@ class _Scanner:
     def _take(self, message: RawMessage, kind: str) -> None:
         """Keep what a message says that is not of a frame."""
         scan, bag = self._scan, self._bag
-        if kind == CAMERA and scan.info is not None:
+        if kind == CAMERA and message.data[12:] in self._info_numbers:
+            self._take_info(message, self._info_numbers[message.data[12:]])
             return
         try:
             fields = bag.decode(message, kind)
@@ -244,7 +271,14 @@ class _Scanner:
             scan.damaged += 1
             return
         if kind == CAMERA:
-            scan.info = fields if is_calibrated(fields) else None
+            if len(scan.infos) == MOST_INFOS:
+                raise DatasetError(
+                    f"{message.topic} has more than {MOST_INFOS} contents. Cut the bag into parts."
+                )
+            number = len(scan.infos) if is_calibrated(fields) else -1
+            scan.infos.extend([] if number < 0 else [fields])
+            self._info_numbers[message.data[12:]] = number
+            self._take_info(message, number)
         elif kind == IMU:
             if float(fields.linear_acceleration_covariance[0]) < 0:  # it has no accelerometer
                 return
@@ -262,6 +296,13 @@ class _Scanner:
                 known.append(_Odometry(parent, child, stamp, pose_row(fields.pose.pose)))
         else:
             self._take_transforms(message, fields)
+
+    def _take_info(self, message: RawMessage, number: int) -> None:
+        stamp = self._bag.stamp_ns(message)
+        part = self._part_at(message.topic, stamp)
+        if number >= 0:
+            part.info_stamps_ns.append(stamp)
+            part.infos.append(number)
 
     def _take_transforms(self, message: RawMessage, fields: Any) -> None:
         fixed = message.topic.rpartition("/")[2] == "tf_static"

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprint.errors import DatasetError, InvalidIntrinsics
+from sceneprint.errors import DatasetError, InvalidIntrinsics, SceneprintError
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
 from sceneprint.formats.recording.bag import CAMERA, Bag, BagTopic
 from sceneprint.formats.recording.scan import BagPart, BagScan, Progress, scan_bag
@@ -27,7 +27,7 @@ from sceneprint.formats.recording.topics import (
     frame_topics,
     listed,
 )
-from sceneprint.types import Floats
+from sceneprint.types import DepthFrame, Floats
 from sceneprint_client.api.base import GivenBase, checked
 from sceneprint_client.errors import printable
 from sceneprint_client.files import naming
@@ -89,6 +89,7 @@ class RecordingOptions:
     keyframe_m, keyframe_deg : a frame is taken this far from the last one, or turned by this much;
         0 takes every frame
     keyframe_s : without poses, a frame is taken this long after the last one
+    depth_scale : stored units per metre of 16-bit depth; None: 1000, or as an intrinsics.json says
     progress : what to call while the bag is read
     """
 
@@ -98,6 +99,7 @@ class RecordingOptions:
     keyframe_m: float = 0.3
     keyframe_deg: float = 15.0
     keyframe_s: float = 0.5
+    depth_scale: float | None = None
     progress: Progress | None = None
 
 
@@ -129,12 +131,24 @@ def recording_sequences(
     """
     bag = Bag(path)
     frames = choose_topic(bag, options.topic)
+    if options.depth_scale is not None and frames.encoding in (None, "32FC1"):
+        raise DatasetError(
+            f"{path}: {frames.topic.name} is {frames.encoding or 'points'} in metres, and has no "
+            "depth scale. Leave --depth-scale out."
+        )
     info = None if frames.encoding is None else camera_topic(bag, frames, options.camera_info)
     scan = scan_bag(bag, frames.topic, info, options.progress)
-    camera = None if frames.encoding is None else _camera(bag, frames, info, scan)
+    cameras = (
+        {} if frames.encoding is None else _cameras(bag, frames, info, scan, options.depth_scale)
+    )
     name = recording_name(path) if name is None else name
     motions = _motions(bag, scan, frames, options)
     note = _note(frames, scan, motions)
+    lenses = {camera.intrinsics for camera in cameras.values()}
+    if len(lenses) > 1:
+        note += (
+            f"; {len(lenses)} cameras, as the camera info changes: each frame has that of its time"
+        )
     if not any(motion.taken for motion in motions):
         raise DatasetError(
             f"{path}: {note}. Record transforms of one publisher, or choose another frame with "
@@ -144,7 +158,8 @@ def recording_sequences(
     for number, motion in enumerate(motions, 1):
         part = name if len(motions) == 1 else f"{name}.part{number}"
         references = [
-            _reference(bag, frames, scan, camera, motion, part, place) for place in motion.taken
+            _reference(bag, frames, scan, cameras.get(place), motion, part, place)
+            for place in motion.taken
         ]
         if references:
             parent = f"{part}/{motion.world}" if motion.world else part
@@ -154,7 +169,60 @@ def recording_sequences(
                     note="" if sequences else note,
                 )
             )  # fmt: skip
+    depth, _ = sampled_depth(sequences)
+    if depth is not None and depth.is_doubtful and frames.encoding != "32FC1":
+        sequences[0] = replace(sequences[0], note=f"{note}; {depth}")
     return tuple(sequences)
+
+
+@dataclass(frozen=True)
+class DepthRange:
+    """Depth of some frames, metres: the twentieth, the median, and all but a twentieth."""
+
+    near: float
+    median: float
+    far: float
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether hardly any depth camera measures such."""
+        return not _NEAREST_M < self.median < _FARTHEST_M or self.far > 2 * _FARTHEST_M
+
+    def __str__(self) -> str:
+        told = f"depth: {self.near:.2g} to {self.far:.2g} m, median {self.median:.2g} m"
+        if not self.is_doubtful:
+            return told
+        return (
+            f"{told}, which is unlikely of a depth camera: if its unit is not the millimetre, give "
+            "--depth-scale, stored units per metre"
+        )
+
+
+#: Between these lies the median of what depth cameras measure, metres.
+_NEAREST_M, _FARTHEST_M = 0.2, 5.0
+
+
+def sampled_depth(
+    sequences: Sequence[FrameSequence],
+) -> tuple[DepthRange | None, SceneprintError | None]:
+    """Depth of the first, the middle and the last frame; and why none could be read."""
+    frames = [one for sequence in sequences for one in sequence.frames]
+    samples, error, count = [np.empty(0, np.float32)], None, 0
+    for place in sorted({0, len(frames) // 2, len(frames) - 1}):
+        try:
+            frame = frames[place].read()
+        except SceneprintError as cause:
+            error = cause
+            continue
+        count += 1
+        if isinstance(frame, DepthFrame):
+            samples.append(frame.depth[frame.depth > 0])
+    depths = np.concatenate(samples)
+    if count:
+        error = None
+    if not len(depths):
+        return None, error
+    return DepthRange(*np.percentile(depths, (5, 50, 95)).tolist()), error
 
 
 def recording_name(path: Path) -> str:
@@ -321,11 +389,33 @@ def _seconds(stamp_ns: int) -> str:
     return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
 
 
-def _camera(bag: Bag, frames: FrameTopic, topic: BagTopic | None, scan: BagScan) -> Camera:
-    """The camera of depth images: of the bag, else of an intrinsics.json beside it."""
-    if topic is not None and scan.info is not None:
-        with naming(f"{bag.path}, {topic.name}"):
-            return Camera(camera_intrinsics(scan.info, rectified=frames.is_rectified), DEPTH_SCALE)
+def _cameras(
+    bag: Bag, frames: FrameTopic, topic: BagTopic | None, scan: BagScan, scale: float | None
+) -> dict[int, Camera]:
+    """The camera of each depth image: by the CameraInfo of its time, else of an intrinsics.json
+    beside the bag.
+    """
+    if topic is None or not scan.infos:
+        beside = _camera_beside(bag, frames, topic)
+        beside = replace(beside, depth_scale=scale or beside.depth_scale)
+        return dict.fromkeys(range(len(scan.stamps_ns)), beside)
+    with naming(f"{bag.path}, {topic.name}"):
+        cameras = [
+            Camera(camera_intrinsics(info, rectified=frames.is_rectified), scale or DEPTH_SCALE)
+            for info in scan.infos
+        ]
+    found, last = dict[int, Camera](), 0
+    for part, end in zip(scan.parts, scan.ends, strict=True):
+        places = range(part.first, end)
+        numbers = [last] * len(places)
+        if part.infos:
+            numbers = part.info_at([scan.stamps_ns[place] for place in places])
+            last = part.infos[-1]
+        found.update((place, cameras[one]) for place, one in zip(places, numbers, strict=True))
+    return found
+
+
+def _camera_beside(bag: Bag, frames: FrameTopic, topic: BagTopic | None) -> Camera:
     try:
         return find_camera(bag.path.parent)
     except DatasetError as cause:
@@ -408,6 +498,7 @@ class BagOutline:
     frames : the topics that can be taken
     chosen : the one that would be taken, or None
     sequences : the frames that would be taken; none where nothing would be
+    depth : of some of these frames; None of points
     problem : why nothing would be taken; empty where something would
     """
 
@@ -419,6 +510,7 @@ class BagOutline:
     chosen: FrameTopic | None
     camera: str | None
     sequences: tuple[FrameSequence, ...]
+    depth: DepthRange | None
     problem: str
 
 
@@ -433,7 +525,7 @@ def bag_outline(path: Path, options: RecordingOptions) -> BagOutline:
     bag = Bag(path)
     try:
         frames = tuple(frame_topics(bag))
-        chosen, camera, problem = None, None, ""
+        chosen, camera, depth, problem = None, None, None, ""
         sequences: tuple[FrameSequence, ...] = ()
         try:
             chosen = choose_topic(bag, options.topic)
@@ -441,11 +533,23 @@ def bag_outline(path: Path, options: RecordingOptions) -> BagOutline:
                 topic = camera_topic(bag, chosen, options.camera_info)
                 camera = None if topic is None else topic.name
             sequences = recording_sequences(path, options)
+            depth, unreadable = sampled_depth(sequences)
+            if unreadable is not None:
+                sequences, problem = (), str(unreadable)
         except (DatasetError, InvalidIntrinsics) as error:
             problem = str(error)
         kind = "ROS 1" if bag.is_ros1 else "ROS 2"
         return BagOutline(
-            kind, bag.start_ns, bag.end_ns, bag.topics, frames, chosen, camera, sequences, problem
+            kind,
+            bag.start_ns,
+            bag.end_ns,
+            bag.topics,
+            frames,
+            chosen,
+            camera,
+            sequences,
+            depth,
+            problem,
         )
     finally:
         bag.close()

@@ -43,7 +43,7 @@ def depth_file(message: Any, *, compressed: bool) -> bytes:
 
     Parameters
     ----------
-    message : sensor_msgs Image, or CompressedImage of compressed_depth_image_transport
+    message : sensor_msgs Image, or CompressedImage of depth
     compressed : which of them
 
     Returns
@@ -57,8 +57,9 @@ def depth_file(message: Any, *, compressed: bool) -> bytes:
     if compressed:
         found = compressed_depth(message)
         if found.inverse is None:
-            return found.png
-        return encode_npy(inverse_depth(decode_png(found.png), *found.inverse))
+            return found.png if found.samples is None else encode_png(found.samples)
+        samples = decode_png(found.png) if found.samples is None else found.samples
+        return encode_npy(inverse_depth(samples, *found.inverse))
     samples = depth_samples(message)
     return encode_npy(samples) if samples.dtype.kind == "f" else encode_png(samples)
 
@@ -198,16 +199,14 @@ def choose_topic(bag: Bag, wanted: str | None) -> FrameTopic:
         if found is None:
             raise DatasetError(
                 f"{bag.path}: The topic {printable(wanted)} ({printable(named[0].type)}, "
-                f"{named[0].count} messages) has no depth images (16UC1, mono16, 32FC1, or PNG of "
-                "compressedDepth) and no points. Choose one of "
-                f"{listed(one.topic for one in candidates)}."
+                f"{named[0].count} messages) has no depth images ({_READ}) and no points. Choose "
+                f"one of {listed(one.topic for one in candidates)}."
             )
         return found
     if not candidates:
         raise DatasetError(
-            f"{bag.path}: There is no topic of depth images (16UC1, mono16, 32FC1, or PNG of "
-            "compressedDepth) or of points (PointCloud2). `sceneprint bag info` lists what is "
-            "there."
+            f"{bag.path}: There is no topic of depth images ({_READ}) or of points (PointCloud2). "
+            f"Images are {_encodings(bag)}. `sceneprint bag info` lists all topics."
         )
     if len(candidates) > 1:
         raise DatasetError(
@@ -215,6 +214,24 @@ def choose_topic(bag: Bag, wanted: str | None) -> FrameTopic:
             f"{listed(one.topic for one in candidates)}. Choose one with --topic."
         )
     return candidates[0]
+
+
+#: What is read of images, for people.
+_READ = "16UC1, mono16, 32FC1, compressedDepth, or PNG of 16 bits"
+
+
+def _encodings(bag: Bag) -> str:
+    """What the images of a bag are, for people."""
+    found = []
+    for topic in bag.of_type(IMAGE, COMPRESSED)[:20]:
+        try:
+            message = bag.first(topic.name)
+            fields = None if message is None else bag.decode(message, topic.type)
+        except DatasetError:
+            fields = None
+        told = getattr(fields, "encoding", None) or getattr(fields, "format", "damaged")
+        found.append(f"{topic.name} ({told!r:.40})")
+    return printable(", ".join(found)) or "not there"
 
 
 def camera_topic(bag: Bag, frames: FrameTopic, wanted: str | None) -> BagTopic | None:

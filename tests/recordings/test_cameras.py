@@ -1,0 +1,229 @@
+"""Cameras of recordings: the camera info of the time of each frame, and the unit of depth."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import DatasetError, UnreadableFrame
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.formats.recording import RecordingOptions, bag_outline
+from sceneprint_client.ros_messages import compressed_depth, rvl_samples
+
+ALL = RecordingOptions(keyframe_m=0, keyframe_s=0)
+IMAGE = np.full((60, 80), 2000, np.uint16)
+
+
+@pytest.mark.parametrize("container", ["mcap", "ros1"])
+@pytest.mark.parametrize("way", ["beside each frame", "after each frame", "now and then"])
+def test_each_frame_has_the_camera_info_of_its_time(
+    way: str, container: str, tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    """The focal length changes at 1 s, and a driver that starts again sends zeros."""
+
+    def fill(writer: Any) -> None:
+        for i in range(8):
+            t = 0.25 * i
+            f = 70.0 if t < 1 else 50.0
+            writer.image(t, IMAGE)
+            writer.late = 0.01
+            if way != "now and then":
+                shift = 0.004 if way == "after each frame" else 0.0
+                writer.camera_info(t + shift, k=(f, f, 39.5, 29.5))
+            elif i in (0, 4):
+                writer.camera_info(t - 0.1, k=(f, f, 39.5, 29.5))
+            if i == 5:
+                writer.camera_info(t, k=(0.0, 0.0, 0.0, 0.0))
+            writer.late = 0.0
+
+    (found,) = find_sequences(ros.write(tmp_path, fill, container), ALL)
+    focal = [one.camera.intrinsics.fx for one in found.frames if one.camera]
+    assert focal == [70.0] * 4 + [50.0] * 4
+    assert found.note.endswith(
+        "2 cameras, as the camera info changes: each frame has that of its time"
+    )
+
+
+def test_a_camera_info_of_another_run_is_not_that_of_this_one(
+    tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    """Two runs of a simulation with other cameras, their stamps between each other."""
+
+    def fill(writer: Any) -> None:
+        for run, f in enumerate((70.0, 50.0)):
+            writer.late = 10.0 * run
+            for i in range(4):
+                writer.image(1.0 + 0.2 * i + 0.1 * run, IMAGE)
+                writer.camera_info(1.0 + 0.2 * i + 0.1 * run, k=(f, f, 39.5, 29.5))
+
+    found = find_sequences(ros.write(tmp_path, fill), ALL)
+    focal = [[one.camera.intrinsics.fx for one in each.frames if one.camera] for each in found]
+    assert focal == [[70.0] * 4, [50.0] * 4]
+
+
+def test_depth_in_other_units(tmp_path: Path, ros: SimpleNamespace) -> None:
+    """0.1 mm: ten times too far as millimetres, which is doubted, and right with its scale."""
+
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.image(0.0, np.full((60, 80), 17_500, np.uint16))
+        writer.image(1.0, np.full((60, 80), 12_500, np.uint16))
+
+    path = ros.write(tmp_path, fill)
+    doubt = "unlikely of a depth camera: if its unit is not the millimetre, give --depth-scale"
+    (wrong,) = find_sequences(path, ALL)
+    assert doubt in wrong.note
+    assert doubt in str(bag_outline(path, ALL).depth)
+    scaled = RecordingOptions(keyframe_s=0, depth_scale=10_000)
+    (right,) = find_sequences(path, scaled)
+    assert doubt not in right.note
+    np.testing.assert_array_equal(right.frames[1].read_depth().depth, np.float32(1.25))
+    assert str(bag_outline(path, scaled).depth) == "depth: 1.2 to 1.8 m, median 1.5 m"
+
+
+def test_metres_have_no_depth_scale(tmp_path: Path, ros: SimpleNamespace) -> None:
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.image(0.0, np.full((60, 80), 1.5), "32FC1")
+
+    with pytest.raises(DatasetError, match=r"is 32FC1 in metres, .* Leave --depth-scale out"):
+        find_sequences(ros.write(tmp_path, fill), RecordingOptions(depth_scale=4000))
+
+
+# Compressed images.
+
+
+def rvl(samples: np.ndarray) -> bytes:
+    """RVL as its paper writes it: number by number, nibble by nibble."""
+    nibbles: list[int] = []
+
+    def put(number: int) -> None:
+        while True:
+            more = number > 7
+            nibbles.append(number & 7 | 8 * more)
+            number >>= 3
+            if not more:
+                return
+
+    values, at, last = [int(v) for v in samples.ravel()], 0, 0
+    while at < len(values):
+        for is_run in (lambda v: v == 0, lambda v: v != 0):
+            end = at
+            while end < len(values) and is_run(values[end]):
+                end += 1
+            put(end - at)
+            for value in values[at:end] if values[at:end] and values[at] else ():
+                delta = value - last
+                put(2 * delta if delta >= 0 else -2 * delta - 1)
+                last = value
+            at = end
+    nibbles += [0] * (-len(nibbles) % 8)
+    height, width = samples.shape
+    words = [
+        sum(one << (28 - 4 * place) for place, one in enumerate(nibbles[i : i + 8]))
+        for i in range(0, len(nibbles), 8)
+    ]
+    return struct.pack(f"<II{len(words)}I", width, height, *words)
+
+
+def test_rvl_by_hand() -> None:
+    """Two zeros; then 1000, 1001 and 990: differences 1000, 1 and -11, zigzag 2000, 2 and 21."""
+    groups = "2 3 | 0 2 7 3 | 2 | 5 2 | 1 0"
+    ends = {0, 1, 5, 6, 8, 9, 10}
+    digits = [int(one) for one in groups.replace("|", "").split()]
+    nibbles = [one | (0 if i in ends else 8) for i, one in enumerate(digits)] + [0] * 5
+    words = [int("".join(f"{one:x}" for one in nibbles[i : i + 8]), 16) for i in (0, 8)]
+    found = rvl_samples(struct.pack("<IIII", 3, 2, *words))
+    assert found.tolist() == [[0, 0, 1000], [1001, 990, 0]]
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_compressed_depth_by_rvl(encoding: str, tmp_path: Path, ros: SimpleNamespace) -> None:
+    rng = np.random.default_rng(4)
+    samples = rng.integers(300, 9000, (60, 80)).astype(np.uint16)
+    samples[rng.random(samples.shape) < 0.3] = 0
+    samples[3] = 65_535
+    a, b = (0.0, 0.0) if encoding == "16UC1" else (10100.0, -1009.0)
+
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        head = struct.pack("<iff", 0, a, b)
+        message = writer.make(
+            "sensor_msgs/msg/CompressedImage", header=writer.header(0.0, "camera"),
+            format=f"{encoding}; compressedDepth rvl",
+            data=np.frombuffer(head + rvl(samples), np.uint8),
+        )  # fmt: skip
+        kind = "sensor_msgs/msg/CompressedImage"
+        writer.write("/camera/depth/image_raw/compressedDepth", kind, 0.0, message)
+
+    ((frame,),) = [one.frames for one in find_sequences(ros.write(tmp_path, fill), ALL)]
+    metres = samples / np.float32(1000) if encoding == "16UC1" else a / (samples - b)
+    missing = (samples == 0) | ((samples == 65_535) & (encoding == "16UC1"))
+    expected = np.where(missing, 0, metres)
+    np.testing.assert_allclose(frame.read_depth().depth, expected, rtol=1e-6)
+    messages = ros.messages()
+    fill(messages)
+    body = compressed_depth(messages.last()).body()
+    stored = samples if encoding == "16UC1" else expected
+    np.testing.assert_allclose(np.asarray(body), stored, rtol=1e-6)
+    for cut in (4, 30, len(rvl(samples)) - 200):
+        with pytest.raises(UnreadableFrame, match="RVL is damaged"):
+            rvl_samples(rvl(samples)[:cut])
+
+
+def test_what_cannot_be_read_is_not_promised(tmp_path: Path, ros: SimpleNamespace) -> None:
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        for i in range(4):
+            writer.compressed(float(i), IMAGE, form="16UC1; compressedDepth rvl")
+
+    outline = bag_outline(ros.write(tmp_path, fill), ALL)
+    assert outline.sequences == ()
+    assert outline.problem.endswith("compressed by RVL is damaged. Record it again.")
+
+
+@pytest.mark.parametrize("form", ["16UC1; png compressed ", "png", "mono16; png compressed"])
+def test_png_of_16_bits(form: str, tmp_path: Path, ros: SimpleNamespace) -> None:
+    topic = "/camera/depth/image_raw/compressed"
+
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.compressed(0.0, IMAGE, form=form, topic=topic)
+
+    (found,) = find_sequences(ros.write(tmp_path, fill), ALL)
+    np.testing.assert_array_equal(found.frames[0].read_depth().depth, np.float32(2))
+
+
+def test_images_that_are_no_depth_are_named(tmp_path: Path, ros: SimpleNamespace) -> None:
+    def fill(writer: Any) -> None:
+        writer.image(0.0, np.zeros((2, 6)), "rgb8", "/camera/color/image_raw")
+        writer.compressed(0.0, IMAGE, form="32FC1; png compressed", topic="/metres")
+
+    path = ros.write(tmp_path, fill)
+    with pytest.raises(DatasetError) as caught:
+        find_sequences(path, ALL)
+    assert "Images are /camera/color/image_raw ('rgb8'), /metres ('32FC1; png" in str(caught.value)
+    with pytest.raises(DatasetError, match=r"/metres .* has no depth images"):
+        find_sequences(path, RecordingOptions(topic="/metres"))
+
+
+def test_an_mcap_without_a_profile(tmp_path: Path, ros: SimpleNamespace) -> None:
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.image(0.0, IMAGE)
+
+    path = ros.write(tmp_path, fill)
+    whole = path.read_bytes()
+    header = b"\x04\x00\x00\x00ros2"
+    assert whole[17:25] == header
+    # the same length, so that nothing moves: the library's name is longer
+    (length,) = struct.unpack_from("<I", whole, 25)
+    empty = bytes(4) + struct.pack("<I", length + 4) + b"none" + whole[29 : 29 + length]
+    path.write_bytes(whole[:17] + empty + whole[29 + length :])
+    (found,) = find_sequences(path, ALL)
+    np.testing.assert_array_equal(found.frames[0].read_depth().depth, np.float32(2))
