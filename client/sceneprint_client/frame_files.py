@@ -43,6 +43,7 @@ from sceneprint_client.files import (
     SUFFIXES,
     format_of,
     is_cloud,
+    naming,
     read_bytes,
 )
 from sceneprint_client.sidecars import (
@@ -120,7 +121,17 @@ class FrameFile:
         """
         if self.source is not None:
             return self.source.read_bytes()
-        return _read(self.path, is_cloud=self.kind == "cloud")
+        data = _read(self.path, is_cloud=self.kind == "cloud")
+        if self.row is None:
+            return data
+        with naming(str(self.path)):
+            return rows_as_npy(data, self.row)
+
+    @property
+    def row(self) -> tuple[str, ...] | None:
+        """Names of the values of a row, of a .bin file whose rows are described."""
+        is_kitti = SUFFIXES.get(self.path.suffix.lower()) == "kitti"
+        return self.cloud.row if self.cloud is not None and is_kitti else None
 
     @property
     def pose(self) -> NDArray[np.float64] | None:
@@ -316,7 +327,9 @@ def _of_cloud(reference: FrameFile) -> dict[str, Any]:
     """How the points of a cloud are read; a KITTI scan's name alone says that it is one."""
     source = reference.cloud or CloudSource()
     told = source.file_format
-    if told is None and SUFFIXES.get(reference.path.suffix.lower()) == "kitti":
+    if reference.row is not None:
+        told = None  # sent as NPY, which tells itself
+    elif told is None and SUFFIXES.get(reference.path.suffix.lower()) == "kitti":
         told = "kitti"
     known: dict[str, Any] = {"format": told, "units_per_metre": source.units_per_metre}
     if source.viewpoint is None:
@@ -481,6 +494,23 @@ def camera_of(
     return checked(
         CameraIntrinsics, "The camera", width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy
     )
+
+
+def rows_as_npy(data: bytes, row: tuple[str, ...]) -> bytes:
+    """Return x, y and z of rows of float32 as an NPY file.
+
+    Raises
+    ------
+    UnreadableCloud : it is no whole number of rows.
+    """
+    width = 4 * len(row)
+    if len(data) % width or not data:
+        raise UnreadableCloud(
+            f"The file has {len(data)} bytes, and rows of {','.join(row)} have {width}. Name what "
+            "a row of it holds."
+        )
+    rows = np.frombuffer(data, "<f4").reshape(-1, len(row))
+    return _npy(rows[:, [row.index(axis) for axis in "xyz"]])
 
 
 def _npy(array: NDArray[Any]) -> bytes:

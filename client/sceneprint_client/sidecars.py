@@ -182,7 +182,8 @@ CLOUDS_FILE = "clouds.json"
 _CLOUDS_EXAMPLE = (
     '{"viewpoint": {"x": 0, "y": 0, "z": 1.7}, "units_per_metre": 1, "format": "kitti"}'
 )
-_FIELDS = ("viewpoint", "units_per_metre", "format", "up")
+_FIELDS = ("viewpoint", "units_per_metre", "format", "up", "row")
+_LONGEST_ROW = 32
 _FORMATS: tuple[CloudFormat, ...] = get_args(CloudFormat)
 
 
@@ -206,12 +207,31 @@ class CloudSource:
         UNSAID: as the file says, else the origin
     units_per_metre : of its coordinates
     up : unit vector in the file's axes, of a sensor that is carried level; None where not known
+    row : names of the float32 in each row of a .bin file, such as x, y, z, i, ring; None: x, y, z
+        and intensity
     """
 
     file_format: CloudFormat | None = None
     viewpoint: Position | Unsaid | None = UNSAID
     units_per_metre: float = 1.0
     up: Position | None = None
+    row: tuple[str, ...] | None = None
+
+
+def row_of(text: str) -> tuple[str, ...]:
+    """Return the names of the values of a row, of text such as x,y,z,i,ring.
+
+    Raises
+    ------
+    DatasetError : x, y or z is not among them once, or they are more than 32.
+    """
+    names = tuple(name.strip().lower() for name in text.split(","))
+    if any(names.count(axis) != 1 for axis in "xyz") or len(names) > _LONGEST_ROW:
+        raise DatasetError(
+            f"The row {text!r:.80} does not name x, y and z once each, or more than "
+            f"{_LONGEST_ROW} values. Write it such as x,y,z,i,ring."
+        )
+    return names
 
 
 def find_cloud_source(folder: Path) -> CloudSource:
@@ -245,7 +265,13 @@ def _read_source(path: Path) -> CloudSource:
         units = _cloud_number("units_per_metre", fields.get("units_per_metre", 1.0))
         if not units > 0.0:
             raise DatasetError(f"units_per_metre is {units}. Write 1000 for millimetres.")
-        return CloudSource(told, _viewpoint(fields), units, _cloud_up(fields.get("up")))
+        row = fields.get("row")
+        if row is not None and told not in (None, "kitti"):
+            raise DatasetError(f"row is of .bin files, and format is {told}. Leave one out.")
+        return CloudSource(
+            told, _viewpoint(fields), units, _cloud_up(fields.get("up")),
+            None if row is None else row_of(str(row)),
+        )  # fmt: skip
 
 
 def _cloud_up(told: object) -> Position | None:

@@ -211,6 +211,12 @@ def add_map_options(command: argparse.ArgumentParser) -> None:
 
 def check_map_options(options: argparse.Namespace) -> None:
     """See that options are of the kind of upload; InvalidRequest where they are not."""
+    if options.row is not None and (options.as_map or any(map(is_archive_file, options.paths))):
+        raise InvalidRequest(
+            "--row is for .bin files, and not for a map or an archive. In an archive, put the "
+            'names as "row" into clouds.json.',
+            (("row", "of a map or an archive"),),
+        )
     if options.as_map:
         folders = [str(path) for path in options.paths if path.is_dir()]
         if folders:

@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +50,7 @@ from sceneprint.errors import (
 from sceneprint.formats.dataset import FrameReference, FrameSequence, find_sequences
 from sceneprint.models import PRESETS
 from sceneprint_client.api.base import NOVEL
+from sceneprint_client.sidecars import row_of
 
 if TYPE_CHECKING:
     from sceneprint_client import Client
@@ -283,6 +284,13 @@ def add_upload(commands: Any) -> None:
         help="keep a frame only if its place is new to the map: the nearest frame is farther "
         f"than D, as a share of the distance of unrelated frames (without a number: {NOVEL:g})",
     )
+    command.add_argument(
+        "--row",
+        type=row_option,
+        metavar="NAMES",
+        help="what a row of float32 in .bin files holds, such as x,y,z,i,ring (default: x,y,z and "
+        "intensity)",
+    )
     command.add_argument("--no-wait", action="store_true", help="do not wait for signing")
     command.add_argument(
         "--parallel",
@@ -370,6 +378,8 @@ def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSe
         with recording_options(options) as recording:
             found = find_sequences(path, recording)
         for sequence in found:
+            if options.row is not None:
+                sequence = _with_row(sequence, options.row)
             place = sequence.place.resolve()
             known = places.setdefault(sequence.parent_frame, place)
             if known != place and options.parent_frame is None:
@@ -380,6 +390,28 @@ def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSe
                 )
             sequences.append(sequence)
     return numbered_sequences(sequences, options.session)
+
+
+def row_option(text: str) -> tuple[str, ...]:
+    """Read the names of `--row`."""
+    try:
+        return row_of(text)
+    except DatasetError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _with_row(sequence: FrameSequence, row: tuple[str, ...]) -> FrameSequence:
+    """Return a sequence of .bin files whose rows hold these values."""
+    frames = tuple(
+        replace(one, cloud=replace(one.cloud, row=row)) for one in sequence.frames if one.cloud
+    )
+    if len(frames) < len(sequence.frames) or not all(one.row for one in frames):
+        raise InvalidRequest(
+            f"--row is for .bin files, and {sequence.name} has others. Leave it out, or name "
+            "folders of .bin files alone.",
+            (("row", "not of these files"),),
+        )
+    return replace(sequence, frames=frames)
 
 
 def _see_to_map(client: Client, options: argparse.Namespace) -> None:

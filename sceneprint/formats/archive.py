@@ -42,7 +42,7 @@ from sceneprint.formats.exports.nerfstudio import TRANSFORMS, ScaledNpy
 from sceneprint.formats.exports.polycam import CAMERAS
 from sceneprint.formats.exports.record3d import DEPTH_SUFFIX, FRAMES
 from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, MAXIMUM_IMAGE_BYTES, is_cloud
-from sceneprint_client.frame_files import POSE_FOLDERS
+from sceneprint_client.frame_files import POSE_FOLDERS, rows_as_npy
 from sceneprint_client.sidecars import CLOUDS_FILE, INTRINSICS_FILE
 
 # Members of a tar or a zip, by the standard library behind guards.
@@ -501,6 +501,8 @@ class Archive:
         """
         limit = MAXIMUM_IMAGE_BYTES if reference.cloud is None else MAXIMUM_CLOUD_BYTES
         data = self._read(self._members[reference.path], limit)
+        if reference.row is not None:
+            return rows_as_npy(data, reference.row)
         # depth in units that no camera can state
         return reference.source.converted(data) if isinstance(reference.source, ScaledNpy) else data
 

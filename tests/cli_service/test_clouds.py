@@ -55,6 +55,21 @@ def test_a_folder_of_scans_is_uploaded_and_found(sceneprint: Run, scans: Path, r
     assert np.allclose(there["pose"]["matrix"], own, atol=0.02)
 
 
+def test_rows_of_five_are_named_or_refused(sceneprint: Run, scans: Path, tmp_path: Path) -> None:
+    rows = np.fromfile(scans / "0.bin", "<f4").reshape(-1, 4)
+    ring = np.arange(len(rows)) % 32
+    (tmp_path / "0.bin").write_bytes(np.c_[rows, ring].astype("<f4").tobytes())
+    without = ("--no-wait", "--model", "depth")
+    done = sceneprint("upload", "rows", tmp_path, *without, expect=2)
+    assert "/0: A row of the file holds 5 numbers" in done.stderr
+    done = sceneprint("upload", "rows", tmp_path, "--row", "x,y,z,i,ring", *without)
+    assert "1 frames: 1 received" in done.stdout
+    done = sceneprint("upload", "rows", scans, "--row", "x,y,z,i", expect=2)
+    assert "--row is for .bin files, and walk has others" in done.stderr
+    done = sceneprint("upload", "rows", scans / "1.ply", "--as-map", "--row", "x,y,z", expect=2)
+    assert "--row is for .bin files, and not for a map" in done.stderr
+
+
 def test_scans_are_signed_where_they_lie(sceneprint: Run, scans: Path) -> None:
     done = sceneprint("sign", scans, "--preset", "depth", expect=2)
     lines = done.stdout.splitlines()

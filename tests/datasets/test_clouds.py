@@ -21,6 +21,7 @@ from sceneprint.formats.dataset import (
 )
 from sceneprint.formats.export import write_ply
 from sceneprint.types import Cloud
+from sceneprint_client.frame_files import meta_of
 
 POINTS = np.arange(36, dtype=np.float32).reshape(12, 3) / 8
 
@@ -106,9 +107,38 @@ def test_what_clouds_json_says(hall: Path) -> None:
         find_sequences(hall)[0].frames[0].read()
 
 
+def test_rows_that_clouds_json_names(tmp_path: Path) -> None:
+    rows = np.c_[np.arange(12), POINTS[:, ::-1], np.ones(12)].astype("<f4")
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    (folder / "0.bin").write_bytes(rows.tobytes())
+    (folder / "1.ply").write_bytes(write_ply(POINTS))
+    (folder / "clouds.json").write_text('{"row": "range, z, y, X, i", "units_per_metre": 100}')
+    first, second = find_sequences(folder)[0].frames
+    np.testing.assert_allclose(points_of(first), POINTS / 100, rtol=1e-6)
+    np.testing.assert_allclose(points_of(second), POINTS / 100, rtol=1e-6)
+    assert meta_of(first).format is None  # what is sent is NPY
+    np.testing.assert_array_equal(np.load(io.BytesIO(first.read_bytes())), POINTS)
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as file:
+        for one in folder.iterdir():
+            file.write(one, f"drive/{one.name}")
+    with open_archive(packed, tmp_path) as archive:
+        ((one, _),) = (sequence.frames for sequence in archive.sequences)
+        assert archive.data_of(one) == first.read_bytes()
+    (folder / "0.bin").write_bytes(rows.tobytes()[:-4])
+    with pytest.raises(
+        UnreadableCloud, match=r"0\.bin: The file has 236 bytes, and rows of range,z,y,x,i have 20"
+    ):
+        points_of(first)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ('{"row": "x,y,i"}', "does not name x, y and z once each"),
+        ('{"row": "x,y,z,x"}', "does not name x, y and z once each"),
+        ('{"row": "x,y,z", "format": "npy"}', "row is of .bin files, and format is npy"),
         ("{", "not JSON"),
         ("[]", "no JSON object"),
         ('{"view": 1}', "'view' is no field"),

@@ -39,6 +39,44 @@ def test_kitti_has_to_be_said(kitti: Write, points: np.ndarray, ply: Write) -> N
         decode_cloud(ply(), file_format="kitti")
 
 
+def scan_rows(values: int) -> np.ndarray:
+    """What a scanner 1.8 m above the floor of a hall sees, with so many values a row."""
+    rng = np.random.default_rng(4)
+    turn, tilt = rng.uniform(-np.pi, np.pi, 6000), rng.uniform(-0.4, 0.2, 6000)
+    reach = np.minimum(12.0 / np.maximum(np.abs(np.sin(turn)), np.abs(np.cos(turn))), 40.0)
+    reach = np.where(tilt < 0, np.minimum(reach, 1.8 / np.maximum(-np.tan(tilt), 1e-3)), reach)
+    xyz = np.stack([reach * np.cos(turn), reach * np.sin(turn), reach * np.tan(tilt)])
+    more = [rng.integers(0, 255, 6000), rng.integers(0, 64, 6000), rng.random(6000), reach]
+    return np.stack([*xyz, *more, *more])[:values].T.astype("<f4")
+
+
+@pytest.mark.parametrize("values", [3, 5, 6, 7, 8])
+def test_rows_of_another_length_are_no_kitti(values: int) -> None:
+    data = scan_rows(values).tobytes()
+    with pytest.raises(UnreadableCloud, match=rf"row of the file holds {values} .*--row x,y,z"):
+        decode_cloud(data, file_format="kitti")
+
+
+def test_rows_of_four_are_kitti() -> None:
+    rows = scan_rows(4)
+    for scale in (1.0, 1 / 255, 0.0):
+        rows[:, 3] *= scale
+        for order in (slice(None), np.lexsort(rows.T)):
+            cloud = decode_cloud(rows[order].tobytes(), file_format="kitti")
+            np.testing.assert_array_equal(cloud.points, rows[order, :3])
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
+def test_axes_in_capitals(pcd: Write, ply: Write, points: np.ndarray, form: str) -> None:
+    data = pcd(form=form).replace(b" x y z", b" X Y Z")
+    np.testing.assert_array_equal(decode_cloud(data).points, points)
+    data = ply(form="ascii" if form == "ascii" else "binary_little_endian")
+    for axis in (b"x", b"y", b"z"):
+        data = data.replace(b" " + axis + b"\n", b" " + axis.upper() + b"\n")
+    assert b" X\n" in data
+    np.testing.assert_array_equal(decode_cloud(data).points, points)
+
+
 @pytest.mark.parametrize("dtype", ["<f4", ">f8", "<f2"])
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_npy(npy: Write, points: np.ndarray, dtype: str, order: str) -> None:

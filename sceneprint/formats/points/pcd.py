@@ -18,6 +18,7 @@ from sceneprint.formats.points.rows import (
     MAXIMUM_POINTS,
     FileBytes,
     FilePoints,
+    axis_names,
     check_count,
     check_room,
     columns,
@@ -247,7 +248,7 @@ def _header(data: FileBytes) -> tuple[dict[str, list[str]], int]:
 
 
 def _fields(entries: dict[str, list[str]]) -> list[Field]:
-    names = entries.get("FIELDS", entries.get("COLUMNS", []))
+    names = axis_names(entries.get("FIELDS", entries.get("COLUMNS", [])))
     kinds, sizes = entries.get("TYPE", []), entries.get("SIZE", [])
     counts = entries.get("COUNT", ["1"] * len(names))
     if not 1 <= len(names) <= _MAXIMUM_FIELDS or not len(names) == len(kinds) == len(sizes) == len(

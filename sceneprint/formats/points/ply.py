@@ -8,7 +8,7 @@ Nothing is allocated that the header alone asks for: each element must fit into 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from sceneprint.formats.points.rows import (
     MAXIMUM_POINTS,
     FileBytes,
     FilePoints,
+    axis_names,
     check_count,
     check_room,
     columns,
@@ -289,7 +290,13 @@ def _described(lines: list[str]) -> tuple[str, list[Element]]:
                 f"The PLY header announces {element.count} rows of {element.name!r:.40} with "
                 f"nothing in them. {_AGAIN}"
             )
-    return order, elements
+    return order, [_with_axis_names(element) for element in elements]
+
+
+def _with_axis_names(element: Element) -> Element:
+    names = axis_names([one.name for one in element.properties])
+    named = zip(element.properties, names, strict=True)
+    return replace(element, properties=tuple(replace(one, name=name) for one, name in named))
 
 
 def _property(words: list[str]) -> Property:

@@ -66,6 +66,13 @@ def steps(count: int) -> Iterator[tuple[int, int]]:
     return ((first, min(BLOCK, count - first)) for first in range(0, count, BLOCK))
 
 
+def axis_names(names: list[str]) -> list[str]:
+    """The names of fields with x, y and z for X, Y and Z, as PDAL writes them."""
+    if {"x", "y", "z"}.isdisjoint(names):
+        return [name.lower() if name in ("X", "Y", "Z") else name for name in names]
+    return names
+
+
 def columns(table: NDArray[np.void], names: tuple[str, str, str]) -> Iterator[Floats]:
     """The three columns of a table of records, a block at a time."""
     for first, n in steps(len(table)):
