@@ -21,7 +21,13 @@ from sceneprint.errors import Busy, DatasetError, InvalidRequest, UnknownFrame
 from sceneprint.formats.archive import is_archive
 from sceneprint.formats.exports import is_export
 from sceneprint_client.api.base import checked
-from sceneprint_client.api.frames import Axis, ImportOptions, MapImportResult, camera_fields
+from sceneprint_client.api.frames import (
+    Axis,
+    ImportOptions,
+    MapImportResult,
+    camera_fields,
+    offset_fields,
+)
 from sceneprint_client.files import is_cloud
 
 if TYPE_CHECKING:
@@ -175,6 +181,14 @@ def camera_of(text: str) -> dict[str, float]:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
+def offset_of(text: str) -> dict[str, float]:
+    """Return the fields of an offset that is written as three numbers."""
+    try:
+        return offset_fields(text)
+    except InvalidRequest as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
 def add_map_options(command: argparse.ArgumentParser) -> None:
     """Add `--as-map`, and the options that describe the file."""
     group = command.add_argument_group("a whole map in one file")
@@ -202,6 +216,13 @@ def add_map_options(command: argparse.ArgumentParser) -> None:
         "says, else estimated)",
     )
     group.add_argument(
+        "--offset",
+        type=offset_of,
+        metavar="X,Y,Z",
+        help="metres that are taken off the coordinates of the file (default: none, or where it "
+        "lies more than a kilometre from its origin, its middle)",
+    )
+    group.add_argument(
         "--camera",
         type=camera_of,
         metavar="FX,FY,CX,CY,WIDTH,HEIGHT",
@@ -225,7 +246,7 @@ def check_map_options(options: argparse.Namespace) -> None:
                 "--as-map out to upload the frames in it."
             )
         return
-    for name in ("height", "units", "camera"):
+    for name in ("height", "units", "offset", "camera"):
         if getattr(options, name):
             raise InvalidRequest(
                 f"--{name} is for a map that is one file. Add --as-map, or leave it out.",
@@ -245,7 +266,8 @@ def import_maps(client: Client, options: argparse.Namespace) -> int:
     for path in options.paths:
         said = _options_of(
             options, path.name, **{"as": "map"}, name=path.name[-64:].lstrip("."),
-            heights=options.height, units_per_metre=options.units, camera=options.camera,
+            heights=options.height, units_per_metre=options.units, offset=options.offset,
+            camera=options.camera,
         )  # fmt: skip
         job = client.import_map(options.map, path, said)
         if options.no_wait:
@@ -281,7 +303,8 @@ def lines_of(name: str, map_name: str, result: MapImportResult) -> list[str]:
         f"({how.get(r.up_from, r.up_from)})",
     ]
     if any(offset := (r.offset.x, r.offset.y, r.offset.z)):
-        lines.append(f"offset: {_numbers(*offset)} m; add it to a pose for the file's coordinates")
+        stated = ",".join(f"{x:.12g}" for x in offset)  # as --offset takes it
+        lines.append(f"offset: {stated} m; add it to a pose for the file's coordinates")
     lines += r.notes
     if r.coverage is not None:
         lines.append(

@@ -25,6 +25,7 @@ from sceneprint_client.api.frames import (
     ImportOptions,
     camera_fields,
     check_frame_id,
+    offset_fields,
 )
 from sceneprint_client.api.listing import FramePage
 from service import bodies
@@ -290,13 +291,16 @@ _TEXTS = (
     "as", "name", "robot", "session", "parent_frame", "every", "with_poses", "units_per_metre",
 )  # fmt: skip
 _PARAMETERS = (
-    *_TEXTS, "tags", "base", "base_frame", "up", "heights", "camera", "priority", "if_novel",
+    *_TEXTS, "tags", "base", "base_frame", "up", "heights", "offset", "camera", "priority",
+    "if_novel",
 )  # fmt: skip
 #: Of those that are lists: how they are written.
 _LISTS = {
     "tags": "Of all frames, with commas between.",
     "heights": "Of a map: heights of the sensor above the floor, metres, with commas between; "
     "default: those of the model's sensors.",
+    "offset": "Of a map: x,y,z in metres, taken off the coordinates of its file; default: none, or "
+    "where the file lies more than a kilometre from its origin, its middle.",
     "camera": "Of a map of depth images: the robot's camera as fx,fy,cx,cy,width,height.",
 }
 
@@ -435,6 +439,8 @@ def _options(request: Request) -> ImportOptions:
             fields[name] = given[name].split(",")
     if "camera" in given:
         fields["camera"] = camera_fields(given["camera"])
+    if "offset" in given:
+        fields["offset"] = offset_fields(given["offset"])
     bodies.add_transform(fields, given, "base", "T_base_sensor", "base_frame")
     if fields.get("as") == "map" and "up" in given:
         fields["up"] = given["up"]

@@ -340,9 +340,9 @@ def test_a_map_that_is_one_file_is_uploaded_as_a_map(
 ) -> None:
     file = tmp_path / "room.ply"
     file.write_bytes(room_mesh)
-    small = ("--camera", "73,73,39.5,29.5,80,60", "--height", "1.2")
+    small = ("--camera", "73,73,39.5,29.5,80,60", "--height", "1.2", "--offset", "0,0,1")
     done = sceneprint("upload", "mesh", file, "--as-map", "--up", "z", "--units", "m", *small)
-    created, views, how, *_ = done.stdout.splitlines()
+    created, views, how, offset, *_ = done.stdout.splitlines()
     assert created.startswith("created map mesh with model depth-")
     assert re.fullmatch(
         r"room\.ply: \d+ views are in map mesh and see \d+% of its surface\. Their poses lead to "
@@ -350,6 +350,7 @@ def test_a_map_that_is_one_file_is_uploaded_as_a_map(
         views,
     )
     assert how == "units: m (as you said); up: z (as you said)"
+    assert offset.startswith("offset: 0,0,1 m; ")
     assert re.search(
         r"^Of \d+ other views of this file \d+% are found in the map: ", done.stdout, re.M
     )
@@ -364,6 +365,7 @@ def test_a_map_that_is_one_file_is_uploaded_as_a_map(
     [
         (("--as-map", "--every", "2"), "every: does not apply to a map"),
         (("--as-map", "--up", "0,0,1"), "up: one of x, -x"),
+        (("--offset", "0,0,1"), "--offset is for a map that is one file"),
         (("--height", "1"), "--height is for a map that is one file. Add --as-map"),
         (("--up", "z"), "--up z is an axis of a file, for --as-map"),
     ],

@@ -20,10 +20,11 @@ from sceneprint.engine.jobs.tasks import LongJob, SliceResult
 from sceneprint.engine.maps.map_lifecycle import edit_map
 from sceneprint.errors import InvalidRequest, LostLease, QuotaExceeded, UnreadableCloud
 from sceneprint.settings import Settings
+from sceneprint.lab.synth.rooms import make_room
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import files_of
 from sceneprint.types import ReferenceSurface
-from sceneprint_client.api import FrameState, Job, JobState, NewMap
+from sceneprint_client.api import FrameState, Job, JobState, NewMap, Query
 from sceneprint_client.api.frames import ImportOptions, MapImportResult
 
 #: A camera of few pixels, so that views are rendered and signed quickly.
@@ -241,6 +242,61 @@ def test_files_that_are_no_map_are_refused(empty: Engine, room_mesh: bytes) -> N
         with pytest.raises((UnreadableCloud, InvalidRequest)):
             begun(empty, data, name="room")
     assert list(empty.store.blobs.digests()) == []
+#: Where a room lies in the coordinates of a country, metres.
+FAR = np.array([431_000.25, 5_411_000.5, 300.0])
+
+
+def room_at(place: Any) -> bytes:
+    """The room as an OBJ file, whose numbers have as many digits as they need."""
+    room = make_room(np.random.default_rng(3))
+    corners = "".join(
+        f"v {x:.4f} {y:.4f} {z:.4f}\n" for x, y, z in (room.vertices + place).tolist()
+    )
+    return (corners + "".join(f"f {a} {b} {c}\n" for a, b, c in room.faces + 1)).encode()
+
+
+def test_files_in_one_parent_frame_need_one_offset(empty: Engine) -> None:
+    """Each would have its own middle as its offset, and views of one would lie in the other."""
+
+    def slices(place: Any, name: str, count: int, **more: Any) -> LongJob:
+        job = begun(empty, room_at(place), name=name, parent_frame="district", **more)
+        for _ in range(count):
+            task = claimed(empty)
+            assert task.job.id == job.job_id
+            state = empty.run(task)
+        if state == JobState.QUEUED:
+            cancel(empty.store, job.job_id)
+        return task
+
+    def places() -> dict[str, Any]:
+        return {
+            one.name: np.array(one.pose.matrix)[:3, 3]
+            for one in empty.list_frames("hall", limit=1000).items
+            if one.pose is not None and one.name is not None
+        }
+
+    slices(FAR, "west.obj", 3)
+    west = places()
+    assert west
+    # in the middle of the room, to a metre
+    assert all((np.abs(at) < 6).all() for at in west.values())
+    east = FAR + np.array([50.0, 0.0, 0.0])
+    failed = slices(east, "east.obj", 2)
+    error = str(empty.get_job(failed.job.id).error)
+    assert "'district' has frames already" in error
+    offset = np.round(FAR + np.ptp(make_room(np.random.default_rng(3)).vertices, axis=0) / 2)
+    stated = dict(zip("xyz", offset.tolist(), strict=True))
+    far_off = slices(east, "east.obj", 1, offset=stated | {"y": 0.0})
+    assert "20 km from the offset" in str(empty.get_job(far_off.job.id).error)
+    slices(east, "east.obj", 3, offset=stated)
+    there = {name: at for name, at in places().items() if name not in west}
+    assert there
+    assert all((np.abs(at - [50.0, 0.0, 0.0]) < 6).all() for at in there.values())
+    # the same file goes on where it was
+    again = slices(FAR, "west.obj", 2)
+    assert empty.get_job(again.job.id).error is None
+
+
     job = begun(empty, room_mesh[: len(room_mesh) // 2])
     assert empty.run(claimed(empty)) == JobState.FAILED
     assert "room.ply" in str(empty.get_job(job.job_id).error)

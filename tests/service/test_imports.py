@@ -122,7 +122,7 @@ def test_a_map_that_is_one_file_becomes_views(
     served, make_map, room_mesh, small_shots, until, refused
 ) -> None:
     http, path = served.client, make_map(served, "room")
-    options = {"as": "map", "name": "room.ply", "up": "z", **_SMALL}
+    options = {"as": "map", "name": "room.ply", "up": "z", "offset": "1,0,-2", **_SMALL}
 
     def post(data: bytes = room_mesh, **more: str) -> Any:
         return http.post(f"{path}/imports", **sent(data, "application/octet-stream", **more))
@@ -134,6 +134,7 @@ def test_a_map_that_is_one_file_becomes_views(
         "up.axis: Input should be 'x', '-x'",
     )
     refused(post(**options | {"camera": "1,2"}), 422, "invalid-request", "six numbers")
+    refused(post(**options | {"offset": "1,2"}), 422, "invalid-request", "three numbers")
     refused(post(**options | {"every": "2"}), 422, "invalid-request", "every")
     refused(post(heights="1"), 422, "invalid-request", "`as` = `map`")
     refused(post(zipped(small_shots[:1]), **options), 422, "invalid-request", "archive")
@@ -149,6 +150,7 @@ def test_a_map_that_is_one_file_becomes_views(
     assert progress["phase"] == "test"
     assert progress["views"] == progress["rendered"] == progress["signed"] > 0
     assert (result["parent_frame"], result["session"]) == ("room", "room")
+    assert result["offset"] == {"x": 1, "y": 0, "z": -2}
     assert result["tested"] == progress["tested"] > 0
     assert result["wrong"] == 0
     frames = http.get(f"{path}/frames", params={"tag": "virtual", "limit": 1}).json()["items"]

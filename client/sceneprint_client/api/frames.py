@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from datetime import datetime
 from typing import Annotated, Literal, get_args
 
@@ -16,6 +17,7 @@ from sceneprint_client.api.base import (
     FrameState,
     Given,
     GivenBase,
+    GivenVector,
     Label,
     Problem,
     Transform,
@@ -140,7 +142,7 @@ AxisOrUp = Annotated[
 VIRTUAL = "virtual"
 #: Options that only an import of frames has, and those that only one of a whole map has.
 _OF_FRAMES = ("with_poses", "every", "T_base_sensor")
-_OF_MAP = ("heights", "units_per_metre", "camera")
+_OF_MAP = ("heights", "units_per_metre", "offset", "camera")
 
 
 class ImportOptions(Given):
@@ -193,6 +195,12 @@ class ImportOptions(Given):
         description="Of a map: 1000 for a file in millimetres; default: as the file says, else "
         "estimated.",
     )
+    offset: GivenVector | None = Field(
+        default=None,
+        description="Of a map: what is taken off the coordinates of its file, in metres. Files in "
+        "one parent frame need one offset; default: none, or where the file lies more than a "
+        "kilometre from its origin, its middle.",
+    )
     camera: CameraIntrinsics | None = Field(
         default=None,
         description="Of a map of depth images: the robot's camera, whose views are rendered.",
@@ -207,7 +215,8 @@ class ImportOptions(Given):
     @model_validator(mode="after")
     def _of_its_kind(self) -> ImportOptions:
         if self.as_ == "map":
-            idle, hint = _OF_FRAMES, "does not apply to a map; leave it out"
+            idle: Sequence[str] = _OF_FRAMES
+            hint = "does not apply to a map; leave it out"
         else:
             idle, hint = _OF_MAP, "applies only with `as` = `map`"
         for name in idle:
@@ -230,13 +239,30 @@ def camera_fields(text: str) -> dict[str, float]:
     ------
     InvalidRequest : these are not six numbers.
     """
-    names = ("fx", "fy", "cx", "cy", "width", "height")
+    return _number_fields("camera", text, ("fx", "fy", "cx", "cy", "width", "height"), "pixels")
+
+
+def offset_fields(text: str) -> dict[str, float]:
+    """Return the fields of an offset that is written as `x,y,z`.
+
+    Raises
+    ------
+    InvalidRequest : these are not three numbers.
+    """
+    return _number_fields("offset", text, ("x", "y", "z"), "metres")
+
+
+_COUNTED = {3: "three", 6: "six"}
+
+
+def _number_fields(what: str, text: str, names: Sequence[str], unit: str) -> dict[str, float]:
     try:
         return dict(zip(names, map(float, text.split(",")), strict=True))
     except ValueError as error:
         raise InvalidRequest(
-            f"The camera {text!r:.80} is not six numbers. Write {','.join(names)}, in pixels.",
-            (("camera", f"not {','.join(names)}"),),
+            f"The {what} {text!r:.80} is not {_COUNTED[len(names)]} numbers. Write "
+            f"{','.join(names)}, in {unit}.",
+            ((what, f"not {','.join(names)}"),),
         ) from error
 
 

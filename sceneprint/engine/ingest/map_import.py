@@ -47,8 +47,8 @@ from sceneprint.formats.surface_file import SurfaceOptions
 from sceneprint.geometry.views import Renderer, ViewParameters, choose_views
 from sceneprint.store import Store, queue
 from sceneprint.store.database_errors import unusable
-from sceneprint.store.frame_queries import PathFrame
-from sceneprint.store.maps import living_map, use_of
+from sceneprint.store.frame_queries import PathFrame, has_parent_frame
+from sceneprint.store.maps import living_frame, living_map, use_of
 from sceneprint.store.tables import ARCHIVE, MapRow
 from sceneprint.types import Floats, Intrinsics, ReferenceSurface
 from sceneprint_client.api import Answer, Filter, FrameMeta, FrameState, Query
@@ -57,6 +57,7 @@ from sceneprint_client.api.base import (
     Direction,
     GivenDirection,
     GivenPose,
+    GivenVector,
     Vector,
 )
 from sceneprint_client.api.coverage import COVERAGE_OUTCOMES, NewMapCoverage
@@ -239,6 +240,8 @@ class MapImporter:
                     "mesh, or write it in another format."
                 ) from error
         surface = read.surface
+        if options.offset is not None:
+            surface = _with_offset(surface, options.offset, options.name)
         progress = {
             "done": 0, "total": None, "phase": "choose", "points": len(surface.points),
             "triangles": 0 if surface.triangles is None else len(surface.triangles),
@@ -262,6 +265,8 @@ class MapImporter:
                 "the units and the axis that points up, or name the height of the sensor."
             )
         self._require_room(task.of_map, n)
+        if options.offset is None and stored.surface.offset.any():
+            self._require_one_offset(task, options, replace(stored, poses=plan.poses))
         floor = 0.0 if plan.floor is None else plan.floor
         chosen = replace(stored, poses=plan.poses, held_out=plan.held_out, floor=floor)
         progress = task.progress | {
@@ -358,6 +363,29 @@ class MapImporter:
             stored.write(blob)
             return queue.JobFile(ARCHIVE, blob.keep(), blob.size, "application/octet-stream")
 
+    def _require_one_offset(
+        self, task: LongJob, options: ImportOptions, stored: StoredSurface
+    ) -> None:
+        """See that no other file has frames in the parent frame: it would have another offset."""
+        _, parent = names_of(options)
+        with self._store.database.read() as connection:
+            row = living_map(connection, task.of_map)
+            if not has_parent_frame(connection, row.number, parent):
+                return
+        first = self._views(task, options, stored).upload(0)
+        with self._store.database.read() as connection:
+            again = living_frame(connection, row.number, str(first.frame_id)) is not None
+        if again:  # the same file, sent once more
+            return
+        x, y, z = stored.surface.offset.tolist()
+        raise InvalidRequest(
+            f"The parent frame {parent!r} has frames already, and {options.name} lies far from its "
+            f"origin: its own offset would be {x:.0f},{y:.0f},{z:.0f}. Send `offset` (--offset) "
+            "with the numbers that the first file in this frame was imported with, or name "
+            "another `parent_frame`.",
+            (("offset", "needed: the parent frame has frames already"),),
+        )
+
     def _require_room(self, row: MapRow, views: int) -> None:
         """See that the quota has room for so many frames, before any is added."""
         with self._store.database.read() as connection:
@@ -417,6 +445,24 @@ class MapImporter:
             coverage=counts["found"] / len(outcomes) if outcomes else None,
             weak=weak_areas(stored, outcomes),
         )
+
+
+#: Farther than this from its new origin a surface would lose its millimetres, metres.
+_FARTHEST_M = 20_000.0
+
+
+def _with_offset(surface: ReferenceSurface, offset: GivenVector, name: str) -> ReferenceSurface:
+    """Return a surface relative to another offset; InvalidRequest where that is far from it."""
+    to = np.array([offset.x, offset.y, offset.z])
+    points = surface.points + (surface.offset - to)
+    if not np.abs(points).max() <= _FARTHEST_M:
+        middle = ", ".join(f"{x:.0f}" for x in surface.offset + surface.points.mean(axis=0))
+        raise InvalidRequest(
+            f"{name} lies about {middle}, more than {_FARTHEST_M / 1000:.0f} km from the offset. "
+            "Check its numbers, which are metres, and the units of the file.",
+            (("offset", "far from the surface"),),
+        )
+    return replace(surface, points=points.astype(np.float32), offset=to)
 
 
 def _counted(progress: dict[str, Any]) -> dict[str, Any]:
