@@ -275,6 +275,22 @@ def test_a_table_is_no_floor() -> None:
     assert heights.max() > 1.5
 
 
+def test_ground_beside_a_slope_is_a_floor_to_a_scanner() -> None:
+    """A field of 24 x 12 m, a wall behind it, and a bank of 45 degrees that falls 12 m from it."""
+    x, y = (one.ravel() for one in np.meshgrid(np.arange(0, 24, 0.2), np.arange(0, 24, 0.2)))
+    field = np.column_stack([x, y, np.minimum(12.0 - y, 0.0)])
+    along, up = (one.ravel() for one in np.meshgrid(np.arange(0, 24, 0.2), np.arange(0, 4, 0.2)))
+    wall = np.column_stack([along, np.zeros(along.size), up])
+    points = np.concatenate([field, wall]).astype(np.float32)
+    surface = ReferenceSurface(points, None, np.zeros(3), UP)
+    p = view_parameters(read_model("lidar").parameters)
+    plan = choose_views(surface, p)
+    assert plan.floor == pytest.approx(0.0, abs=0.05)
+    assert len(plan.poses) > 5
+    # a camera may have seen a table, and what lies below it
+    assert find_floors(surfels(surface, p.cell, 10_000), 2 * p.spacing).lowest is None
+
+
 def test_scanners_stand_in_the_room_whose_cloud_has_no_sides() -> None:
     p = view_parameters(read_model("lidar").parameters)
     cloud = cloud_of_room(0.1)

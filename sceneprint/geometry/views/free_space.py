@@ -28,8 +28,8 @@ _STEP = 0.15
 _STOREY = 2.0
 #: A floor fills at least this share of the cells around a column, the lowest and one above.
 _LEAST_FLOOR, _LEAST_STOREY = 0.12, 0.3
-#: A floor is none where more than this share of the surface lies below it: a table, say, in a room
-#: whose floor was not seen.
+#: What a camera sees as a floor is none where more than this share of the surface lies below it: a
+#: table, say, in a room whose floor was not seen. Below the ground outdoors there may be more.
 _MOST_BELOW = 0.07
 #: Places of a grid, and columns times heights of another, at most.
 _MOST_COLUMNS, _MOST_BINS = 1_000_000, 8_000_000
@@ -70,13 +70,14 @@ def extent_of(pieces: Surfels) -> tuple[Floats, Floats]:
     return ordered[stray], ordered[n - 1 - stray]
 
 
-def find_floors(pieces: Surfels, side: float) -> Floors:
+def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Floors:
     """Find the floors of a surface.
 
     Parameters
     ----------
     pieces : in level axes
     side : of a column, metres; it grows where there were too many
+    has_tables : whether what is level may be furniture, as in the surface that a depth camera saw
     """
     # either side up: a mesh may be inside out, and no place above a ceiling is free
     level = pieces.points[np.abs(pieces.normals[:, 2]) > _LEVEL].astype(np.float64)
@@ -114,7 +115,7 @@ def find_floors(pieces: Surfels, side: float) -> Floors:
     column = np.floor((pieces.points[:, :2] - low[:2]) / side).astype(np.int64)
     column = np.clip(column, 0, shape[:2] - 1)
     floor = heights[0][column[:, 0], column[:, 1]]
-    if np.isfinite(floor).any():
+    if has_tables and np.isfinite(floor).any():
         floor = np.where(np.isfinite(floor), floor, np.nanmedian(floor))
         if (pieces.points[:, 2] < floor - 2 * _STEP).mean() > _MOST_BELOW:
             heights = np.full((1, *shape[:2]), np.nan)

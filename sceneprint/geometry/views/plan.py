@@ -94,7 +94,7 @@ def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewP
         pieces, points=_turned(pieces.points, axes), normals=_turned(pieces.normals, axes)
     )
     turns = np.eye(3)[None] if p.camera is None else camera_turns()
-    floors = find_floors(level, 2.0 * p.spacing)
+    floors = find_floors(level, 2.0 * p.spacing, has_tables=p.camera is not None)
     spacing, places = p.spacing, candidate_places(floors, level, p, p.spacing)
     while len(places) > _MOST_PLACES:
         spacing *= max(math.sqrt(len(places) / _MOST_PLACES), 1.05)
