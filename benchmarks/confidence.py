@@ -4,7 +4,8 @@ sites  --collect-->  samples, in a file  --fit-->  numbers, in a model file
 
 Sites of every kind are built, most of them with maps that lack frames and whose poses drift, and
 all their queries are answered. The penalties are fitted to which candidate pose was right.
-Recordings take no part.
+Recordings take no part. With --views the frames of each map are joined to one surface, and views of
+it take their place: what is learnt is the confidence in maps that came whole.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ TIMES = {"rooms": 3, "sites": 3, "unmapped": 2}
 #: Flaws of two maps in three. Scans are taken so often that most may be missing; their poses drift
 #: as it is.
 FLAWS = {"depth": MapFlaws(0.5, 0.01, 0.004), "lidar": MapFlaws(0.9, 0.0, 0.0)}
+#: Likewise of maps whose frames become one surface: who makes such a map leaves fewer gaps.
+SURFACE_FLAWS = {"depth": MapFlaws(0.3, 0.01, 0.004), "lidar": MapFlaws(0.3, 0.0, 0.0)}
 #: Least step of the penalty of a pose that one view alone suggests. Two scans of a real street
 #: often agree metres along it, and the streets that are built here are too rich to show that.
 LONE = {"depth": 0.0, "lidar": 2.5}
@@ -57,12 +60,19 @@ def sensor_of(preset: str) -> str:
 
 
 def collect(
-    preset: str, seed: int, sites: int, queries: int, jobs: int
+    preset: str, seed: int, sites: int, queries: int, jobs: int, views: bool = False
 ) -> Iterator[list[SiteAnswer]]:
     """Ask sites of every kind with a preset, one site after another.
 
     Every query is answered with the best pose there is, so that frames elsewhere that look alike
     are always compared, as they are before a pose is found.
+
+    Parameters
+    ----------
+    preset, seed : of the model, and of the sites
+    sites, queries : of each kind, and of each site
+    jobs : processes
+    views : whether maps are views of the surface that their frames show
     """
     work = [
         (kind, index * TIMES.get(kind, 1) + k, queries)
@@ -70,7 +80,8 @@ def collect(
         for kind in SHARES[sensor_of(preset)]
         for k in range(TIMES.get(kind, 1))
     ]
-    ask = partial(_ask, seed=seed, flaws=FLAWS[sensor_of(preset)])
+    flaws = (SURFACE_FLAWS if views else FLAWS)[sensor_of(preset)]
+    ask = partial(_ask, seed=seed, flaws=flaws, views=views)
     yield from tqdm(
         map_over(work, ask, partial(_open, preset), jobs), total=len(work), disable=None
     )
@@ -81,9 +92,10 @@ def _open(preset: str) -> Signer:
 
 
 def _ask(
-    signer: Signer, work: tuple[str, int, int], *, seed: int, flaws: MapFlaws
+    signer: Signer, work: tuple[str, int, int], *, seed: int, flaws: MapFlaws, views: bool
 ) -> list[SiteAnswer]:
-    return ask_site(signer, work, seed=seed, flaws=flaws if work[1] % 3 else None, confidence=0.0)
+    flawed = flaws if work[1] % 3 else None
+    return ask_site(signer, work, seed=seed, flaws=flawed, confidence=0.0, as_surface=views)
 
 
 def write_samples(path: Path, samples: Iterable[JudgedQuery]) -> None:
@@ -113,6 +125,7 @@ def main() -> None:
     parser.add_argument("--sites", type=int, default=10, help="of each kind (default: 10)")
     parser.add_argument("--queries", type=int, default=12, help="of each site (default: 12)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
+    parser.add_argument("--views", action="store_true", help="maps are views of a surface")
     parser.add_argument(
         "--evidence", type=Path, required=True, help="file of samples: read, if it is there"
     )
@@ -121,19 +134,21 @@ def main() -> None:
     model = read_model(options.preset)
     if not options.evidence.exists():
         for answers in collect(
-            options.preset, options.seed, options.sites, options.queries, options.jobs
-        ):
+            options.preset, options.seed, options.sites, options.queries, options.jobs,
+            options.views,
+        ):  # fmt: skip
             write_samples(options.evidence, judged_queries(answers))
     samples = read_samples(options.evidence)
     sensor = sensor_of(options.preset)
-    parameters = fit(samples, SHARES[sensor], lone=LONE[sensor])
-    confidences = [c for one in samples for c in confidences_of(one.evidence, parameters)]
+    parameters = fit(samples, SHARES[sensor], lone=0.0 if options.views else LONE[sensor])
+    own = replace(model.answer.confidence, **{"views" if options.views else "frames": parameters})
+    confidences = [c for one in samples for c in confidences_of(one.evidence, own)]
     measured = calibration(confidences, [right for one in samples for right in one.right])
     error, brier = measured.error, measured.brier
     print(f"{len(confidences)} poses; calibration error {error:.3f}, Brier {brier:.4f}")
     print(parameters)
     if options.out is not None:
-        save_model(replace(model, answer=replace(model.answer, confidence=parameters)), options.out)
+        save_model(replace(model, answer=replace(model.answer, confidence=own)), options.out)
 
 
 if __name__ == "__main__":

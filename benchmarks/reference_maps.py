@@ -21,11 +21,10 @@ import numpy as np
 
 from sceneprint.errors import UselessFrame
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.fusion import FusionParameters, fuse
-from sceneprint.geometry.rigid import moved
-from sceneprint.geometry.views import Renderer, ViewParameters, choose_views, view_parameters
+from sceneprint.geometry.views import ViewParameters, view_parameters
 from sceneprint.lab.evaluation.protocol import JudgedAnswer
 from sceneprint.lab.evaluation.sites import answers_of, signed
+from sceneprint.lab.evaluation.surface_maps import join_frames, render_views
 from sceneprint.lab.synth.dataset import (
     premises_and_rng,
     room_and_rng,
@@ -34,12 +33,12 @@ from sceneprint.lab.synth.dataset import (
 )
 from sceneprint.lab.synth.mesh import SyntheticMesh
 from sceneprint.pipeline import Signer, open_signer, prepare
-from sceneprint.types import AnyFrame, Cloud, DepthFrame, Intrinsics, ReferenceSurface
+from sceneprint.types import AnyFrame, ReferenceSurface
 
 #: A pose is right within so many metres and degrees.
 RIGHT = {"depth": (0.25, 5.0), "lidar": (0.5, 5.0)}
-#: Side of the voxels that a joined cloud is thinned to, metres.
-VOXEL_M = 0.1
+#: Side of the voxels that a mesh is made of, and that a joined cloud is thinned to, metres.
+VOXEL_M = {"depth": 0.02, "lidar": 0.1}
 #: Frames whose signing is timed.
 _TIMED = 20
 
@@ -59,15 +58,7 @@ def hall(recordings: Path) -> Place:
     references = find_sequences(recordings / "lidar" / "hall")[0].frames
     scans = {int(one.path.stem.split("-")[-1]): one.read() for one in references}
     frames = [one for number, one in scans.items() if number < 100]
-    points = np.concatenate(
-        [moved(one.pose, one.points) for one in frames if isinstance(one, Cloud)]  # type: ignore[arg-type]
-    )
-    cells = np.floor(points / VOXEL_M).astype(np.int64)
-    _, index, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(index, points[:, k]) for k in range(3)], axis=1)
-    surface = ReferenceSurface(
-        (sums / counts[:, None]).astype(np.float32), None, np.zeros(3), np.array([0.0, 0.0, 1.0])
-    )
+    surface = join_frames(frames, VOXEL_M["lidar"], np.array([0.0, 0.0, 1.0]))
     return Place("lidar", surface, frames, [one for number, one in scans.items() if number >= 100])
 
 
@@ -75,10 +66,7 @@ def redkitchen(recordings: Path) -> Place:
     """Return the kitchen: every fifth of frames 0-599 as a mesh."""
     references = find_sequences(recordings / "7scenes" / "redkitchen")[0].frames
     frames = [one.read_depth() for one in references[:600:5]]
-    fused, _ = fuse(frames, FusionParameters(voxel_m=0.02, most_blocks=400_000, farthest_m=4.0))
-    surface = ReferenceSurface(
-        fused.points.astype(np.float32), fused.triangles, np.zeros(3), np.array([0.0, -1.0, 0.0])
-    )
+    surface = join_frames(frames, VOXEL_M["depth"], np.array([0.0, -1.0, 0.0]))
     return Place("depth", surface, frames, [one.read_depth() for one in references[650:1000:10]])
 
 
@@ -107,30 +95,22 @@ def _surface(mesh: SyntheticMesh) -> ReferenceSurface:
 def views(place: Place, p: ViewParameters) -> tuple[list[AnyFrame], str]:
     """Return the views of a surface as frames, and how long choosing and rendering took."""
     began = time.process_time()
-    plan = choose_views(place.surface, p)
-    chosen = time.process_time() - began
-    renderer = Renderer(place.surface, p)
-    frames: list[AnyFrame] = []
-    for number, pose in enumerate(plan.poses):
-        seen, name = renderer.view(pose), f"view-{number:06d}"
-        frames.append(
-            DepthFrame(seen, p.camera, name, pose)
-            if isinstance(p.camera, Intrinsics)
-            else Cloud(seen, name=name, pose=pose)
-        )
-    spent = time.process_time() - began - chosen
+    plan, frames = render_views(place.surface, p)
+    spent = time.process_time() - began
     floor = "none" if plan.floor is None else f"at {plan.floor:.2f} m"
     return frames, (
         f"{len(plan.poses)} of {plan.candidates} views, {plan.covered:.3f} covered, floor {floor}; "
-        f"{chosen:.1f} s choosing, {spent:.1f} s rendering"
+        f"{spent:.1f} s choosing and rendering"
     )
 
 
-def answers(place: Place, frames: Sequence[AnyFrame], signer: Signer) -> list[JudgedAnswer]:
+def answers(
+    place: Place, frames: Sequence[AnyFrame], signer: Signer, *, rendered: bool
+) -> list[JudgedAnswer]:
     """Answer all queries on a map of some frames; those that show nothing are not found."""
     _, database, of_map = signed(frames, "map", signer, 0)
     _, queries, of_queries = signed(place.queries, "map", signer, len(database))
-    found = answers_of(signer, database, queries, [*of_map, *of_queries])
+    found = answers_of(signer, database, queries, [*of_map, *of_queries], rendered=rendered)
     return found + [JudgedAnswer()] * (len(place.queries) - len(queries))
 
 
@@ -159,7 +139,7 @@ def report(name: str, place: Place, signer: Signer, options: argparse.Namespace)
         text += f"; signing {1e3 * rendered:.0f} ms each, a real frame {1e3 * real:.0f} ms"
     counts: Counter[str] = Counter()
     metres = []
-    for one in answers(place, frames, signer):
+    for one in answers(place, frames, signer, rendered=not options.frames):
         right = one.error.within(*RIGHT[place.preset])
         counts[one.status if one.status != "found" else "right" if right else "wrong"] += 1
         if one.status == "found" and right:

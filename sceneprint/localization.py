@@ -236,6 +236,7 @@ def views_of_rows(
     p: MapParameters | None = None,
     overlap_p: OverlapParameters | None = None,
     ahead: Sequence[bool] | None = None,
+    rendered: Sequence[bool] | None = None,
 ) -> ViewsOf:
     """Return a function that gives `localize` the map's frames, where all poses are in memory.
 
@@ -247,6 +248,7 @@ def views_of_rows(
     parents : parent frame of every row; default: one for all
     p, overlap_p : see there
     ahead : of every row, whether its sensor looks along z; default: all do
+    rendered : of every row, whether it is a view rendered from a surface; default: none is
     """
 
     def views_of(parent: str, at: Floats) -> MapViews:  # noqa: ARG001
@@ -259,6 +261,7 @@ def views_of_rows(
             overlap_p or OverlapParameters(),
             [k for k, i in enumerate(own) if i in tried],
             None if ahead is None else [ahead[i] for i in own],
+            None if rendered is None else [rendered[i] for i in own],
         )
 
     return views_of

@@ -17,7 +17,7 @@ import numpy as np
 from sceneprint.geometry.registration.icp import error_of, transported
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.rigid import inverse
-from sceneprint.geometry.validation.confidence import ConfidenceParameters, PlaceEvidence
+from sceneprint.geometry.validation.confidence import ConfidenceModel, PlaceEvidence
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
     MapViews,
@@ -52,7 +52,7 @@ class LocalizationParameters:
     rivals: int = 2  #: frames elsewhere that are compared before a pose is found, at most
     rival_distance: float = 1.2  #: times that of the farthest match for the pose, at most
     map: MapParameters = field(default_factory=MapParameters)
-    judgement: ConfidenceParameters = field(default_factory=ConfidenceParameters)
+    judgement: ConfidenceModel = field(default_factory=ConfidenceModel)
 
     @classmethod
     def of(cls, answer: AnswerParameters) -> LocalizationParameters:
@@ -393,7 +393,7 @@ def _evidence(
     if pose is None:
         return PlaceEvidence(
             0.0, 0.0, 0.0, 0, 0, 1.0, weight, strong, accepted, suggesting, similarity,
-            1.0, rival_weight,
+            1.0, rival_weight, views.mostly_rendered(()),
         )  # fmt: skip
     agreeing = np.unique([i for _, i in pose.views]).astype(np.intp)
     seen_from = len(different_views(views.poses[agreeing], p.map))
@@ -402,4 +402,5 @@ def _evidence(
     return PlaceEvidence(
         pose.score, pose.share, pose.planes, len(agreeing), seen_from, excess, weight, strong,
         accepted, suggesting, similarity, ratio, rival_weight,
+        views.mostly_rendered(agreeing),
     )  # fmt: skip

@@ -15,7 +15,12 @@ from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import inverse
-from sceneprint.geometry.validation.confidence import KNOTS, ConfidenceParameters, Penalty
+from sceneprint.geometry.validation.confidence import (
+    KNOTS,
+    ConfidenceModel,
+    ConfidenceParameters,
+    Penalty,
+)
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
     MapViews,
@@ -352,7 +357,7 @@ SAME, FARTHER, NEARER, NOTHING = 0.0, 20.0, -10.0, math.nan
 #: Lengths do not grow with depth, poses are not refined, and the map is not asked for its noise.
 FIXED = OverlapParameters(growth=0)
 #: Odds of e^8 with the best evidence; 0.99 alone is e^4.6. Only these kinds cost anything.
-JUDGEMENT = ConfidenceParameters(
+_OF_FRAMES = ConfidenceParameters(
     best=8.0,
     planes=Penalty(9.0, 5.0, 0.0),  # 0 from 12 planes on, 5 at 6
     excess=Penalty(8.0, 6.0, 3.0),  # 3 at 5 %, 6 at 12 %
@@ -364,6 +369,8 @@ JUDGEMENT = ConfidenceParameters(
         if name not in ("planes", "excess", "rival", "suggested")
     },
 )
+#: Of views of a surface, what is missing says nothing.
+JUDGEMENT = ConfidenceModel(_OF_FRAMES, replace(_OF_FRAMES, excess=Penalty(0.0, 0.0, 0.0)))
 BY_HAND = LocalizationParameters(map=MapParameters(n_refining=0, n_noise=0), judgement=JUDGEMENT)
 #: Places of the map lie so far apart, metres: what one shows tells nothing of another.
 APART = 100.0
@@ -396,14 +403,16 @@ def picture(*tiles: tuple[int, float]) -> Geometry:
 WHOLE = picture((TILES, SAME))
 
 
-def told_by(*places: Sequence[Geometry], parent: str = "") -> ViewsOf:
+def told_by(
+    *places: Sequence[Geometry], parent: str = "", rendered: Sequence[bool] | None = None
+) -> ViewsOf:
     """A map with these pictures at each place, in the parent frame of that name alone."""
     pictures = [one for place in places for one in place]
     poses = [shifted(APART * k) for k, place in enumerate(places) for _ in place]
 
     def views_of(asked: str, at: Floats) -> MapViews:
         opened = pictures.__getitem__ if asked == parent else lambda _: None
-        return MapViews(np.stack(poses), opened, BY_HAND.map, FIXED)
+        return MapViews(np.stack(poses), opened, BY_HAND.map, FIXED, rendered=rendered)
 
     return views_of
 
@@ -585,6 +594,25 @@ def test_violations_that_the_map_shows_of_itself_are_borne(
     found = judged(seen_at(0.0, [0]), frames, query=query, p=noisy)
     assert found.alternatives[0].evidence is not None
     assert found.alternatives[0].evidence.excess == pytest.approx(excess)
+
+
+@pytest.mark.parametrize(
+    ("rendered", "status"), [((False, True, False), "ambiguous"), ((False, True, True), "found")]
+)
+def test_most_of_the_frames_that_agree_decide_what_a_map_is_made_of(
+    rendered: Sequence[bool], status: str
+) -> None:
+    """A tenth is missing, for which frames of a sensor pay and rendered views do not."""
+    query = picture((40, SAME))
+    frames = [picture((36, SAME), (4, FARTHER))] * 3
+    views_of = told_by(frames, [picture()], rendered=[*rendered, True])
+    matches = seen_at(0.0, [0, 1, 2])
+    found = localize([QueryFrame(query, matches)], ROWS, None, views_of, p=BY_HAND, overlap_p=FIXED)
+    assert found is not None
+    assert found.status == status
+    assert found.evidence is not None
+    assert found.evidence.rendered == (status == "found")
+    assert found.evidence.excess == pytest.approx(0.1)
 
 
 def test_a_pose_that_refines_to_another_is_no_rival(

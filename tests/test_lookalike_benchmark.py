@@ -7,6 +7,7 @@ import math
 import pytest
 
 from benchmarks.lookalikes import ask_site
+from sceneprint.lab.evaluation import sites
 from sceneprint.lab.evaluation.protocol import Error, JudgedAnswer
 from sceneprint.lab.evaluation.sites import kinds_of
 from sceneprint.lab.synth.lookalike_surveys import SURVEYED_KINDS
@@ -60,6 +61,16 @@ def test_the_answer_of_a_scanner_may_be_five_times_as_far_off() -> None:
         assert (seen.right, seen.grossly_wrong) == (right, gross)
     turned = JudgedAnswer("found", "weak", Error(0.0, math.radians(16)), limits=SCAN)
     assert (turned.right, turned.grossly_wrong) == (False, True)
+
+
+def test_a_site_whose_map_is_one_surface_is_asked_of_views(
+    small_signer: Signer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sites, "VIEWS", 12)
+    answers = ask_site(small_signer, ("object", 0, 1), seed=5, as_surface=True)
+    places = [place for one in answers for place in one.answer.places]
+    assert places
+    assert all(place.evidence.rendered for place in places)
 
 
 @pytest.mark.thorough

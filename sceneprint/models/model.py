@@ -40,7 +40,7 @@ from sceneprint.geometry.signature.segmentation import (
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters, NormalParameters
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, AmbiguityParameters
-from sceneprint.geometry.validation.confidence import ConfidenceParameters
+from sceneprint.geometry.validation.confidence import ConfidenceModel
 from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.types import Floats32
@@ -80,7 +80,7 @@ class AnswerParameters:
     """The numbers by which poses are judged on a map; signatures and artifacts do without them."""
 
     map: MapParameters = field(default_factory=MapParameters)
-    confidence: ConfidenceParameters = field(default_factory=ConfidenceParameters)
+    confidence: ConfidenceModel = field(default_factory=ConfidenceModel)
 
 
 @dataclass(frozen=True, eq=False)

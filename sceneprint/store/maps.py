@@ -415,14 +415,15 @@ def _pose_of_text(text: str) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class PlacedFrame:
-    """A posed frame: its number, T_parent_sensor (4, 4), the blob of its geometry, and whether it
-    is a point cloud.
+    """A posed frame: its number, T_parent_sensor (4, 4), the blob of its geometry, whether it is a
+    point cloud, and its tags.
     """
 
     number: int
     pose: Floats
     geometry: str
     is_cloud: bool
+    tags: Sequence[str]
 
 
 def placed_frames(
@@ -446,8 +447,8 @@ def placed_frames(
     for axis, middle in zip("xyz", centre, strict=True):
         values |= {axis: middle, f"least_{axis}": middle - within, f"most_{axis}": middle + within}
     return [
-        PlacedFrame(number, _pose_of_text(pose), geometry, is_cloud)
-        for number, pose, geometry, is_cloud in connection.execute(_placed_frames(), values)
+        PlacedFrame(number, _pose_of_text(pose), geometry, is_cloud, tags)
+        for number, pose, geometry, is_cloud, tags in connection.execute(_placed_frames(), values)
     ]
 
 
@@ -460,7 +461,7 @@ def _placed_frames() -> Select[Any]:
         for axis, column in columns.items()
     )
     return (
-        select(c.number, cast(c.pose, TEXT), signatures.c.geometry, c.cloud.is_not(null()))
+        select(c.number, cast(c.pose, TEXT), signatures.c.geometry, c.cloud.is_not(null()), c.tags)
         .join(signatures, signatures.c.frame_number == c.number)
         .where(
             c.map_number == bindparam("map_number"),

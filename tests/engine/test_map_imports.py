@@ -18,9 +18,10 @@ from sceneprint.engine.ingest.map_import import StoredSurface, weak_areas
 from sceneprint.engine.jobs.lifecycle import cancel
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
 from sceneprint.engine.maps.map_lifecycle import edit_map
+from sceneprint.engine.search.query import localization_of
 from sceneprint.errors import InvalidRequest, LostLease, QuotaExceeded, UnreadableCloud
-from sceneprint.settings import Settings
 from sceneprint.lab.synth.rooms import make_room
+from sceneprint.settings import Settings
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import files_of
 from sceneprint.types import ReferenceSurface
@@ -129,6 +130,10 @@ def test_a_room_becomes_a_map_in_which_it_is_found(
     assert (progress.tested, progress.done) == (result.tested, progress.total)
     # neither the file nor what was read of it is left
     assert used_bytes(chosen) == sum(one.bytes for one in frames)
+    # most frames that bear a pose out are read beside the one candidate
+    query = Query(candidates=1, keep=False)
+    there = localization_of(chosen.query_frame("hall", frames[0].frame_id, query))
+    assert (there.evidence or there.alternatives[0].evidence).rendered  # type: ignore[union-attr]
     items = chosen.imports.items("hall", job_id, limit=1000).items
     assert {one.frame_id for one in items} - {None} == {one.frame_id for one in frames}
 
@@ -237,11 +242,6 @@ def test_a_surface_needs_room_beyond_that_of_its_file(empty: Engine) -> None:
     assert used_bytes(empty) == len(data)
 
 
-def test_files_that_are_no_map_are_refused(empty: Engine, room_mesh: bytes) -> None:
-    for data in (b"", b"no map at all", b"PK\x03\x04" + bytes(600)):
-        with pytest.raises((UnreadableCloud, InvalidRequest)):
-            begun(empty, data, name="room")
-    assert list(empty.store.blobs.digests()) == []
 #: Where a room lies in the coordinates of a country, metres.
 FAR = np.array([431_000.25, 5_411_000.5, 300.0])
 
@@ -297,6 +297,11 @@ def test_files_in_one_parent_frame_need_one_offset(empty: Engine) -> None:
     assert empty.get_job(again.job.id).error is None
 
 
+def test_files_that_are_no_map_are_refused(empty: Engine, room_mesh: bytes) -> None:
+    for data in (b"", b"no map at all", b"PK\x03\x04" + bytes(600)):
+        with pytest.raises((UnreadableCloud, InvalidRequest)):
+            begun(empty, data, name="room")
+    assert list(empty.store.blobs.digests()) == []
     job = begun(empty, room_mesh[: len(room_mesh) // 2])
     assert empty.run(claimed(empty)) == JobState.FAILED
     assert "room.ply" in str(empty.get_job(job.job_id).error)

@@ -10,6 +10,7 @@ import pytest
 
 from sceneprint.geometry.validation.confidence import (
     KNOTS,
+    ConfidenceModel,
     ConfidenceParameters,
     Penalty,
     PlaceEvidence,
@@ -58,7 +59,7 @@ def test_what_was_drawn_from_a_model_is_learnt_again() -> None:
     samples = []
     for number in range(4000):
         pair = (drawn(rng), drawn(rng))
-        confidences = confidences_of(pair, TRUTH)
+        confidences = confidences_of(pair, ConfidenceModel(TRUTH))
         which = int(rng.choice(3, p=[*confidences, 1.0 - sum(confidences)]))
         samples.append(
             JudgedQuery("site", "rooms", number, pair, tuple(k == which for k in range(2)))
@@ -68,7 +69,9 @@ def test_what_was_drawn_from_a_model_is_learnt_again() -> None:
     off = [
         abs(a - b)
         for pair in tried
-        for a, b in zip(confidences_of(pair, learnt), confidences_of(pair, TRUTH), strict=True)
+        for a, b in zip(
+            *(confidences_of(pair, ConfidenceModel(one)) for one in (learnt, TRUTH)), strict=True
+        )
     ]
     assert float(np.mean(off)) < 0.03
     # no penalty falls with worse evidence
@@ -83,7 +86,7 @@ def test_kinds_count_by_their_shares() -> None:
     samples = [JudgedQuery("a", "rooms", k, (e,), (True,)) for k in range(30)]
     samples += [JudgedQuery("b", "absent", k, (e,), (False,)) for k in range(90)]
     learnt = fit(samples, {"rooms": 3.0, "absent": 1.0}, ridge=0.0)
-    assert confidences_of([e], learnt) == pytest.approx([0.75], abs=1e-3)
+    assert confidences_of([e], ConfidenceModel(learnt)) == pytest.approx([0.75], abs=1e-3)
 
 
 def test_a_calibration_by_hand() -> None:

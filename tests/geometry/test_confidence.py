@@ -9,6 +9,7 @@ import pytest
 
 from sceneprint.geometry.validation.confidence import (
     KNOTS,
+    ConfidenceModel,
     ConfidenceParameters,
     Penalty,
     PlaceEvidence,
@@ -22,11 +23,14 @@ P = ConfidenceParameters(
     best=6.0,
     **{name: Penalty(3.0, 2.0, 1.0) for name in KNOTS},
 )
+#: Rendered views cost one kind of evidence more, and another nothing.
+VIEWS = replace(P, excess=Penalty(0.0, 0.0, 0.0), rival=Penalty(9.0, 6.0, 3.0))
+JUDGEMENT = ConfidenceModel(P, VIEWS)
 
 
 def test_the_best_evidence_costs_nothing() -> None:
     assert set(penalties_of(BEST, P).values()) == {0.0}
-    assert confidences_of([BEST], P) == pytest.approx([1 / (1 + math.exp(-6.0))])
+    assert confidences_of([BEST], JUDGEMENT) == pytest.approx([1 / (1 + math.exp(-6.0))])
 
 
 def test_a_penalty_is_linear_between_its_knots() -> None:
@@ -36,7 +40,7 @@ def test_a_penalty_is_linear_between_its_knots() -> None:
     for rival, penalty in ((1.5, 3.0), (0.9, 2.5), (0.5, 1.0), (0.35, 0.5), (0.2, 0.0)):
         assert penalties_of(replace(BEST, rival=rival), P)["rival"] == pytest.approx(penalty)
     two = replace(BEST, planes=12.0, rival=0.8)
-    assert confidences_of([two], P) == pytest.approx([1 / (1 + math.exp(-3.0))])
+    assert confidences_of([two], JUDGEMENT) == pytest.approx([1 / (1 + math.exp(-3.0))])
 
 
 def test_accepted_matches_count_by_the_frames_that_see_the_place() -> None:
@@ -48,9 +52,9 @@ def test_accepted_matches_count_by_the_frames_that_see_the_place() -> None:
 def test_candidates_share_what_one_of_them_has() -> None:
     """Odds of e^6 and e^5 against 1 that none is right."""
     whole = 1 + math.exp(6.0) + math.exp(5.0)
-    found = confidences_of([BEST, replace(BEST, planes=12.0)], P)
+    found = confidences_of([BEST, replace(BEST, planes=12.0)], JUDGEMENT)
     assert found == pytest.approx([math.exp(6.0) / whole, math.exp(5.0) / whole])
-    assert confidences_of([], P) == []
+    assert confidences_of([], JUDGEMENT) == []
 
 
 @pytest.mark.parametrize("name", KNOTS)
@@ -60,11 +64,23 @@ def test_better_evidence_never_lowers_a_confidence(name: str) -> None:
     # five frames or more see the place, and each accepted match is a fifth
     field, times = ("accepted", 5.0) if name == "acceptance" else (name, 1.0)
     tried = [replace(BEST, **{field: times * x}) for x in steps]
-    found = [confidences_of([e], ConfidenceParameters())[0] for e in tried]
+    found = [confidences_of([e], ConfidenceModel())[0] for e in tried]
     assert found == sorted(found)
 
 
+def test_rendered_views_have_numbers_of_their_own() -> None:
+    """5 % excess costs 1 beside frames and nothing beside views; a rival of .8 costs 2, or 6."""
+    at_once = replace(BEST, excess=0.05), replace(BEST, rival=0.8, rendered=True)
+    whole = 1 + math.exp(5.0) + math.exp(0.0)
+    assert confidences_of(at_once, JUDGEMENT) == pytest.approx(
+        [math.exp(5.0) / whole, math.exp(0.0) / whole]
+    )
+    weak = replace(BEST, excess=0.1, rival=0.4)
+    assert "10%" in weakest_evidence(weak, JUDGEMENT)
+    assert "another pose" in weakest_evidence(replace(weak, rendered=True), JUDGEMENT)
+
+
 def test_the_reason_names_what_costs_most() -> None:
-    assert "only 5 distinct planes" in weakest_evidence(replace(BEST, planes=5.0), P)
-    assert "another pose" in weakest_evidence(replace(BEST, planes=12.0, rival=0.9), P)
-    assert "14%" in weakest_evidence(replace(BEST, excess=0.14), P)
+    assert "only 5 distinct planes" in weakest_evidence(replace(BEST, planes=5.0), JUDGEMENT)
+    assert "another pose" in weakest_evidence(replace(BEST, planes=12.0, rival=0.9), JUDGEMENT)
+    assert "14%" in weakest_evidence(replace(BEST, excess=0.14), JUDGEMENT)

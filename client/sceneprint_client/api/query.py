@@ -279,6 +279,11 @@ class EvidenceRecord(ApiRecord):
     rival_weight: float = Field(
         description="Largest weight of the matches that vote for another place."
     )
+    rendered: bool = Field(
+        default=False,
+        description="Whether most of these frames are views rendered from a surface that was "
+        "imported as a map. The same numbers then give another confidence.",
+    )
 
 
 _CONFIDENCE = "Probability that the pose is right, 0 to 1. Null where the map was not asked."

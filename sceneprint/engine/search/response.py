@@ -181,7 +181,10 @@ def evidence_record(evidence: PlaceEvidence | None) -> EvidenceRecord | None:
     """Return the evidence for a pose as JSON; shares are rounded to a tenth of 1 %."""
     if evidence is None:
         return None
-    rounded = {name: round(value, 3) for name, value in asdict(evidence).items()}
+    rounded = {
+        name: round(value, 3) if isinstance(value, float) else value
+        for name, value in asdict(evidence).items()
+    }
     return EvidenceRecord.model_validate(rounded)
 
 

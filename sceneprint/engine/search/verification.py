@@ -42,6 +42,7 @@ from sceneprint.store.maps import (
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Prior, Query, ValidationOptions
+from sceneprint_client.api.frames import VIRTUAL
 from sceneprint_client.api.query import FARTHEST_PRIOR, LEAST_DEVIATION, MOST_DEVIATION
 
 #: Candidates that are validated for the pose of a query, unless it gives a number: more cost time.
@@ -210,6 +211,7 @@ def placed(
         numbers = sorted({*known, *near})
         at_poses = [poses[n] if n in known else near[n].pose for n in numbers]
         ahead = [rows[n].cloud is None if n in known else not near[n].is_cloud for n in numbers]
+        rendered = [VIRTUAL in (rows[n] if n in known else near[n]).tags for n in numbers]
 
         def open_view(i: int) -> Geometry | None:
             number = numbers[i]
@@ -222,7 +224,7 @@ def placed(
 
         stack = np.array(at_poses).reshape(-1, 4, 4)
         first = [i for i, number in enumerate(numbers) if number in known]
-        return MapViews(stack, open_view, own_p.map, agreement, first, ahead)
+        return MapViews(stack, open_view, own_p.map, agreement, first, ahead, rendered)
 
     asks_map = None if _is_paper(query) else views_of
     return localize(frames, poses, parents, asks_map, prior, own_p, agreement)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -42,6 +42,7 @@ class PlaceEvidence:
     similarity : of the signatures of the query and the nearest of these candidates, 0 to 1
     rival : score of the best other place, relative to this one's; 0 where there is none
     rival_weight : largest weight of the votes for another place
+    rendered : whether most of these frames are views rendered from one surface
     """
 
     score: float
@@ -57,6 +58,7 @@ class PlaceEvidence:
     similarity: float
     rival: float
     rival_weight: float
+    rendered: bool = False
 
     @property
     def acceptance(self) -> float:
@@ -127,6 +129,28 @@ class ConfidenceParameters:
     rival_weight: Penalty = Penalty(4.0, 2.0, 1.0)
 
 
+@dataclass(frozen=True)
+class ConfidenceModel:
+    """The numbers of the confidence, by what the map is made of.
+
+    Views of one surface agree with each other perfectly, whatever is wrong with that surface: they
+    show no violations among themselves that could be allowed for. So free space that a real frame
+    violates says less there, and the other kinds of evidence have to say more.
+
+    Parameters
+    ----------
+    frames : where the map has frames of a sensor
+    views : where it has views rendered from a surface
+    """
+
+    frames: ConfidenceParameters = field(default_factory=ConfidenceParameters)
+    views: ConfidenceParameters = field(default_factory=ConfidenceParameters)
+
+    def of(self, e: PlaceEvidence) -> ConfidenceParameters:
+        """Return the numbers for a pose."""
+        return self.views if e.rendered else self.frames
+
+
 def penalties_of(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, float]:
     """Return how much each kind of evidence reduces the log odds: >= 0, by name."""
     penalties = {}
@@ -138,26 +162,26 @@ def penalties_of(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, float]:
     return penalties
 
 
-def confidences_of(evidence: Sequence[PlaceEvidence], p: ConfidenceParameters) -> list[float]:
+def confidences_of(evidence: Sequence[PlaceEvidence], p: ConfidenceModel) -> list[float]:
     """Return the probability of each candidate pose of a query to be the right one.
 
     Parameters
     ----------
     evidence : of every candidate of one query, each of another place
-    p : see ConfidenceParameters
+    p : see ConfidenceModel
 
     Returns
     -------
     confidences : in the same order; 1 less their sum is the probability that none is right
     """
-    odds = [math.exp(p.best - sum(penalties_of(e, p).values())) for e in evidence]
+    odds = [math.exp(p.of(e).best - sum(penalties_of(e, p.of(e)).values())) for e in evidence]
     whole = 1.0 + sum(odds)
     return [one / whole for one in odds]
 
 
-def weakest_evidence(e: PlaceEvidence, p: ConfidenceParameters) -> str:
+def weakest_evidence(e: PlaceEvidence, p: ConfidenceModel) -> str:
     """Return a sentence on the evidence that lowers the confidence of a pose most."""
-    penalties = penalties_of(e, p)
+    penalties = penalties_of(e, p.of(e))
     name = max(penalties, key=penalties.__getitem__)
     return {
         "score": f"the map shows only {e.share:.0%} of what the frame sees",

@@ -132,7 +132,7 @@ class MapViews:
     def __init__(
         self, poses: Floats, open_geometry: Callable[[int], Geometry | None],
         p: MapParameters, overlap_p: OverlapParameters, candidates: Sequence[int] = (),
-        ahead: Sequence[bool] | None = None,
+        ahead: Sequence[bool] | None = None, rendered: Sequence[bool] | None = None,
     ) -> None:  # fmt: skip
         """Hold frames by their poses.
 
@@ -144,10 +144,12 @@ class MapViews:
         candidates : positions of those that poses are first compared on, being open already;
             none: all
         ahead : of each, whether its sensor looks along z, as depth cameras do; default: all do
+        rendered : of each, whether it is a view rendered from a surface; default: none is
         """
         self.poses, self._open, self._p, self._overlap = poses, open_geometry, p, overlap_p
         self.candidates = np.array(candidates, np.intp)
         self._ahead = np.ones(len(poses), bool) if ahead is None else np.array(ahead, bool)
+        self._rendered = np.array([False] * len(poses) if rendered is None else rendered, bool)
         self._frames: dict[int, MapFrame | None] = {}
 
     def __getitem__(self, i: int) -> MapFrame | None:
@@ -158,6 +160,14 @@ class MapViews:
                 geometry, self.poses[i], self._p, self._overlap
             )  # fmt: skip
         return self._frames[i]
+
+    def mostly_rendered(self, frames: Sequence[int] | NDArray[np.intp]) -> bool:
+        """Return whether more than half of some frames are views rendered from a surface.
+
+        Of all, where none is named.
+        """
+        among = self._rendered[list(frames)] if len(frames) else self._rendered
+        return 2 * int(among.sum()) > len(among)
 
     def near(self, T: Floats, ahead: bool, among: NDArray[np.intp] | None = None) -> list[int]:
         """Return the frames that most likely see what a sensor at T sees, nearest first.

@@ -128,6 +128,7 @@ class Judge:
     answer : of the model
     confidence : least of a pose that is found
     unrelated_distance : of the model, by which distances are similarities
+    rendered : whether the frames of the map are views rendered from a surface
     """
 
     geometry: Callable[[int], Geometry]
@@ -139,6 +140,7 @@ class Judge:
     answer: AnswerParameters = field(default_factory=AnswerParameters)
     confidence: float = LocalizationParameters.confidence
     unrelated_distance: float = math.inf
+    rendered: bool = False
 
 
 def open_judge(
@@ -279,8 +281,9 @@ class _Recording:
         p, agreement = self.p, self._judging.p.agreement
         ahead = [looks_ahead(self.query)] * len(self._poses)  # a recording has one sensor
         views_of = views_of_rows(
-            frames[-1].matches, self._poses, self._geometry, self._scenes, p.map, agreement, ahead
-        )
+            frames[-1].matches, self._poses, self._geometry, self._scenes, p.map, agreement, ahead,
+            [self._judging.rendered] * len(self._poses),
+        )  # fmt: skip
         asks_map = views_of if self._judging.mode == "full" else None
         return localize(frames, self._poses, self._scenes, asks_map, self._prior, p, agreement)
 

@@ -12,8 +12,10 @@ import numpy as np
 
 from sceneprint.errors import UselessFrame
 from sceneprint.geometry.rigid import turned
+from sceneprint.geometry.views import view_parameters
 from sceneprint.lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
 from sceneprint.lab.evaluation.protocol import JudgedAnswer, SignedFrame, overlaps, view_of
+from sceneprint.lab.evaluation.surface_maps import join_frames, render_views
 from sceneprint.lab.synth import synthesise_lookalike, synthesise_lookalike_survey
 from sceneprint.lab.synth.lookalike_surveys import SURVEYED_KINDS
 from sceneprint.lab.synth.lookalikes import KINDS, ORDINARY, LookalikeSite
@@ -29,6 +31,10 @@ ANSWERABLE = 0.3
 ANSWERABLE_M = 10.0
 #: Deviations that a robot states with its prior, and how far that is turned at most, degrees.
 PRIOR_M, PRIOR_DEG = 0.3, 10.0
+#: Least and greatest side of the voxels of a surface that a site's map is joined to, metres.
+CLOUD_VOXEL_M, MESH_VOXEL_M = (0.05, 0.2), (0.015, 0.03)
+#: Views of such a surface, at most.
+VIEWS = 150
 
 
 @dataclass(frozen=True)
@@ -145,6 +151,7 @@ def ask_site(
     prior: tuple[float, float] | None = None,
     flaws: MapFlaws | None = None,
     confidence: float | None = None,
+    as_surface: bool = False,
 ) -> list[SiteAnswer]:
     """Build one site and ask all its queries.
 
@@ -158,6 +165,7 @@ def ask_site(
     prior : least and most metres that the robot's prior is off; None: it has none
     flaws : of the map; None: it has all frames, and true poses
     confidence : least of a pose that is found; default: that of LocalizationParameters
+    as_surface : whether the map is one surface, joined from its frames, of which views are rendered
     """
     kind, index, queries = work
     of_scans = _is_of_scans(signer.model)
@@ -167,18 +175,24 @@ def ask_site(
         if of_scans
         else synthesise_lookalike(kind, seed, index, queries=queries)
     )
-    frames = site.map if flaws is None else with_flaws(site.map, flaws, rng)
+    frames: Sequence[AnyFrame] = site.map if flaws is None else with_flaws(site.map, flaws, rng)
+    if as_surface:
+        frames = _views_of(frames, signer.model, rng)
     shown, database, of_map = signed(frames, site.name, signer, 0)
     # of another place: a pose in its own frame is a pose in no map
     scene = site.name if site.same_frame else f"{site.name}, elsewhere"
     sent, queries_signed, of_queries = signed(site.queries, scene, signer, len(database))
+    if not database:
+        nothing = JudgedAnswer()
+        return [SiteAnswer(site.name, kind, n, False, nothing) for n in range(len(queries_signed))]
     priors = [
         None if prior is None else prior_about(query.pose, site.name, *prior, rng)
         for query in queries_signed
     ]
     answers = answers_of(
-        signer, database, queries_signed, [*of_map, *of_queries], candidates, priors, confidence
-    )
+        signer, database, queries_signed, [*of_map, *of_queries], candidates, priors, confidence,
+        as_surface,
+    )  # fmt: skip
     able = _answerable(site, shown, sent)
     return [
         SiteAnswer(site.name, kind, number, able[number], answer)
@@ -186,10 +200,20 @@ def ask_site(
     ]
 
 
+def _views_of(
+    frames: Sequence[AnyFrame], model: Model, rng: np.random.Generator
+) -> Sequence[AnyFrame]:
+    """Return views of the surface that frames show together, and that somebody brings as a map."""
+    voxel = rng.uniform(*(CLOUD_VOXEL_M if _is_of_scans(model) else MESH_VOXEL_M))
+    surface = join_frames(frames, float(voxel), np.array([0.0, 0.0, 1.0]))
+    return render_views(surface, replace(view_parameters(model.parameters), most_views=VIEWS))[1]
+
+
 def answers_of(
     signer: Signer, database: Sequence[SignedFrame], queries: Sequence[SignedFrame],
     geometries: Sequence[Geometry], candidates: int = 10,
     priors: Sequence[PosePrior | None] | None = None, confidence: float | None = None,
+    rendered: bool = False,
 ) -> list[JudgedAnswer]:  # fmt: skip
     """Answer queries on a map of some frames, as a service does.
 
@@ -201,11 +225,12 @@ def answers_of(
     candidates : size of C
     priors : of each query; None: it has none
     confidence : see `ask_site`
+    rendered : whether the frames of the map are views rendered from a surface
     """
     model = signer.model
     judge = Judge(
         geometries.__getitem__, "full", 0, model.parameters.validation, database=database,
-        answer=model.answer, unrelated_distance=model.unrelated_distance,
+        answer=model.answer, unrelated_distance=model.unrelated_distance, rendered=rendered,
     )  # fmt: skip
     if confidence is not None:
         judge = replace(judge, confidence=confidence)

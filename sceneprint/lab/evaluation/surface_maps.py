@@ -1,0 +1,71 @@
+"""Join the frames of a map to one surface, and render views of it.
+
+frames  --join_frames-->  ReferenceSurface  --render_views-->  views, frames with poses
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sceneprint.fusion import FusionParameters, fuse
+from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.views import Renderer, ViewParameters, ViewPlan, choose_views
+from sceneprint.types import AnyFrame, Cloud, DepthFrame, Floats, Intrinsics, ReferenceSurface
+
+#: Most blocks of a fused mesh, and the farthest depth that goes into it, metres.
+_FUSION = FusionParameters(most_blocks=400_000, farthest_m=4.0)
+
+
+def join_frames(frames: Sequence[AnyFrame], voxel_m: float, up: Floats) -> ReferenceSurface:
+    """Return the surface that frames with poses show together.
+
+    Parameters
+    ----------
+    frames : all clouds, which become one cloud with a point a voxel; or all depth images, which
+        become a mesh
+    voxel_m : side of the voxels, metres
+    up : (3,) in the parent frame
+
+    Raises
+    ------
+    MissingDependency, UselessFrame, InvalidRequest : see `fuse`
+    """
+    clouds = [(one.points, one.pose) for one in frames if isinstance(one, Cloud)]
+    if not clouds:
+        depth = [one for one in frames if isinstance(one, DepthFrame)]
+        mesh, _ = fuse(depth, replace(_FUSION, voxel_m=voxel_m))
+        return ReferenceSurface(mesh.points.astype(np.float32), mesh.triangles, np.zeros(3), up)
+    points = np.concatenate(
+        [moved(T, points.astype(np.float64)) for points, T in clouds if T is not None]
+    )
+    _, cell, counts = np.unique(
+        np.floor(points / voxel_m).astype(np.int64), axis=0,
+        return_inverse=True, return_counts=True,
+    )  # fmt: skip
+    sums = np.stack([np.bincount(cell.ravel(), points[:, k]) for k in range(3)], axis=1)
+    means = (sums / counts[:, None]).astype(np.float32)
+    return ReferenceSurface(means, None, np.zeros(3), up)
+
+
+def render_views(
+    surface: ReferenceSurface, p: ViewParameters
+) -> tuple[ViewPlan, list[AnyFrame]]:  # fmt: skip
+    """Return the views of a surface that a map is made of, as frames with poses.
+
+    Parameters
+    ----------
+    surface, p : see `choose_views`
+    """
+    plan, renderer = choose_views(surface, p), Renderer(surface, p)
+    frames: list[AnyFrame] = []
+    for number, pose in enumerate(plan.poses):
+        seen, name = renderer.view(pose), f"view-{number:06d}"
+        frames.append(
+            DepthFrame(seen, p.camera, name, pose)
+            if isinstance(p.camera, Intrinsics)
+            else Cloud(seen, name=name, pose=pose)
+        )
+    return plan, frames
