@@ -227,6 +227,21 @@ class TransformTree:
             up.append(came[up[-1]])
         return up[::-1]
 
+    def leaves(self, frame: str) -> list[str]:
+        """Frames below one that have none below them."""
+        parents = {one for edges in self._edges.values() for one in edges}
+        return [
+            one for one in sorted(self._edges.keys() - parents) if self.path(frame, one) is not None
+        ]
+
+    def moves_below(self, frame: str) -> bool:
+        """Whether a frame directly below one moves in it."""
+        return any(
+            not self._holds_still(frame, child)
+            for child, edges in self._edges.items()
+            if frame in edges
+        )
+
     def base_of(self, sensor: str, world: str | None) -> str | None:
         """The frame of the robot that carries a sensor; None where nothing tells.
 

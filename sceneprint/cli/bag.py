@@ -47,6 +47,12 @@ def add_recording_options(command: argparse.ArgumentParser) -> None:
         help="frame that poses lead to (default: map, else odom, else the topmost frame)",
     )
     group.add_argument(
+        "--sensor-frame",
+        metavar="FRAME",
+        help="frame of the sensor, of points that are in the frame of the world (default: the only "
+        "one at the end of the transforms below it)",
+    )
+    group.add_argument(
         "--keyframe-m",
         type=_from_zero,
         default=_DEFAULT.keyframe_m,
@@ -102,6 +108,7 @@ def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]
             keyframe_m=options.keyframe_m,
             keyframe_deg=options.keyframe_deg,
             keyframe_s=options.keyframe_s,
+            sensor_frame=options.sensor_frame,
             depth_scale=options.depth_scale,
             progress=progress,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -187,3 +188,74 @@ def test_a_fixed_transform_with_two_values_is_passed_over(
         "base_link -> camera is passed over as it is fixed, and has values that differ by 0.3 m or "
         "rad"
     )
+
+
+# Points in the frame of the world.
+
+
+def registered(ros: SimpleNamespace, writer: Any, *, frame: str, tf: str, leaf: str = "") -> None:
+    """Points ahead of a LiDAR that drives along a bend, in the frame of the world."""
+    if tf:
+        fixed = {("body", "lidar"): ros.transform(0.1, 0, 0.4)}
+        fixed |= {("body", leaf): np.eye(4)} if leaf else {}
+        writer.transforms(0.0, fixed, "/tf_static")
+    for i in range(4):
+        T = ros.transform(3.0 * i, 0.5 * i, 1, 0, 0, np.sin(0.2 * i), np.cos(0.2 * i))
+        if tf:
+            writer.transforms(float(i), {(frame, "body"): T})
+        T_world_lidar = T @ ros.transform(0.1, 0, 0.4)
+        rows = np.zeros(len(SEEN), [("x", "<f8"), ("y", "<f8"), ("z", "<f8")])
+        for axis, name in enumerate("xyz"):
+            rows[name] = (SEEN @ T_world_lidar[:3, :3].T + T_world_lidar[:3, 3])[:, axis]
+        writer.points(float(i), rows, "/cloud_registered", frame=frame)
+
+
+SEEN = np.array([[4.0 + 0.2 * i, i % 3 - 1.0, 0.1 * i] for i in range(12)])
+
+
+@pytest.mark.parametrize("frame", ["camera_init", "odom", "start"])
+def test_registered_clouds_are_taken_back_to_their_sensor(
+    frame: str, tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    (found,) = sequences(
+        ros, tmp_path, lambda writer: registered(ros, writer, frame=frame, tf="yes")
+    )
+    assert found.parent_frame == f"run/{frame}"
+    for i, one in enumerate(found.frames):
+        np.testing.assert_allclose(one.read().points, SEEN, atol=1e-5)
+        T = ros.transform(3.0 * i, 0.5 * i, 1, 0, 0, np.sin(0.2 * i), np.cos(0.2 * i))
+        np.testing.assert_allclose(one.pose, T @ ros.transform(0.1, 0, 0.4), atol=1e-9)
+    travelled = pickle.loads(pickle.dumps(found.frames[3]))
+    assert travelled.read_bytes() == found.frames[3].read_bytes()
+
+
+def test_registered_clouds_of_an_unknown_sensor_are_refused(
+    tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    path = ros.write(tmp_path, lambda w: registered(ros, w, frame="camera_init", tf=""))
+    with pytest.raises(DatasetError, match=r"are in camera_init, .* Record /tf or odometry"):
+        find_sequences(path, ALL)
+    two = ros.write(
+        tmp_path / "two", lambda w: registered(ros, w, frame="map", tf="yes", leaf="camera")
+    )
+    with pytest.raises(DatasetError, match="Choose one of camera, lidar with --sensor-frame"):
+        find_sequences(two, ALL)
+    (found,) = find_sequences(two, RecordingOptions(keyframe_m=0, sensor_frame="lidar"))
+    np.testing.assert_allclose(found.frames[2].read().points, SEEN, atol=1e-5)
+    with pytest.raises(DatasetError, match="'wheel' is not below"):
+        find_sequences(two, RecordingOptions(sensor_frame="wheel"))
+
+
+def test_points_in_the_base_of_a_robot_with_an_arm_stay_there(
+    tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    rows = np.ones(12, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+
+    def fill(writer: Any) -> None:
+        for i in range(3):
+            writer.transforms(0.1 * i, {("base_link", "hand"): ros.transform(0.1 * i, 0, 1)})
+            writer.points(0.1 * i, rows, frame="base_link")
+
+    (found,) = sequences(ros, tmp_path, fill)
+    assert [one.pose for one in found.frames] == [None] * 3
+    np.testing.assert_array_equal(found.frames[2].read().points, np.ones((12, 3)))

@@ -33,7 +33,15 @@ from sceneprint_client.errors import printable
 from sceneprint_client.files import naming
 from sceneprint_client.ros_messages import DEPTH_SCALE, camera_intrinsics
 from sceneprint_client.sidecars import Camera, CloudSource, find_camera
-from sceneprint_client.transforms import FASTEST, TOLERANCE_S, UnknownTransform, frame_name
+from sceneprint_client.transforms import (
+    BASES,
+    FASTEST,
+    TOLERANCE_S,
+    WORLDS,
+    TransformTree,
+    UnknownTransform,
+    frame_name,
+)
 
 # Which frames are taken: far enough from the last one, or long enough after it.
 
@@ -89,6 +97,7 @@ class RecordingOptions:
     keyframe_m, keyframe_deg : a frame is taken this far from the last one, or turned by this much;
         0 takes every frame
     keyframe_s : without poses, a frame is taken this long after the last one
+    sensor_frame : where the sensor is, of points in another frame
     depth_scale : stored units per metre of 16-bit depth; None: 1000, or as an intrinsics.json says
     progress : what to call while the bag is read
     """
@@ -99,6 +108,7 @@ class RecordingOptions:
     keyframe_m: float = 0.3
     keyframe_deg: float = 15.0
     keyframe_s: float = 0.5
+    sensor_frame: str | None = None
     depth_scale: float | None = None
     progress: Progress | None = None
 
@@ -142,7 +152,8 @@ def recording_sequences(
         {} if frames.encoding is None else _cameras(bag, frames, info, scan, options.depth_scale)
     )
     name = recording_name(path) if name is None else name
-    motions = _motions(bag, scan, frames, options)
+    sensor = _sensor(bag, scan, frames, options)
+    motions = _motions(bag, scan, frames, sensor, options)
     note = _note(frames, scan, motions)
     lenses = {camera.intrinsics for camera in cameras.values()}
     if len(lenses) > 1:
@@ -230,6 +241,50 @@ def recording_name(path: Path) -> str:
     return path.name if path.is_dir() else path.stem
 
 
+def _sensor(bag: Bag, scan: BagScan, frames: FrameTopic, options: RecordingOptions) -> str:
+    """The frame of the sensor: that of the messages, unless it is named, or points are in the frame
+    of the world, as those that FAST-LIO has registered.
+
+    Raises
+    ------
+    DatasetError : points are in the frame of the world, and transforms do not tell their sensor.
+    """
+    frame, trees = frames.frame, [part.tree for part in scan.parts]
+    wanted = options.sensor_frame
+    if frames.encoding is not None or (wanted is None and not _is_world(frame, trees)):
+        return frame
+    leaves = sorted({leaf for tree in trees for leaf in tree.leaves(frame)})
+    if wanted is None and len(leaves) == 1:
+        return leaves[0]
+    if wanted is not None and any(tree.path(frame, wanted) is not None for tree in trees):
+        return str(frame_name(wanted))
+    below = ", ".join(leaves[:20])
+    what = (
+        "where its sensor was is not known" if wanted is None else f"{wanted!r:.100} is not below"
+    )
+    remedy = f"Choose one of {below} with --sensor-frame" if below else "Record /tf or odometry"
+    raise DatasetError(
+        f"{bag.path}: The points of {frames.topic.name} are in {frame or 'no frame'}, and {what}. "
+        f"{remedy}, or take the topic of the raw scans."
+    )
+
+
+def _is_world(frame: str, trees: Sequence[TransformTree]) -> bool:
+    """Whether points in a frame have been taken out of the axes of the sensor that measured them:
+    it is called like a world, or sensors move in it and it moves in none.
+    """
+    name = frame.rpartition("/")[2]
+    if name in WORLDS or name == _WORLD_OF_LOAM:
+        return True
+    return name not in BASES and any(
+        tree.moves_below(frame) and tree.world_of(frame) is None for tree in trees
+    )
+
+
+#: What LOAM and FAST-LIO call the frame in which they started.
+_WORLD_OF_LOAM = "camera_init"
+
+
 @dataclass(eq=False)
 class _Motion:
     """Where the sensor was in one part of a recording, by the place of each frame.
@@ -240,6 +295,7 @@ class _Motion:
     base : frame of the robot; None where nothing tells
     poses, mountings : T_world_sensor and T_base_sensor of each frame, where known
     ups : up in the sensor's axes of each frame, where known
+    cloud_poses : T_cloud_sensor of each frame whose points are not in the axes of the sensor
     taken : places of the keyframes
     unknown : of the frames without a pose, why
     remarks : what else is to be said of transforms above the sensor
@@ -250,6 +306,7 @@ class _Motion:
     poses: dict[int, Floats] = field(default_factory=dict)
     mountings: dict[int, Floats] = field(default_factory=dict)
     ups: dict[int, Floats] = field(default_factory=dict)
+    cloud_poses: dict[int, Floats] = field(default_factory=dict)
     taken: list[int] = field(default_factory=list)
     unknown: dict[int, UnknownTransform] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
@@ -261,7 +318,7 @@ class _Motion:
 
 
 def _motions(
-    bag: Bag, scan: BagScan, frames: FrameTopic, options: RecordingOptions
+    bag: Bag, scan: BagScan, frames: FrameTopic, sensor: str, options: RecordingOptions
 ) -> list[_Motion]:
     """Of each part that has frames."""
     parts = [
@@ -271,26 +328,29 @@ def _motions(
     ]
     wanted = options.pose_frame
     trees = [part.tree for part, _ in parts]
-    if wanted is not None and all(tree.path(wanted, frames.frame) is None for tree in trees):
-        above = dict.fromkeys(one for tree in trees for one in tree.ancestors(frames.frame)[1:])
+    if wanted is not None and all(tree.path(wanted, sensor) is None for tree in trees):
+        above = dict.fromkeys(one for tree in trees for one in tree.ancestors(sensor)[1:])
         raise DatasetError(
-            f"{bag.path}: No transforms lead from {frames.frame or 'the sensor'} to "
+            f"{bag.path}: No transforms lead from {sensor or 'the sensor'} to "
             f"{wanted!r:.100}. Frames above it are {', '.join(above) or 'none'}."
         )
-    motions = [_motion(part, places, scan, frames, wanted) for part, places in parts]
+    motions = [
+        _motion(part, places, scan, (sensor, frames.frame), wanted) for part, places in parts
+    ]
     with_poses = any(motion.poses for motion in motions)
-    if not with_poses and any(motion.is_disputed for motion in motions):
+    is_elsewhere = sensor != frames.frame
+    if not with_poses and (is_elsewhere or any(motion.is_disputed for motion in motions)):
         return motions  # frames without poses would hide that the transforms are wrong
     for (part, places), motion in zip(parts, motions, strict=True):
-        _choose(motion, part, places, scan, frames.frame, options, with_poses=with_poses)
+        _choose(motion, part, places, scan, sensor, options, with_poses=with_poses)
     return motions
 
 
 def _motion(
-    part: BagPart, places: range, scan: BagScan, frames: FrameTopic, wanted: str | None
+    part: BagPart, places: range, scan: BagScan, names: tuple[str, str], wanted: str | None
 ) -> _Motion:
-    """Poses and mountings of one part."""
-    tree, sensor = part.tree, frames.frame
+    """Poses and mountings in one part of a sensor, and of it in the frame of its messages."""
+    tree, (sensor, frame) = part.tree, names
     stamps = [scan.stamps_ns[place] for place in places]
     world = frame_name(wanted or "") or tree.world_of(sensor)
     motion = _Motion(world, tree.base_of(sensor, world))
@@ -310,6 +370,14 @@ def _motion(
                 motion.unknown[place] = found
             else:
                 motion.poses[place] = found
+    if sensor != frame:
+        within = tree.poses(frame, sensor, stamps)
+        motion.cloud_poses = {
+            place: T for place, T in zip(places, within, strict=True) if T is not None
+        }
+        motion.poses = {
+            place: T for place, T in motion.poses.items() if place in motion.cloud_poses
+        }
     if motion.base is not None:
         mountings = tree.poses(motion.base, sensor, stamps)
         motion.mountings = {
@@ -377,7 +445,7 @@ def _reference(
         scan.stamps_ns[place] * 1e-9,
         motion.poses.get(place),
         CloudSource(up=direction) if camera is None else None,
-        source=BagSource(bag, frames.topic, *scan.places[place]),
+        source=BagSource(bag, frames.topic, *scan.places[place], motion.cloud_poses.get(place)),
         base=base,
         original=f"{frames.topic.name}/{_seconds(scan.stamps_ns[place])}",
         sequence=place,

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sceneprint.errors import DatasetError, FrameError, UnreadableCloud, UnreadableFrame
 from sceneprint.formats.depth_file import decode_png, encode_npy, encode_png, inverse_depth
 from sceneprint.formats.recording.bag import (
@@ -23,10 +25,13 @@ from sceneprint.formats.recording.bag import (
     BagTopic,
     shared_bag,
 )
+from sceneprint.types import Floats
 from sceneprint_client.errors import printable
 from sceneprint_client.files import naming
 from sceneprint_client.ros_messages import (
+    cloud_blocks,
     cloud_points,
+    cloud_table,
     compressed_depth,
     depth_samples,
     image_encoding,
@@ -64,9 +69,19 @@ def depth_file(message: Any, *, compressed: bool) -> bytes:
     return encode_npy(samples) if samples.dtype.kind == "f" else encode_png(samples)
 
 
-def cloud_file(message: Any) -> bytes:
-    """Return the bytes of an NPY file with the points of a PointCloud2; see `cloud_points`."""
-    return encode_npy(cloud_points(message))
+def cloud_file(message: Any, T_cloud_sensor: Floats | None = None) -> bytes:
+    """Return the bytes of an NPY file with the points of a PointCloud2; see `cloud_points`.
+
+    Parameters
+    ----------
+    message : sensor_msgs PointCloud2
+    T_cloud_sensor : where given, the points are taken into the axes of the sensor
+    """
+    if T_cloud_sensor is None:
+        return encode_npy(cloud_points(message))
+    found = [np.empty((0, 3)), *cloud_blocks(cloud_table(message))]
+    points = (np.concatenate(found) - T_cloud_sensor[:3, 3]) @ T_cloud_sensor[:3, :3]
+    return encode_npy(points[np.isfinite(points).all(axis=1)].astype(np.float32))
 
 
 @dataclass(frozen=True)
@@ -104,12 +119,14 @@ class BagSource:
     bag : where it is
     topic : of it
     log_ns, occurrence : when it was recorded, and which of those with that time it is
+    T_cloud_sensor : (4, 4) where points are not in the axes of the sensor, and become so
     """
 
     bag: Bag
     topic: BagTopic
     log_ns: int
     occurrence: int
+    T_cloud_sensor: Floats | None = None
 
     def read_bytes(self) -> bytes:
         """The message as the bytes of a PNG or NPY file.
@@ -128,16 +145,17 @@ class BagSource:
                 error: type[FrameError] = UnreadableCloud if is_cloud else UnreadableFrame
                 raise error("The message is damaged. Record it again.") from cause
             if is_cloud:
-                return cloud_file(fields)
+                return cloud_file(fields, self.T_cloud_sensor)
             return depth_file(fields, compressed=self.topic.type == COMPRESSED)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _source_in, (self.bag.path, self.topic, self.log_ns, self.occurrence)
+        place = self.log_ns, self.occurrence, self.T_cloud_sensor
+        return _source_in, (self.bag.path, self.topic, *place)
 
 
-def _source_in(path: Path, topic: BagTopic, log_ns: int, occurrence: int) -> BagSource:
+def _source_in(path: Path, topic: BagTopic, *place: Any) -> BagSource:
     """A source that came from another process: its bag is opened here."""
-    return BagSource(shared_bag(path), topic, log_ns, occurrence)
+    return BagSource(shared_bag(path), topic, *place)
 
 
 # Which topics.
