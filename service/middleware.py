@@ -12,7 +12,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from sceneprint.errors import AmbiguousKey, Busy, SceneprintError
+from sceneprint.errors import AmbiguousKey, Busy, SceneprintError, UnsupportedType
 from sceneprint.process import NOBODY, name_request, set_actor, set_tenant
 from sceneprint.settings import Settings
 from service.auth import REFUSED, address_of, record_refusal
@@ -159,6 +159,13 @@ class RequestMiddleware:
             return AmbiguousKey(
                 "The request has more than one Authorization header, so it is not clear whose it "
                 "is. Send one."
+            )
+        encoding = headers.get(b"content-encoding", b"identity").strip().lower()
+        # an archive is compressed itself, and some say so here
+        if encoding not in (b"identity", b"") and not is_import(scope):
+            return UnsupportedType(
+                f"The body has Content-Encoding {encoding.decode('latin-1')!r:.40}, and bodies are "
+                "read as they are. Send it uncompressed, without this header."
             )
         most = self._limit(scope)
         if length.isdigit() and (len(length) > 18 or int(length) > most):

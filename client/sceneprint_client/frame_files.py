@@ -433,7 +433,7 @@ def array_sendable(
     if up is not None:
         known = known.model_copy(update={"up": _direction(up)})
     if known.intrinsics is None:
-        return _npy(_checked_points(array)), known
+        return _npy(_checked_points(array), _MOST_LOST_M), known
     if size is None or not array.size or array.dtype.kind + str(array.dtype.itemsize) not in _DEPTH:
         raise UnreadableFrame(
             f"The array has shape {array.shape} and type {array.dtype}, and depth is (H, W), "
@@ -513,10 +513,21 @@ def rows_as_npy(data: bytes, row: tuple[str, ...]) -> bytes:
     return _npy(rows[:, [row.index(axis) for axis in "xyz"]])
 
 
-def _npy(array: NDArray[Any]) -> bytes:
-    """An NPY file. It is not compressed: to compress takes longer than to send."""
-    file = io.BytesIO()
-    compact = array.astype(np.float32) if array.dtype.itemsize == 8 else array
+#: What float32 may change in coordinates; those of a map, such as UTM, are sent as float64.
+_MOST_LOST_M = 1e-4
+
+
+def _npy(array: NDArray[Any], most_lost: float = np.inf) -> bytes:
+    """An NPY file. It is not compressed: to compress takes longer than to send.
+
+    float64 is sent as float32 where no number changes by more than `most_lost`.
+    """
+    file, compact = io.BytesIO(), array
+    if array.dtype.itemsize == 8:
+        with np.errstate(all="ignore"):
+            compact = array.astype(np.float32)
+            if np.nanmax(np.abs(compact[:, :3] - array[:, :3]), initial=0.0) > most_lost:
+                compact = array
     np.save(file, np.ascontiguousarray(compact), allow_pickle=False)
     return file.getvalue()
 

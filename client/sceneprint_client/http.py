@@ -310,6 +310,8 @@ class ServiceConnection:
     Raises
     ------
     Unreachable : the address is none.
+    KeyRequired : the key is none.
+    MissingDependency : a SOCKS proxy is set, and the package for it is not installed.
     """
 
     def __init__(
@@ -322,7 +324,7 @@ class ServiceConnection:
         self._met = False  # whether it has ever answered
         headers = {"User-Agent": f"sceneprint-client/{__version__}"}
         if key is not None:
-            headers["Authorization"] = f"Bearer {key}"
+            headers["Authorization"] = f"Bearer {_checked_key(key)}"
         try:
             parsed = httpx.URL(self._url)
             if parsed.scheme not in ("http", "https") or not parsed.host:
@@ -336,10 +338,15 @@ class ServiceConnection:
                 # no proxy stands before this machine
                 trust_env=transport is None and not is_loopback(parsed.host),
             )
-        except (httpx.InvalidURL, UnicodeEncodeError, ValueError) as error:
+        except (httpx.InvalidURL, ValueError) as error:
             raise errors.Unreachable(
-                f"{url!r:.200} is not the address of a service, or the key is not one ({error}). "
-                "Write it like http://127.0.0.1:8008."
+                f"{url!r:.200} is not the address of a service ({error}). Write it like "
+                "http://127.0.0.1:8008."
+            ) from error
+        except ImportError as error:  # of socksio
+            raise errors.MissingDependency(
+                "ALL_PROXY, HTTP_PROXY or HTTPS_PROXY names a SOCKS proxy, which needs a package: "
+                "pip install 'httpx[socks]'. Or leave it out for this service with NO_PROXY."
             ) from error
         self._log_filter = RequestLogFilter(self._url)
         logging.getLogger("httpx").addFilter(self._log_filter)
@@ -427,6 +434,17 @@ class RequestLogFilter(logging.Filter):
         """False for what httpx tells of requests to the service."""
         about = record.args if isinstance(record.args, tuple) else ()
         return not any(str(one).startswith(self._url) for one in about)
+
+
+def _checked_key(key: str) -> str:
+    """Return a key without blanks around it, such as the newline of its file; never show it."""
+    key = key.strip()
+    if not key or not all(33 <= ord(sign) < 127 for sign in key):
+        raise errors.KeyRequired(
+            "The key is empty, or has a blank or a sign in it that no key has. Copy it again, "
+            "or unset SCENEPRINT_KEY."
+        )
+    return key
 
 
 def _authorities(url: httpx.URL) -> ssl.SSLContext | bool:

@@ -57,6 +57,23 @@ def test_an_array_without_a_camera_is_points() -> None:
     assert sendable(points, FrameMeta(robot="r"), with_pose=False)[1].robot == "r"
 
 
+def test_points_of_a_map_keep_their_precision() -> None:
+    points = np.random.default_rng(2).uniform(-20, 20, (40, 3))
+    data, _ = sendable(points, None, with_pose=False)
+    assert loaded(data).dtype == np.float32  # to a hundredth of a millimetre
+    far = points + np.array([512_345.25, 5_412_345.5, 210.0])
+    data, _ = sendable(far, None, with_pose=False)
+    np.testing.assert_array_equal(loaded(data), far)
+
+
+def test_calls_have_no_other_keywords() -> None:
+    points = np.zeros((400, 3), np.float32)
+    with Client("http://127.0.0.1:9") as client:
+        for call in (client.upload, client.query, client.localize):
+            with pytest.raises(TypeError, match="camera"):
+                call("hall", points, camera=CAMERA)  # type: ignore[operator]
+
+
 @pytest.mark.parametrize(
     ("array", "camera", "error", "message"),
     [

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
+from importlib.util import find_spec
 from typing import Any
 
 import pytest
@@ -228,9 +229,25 @@ def test_a_silent_service() -> None:
             client.maps()
 
 
-def test_a_key_that_cannot_be_sent() -> None:
-    with pytest.raises(errors.Unreachable, match="key"):
-        Client("http://127.0.0.1:8008", "schlüssel☃")
+@pytest.mark.parametrize("key", ["schlüssel☃", "top\nsecret", "top secret", "\n", ""])
+def test_a_key_that_cannot_be_sent_is_not_shown(key: str) -> None:
+    with pytest.raises(errors.KeyRequired, match="Copy it again") as told:
+        Client("http://127.0.0.1:8008", key)
+    assert not key.strip() or key not in str(told.value)
+
+
+def test_a_key_is_sent_without_the_newline_of_its_file(scripted: Make) -> None:
+    server = scripted([(200, {}, MAP)])
+    with Client(server.url, " secret\r\n") as client:
+        client.map("m")
+    assert [headers["Authorization"] for headers in server.headers] == ["Bearer secret"]
+
+
+@pytest.mark.skipif(find_spec("socksio") is not None, reason="SOCKS proxies work here")
+def test_a_socks_proxy_needs_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ALL_PROXY", "socks5://127.0.0.1:9")
+    with pytest.raises(errors.MissingDependency, match=r"httpx\[socks\]"):
+        Client("http://maps.example")
 
 
 def test_too_large_a_body_is_refused_by_the_service(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import socket
 import time
@@ -161,6 +162,17 @@ def test_what_is_as_large_as_may_be_is_read(narrow, refused):
     refused(streamed, 422, "unreadable-frame")
     over = narrow.client.post("/v1/maps/hall/frames", content=iter([body, b" "]), headers=headers)
     refused(over, 413, "too-large")
+
+
+def test_a_compressed_body_is_refused(narrow, refused):
+    for route in ("frames", "queries"):
+        packed = gzip.compress(FRAME + KNOWN + END)
+        headers = {"content-type": X, "content-encoding": "gzip"}
+        told = narrow.client.post(f"/v1/maps/hall/{route}", content=packed, headers=headers)
+        refused(told, 415, "unsupported-type", "Content-Encoding 'gzip'")
+    plain = {"content-type": X, "content-encoding": "identity"}
+    told = narrow.client.post("/v1/maps/hall/frames", content=FRAME + KNOWN + END, headers=plain)
+    refused(told, 422, "unreadable-frame")
 
 
 def test_a_caller_who_hangs_up_leaves_nothing_behind(narrow, wire, small_shots):
