@@ -221,6 +221,7 @@ def test_registered_clouds_are_taken_back_to_their_sensor(
         ros, tmp_path, lambda writer: registered(ros, writer, frame=frame, tf="yes")
     )
     assert found.parent_frame == f"run/{frame}"
+    assert found.note.endswith(f"; points are taken from {frame} to their sensor, lidar")
     for i, one in enumerate(found.frames):
         np.testing.assert_allclose(one.read().points, SEEN, atol=1e-5)
         T = ros.transform(3.0 * i, 0.5 * i, 1, 0, 0, np.sin(0.2 * i), np.cos(0.2 * i))

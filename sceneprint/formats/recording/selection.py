@@ -155,6 +155,8 @@ def recording_sequences(
     sensor = _sensor(bag, scan, frames, options)
     motions = _motions(bag, scan, frames, sensor, options)
     note = _note(frames, scan, motions)
+    if sensor != frames.frame:
+        note += f"; points are taken from {frames.frame} to their sensor, {sensor}"
     lenses = {camera.intrinsics for camera in cameras.values()}
     if len(lenses) > 1:
         note += (
