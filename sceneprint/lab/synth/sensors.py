@@ -385,7 +385,8 @@ class Rosette:
         """(firings, 3) unit directions in the order of time, other ones in every scan."""
         start = rng.uniform(-math.pi, math.pi, 2)
         turned = np.arange(self.firings)[:, None] / self.firings * (2 * math.pi) * self.turns
-        bent = self.half_angle / 2 * np.exp(1j * (turned + start)).sum(axis=1)
+        waves: NDArray[np.complex128] = np.exp(1j * (turned + start))
+        bent = self.half_angle / 2 * waves.sum(axis=1)
         laser = np.arange(self.firings) % self.lasers
         bent += 1j * self.laser_step * (laser - (self.lasers - 1) / 2)
         angle, around = np.abs(bent), np.angle(bent)
