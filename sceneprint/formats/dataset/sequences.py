@@ -300,8 +300,9 @@ def find_sequences(
     names them. Clouds in a folder seq-01 that such a split file names are a sequence of a 7-Scenes
     scene as well. A sequence is named by its place below the path, or by its own folder where that
     is the path. A recording of ROS (.mcap, .db3, .bag, a rosbag2 folder) is one sequence, named
-    after it; so is each of a folder of recordings. Files and folders of other systems (RTAB-Map,
-    E57, Polycam, Record3D, nerfstudio) are sequences too.
+    after it, or one for each part between which its stamps go back; so is each of a folder of
+    recordings. Files and folders of other systems (RTAB-Map, E57, Polycam, Record3D, nerfstudio)
+    are sequences too.
 
     Parameters
     ----------
