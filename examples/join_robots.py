@@ -27,7 +27,9 @@ MAP = "two-robots"
 
 def upload(client: Client, bag: Path) -> str:
     """Upload the keyframes of a recording, and wait until they are signed; their session."""
-    (sequence,) = find_sequences(bag)
+    sequence, *others = find_sequences(bag)
+    if others:
+        raise SystemExit(f"{bag}: its stamps go back. Cut it there, and name one of the parts.")
     print(f"{bag}: {sequence.note}")
     named = {"session": sequence.name, "parent_frame": sequence.parent_frame}
     added = [client.upload(MAP, one, meta_of(one, **named)) for one in sequence.frames]

@@ -26,7 +26,9 @@ from sceneprint_client.tracker import State
 
 def frames_of(bag: Path) -> tuple[FrameReference, ...]:
     """Every frame of a recording, its pose in the frame of the odometry."""
-    (sequence,) = find_sequences(bag, RecordingOptions(pose_frame="odom", keyframe_m=0))
+    sequence, *others = find_sequences(bag, RecordingOptions(pose_frame="odom", keyframe_m=0))
+    if others:
+        raise SystemExit(f"{bag}: its stamps go back. Cut it there, and name one of the parts.")
     print(sequence.note)
     return sequence.frames
 
