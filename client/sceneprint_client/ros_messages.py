@@ -390,14 +390,14 @@ def _point_type(message: Any, step: int) -> np.dtype[Any]:
         raise UnreadableCloud(
             f"The fields of the cloud do not fit into its points of {step} bytes. Record it again."
         )
-    return np.dtype(
-        {
-            "names": list(found),
-            "formats": [kind for kind, _ in found.values()],
-            "offsets": [offset for _, offset in found.values()],
-            "itemsize": step,
-        }
-    )
+    layout: Any = {
+        "names": list(found),
+        "formats": [kind for kind, _ in found.values()],
+        "offsets": [offset for _, offset in found.values()],
+        "itemsize": step,
+    }
+    points: np.dtype[Any] = np.dtype(layout)
+    return points
 
 
 # Poses and what moves.
