@@ -178,6 +178,13 @@ def add_frame_options(
 ) -> None:
     """`--robot` and its like: metadata of frames; `up` reads what `--up` is."""
     command.add_argument(
+        "--row",
+        type=row_option,
+        metavar="NAMES",
+        help="what a row of float32 in .bin files holds, such as x,y,z,i,ring (default: x,y,z and "
+        "intensity)",
+    )
+    command.add_argument(
         "--robot",
         metavar="NAME",
         help="robot that took the frames; also qualifies the parent frame of the poses",
@@ -283,13 +290,6 @@ def add_upload(commands: Any) -> None:
         metavar="D",
         help="keep a frame only if its place is new to the map: the nearest frame is farther "
         f"than D, as a share of the distance of unrelated frames (without a number: {NOVEL:g})",
-    )
-    command.add_argument(
-        "--row",
-        type=row_option,
-        metavar="NAMES",
-        help="what a row of float32 in .bin files holds, such as x,y,z,i,ring (default: x,y,z and "
-        "intensity)",
     )
     command.add_argument("--no-wait", action="store_true", help="do not wait for signing")
     command.add_argument(

@@ -453,8 +453,9 @@ def desk(rng: np.random.Generator) -> Piece:
     count = min(int(rng.choice(4, p=(0.2, 0.4, 0.3, 0.1))), int(w / 0.65))
     for k in range(count):
         across = (k - (count - 1) / 2) * 0.6 + rng.normal(0, 0.05)
+        screen = monitor(rng)
         place = (across, rng.uniform(0.05, d / 2 - 0.15), h)
-        parts.append(monitor(rng).moved(place, rng.normal(-0.2 * across, 0.2)))
+        parts.append(screen.moved(place, rng.normal(-0.2 * across, 0.2)))
     if rng.random() < 0.7:
         parts.append(
             box(0.43, 0.15, 0.025, (rng.normal(0, 0.1), -d / 2 + 0.2, h), rng.normal(0, 0.1))
