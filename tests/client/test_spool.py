@@ -96,7 +96,7 @@ def png_of(image: np.ndarray[Any, Any]) -> bytes:
 
 def names(path: Path) -> list[str]:
     """Names of the frames that wait, oldest first."""
-    with sqlite3.connect(path) as database:
+    with closing(sqlite3.connect(path)) as database, database:
         rows = database.execute("SELECT meta FROM frames WHERE reason IS NULL ORDER BY id")
         return [json.loads(text)["name"] for (text,) in rows]
 
@@ -213,7 +213,7 @@ def test_what_a_spool_cannot_take_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidRequest, match="above 0"):
         Spool(tmp_path / "spool", 0)
     other = tmp_path / "other.db"
-    with sqlite3.connect(other) as database:
+    with closing(sqlite3.connect(other)) as database, database:
         database.execute("CREATE TABLE a (b)")
     with pytest.raises(UnusableStore, match="not a spool"):
         Spool(other)
@@ -253,7 +253,7 @@ def test_a_full_disk_leaves_the_spool_as_it_was(tmp_path: Path) -> None:
         assert 200 <= taken <= 600  # also what was reserved for the journal is used for frames
         assert spool.add(depth(taken), meta(name=f"{taken}"))
     assert names(path) == [str(number) for number in range(taken + 1)]
-    with sqlite3.connect(path) as database:
+    with closing(sqlite3.connect(path)) as database, database:
         assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
 
 
