@@ -4,8 +4,9 @@ sites  --collect-->  samples, in a file  --fit-->  numbers, in a model file
 
 Sites of every kind are built, most of them with maps that lack frames and whose poses drift, and
 all their queries are answered. The penalties are fitted to which candidate pose was right.
-Recordings take no part. With --views the frames of each map are joined to one surface, and views of
-it take their place: what is learnt is the confidence in maps that came whole.
+Recordings take no part. With --views the frames of each map are joined to one surface, and rendered
+views of it replace them. What is learnt then is the confidence in maps that were imported as one
+file.
 """
 
 from __future__ import annotations

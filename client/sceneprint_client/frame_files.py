@@ -326,12 +326,12 @@ def _of_depth(camera: Camera) -> dict[str, Any]:
 def _of_cloud(reference: FrameFile) -> dict[str, Any]:
     """How the points of a cloud are read; a KITTI scan's name alone says that it is one."""
     source = reference.cloud or CloudSource()
-    told = source.file_format
+    file_format = source.file_format
     if reference.row is not None:
-        told = None  # sent as NPY, which tells itself
-    elif told is None and SUFFIXES.get(reference.path.suffix.lower()) == "kitti":
-        told = "kitti"
-    known: dict[str, Any] = {"format": told, "units_per_metre": source.units_per_metre}
+        file_format = None  # it is sent as NPY, whose content says so
+    elif file_format is None and SUFFIXES.get(reference.path.suffix.lower()) == "kitti":
+        file_format = "kitti"
+    known: dict[str, Any] = {"format": file_format, "units_per_metre": source.units_per_metre}
     if source.viewpoint is None:
         known["viewpoint"] = None
     elif not isinstance(source.viewpoint, Unsaid):

@@ -53,14 +53,14 @@ def image_encoding(message: Any, *, compressed: bool) -> str | None:
     """
     if not compressed:
         return str(message.encoding) if message.encoding in ENCODINGS else None
-    told = str(message.format)
-    encoding = told.partition(";")[0].strip()
-    if "compressedDepth" not in told:  # a PNG of 16 bits and one channel is depth, others are not
-        head = bytes(memoryview(message.data)[:_PNG_HEAD])
-        is_deep = head.startswith(PNG_SIGNATURE) and head[24:26] == b"\x10\x00"
-        known = encoding if encoding in ENCODINGS else "16UC1"
-        return known if is_deep and known != "32FC1" else None
-    return encoding if encoding in ENCODINGS else None
+    encoding = str(message.format).partition(";")[0].strip()
+    if "compressedDepth" in str(message.format):
+        return encoding if encoding in ENCODINGS else None
+    # a PNG of 16 bits and one channel is depth
+    head = bytes(memoryview(message.data)[:_PNG_HEAD])
+    is_deep = head.startswith(PNG_SIGNATURE) and head[24:26] == b"\x10\x00"
+    encoding = encoding if encoding in ENCODINGS else "16UC1"
+    return encoding if is_deep and encoding != "32FC1" else None
 
 
 def depth_samples(message: Any) -> NDArray[Any]:
@@ -119,16 +119,13 @@ class CompressedDepth:
     inverse: tuple[float, float] | None
 
     def body(self) -> bytes | NDArray[Any]:
-        """What a service takes as a frame: a PNG, after its header where that matters, or an array
-        of millimetres or metres.
+        """Return what a service takes as a frame: a PNG, after its header where that matters, or an
+        array of millimetres or metres.
         """
         if self.samples is not None:
-            if self.inverse is None:
-                return self.samples
-            a, b = self.inverse
-            with np.errstate(all="ignore"):
-                metres = (a / (self.samples - b)).astype(np.float32)
-            return np.where((self.samples > 0) & (metres > 0), metres, np.float32(0))
+            return (
+                self.samples if self.inverse is None else inverse_depth(self.samples, *self.inverse)
+            )
         if self.inverse is None:
             return self.png
         return struct.pack("<iff", 0, *self.inverse) + self.png
@@ -174,6 +171,16 @@ def compressed_depth(message: Any) -> CompressedDepth:
     return CompressedDepth(png, samples, (a, b))
 
 
+def inverse_depth(samples: NDArray[np.uint16], a: float, b: float) -> NDArray[np.float32]:
+    """Return metres (H, W) of quantised inverse depth, z = a / (v - b); 0 where missing."""
+    values = np.arange(65_536, dtype=np.float64)
+    with np.errstate(all="ignore"):
+        table = (a / (values - b)).astype(np.float32)
+    table[~(np.isfinite(table) & (table > 0))] = 0.0
+    table[0] = 0.0
+    return table[samples]
+
+
 def rvl_samples(data: bytes) -> NDArray[np.uint16]:
     """Return the samples (H, W) of an image compressed by RVL, after its width and height.
 
@@ -183,7 +190,7 @@ def rvl_samples(data: bytes) -> NDArray[np.uint16]:
 
     Raises
     ------
-    UnreadableFrame : the data ends early, or the sizes are none.
+    UnreadableFrame : the data ends early, the sizes are none, or a sample has more than 16 bits.
     """
     broken = UnreadableFrame("The image compressed by RVL is damaged. Record it again.")
     width, height = struct.unpack_from("<II", data) if len(data) >= 8 else (0, 0)
@@ -215,6 +222,8 @@ def rvl_samples(data: bytes) -> NDArray[np.uint16]:
             last = int(samples[done - 1])
         elif not zeros:
             raise broken
+    if samples.min() < 0 or samples.max() > 65_535:
+        raise broken
     return samples.astype(np.uint16).reshape(height, width)
 
 

@@ -259,17 +259,17 @@ def _read_source(path: Path) -> CloudSource:
                 f"{', '.join(unknown)!r:.80} is no field of it. "
                 f"The fields are {', '.join(_FIELDS)}."
             )
-        told = fields.get("format")
-        if told is not None and told not in _FORMATS:
-            raise DatasetError(f"format is {told!r:.40}. Known are {', '.join(_FORMATS)}.")
+        file_format = fields.get("format")
+        if file_format is not None and file_format not in _FORMATS:
+            raise DatasetError(f"format is {file_format!r:.40}. Known are {', '.join(_FORMATS)}.")
         units = _cloud_number("units_per_metre", fields.get("units_per_metre", 1.0))
         if not units > 0.0:
             raise DatasetError(f"units_per_metre is {units}. Write 1000 for millimetres.")
         row = fields.get("row")
-        if row is not None and told not in (None, "kitti"):
-            raise DatasetError(f"row is of .bin files, and format is {told}. Leave one out.")
+        if row is not None and file_format not in (None, "kitti"):
+            raise DatasetError(f"row is of .bin files, and format is {file_format}. Leave one out.")
         return CloudSource(
-            told, _viewpoint(fields), units, _cloud_up(fields.get("up")),
+            file_format, _viewpoint(fields), units, _cloud_up(fields.get("up")),
             None if row is None else row_of(str(row)),
         )  # fmt: skip
 

@@ -75,7 +75,7 @@ class _Edge:
 
     @property
     def is_constant(self) -> bool:
-        """Whether it never moved, as fixed joints that are published again and again."""
+        """Return whether it never moved, as a fixed joint that is published repeatedly."""
         rows = np.frombuffer(self.samples, np.float64).reshape(-1, 7)
         return self.fixed or bool((np.ptp(rows, axis=0) < 1e-9).all())
 
@@ -95,7 +95,7 @@ class TransformTree:
     def add(
         self, parent: str, child: str, stamp_ns: int, sample: Sequence[float], *, fixed: bool
     ) -> bool:
-        """Take a transform; one that is no rigid transform is passed over, and noted.
+        """Add a sample of a transform; what is no rigid transform is passed over, and noted.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class TransformTree:
 
         Returns
         -------
-        taken : whether it was
+        taken : False where the sample was passed over
 
         Raises
         ------
@@ -147,7 +147,7 @@ class TransformTree:
         return True
 
     def pass_over(self, parent: str, child: str, reason: str) -> None:
-        """Note that a sample of a transform was not taken, and why."""
+        """Note a sample of a transform that was passed over, with the reason."""
         _, count = self.passed_over.get((parent, child), ("", 0))
         self.passed_over[parent, child] = reason, count + 1
 
@@ -157,7 +157,7 @@ class TransformTree:
         self._count -= 0 if edge is None else len(edge.stamps_ns)
 
     def samples(self, parent: str, child: str) -> Floats:
-        """The samples (N, 7) of a transform in the order in which they came."""
+        """Return the samples (N, 7) of a transform in the order in which they came."""
         edge = self._edges.get(frame_name(child), {}).get(frame_name(parent))
         rows = np.frombuffer(b"" if edge is None else edge.samples.tobytes(), np.float64)
         return rows.reshape(-1, 7)
@@ -179,16 +179,16 @@ class TransformTree:
                     self._count -= old
 
     def frames(self) -> list[str]:
-        """Names of all frames."""
+        """Return the names of all frames."""
         parents = {one for edges in self._edges.values() for one in edges}
         return sorted(parents | self._edges.keys())
 
     def has_edge(self, parent: str, child: str) -> bool:
-        """Whether a transform between these two is known."""
+        """Return whether there is a transform from a child directly to a parent."""
         return frame_name(parent) in self._edges.get(frame_name(child), {})
 
     def ancestors(self, child: str, *, constant: bool = False) -> list[str]:
-        """Frames above one, nearest first, itself at the beginning.
+        """Return a frame and those above it, nearest first.
 
         Of several parents that with the most samples is taken.
 
@@ -200,17 +200,17 @@ class TransformTree:
         found = [frame_name(child)]
         while True:
             edges = self._edges.get(found[-1], {})
-            known = {
+            parents = {
                 parent: edge
                 for parent, edge in edges.items()
                 if parent not in found and (not constant or self._holds_still(parent, found[-1]))
             }
-            if not known:
+            if not parents:
                 return found
-            found.append(max(known, key=lambda name: (len(known[name].samples), name)))
+            found.append(max(parents, key=lambda name: (len(parents[name].samples), name)))
 
     def path(self, ancestor: str, child: str) -> list[str] | None:
-        """Frames from a child up to an ancestor, both included; None where it is none."""
+        """Return the frames from a child up to an ancestor, both included, or None."""
         ancestor, child = frame_name(ancestor), frame_name(child)
         came: dict[str, str] = {child: ""}
         waiting = [child]
@@ -228,14 +228,14 @@ class TransformTree:
         return up[::-1]
 
     def leaves(self, frame: str) -> list[str]:
-        """Frames below one that have none below them."""
+        """Return the frames below one that have none below them."""
         parents = {one for edges in self._edges.values() for one in edges}
         return [
             one for one in sorted(self._edges.keys() - parents) if self.path(frame, one) is not None
         ]
 
     def moves_below(self, frame: str) -> bool:
-        """Whether a frame directly below one moves in it."""
+        """Return whether a frame directly below one moves in it."""
         return any(
             not self._holds_still(frame, child)
             for child, edges in self._edges.items()
@@ -243,7 +243,7 @@ class TransformTree:
         )
 
     def base_of(self, sensor: str, world: str | None) -> str | None:
-        """The frame of the robot that carries a sensor; None where nothing tells.
+        """Return the frame of the robot that carries a sensor; None where nothing tells.
 
         It is `base_link` or its like above the sensor; else the last frame above it to which the
         sensor does not move.
@@ -265,7 +265,7 @@ class TransformTree:
         return still[-1] if still and still[-1] != frame_name(sensor) else None
 
     def world_of(self, sensor: str) -> str | None:
-        """The frame that poses of a sensor lead to; None where nothing above it moves.
+        """Return the frame that poses of a sensor lead to; None where nothing above it moves.
 
         It is `map`, else `odom`, else the topmost.
         """
@@ -285,7 +285,7 @@ class TransformTree:
         return up[-1] if any(moves) else None
 
     def fixed_transform(self, target: str, source: str) -> Floats | None:
-        """T_target_source (4, 4) between frames that do not move against each other, or None."""
+        """Return T_target_source (4, 4) of frames that do not move against each other, or None."""
         ups = [self.ancestors(one, constant=True) for one in (target, source)]
         common = next((one for one in ups[1] if one in ups[0]), None)
         if common is None:
@@ -298,14 +298,14 @@ class TransformTree:
         return found
 
     def poses(self, parent: str, child: str, stamps_ns: Sequence[int]) -> list[Floats | None]:
-        """As `lookup`, with None where a transform on the way is not known."""
+        """Return what `lookup` does, with None where a transform on the way is not known."""
         found = self.lookup(parent, child, stamps_ns)
         return [None if isinstance(one, UnknownTransform) else one for one in found]
 
     def lookup(
         self, parent: str, child: str, stamps_ns: Sequence[int]
     ) -> list[Floats | UnknownTransform]:
-        """T_parent_child (4, 4) at each stamp, positions linear and rotations by slerp.
+        """Return T_parent_child (4, 4) at each stamp, positions linear and rotations by slerp.
 
         Parameters
         ----------
@@ -335,8 +335,8 @@ class TransformTree:
         return found
 
     def _holds_still(self, parent: str, child: str) -> bool:
-        """Whether a transform is fixed: one that never moved counts, but for that of a base, which
-        may have stood still.
+        """Return whether a transform is fixed: one that never moved counts, but for that of a base,
+        which may have stood still.
         """
         edge = self._edges[child][parent]
         names = {parent.rpartition("/")[2], child.rpartition("/")[2]}
@@ -346,7 +346,7 @@ class TransformTree:
     def _samples_at(
         self, parent: str, child: str, stamps_ns: Sequence[int]
     ) -> Sequence[Floats | UnknownTransform]:
-        """One transform at the stamps."""
+        """Return one transform at the stamps; see `lookup`."""
         edge = self._edges[child][parent]
         rows = np.frombuffer(edge.samples, np.float64).reshape(-1, 7)
         if self._holds_still(parent, child):
@@ -359,29 +359,23 @@ class TransformTree:
         # seconds since a time of the recording: exact to nanoseconds for a hundred days
         times: Floats = (recorded[order] - origin).astype(np.float64) * 1e-9
         rows = rows[order]
-        asked = (np.asarray(stamps_ns, np.int64) - origin) * 1e-9
-        before = np.maximum(np.searchsorted(times, asked, "right") - 1, 0)
-        after = np.minimum(np.searchsorted(times, asked), len(times) - 1)
-        off = np.abs(times[before] - asked), np.abs(times[after] - asked)
-        nearest = times[np.where(off[0] <= off[1], before, after)]
-        between = (times[before] <= asked) & (asked <= times[after])
-        between &= times[after] - times[before] <= LONGEST_GAP_S
-        distance = np.minimum(*off)
+        wanted = (np.asarray(stamps_ns, np.int64) - origin) * 1e-9
+        before = np.maximum(np.searchsorted(times, wanted, "right") - 1, 0)
+        after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
+        distance = np.minimum(np.abs(times[before] - wanted), np.abs(times[after] - wanted))
         doubted = _between_doubts(*contradictions(times, rows), before, after)
 
         _, first = np.unique(times, return_index=True)
         trajectory = SensorTrajectory(times[first], rows[first, :3], rows[first, 3:])
-        asked = np.where(between, asked, nearest)
-        known = between | (distance <= TOLERANCE_S)
+        poses = interpolate(
+            trajectory, wanted.tolist(), longest_gap=LONGEST_GAP_S, tolerance=TOLERANCE_S
+        )
         name = f"{parent} -> {child}"
         return [
-            UnknownTransform(name, None) if doubt and ok
-            else pose if ok and pose is not None
-            else UnknownTransform(name, float(seconds))
-            for pose, ok, doubt, seconds in zip(
-                interpolate(trajectory, asked.tolist(), longest_gap=LONGEST_GAP_S),
-                known, doubted, distance, strict=True,
-            )
+            UnknownTransform(name, float(seconds)) if pose is None
+            else UnknownTransform(name, None) if doubt
+            else pose
+            for pose, doubt, seconds in zip(poses, doubted, distance, strict=True)
         ]  # fmt: skip
 
 
@@ -420,14 +414,14 @@ def contradictions(
 
 
 def motion(rows: Floats, others: Floats) -> Floats:
-    """How far samples (M, 7) lie from others: metres, where a radian counts as one."""
+    """Return how far samples (M, 7) lie from others: metres, where a radian counts as one."""
     found: Floats = np.linalg.norm(_steps(rows, others), axis=1)
     return found
 
 
 def _steps(rows: Floats, others: Floats) -> Floats:
-    """From samples to others (M, 6): translations, and rotations in the axes of the first, whose
-    length is 2 sin of half the angle.
+    """Return the steps from samples to others (M, 6): translations, and rotations in the axes of
+    the first, whose length is 2 sin of half the angle.
     """
     x, y, z, w = rows[:, 3:].T * np.array([[-1.0], [-1.0], [-1.0], [1.0]])
     a, b, c, d = others[:, 3:].T
@@ -448,7 +442,7 @@ def _between_doubts(
     too_fast: NDArray[np.bool_], disputed: NDArray[np.bool_], before: NDArray[np.intp],
     after: NDArray[np.intp],
 ) -> NDArray[np.bool_]:  # fmt: skip
-    """Whether the samples on either side of M times contradict each other."""
+    """Return whether the samples on either side of M times contradict each other."""
     low, high = np.minimum(before, after), np.maximum(before, after)
     sums = np.concatenate([[0], np.cumsum(too_fast)])
     found: NDArray[np.bool_] = (sums[high] > sums[low]) | disputed[low] | disputed[high]
@@ -456,5 +450,5 @@ def _between_doubts(
 
 
 def frame_name(name: str) -> str:
-    """A frame's name without the leading slash of ROS 1, in one line of printable characters."""
+    """Return a frame's name without the leading slash of ROS 1, in one printable line."""
     return printable(name.lstrip("/"))

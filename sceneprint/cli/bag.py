@@ -13,6 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from sceneprint.cli import positive_number
 from sceneprint.cli.options import one_line
 from sceneprint.formats.dataset import FrameSequence, find_recordings, find_sequences
 from sceneprint.formats.recording import BagOutline, RecordingOptions, bag_outline
@@ -37,7 +38,7 @@ def add_recording_options(command: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--depth-scale",
-        type=_above_zero,
+        type=positive_number,
         metavar="UNITS",
         help="stored units per metre of 16-bit depth images (default: 1000, millimetres)",
     )
@@ -82,13 +83,6 @@ def _from_zero(text: str) -> float:
         number = math.nan
     if not 0 <= number < math.inf:  # false for NaN as well
         raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 up")
-    return number
-
-
-def _above_zero(text: str) -> float:
-    number = _from_zero(text)
-    if number == 0:
-        raise argparse.ArgumentTypeError("0 units per metre are no scale")
     return number
 
 

@@ -453,7 +453,6 @@ DEFAULT_NAME = "import"
 _LISTS = ("depth.txt", "groundtruth.txt", TRANSFORMS)
 _TEXTS = (INTRINSICS_FILE, CLOUDS_FILE, "TrainSplit.txt", "TestSplit.txt")
 _MAXIMUM_LIST, _MAXIMUM_TEXT, _MAXIMUM_TEXTS = 1 << 26, 1 << 16, 1 << 27  #: bytes; of all of them
-_POSE = re.compile(r".+[._-]pose\.txt|pose[._-].+\.txt")
 _HEAD_BYTES = 1024  #: of an image, which tell its size
 _PARENTS = ("0", "1", "2", "3", "4")  #: a camera is looked for above the frames: not beyond these
 
@@ -686,9 +685,8 @@ def _wanted(parts: tuple[str, ...]) -> Wanted | None:
     # the first folder may be what the packed folder was called
     if hidden or any(is_beside_depth(folder) for folder in folders[1:]):
         return None
-    is_pose = _POSE.fullmatch(name) is not None or (
-        name.endswith(".txt") and folders[-1:] in ([one] for one in POSE_FOLDERS)
-    )
+    # `find_pose_file` decides which of these belongs to a frame
+    is_pose = name.endswith(".txt") and ("pose" in name or {*folders[-1:]} & {*POSE_FOLDERS})
     if name in _TEXTS or name in _LISTS or is_pose or _is_of_export(parts):
         return "text"
     if is_image(name) and not name.lower().endswith(".color.png"):

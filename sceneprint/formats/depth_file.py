@@ -33,7 +33,7 @@ from sceneprint_client.files import (
     read_bytes,
 )
 from sceneprint_client.poses import rigid_transform
-from sceneprint_client.ros_messages import TRANSPORT_BYTES
+from sceneprint_client.ros_messages import TRANSPORT_BYTES, inverse_depth
 
 #: What a depth image is stored as: whole numbers of some unit, or metres.
 Samples = NDArray[np.uint16] | Floats32
@@ -247,16 +247,6 @@ def _decode_transported(data: bytes) -> Samples:
         f"The header of the compressedDepth image (a = {a:g}, b = {b:g}) is neither that of 16UC1 "
         "nor of 32FC1. Send the PNG after its 12 bytes, or float32 metres a / (v - b) as NPY."
     )
-
-
-def inverse_depth(samples: NDArray[np.uint16], a: float, b: float) -> Floats32:
-    """Metres (H, W) of quantised inverse depth, z = a / (v - b); 0 where missing."""
-    values = np.arange(65_536, dtype=np.float64)
-    with np.errstate(all="ignore"):
-        table = (a / (values - b)).astype(np.float32)
-    table[~(np.isfinite(table) & (table > 0))] = 0.0
-    table[0] = 0.0
-    return table[samples]
 
 
 # NPY files of float metres or of stored units, read without trusting their header.

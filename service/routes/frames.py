@@ -294,14 +294,12 @@ _PARAMETERS = (
     *_TEXTS, "tags", "base", "base_frame", "up", "heights", "offset", "camera", "priority",
     "if_novel",
 )  # fmt: skip
-#: Of those that are lists: how they are written.
-_LISTS = {
-    "tags": "Of all frames, with commas between.",
-    "heights": "Of a map: heights of the sensor above the floor, metres, with commas between; "
-    "default: those of the model's sensors.",
-    "offset": "Of a map: x,y,z in metres, taken off the coordinates of its file; default: none, or "
-    "where the file lies more than a kilometre from its origin, its middle.",
-    "camera": "Of a map of depth images: the robot's camera as fx,fy,cx,cy,width,height.",
+#: How those of several values are written in a query string.
+_WRITTEN = {
+    "tags": "With commas between.",
+    "heights": "With commas between.",
+    "offset": "Written as x,y,z.",
+    "camera": "Written as fx,fy,cx,cy,width,height.",
 }
 
 
@@ -328,7 +326,7 @@ def _described_import() -> dict[str, Any]:
         if name == "units_per_metre":
             schema = {"type": "number", "exclusiveMinimum": 0}
         said = told.get("description") or base.get(name, {}).get("description", "")
-        said = _LISTS.get(name, said)
+        said = " ".join(filter(None, (said, _WRITTEN.get(name))))
         parameters.append(
             {"name": name, "in": "query", "required": False, "schema": schema, "description": said}
         )

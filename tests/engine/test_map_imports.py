@@ -281,7 +281,7 @@ def test_files_in_one_parent_frame_need_one_offset(empty: Engine) -> None:
     # in the middle of the room, to a metre
     assert all((np.abs(at) < 6).all() for at in west.values())
     east = FAR + np.array([50.0, 0.0, 0.0])
-    failed = slices(east, "east.obj", 2)
+    failed = slices(east, "east.obj", 3)
     error = str(empty.get_job(failed.job.id).error)
     assert "'district' has frames already" in error
     offset = np.round(FAR + np.ptp(make_room(np.random.default_rng(3)).vertices, axis=0) / 2)
@@ -293,7 +293,7 @@ def test_files_in_one_parent_frame_need_one_offset(empty: Engine) -> None:
     assert there
     assert all((np.abs(at - [50.0, 0.0, 0.0]) < 6).all() for at in there.values())
     # the same file goes on where it was
-    again = slices(FAR, "west.obj", 2)
+    again = slices(FAR, "west.obj", 3)
     assert empty.get_job(again.job.id).error is None
 
 

@@ -176,6 +176,23 @@ def test_compressed_depth_by_rvl(encoding: str, tmp_path: Path, ros: SimpleNames
             rvl_samples(rvl(samples)[:cut])
 
 
+def test_rvl_of_more_than_16_bits_is_damaged() -> None:
+    for wrong in (65_536, -1):
+        with pytest.raises(UnreadableFrame, match="RVL is damaged"):
+            rvl_samples(rvl(np.array([[5, wrong, 7]])))
+    np.testing.assert_array_equal(rvl_samples(rvl(np.array([[5, 65_535]]))), [[5, 65_535]])
+
+
+def test_an_inverse_depth_of_no_distance_is_missing(ros: SimpleNamespace) -> None:
+    """z = a / (v - b): at v = b it is nowhere, and below b behind the camera."""
+    data = struct.pack("<iff", 0, 100.0, 7.0) + rvl(np.array([[6, 7, 8]]))
+    message = ros.messages().make(
+        "sensor_msgs/msg/CompressedImage", header=ros.messages().header(0.0, "camera"),
+        format="32FC1; compressedDepth rvl", data=np.frombuffer(data, np.uint8),
+    )  # fmt: skip
+    np.testing.assert_array_equal(compressed_depth(message).body(), [[0.0, 0.0, 100.0]])
+
+
 def test_what_cannot_be_read_is_not_promised(tmp_path: Path, ros: SimpleNamespace) -> None:
     def fill(writer: Any) -> None:
         writer.camera_info(0.0)

@@ -166,7 +166,7 @@ class ImportOptions(Given):
         default=None,
         description="In which run; default: the name of each sequence, or of the map's file.",
     )
-    tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
+    tags: list[Label] = Field(default=[], max_length=MOST_TAGS, description="Of all frames.")
     parent_frame: Label | None = Field(
         default=None,
         description="What all poses lead to; default: the name of the scene, or of the map's "
@@ -197,8 +197,8 @@ class ImportOptions(Given):
     )
     offset: GivenVector | None = Field(
         default=None,
-        description="Of a map: what is taken off the coordinates of its file, in metres. Files in "
-        "one parent frame need one offset; default: none, or where the file lies more than a "
+        description="Of a map: metres that are subtracted from the coordinates of its file. Files "
+        "in one parent frame need the same offset. Default: none; of a file that lies more than a "
         "kilometre from its origin, its middle.",
     )
     camera: CameraIntrinsics | None = Field(
@@ -252,16 +252,14 @@ def offset_fields(text: str) -> dict[str, float]:
     return _number_fields("offset", text, ("x", "y", "z"), "metres")
 
 
-_COUNTED = {3: "three", 6: "six"}
-
-
 def _number_fields(what: str, text: str, names: Sequence[str], unit: str) -> dict[str, float]:
+    """Return numbers that are written with commas between, by their names."""
     try:
         return dict(zip(names, map(float, text.split(",")), strict=True))
     except ValueError as error:
         raise InvalidRequest(
-            f"The {what} {text!r:.80} is not {_COUNTED[len(names)]} numbers. Write "
-            f"{','.join(names)}, in {unit}.",
+            f"The {what} {text!r:.80} is not {len(names)} numbers. Write {','.join(names)}, in "
+            f"{unit}.",
             ((what, f"not {','.join(names)}"),),
         ) from error
 

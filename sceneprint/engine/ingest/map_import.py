@@ -265,8 +265,6 @@ class MapImporter:
                 "the units and the axis that points up, or name the height of the sensor."
             )
         self._require_room(task.of_map, n)
-        if options.offset is None and stored.surface.offset.any():
-            self._require_one_offset(task, options, replace(stored, poses=plan.poses))
         floor = 0.0 if plan.floor is None else plan.floor
         chosen = replace(stored, poses=plan.poses, held_out=plan.held_out, floor=floor)
         progress = task.progress | {
@@ -279,8 +277,11 @@ class MapImporter:
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
         """Render views and add them, at least some."""
-        views = self._views(task, options, self._stored(file))
+        stored = self._stored(file)
+        views = self._views(task, options, stored)
         progress, items = dict(task.progress), list[dict[str, Any]]()
+        if not progress["rendered"] and options.offset is None and stored.surface.offset.any():
+            self._require_one_offset(task, options, stored.surface.offset, views)
 
         def fence(connection: Connection) -> None:  # cancelled, or of a map that was made anew
             queue.check_held(connection, task.job)
@@ -364,20 +365,16 @@ class MapImporter:
             return queue.JobFile(ARCHIVE, blob.keep(), blob.size, "application/octet-stream")
 
     def _require_one_offset(
-        self, task: LongJob, options: ImportOptions, stored: StoredSurface
+        self, task: LongJob, options: ImportOptions, offset: Floats, views: _Views
     ) -> None:
         """See that no other file has frames in the parent frame: it would have another offset."""
         _, parent = names_of(options)
+        number, first = task.of_map.number, str(views.upload(0).frame_id)
         with self._store.database.read() as connection:
-            row = living_map(connection, task.of_map)
-            if not has_parent_frame(connection, row.number, parent):
-                return
-        first = self._views(task, options, stored).upload(0)
-        with self._store.database.read() as connection:
-            again = living_frame(connection, row.number, str(first.frame_id)) is not None
-        if again:  # the same file, sent once more
-            return
-        x, y, z = stored.surface.offset.tolist()
+            is_taken = has_parent_frame(connection, number, parent)
+            if not is_taken or living_frame(connection, number, first) is not None:
+                return  # the first file, or the same one sent once more
+        x, y, z = offset.tolist()
         raise InvalidRequest(
             f"The parent frame {parent!r} has frames already, and {options.name} lies far from its "
             f"origin: its own offset would be {x:.0f},{y:.0f},{z:.0f}. Send `offset` (--offset) "

@@ -79,8 +79,8 @@ class BagPart:
     infos: array[int] = field(default_factory=lambda: array("q"))
 
     def info_at(self, stamps_ns: Sequence[int]) -> list[int]:
-        """Number of the CameraInfo of each stamp: of the same one, else the nearest within 20 ms,
-        else the last one before it, else the first.
+        """Return the number of the CameraInfo of each stamp: that of the same stamp, else the
+        nearest within 20 ms, else the last one before it, else the first.
         """
         times = np.frombuffer(self.info_stamps_ns, np.int64)
         order = np.argsort(times, kind="stable")
@@ -117,7 +117,7 @@ class BagScan:
 
     @property
     def ends(self) -> list[int]:
-        """Number of the frame after the last one of each part."""
+        """Return the number of the frame after the last one of each part."""
         return [*(part.first for part in self.parts[1:]), len(self.stamps_ns)]
 
 
@@ -155,7 +155,7 @@ class _Clocks:
     _flips: dict[str, int] = field(default_factory=dict)
 
     def goes_back(self, source: str, stamp_ns: int) -> bool:
-        """Take a stamp; whether it says that the clock was set back.
+        """Take a stamp, and return whether it says that the clock was set back.
 
         Raises
         ------
@@ -238,7 +238,7 @@ class _Scanner:
         return scan
 
     def _part_at(self, source: str, stamp_ns: int) -> BagPart:
-        """The part to which a stamp belongs: a new one where the source goes back."""
+        """Return the part to which a stamp belongs: a new one where the source goes back."""
         parts = self._scan.parts
         if self._clocks.goes_back(source, stamp_ns):
             if len(parts) == MOST_PARTS:
@@ -322,14 +322,14 @@ def _add_fixed(tree: TransformTree, fixed: dict[tuple[str, str], list[list[float
     """Add transforms that hold at all times, but for those that contradict themselves or tf."""
     for (parent, child), rows in fixed.items():
         moving = tree.samples(parent, child)
-        known = [
+        accepted = [
             tree.samples(parent, child)
             for row in rows
             if tree.add(parent, child, 0, row, fixed=True)
         ]
-        if not known:
+        if not accepted:
             continue
-        apart = motion(np.vstack([moving, *known]), known[-1])
+        apart = motion(np.vstack([moving, *accepted]), accepted[-1])
         if apart.max() > _FIXED:
             tree.remove(parent, child)
             reason = f"it is fixed, and has values that differ by {apart.max():.2g} m or rad"
@@ -337,7 +337,9 @@ def _add_fixed(tree: TransformTree, fixed: dict[tuple[str, str], list[list[float
 
 
 def _add_odometry(tree: TransformTree, odometry: dict[str, list[_Odometry]]) -> None:
-    """Where tf does not say the same; of several topics of one edge, that with most messages."""
+    """Add odometry where tf does not say the same; of several topics of one edge that with the most
+    messages.
+    """
     edges: dict[tuple[str, str], list[_Odometry]] = {}
     for topic in sorted(odometry, key=lambda name: len(odometry[name])):
         for one in odometry[topic][:1]:

@@ -75,14 +75,14 @@ def keyframes(
 
 
 def _relative_motion(a: Floats, b: Floats) -> tuple[float, float]:
-    """Metres and radians between two poses."""
+    """Return the metres and radians between two poses."""
     turn = a[:3, :3].T @ b[:3, :3]
     cosine = (float(np.trace(turn)) - 1.0) / 2.0
     sine = math.hypot(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]) / 2
     return float(np.linalg.norm(b[:3, 3] - a[:3, 3])), math.atan2(sine, cosine)
 
 
-# At which poses.
+# The keyframes.
 
 
 @dataclass(frozen=True)
@@ -141,17 +141,27 @@ def recording_sequences(
     """
     bag = Bag(path)
     frames = choose_topic(bag, options.topic)
+    sequences = _sequences_of(bag, frames, options, recording_name(path) if name is None else name)
+    depth, _ = sampled_depth(sequences)
+    if depth is not None and depth.is_doubtful and frames.encoding != "32FC1":
+        sequences[0] = replace(sequences[0], note=f"{sequences[0].note}; {depth}")
+    return tuple(sequences)
+
+
+def _sequences_of(
+    bag: Bag, frames: FrameTopic, options: RecordingOptions, name: str
+) -> list[FrameSequence]:
+    """Return the frames of a topic that are taken; see `recording_sequences`."""
     if options.depth_scale is not None and frames.encoding in (None, "32FC1"):
         raise DatasetError(
-            f"{path}: {frames.topic.name} is {frames.encoding or 'points'} in metres, and has no "
-            "depth scale. Leave --depth-scale out."
+            f"{bag.path}: {frames.topic.name} is {frames.encoding or 'points'} in metres, and has "
+            "no depth scale. Leave --depth-scale out."
         )
     info = None if frames.encoding is None else camera_topic(bag, frames, options.camera_info)
     scan = scan_bag(bag, frames.topic, info, options.progress)
     cameras = (
         {} if frames.encoding is None else _cameras(bag, frames, info, scan, options.depth_scale)
     )
-    name = recording_name(path) if name is None else name
     sensor = _sensor(bag, scan, frames, options)
     motions = _motions(bag, scan, frames, sensor, options)
     note = _note(frames, scan, motions)
@@ -164,7 +174,7 @@ def recording_sequences(
         )
     if not any(motion.taken for motion in motions):
         raise DatasetError(
-            f"{path}: {note}. Record transforms of one publisher, or choose another frame with "
+            f"{bag.path}: {note}. Record transforms of one publisher, or choose another frame with "
             "--pose-frame."
         )
     sequences: list[FrameSequence] = []
@@ -178,14 +188,11 @@ def recording_sequences(
             parent = f"{part}/{motion.world}" if motion.world else part
             sequences.append(
                 FrameSequence(
-                    part, path, Layout.RECORDING, parent, None, tuple(references),
+                    part, bag.path, Layout.RECORDING, parent, None, tuple(references),
                     note="" if sequences else note,
                 )
             )  # fmt: skip
-    depth, _ = sampled_depth(sequences)
-    if depth is not None and depth.is_doubtful and frames.encoding != "32FC1":
-        sequences[0] = replace(sequences[0], note=f"{note}; {depth}")
-    return tuple(sequences)
+    return sequences
 
 
 @dataclass(frozen=True)
@@ -198,15 +205,15 @@ class DepthRange:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether hardly any depth camera measures such."""
+        """Return whether hardly any depth camera measures such a range."""
         return not _NEAREST_M < self.median < _FARTHEST_M or self.far > 2 * _FARTHEST_M
 
     def __str__(self) -> str:
-        told = f"depth: {self.near:.2g} to {self.far:.2g} m, median {self.median:.2g} m"
+        text = f"depth: {self.near:.2g} to {self.far:.2g} m, median {self.median:.2g} m"
         if not self.is_doubtful:
-            return told
+            return text
         return (
-            f"{told}, which is unlikely of a depth camera: if its unit is not the millimetre, give "
+            f"{text}, which is unlikely of a depth camera: if its unit is not the millimetre, give "
             "--depth-scale, stored units per metre"
         )
 
@@ -218,7 +225,7 @@ _NEAREST_M, _FARTHEST_M = 0.2, 5.0
 def sampled_depth(
     sequences: Sequence[FrameSequence],
 ) -> tuple[DepthRange | None, SceneprintError | None]:
-    """Depth of the first, the middle and the last frame; and why none could be read."""
+    """Return the depth of the first, the middle and the last frame, and why none could be read."""
     frames = [one for sequence in sequences for one in sequence.frames]
     samples, error, count = [np.empty(0, np.float32)], None, 0
     for place in sorted({0, len(frames) // 2, len(frames) - 1}):
@@ -239,13 +246,13 @@ def sampled_depth(
 
 
 def recording_name(path: Path) -> str:
-    """The name of a recording without what tells its format."""
+    """Return the name of a recording without the suffix of its format."""
     return path.name if path.is_dir() else path.stem
 
 
 def _sensor(bag: Bag, scan: BagScan, frames: FrameTopic, options: RecordingOptions) -> str:
-    """The frame of the sensor: that of the messages, unless it is named, or points are in the frame
-    of the world, as those that FAST-LIO has registered.
+    """Return the frame of the sensor: that of the messages, unless it is named, or points are in
+    the frame of the world, as those that FAST-LIO has registered.
 
     Raises
     ------
@@ -272,8 +279,8 @@ def _sensor(bag: Bag, scan: BagScan, frames: FrameTopic, options: RecordingOptio
 
 
 def _is_world(frame: str, trees: Sequence[TransformTree]) -> bool:
-    """Whether points in a frame have been taken out of the axes of the sensor that measured them:
-    it is called like a world, or sensors move in it and it moves in none.
+    """Return whether points in a frame have been taken out of the axes of their sensor: it is
+    called like a world, or sensors move in it and it moves in none.
     """
     name = frame.rpartition("/")[2]
     if name in WORLDS or name == _WORLD_OF_LOAM:
@@ -315,14 +322,14 @@ class _Motion:
 
     @property
     def is_disputed(self) -> bool:
-        """Whether transforms contradict each other."""
+        """Return whether transforms contradict each other."""
         return any(why.nearest_s is None for why in self.unknown.values())
 
 
 def _motions(
     bag: Bag, scan: BagScan, frames: FrameTopic, sensor: str, options: RecordingOptions
 ) -> list[_Motion]:
-    """Of each part that has frames."""
+    """Return the motion in each part that has frames."""
     parts = [
         (part, range(part.first, end))
         for part, end in zip(scan.parts, scan.ends, strict=True)
@@ -351,7 +358,7 @@ def _motions(
 def _motion(
     part: BagPart, places: range, scan: BagScan, names: tuple[str, str], wanted: str | None
 ) -> _Motion:
-    """Poses and mountings in one part of a sensor, and of it in the frame of its messages."""
+    """Return the poses and mountings of a sensor in one part, before keyframes are chosen."""
     tree, (sensor, frame) = part.tree, names
     stamps = [scan.stamps_ns[place] for place in places]
     world = frame_name(wanted or "") or tree.world_of(sensor)
@@ -413,8 +420,8 @@ def _choose(
 def _ups(
     part: BagPart, sensor: str, taken: list[int], stamps_ns: Sequence[int]
 ) -> dict[int, Floats]:
-    """Up in the sensor's axes of the frames taken, of the IMU with most measurements that does not
-    move against the sensor.
+    """Return up in the sensor's axes of the frames taken, by the IMU with most measurements that
+    does not move against the sensor.
     """
     for imu in sorted(part.imus, key=lambda name: (-len(part.imus[name]), name)):
         T_sensor_imu = part.tree.fixed_transform(sensor, imu)
@@ -455,15 +462,15 @@ def _reference(
 
 
 def _seconds(stamp_ns: int) -> str:
-    """A stamp in seconds, to the nanosecond, which no float holds."""
+    """Return a stamp in seconds, to the nanosecond, which no float holds."""
     return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
 
 
 def _cameras(
     bag: Bag, frames: FrameTopic, topic: BagTopic | None, scan: BagScan, scale: float | None
 ) -> dict[int, Camera]:
-    """The camera of each depth image: by the CameraInfo of its time, else of an intrinsics.json
-    beside the bag.
+    """Return the camera of each depth image: by the CameraInfo of its time, else of an
+    intrinsics.json beside the bag.
     """
     if topic is None or not scan.infos:
         beside = _camera_beside(bag, frames, topic)
@@ -499,16 +506,16 @@ def _camera_beside(bag: Bag, frames: FrameTopic, topic: BagTopic | None) -> Came
 
 
 def _note(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
-    """What was taken and what was left out, for people."""
+    """Return what was taken and what was left out, for people."""
     total, taken = len(scan.stamps_ns), sum(len(motion.taken) for motion in motions)
     poses = sum(len(motion.poses) for motion in motions)
     worlds = sorted({motion.world for motion in motions if motion.poses and motion.world})
-    told = (
+    text = (
         f"{taken} of {total} frames of {printable(frames.topic.name)} taken, poses of {poses} of "
         f"{total} frames{' in ' if worlds else ''}{', '.join(worlds)}"
     )
     if poses < total:
-        told += f"; {total - poses} without: {_reasons(frames, motions)}"
+        text += f"; {total - poses} without: {_reasons(frames, motions)}"
     without = total - poses if poses or not taken else 0
     left = [
         f"{count} {reason}"
@@ -520,15 +527,15 @@ def _note(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
         if count
     ]
     if left:
-        told += f"; left out: {', '.join(left)}"
+        text += f"; left out: {', '.join(left)}"
     if len(motions) > 1:
-        told += f"; split into {len(motions)} parts, as stamps go back"
+        text += f"; split into {len(motions)} parts, as stamps go back"
     remarks = dict.fromkeys(one for motion in motions for one in motion.remarks)
-    return printable("; ".join([told, *list(remarks)[:5]]))
+    return printable("; ".join([text, *list(remarks)[:5]]))
 
 
 def _reasons(frames: FrameTopic, motions: list[_Motion]) -> str:
-    """Why frames have no poses, by transforms, the most frequent first."""
+    """Return why frames have no poses, by transforms, the most frequent first."""
     whys = [why for motion in motions for why in motion.unknown.values()]
     found = []
     for (transform, disputed), count in Counter(
@@ -602,7 +609,7 @@ def bag_outline(path: Path, options: RecordingOptions) -> BagOutline:
             if chosen.encoding is not None:
                 topic = camera_topic(bag, chosen, options.camera_info)
                 camera = None if topic is None else topic.name
-            sequences = recording_sequences(path, options)
+            sequences = tuple(_sequences_of(bag, chosen, options, recording_name(path)))
             depth, unreadable = sampled_depth(sequences)
             if unreadable is not None:
                 sequences, problem = (), str(unreadable)

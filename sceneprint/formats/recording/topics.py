@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from sceneprint.errors import DatasetError, FrameError, UnreadableCloud, UnreadableFrame
-from sceneprint.formats.depth_file import decode_png, encode_npy, encode_png, inverse_depth
+from sceneprint.formats.depth_file import decode_png, encode_npy, encode_png
 from sceneprint.formats.recording.bag import (
     CAMERA,
     COMPRESSED,
@@ -35,6 +35,7 @@ from sceneprint_client.ros_messages import (
     compressed_depth,
     depth_samples,
     image_encoding,
+    inverse_depth,
     is_rectified,
     topic_without_transport,
 )
@@ -101,12 +102,12 @@ class FrameTopic:
 
     @property
     def is_compressed(self) -> bool:
-        """Whether its messages are compressed images."""
+        """Return whether its messages are compressed images."""
         return self.topic.type == COMPRESSED
 
     @property
     def is_rectified(self) -> bool:
-        """Whether its images have been rectified, by the name that ROS gives them."""
+        """Return whether its images have been rectified, by the name that ROS gives them."""
         return is_rectified(self.topic.name)
 
 
@@ -129,7 +130,7 @@ class BagSource:
     T_cloud_sensor: Floats | None = None
 
     def read_bytes(self) -> bytes:
-        """The message as the bytes of a PNG or NPY file.
+        """Return the message as the bytes of a PNG or NPY file.
 
         Raises
         ------
@@ -154,15 +155,15 @@ class BagSource:
 
 
 def _source_in(path: Path, topic: BagTopic, *place: Any) -> BagSource:
-    """A source that came from another process: its bag is opened here."""
+    """Return a source that came from another process: its bag is opened here."""
     return BagSource(shared_bag(path), topic, *place)
 
 
-# Which topics.
+# The topics that are taken.
 
 
 def frame_topics(bag: Bag) -> list[FrameTopic]:
-    """Topics of depth images and of points, each judged by its first message.
+    """Return the topics of depth images and of points, each judged by its first message.
 
     Of an image that is there raw and compressed, the raw one is given.
     """
@@ -180,7 +181,7 @@ def frame_topics(bag: Bag) -> list[FrameTopic]:
 
 
 def _frame_topic(bag: Bag, topic: BagTopic) -> FrameTopic | None:
-    """A topic by its first message; None where it has no depth."""
+    """Return a topic as its first message describes it; None where it has no depth."""
     try:
         message = bag.first(topic.name)
         fields = None if message is None else bag.decode(message, topic.type)
@@ -197,7 +198,7 @@ def _frame_topic(bag: Bag, topic: BagTopic) -> FrameTopic | None:
 
 
 def choose_topic(bag: Bag, wanted: str | None) -> FrameTopic:
-    """The topic whose messages are the frames.
+    """Return the topic whose messages are the frames.
 
     Raises
     ------
@@ -239,7 +240,7 @@ _READ = "16UC1, mono16, 32FC1, compressedDepth, or PNG of 16 bits"
 
 
 def _encodings(bag: Bag) -> str:
-    """What the images of a bag are, for people."""
+    """Return the encodings of the images of a bag, for people."""
     found = []
     for topic in bag.of_type(IMAGE, COMPRESSED)[:20]:
         try:
@@ -247,13 +248,14 @@ def _encodings(bag: Bag) -> str:
             fields = None if message is None else bag.decode(message, topic.type)
         except DatasetError:
             fields = None
-        told = getattr(fields, "encoding", None) or getattr(fields, "format", "damaged")
-        found.append(f"{topic.name} ({told!r:.40})")
+        encoding = getattr(fields, "encoding", None) or getattr(fields, "format", "damaged")
+        found.append(f"{topic.name} ({encoding!r:.40})")
     return printable(", ".join(found)) or "not there"
 
 
 def camera_topic(bag: Bag, frames: FrameTopic, wanted: str | None) -> BagTopic | None:
-    """The topic of the camera of depth images: beside theirs, else the only one of their frame.
+    """Return the topic of the camera of depth images: beside theirs, else the only one of their
+    frame.
 
     Raises
     ------
@@ -282,7 +284,7 @@ def camera_topic(bag: Bag, frames: FrameTopic, wanted: str | None) -> BagTopic |
 
 
 def _frame_of(bag: Bag, topic: BagTopic) -> str | None:
-    """The frame of a topic's first message."""
+    """Return the frame of a topic's first message."""
     try:
         message = bag.first(topic.name)
         fields = None if message is None else bag.decode(message, topic.type)
@@ -292,6 +294,6 @@ def _frame_of(bag: Bag, topic: BagTopic) -> str | None:
 
 
 def listed(topics: Iterable[BagTopic]) -> str:
-    """Names for people."""
+    """Return the names of topics, for people."""
     names = [f"{one.name} ({one.type.rpartition('/')[2]}, {one.count} messages)" for one in topics]
     return printable(", ".join(names[:20])) or "none"
