@@ -249,6 +249,7 @@ def test_a_cloud_or_mesh_may_be_a_whole_map(
     expect(row(page, "room.ply").locator(".row-about")).to_contain_text("Whole map")
     page.locator("summary", has_text="Whole maps").click()
     page.locator("select[name=map_up]").select_option("z")
+    page.locator("input[name=map_offset]").fill("1,0,-2")
     assert axe(page) == []
     page.get_by_role("button", name="Upload 1 file").click()
     more = row(page, "room.ply").locator(".row-more")
@@ -256,7 +257,9 @@ def test_a_cloud_or_mesh_may_be_a_whole_map(
     [job] = station.client.get("/v1/jobs", params={"kind": "import-map"}).json()["items"]
     result = job["result"]
     assert result["up_from"] == "stated"
+    assert result["offset"] == {"x": 1, "y": 0, "z": -2}
     expect(more).to_contain_text(f"{result['views']} views are in the map")
+    expect(more).to_contain_text("Offset: 1,0,-2 m")
     expect(more).to_contain_text(f"{result['found']} were found, {result['ambiguous']} ambiguous")
     [frame] = station.client.get("/v1/maps/whole/frames", params={"limit": 1}).json()["items"]
     assert frame["tags"] == ["virtual"]

@@ -174,18 +174,19 @@ function importOf(item) {
   ];
 }
 
-/** What became of a whole map, and how good it is. */
+/** Result of the import of a whole map, in sentences. */
 function mapOf(item) {
-  const told = item.job.result ?? {};
-  const weak = told.weak ?? [];
+  const result = item.job.result ?? {};
+  const weak = result.weak ?? [];
   const at = ({ x, y, z }) => [x, y, z].map((value) => value.toFixed(1)).join(", ");
   return [
-    h("p", {}, `${count(told.views)} views are in the map and see ${percent(told.seen)} of its surface.`,
-      told.refused > 0 && ` ${count(told.refused)} were refused.`),
-    told.coverage !== null && h("p", {}, h("strong", {}, `Of ${count(told.tested)} other views of this file, ${percent(told.coverage)} are found in the map. `),
-      `${count(told.found)} were found, ${count(told.ambiguous)} ambiguous, ${count(told.not_found)} not found, ${count(told.wrong)} wrong. Real frames are found less often: try some.`),
-    h("p", {}, `Units: ${told.units_per_metre} per metre (${told.units_from}). Up: ${at(told.up)} (${told.up_from}).`),
-    (told.notes ?? []).map((note) => h("p", {}, note)),
+    h("p", {}, `${count(result.views)} views are in the map and see ${percent(result.seen)} of its surface.`,
+      result.refused > 0 && ` ${count(result.refused)} were refused.`),
+    result.coverage !== null && h("p", {}, h("strong", {}, `Of ${count(result.tested)} other views of this file, ${percent(result.coverage)} are found in the map. `),
+      `${count(result.found)} were found, ${count(result.ambiguous)} ambiguous, ${count(result.not_found)} not found, ${count(result.wrong)} wrong. Real frames are found less often: try some.`),
+    h("p", {}, `Units: ${result.units_per_metre} per metre (${result.units_from}). Up: ${at(result.up)} (${result.up_from}).`),
+    Object.values(result.offset ?? {}).some((value) => value !== 0) && h("p", {}, `Offset: ${Object.values(result.offset).join(",")} m. Add it to a pose for the coordinates of the file.`),
+    (result.notes ?? []).map((note) => h("p", {}, note)),
     weak.length > 0 && h("details", {}, h("summary", {}, "Weak here"),
       h("ul", {}, weak.map((area) => h("li", {}, `${at(area.centre)} m, ${area.width_m} m wide: ${count(area.found)} of ${count(area.views)} found`)))),
   ];

@@ -12,14 +12,16 @@ const UNITS = [["", "From the file"], ["1", "Metres"], ["100", "Centimetres"], [
  */
 export function mapFields(given) {
   const write = (name) => (event) => { given[name] = event.target.value; remember(given); };
+  const text = (name, label, unit, placeholder) => h("label", { class: "field" }, h("span", {}, label, h("small", { class: "muted" }, unit)),
+    h("input", { type: "text", name, autocomplete: "off", placeholder, value: given[name], onInput: write(name) }));
   const choice = (name, label, options) => h("label", { class: "field" }, h("span", {}, label),
     h("select", { name, onChange: write(name) }, options.map(([value, text]) => h("option", { value, selected: given[name] === value }, text))));
   return h("div", { class: "source-fields" }, h("details", {},
     h("summary", {}, "Whole maps"),
     h("div", { class: "source-row" },
       choice("map_up", "Up", UPS), choice("map_units", "Unit", UNITS),
-      h("label", { class: "field" }, h("span", {}, "Sensor heights", h("small", { class: "muted" }, " m above the floor")),
-        h("input", { type: "text", name: "map_heights", autocomplete: "off", placeholder: "those of the model", value: given.map_heights, onInput: write("map_heights") })))));
+      text("map_heights", "Sensor heights", " m above the floor", "those of the model"),
+      text("map_offset", "Offset", " x,y,z m", "from the file"))));
 }
 
 /**
@@ -28,6 +30,6 @@ export function mapFields(given) {
  * @returns {Object<string, string>}
  */
 export function mapParams(given) {
-  const params = { as: "map", up: given.map_up, units_per_metre: given.map_units, heights: given.map_heights.trim() };
+  const params = { as: "map", up: given.map_up, units_per_metre: given.map_units, heights: given.map_heights.trim(), offset: given.map_offset.trim() };
   return Object.fromEntries(Object.entries(params).filter(([, value]) => value !== ""));
 }
