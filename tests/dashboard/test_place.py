@@ -305,6 +305,38 @@ def test_robots_stand_where_their_queries_found_them(
     expect(rows.first).to_contain_text("cart")
 
 
+def test_a_query_between_the_list_and_the_events_moves_its_robot_too(
+    page: Page, station: Any, patrolled: dict[str, Any], settle: Any, until: Any
+) -> None:
+    held: list[Any] = []
+
+    def hold(route: Any) -> None:
+        if route.request.headers.get("accept") == "text/event-stream":
+            held.append(route)
+        else:
+            route.continue_()
+
+    def heard() -> bool:
+        page.wait_for_timeout(20)  # requests are handled while the page is waited for
+        return bool(held)
+
+    page.route("**/v1/events*", hold)
+    page.goto(f"{station.home}#/maps/patrolled/place")
+    settle(page)
+    until(heard)
+    rows = page.locator(".place-robots > li")
+    assert "late" not in rows.evaluate_all("all => all.map((one) => one.dataset.robot)")
+    moved = ask(station, "late", 0)
+
+    def listed() -> bool:
+        found = station.client.get("/v1/queries", params={"map": "patrolled"}).json()["items"]
+        return any(one["query_id"] == moved["query_id"] for one in found)
+
+    until(listed)
+    held.pop().continue_()
+    expect(rows.first).to_contain_text("late", timeout=60_000)
+
+
 def test_what_is_missing_is_told(
     page: Page, open_page: Callable[..., Page], station: Any, built: dict[str, Any], settle: Any,
     until: Any,

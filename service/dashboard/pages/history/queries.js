@@ -43,7 +43,8 @@ export async function render(root, { params, search, signal, go, title }) {
   const news = h("button", { class: "button primary", type: "button", hidden: true, onClick: () => newest() });
   const show = rows(body, (one) => one.query_id, row);
   let found = [];
-  let fresh = 0;
+  /** @type {Set<string>} ids of queries that came and are not shown */
+  const fresh = new Set();
   /** @type {string | null} */
   let cursor = null;
 
@@ -54,12 +55,13 @@ export async function render(root, { params, search, signal, go, title }) {
     more.hidden = cursor === null;
     card.hidden = found.length === 0;
     none.hidden = found.length > 0;
-    news.hidden = fresh === 0;
-    put(news, `Show ${fresh === 1 ? "1 new query" : `${count(fresh)} new queries`}`);
+    news.hidden = fresh.size === 0;
+    put(news, `Show ${fresh.size === 1 ? "1 new query" : `${count(fresh.size)} new queries`}`);
   }
   async function newest() {
     const told = await page(null);
-    [found, cursor, fresh] = [told.items, told.next_cursor, 0];
+    [found, cursor] = [told.items, told.next_cursor];
+    fresh.clear();
     tell();
   }
   async function older() {
@@ -83,7 +85,17 @@ export async function render(root, { params, search, signal, go, title }) {
       select("queries-kept", "Answers", KEPT, asked.kept, (kept) => to({ kept })),
       robotField(asked.robot, (robot) => to({ robot }))),
     news), card, none, more);
-  follow(map, asked, signal, (events) => { fresh += events; tell(); });
+  /** Announce queries of the newest page that are not shown. */
+  async function look() {
+    const told = await page(null), newest = Date.parse(found[0]?.at ?? 0);
+    came(told.items.filter((one) => Date.parse(one.at) >= newest).map((one) => one.query_id));
+  }
+  function came(ids) {
+    const known = new Set(found.map((one) => one.query_id));
+    for (const id of ids) if (!known.has(id)) fresh.add(id);
+    tell();
+  }
+  follow(map, asked, signal, came, look);
 }
 
 /** Parameters of the list, by what the address says. */
@@ -95,15 +107,22 @@ function wanted({ status, robot, last, since, until, kept }) {
   };
 }
 
-/** Hear of queries that came, where they would be in the list; of many at once only once. */
-function follow(map, asked, signal, heard) {
-  let waiting = 0;
+/**
+ * Hear of queries that came, where they would be in the list; of many at once only once.
+ * @param {(ids: string[]) => void} came @param {() => Promise<void>} look for those of which no event may have come
+ */
+function follow(map, asked, signal, came, look) {
+  if (asked.until !== null || asked.kept !== null) return;
+  /** @type {string[]} */
+  let waiting = [];
   const fits = ({ status, robot }) => (!asked.robot || asked.robot === robot)
     && (!asked.status || asked.status === status || (asked.status === "lost" && LOST.includes(status)));
-  watch({ map, kinds: ["query.answered"], signal, onevent: (event) => {
-    if (asked.until !== null || asked.kept !== null || !fits(event.data)) return;
-    waiting += 1;
-    if (waiting === 1) setTimeout(() => { if (!signal.aborted) heard(waiting); waiting = 0; }, TOGETHER_MS);
+  const tell = () => { if (!signal.aborted) came(waiting); waiting = []; };
+  watch({ map, kinds: ["query.answered"], signal, onstate: (state) => { if (state === "live") look(); }, onevent: ({ kind, data }) => {
+    if (kind === "events.missed") { look(); return; }
+    if (!fits(data)) return;
+    waiting.push(data.query_id);
+    if (waiting.length === 1) setTimeout(tell, TOGETHER_MS);
   } });
 }
 

@@ -8,6 +8,8 @@ const SILENT_S = 8; // a stream says every three seconds that it lives
 /**
  * Hear what happens until `signal` aborts. Where the stream breaks off it goes on at the last
  * event; while the page is hidden it rests, since a browser has few connections for all its tabs.
+ * It is "live" once the service has told its place: what comes from then on is heard, so a list that
+ * is read then lacks nothing.
  * @param {{map?: string, kinds?: string[], onevent: (event: Object<string, any>) => void,
  *   onstate?: (state: "live" | "waiting") => void, signal: AbortSignal}} what kinds: their beginnings
  * @returns {Promise<void>} rejected with a Problem where the API refuses for good
@@ -38,8 +40,11 @@ export async function watch({ map, kinds, onevent, onstate = () => {}, signal })
       if (state.last !== null) headers["Last-Event-ID"] = state.last;
       const answer = await ask("events", { map, kind: kinds }, { headers, signal: turn.signal });
       wait = FIRST_S;
-      tell("live", onstate);
-      await messages(answer.body, state, onevent, heard);
+      let begun = false;
+      await messages(answer.body, state, onevent, () => {
+        heard();
+        if (!begun && state.last !== null) { begun = true; tell("live", onstate); }
+      });
     } catch (error) {
       lost = silent || !turn.signal.aborted; // else it rests
       if (error.name !== "AbortError" && !passes(error)) throw error;
@@ -73,7 +78,6 @@ async function messages(body, state, onevent, heard) {
   for (;;) {
     const { done, value } = await whole(reader.read());
     if (done) return;
-    heard();
     const parts = (rest + value).split("\n\n");
     rest = parts.pop() ?? "";
     for (const part of parts) {
@@ -88,6 +92,7 @@ async function messages(body, state, onevent, heard) {
       if (data) onevent(JSON.parse(data));
       if (id !== null) state.last = id;
     }
+    heard();
   }
 }
 

@@ -26,7 +26,7 @@ export const styles = ["paths/paths.css", "place/place.css", "query/alternatives
 /** How often a surface that is built is asked for, and one that may be soon. */
 const BUILDING_MS = 1500, WAITING_MS = 6000;
 const TOGETHER_MS = 1500; // frames of a burst are one look
-const CHANGES = new Set(["frame.indexed", "frame.deleted", "frame.edited", "surface.updated"]);
+const CHANGES = new Set(["events.missed", "frame.indexed", "frame.deleted", "frame.edited", "surface.updated"]);
 /** Frames are told from so far below the plan to so far above it, metres. */
 const TALL = 1000;
 
@@ -274,12 +274,17 @@ class Place {
     watch({
       map: this.map, kinds: ["query.answered", "frame.", "surface."], signal: this.signal,
       onevent: ({ kind }) => {
-        if (kind === "query.answered") { this.robots.heard(); return; }
-        if (!CHANGES.has(kind) || this.surface.record.state === "building") return;
-        clearTimeout(this.#timer);
-        this.#timer = setTimeout(() => this.#again(), TOGETHER_MS);
+        if (kind === "query.answered" || kind === "events.missed") this.robots.heard();
+        if (CHANGES.has(kind)) this.#soon();
       },
+      onstate: (state) => { if (state === "live") { this.robots.heard(); this.#soon(); } }, // what came before it was live
     });
+  }
+
+  #soon() {
+    if (this.surface.record.state === "building") return; // it is asked for anyway
+    clearTimeout(this.#timer);
+    this.#timer = setTimeout(() => this.#again(), TOGETHER_MS);
   }
 
   /** The address says what is shown, so that it survives a reload. */
