@@ -147,12 +147,7 @@ class TurnOrder(Generic[Waiter]):
 
 
 class ThreadTurns:
-    """Turns of threads.
-
-    Parameters
-    ----------
-    count, beside : see TurnOrder
-    """
+    """Turns of threads."""
 
     def __init__(self, count: int, beside: int | None = None) -> None:
         self._order: TurnOrder[threading.Lock] = TurnOrder(count, beside)

@@ -74,12 +74,7 @@ def share(room: int) -> int:
 
 
 class Turns:
-    """Turns of requests: see TurnOrder.
-
-    Parameters
-    ----------
-    count, beside, clock, rests : see TurnOrder
-    """
+    """Turns of requests: see TurnOrder."""
 
     def __init__(
         self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic,

@@ -42,13 +42,7 @@ class Check:
 
 
 def disk_check(subject: str, free: int) -> Check:
-    """Whether there is room for frames to come.
-
-    Parameters
-    ----------
-    subject : whose disk it is
-    free : bytes left on it
-    """
+    """Whether there is room for frames to come."""
     text = f"{free / 1e9:.1f} GB free; a frame takes about 0.25 MB"
     if free < LEAST_FREE:
         return Check("WRONG", subject, f"{text}. Free some space, or uploads will be rejected.")
@@ -75,16 +69,8 @@ _MOST_NAMES = 5
 
 
 def service_checks(client: Client, url: str) -> Iterator[Check]:
-    """Ask a service that answers for all that it tells.
-
-    Parameters
-    ----------
-    client : of the service
-    url : its address, for people
-
-    Raises
-    ------
-    SceneprintError : it ceased to answer.
+    """Ask a service that answers for all that it tells. Raises SceneprintError if it ceased to
+    answer.
     """
     try:
         status = client.status()

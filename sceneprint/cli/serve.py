@@ -61,11 +61,8 @@ def add_workers_option(command: argparse.ArgumentParser) -> None:
 
 
 def settings_of(options: argparse.Namespace) -> Settings:
-    """Settings of the environment, and what the options say instead.
-
-    Raises
-    ------
-    InvalidRequest : a value that is none.
+    """Settings of the environment, and what the options say instead. Raises InvalidRequest for a
+    value that is not valid.
     """
     from pydantic import ValidationError
 

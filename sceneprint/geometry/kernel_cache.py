@@ -78,12 +78,7 @@ class _Locations(CompileResultCacheImpl):
 
 
 class KernelCache(FunctionCache):
-    """The machine code of one kernel on disk.
-
-    Parameters
-    ----------
-    function : the kernel
-    """
+    """The machine code of one kernel on disk."""
 
     _impl_class = _Locations
 

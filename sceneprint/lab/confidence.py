@@ -41,12 +41,7 @@ class JudgedQuery:
 
 
 def judged_queries(answers: Iterable[SiteAnswer]) -> list[JudgedQuery]:
-    """Return the candidate poses of every answer that has any.
-
-    Parameters
-    ----------
-    answers : of `ask_site`
-    """
+    """Return the candidate poses of every answer that has any."""
     return [
         JudgedQuery(
             one.site, one.kind, one.query,

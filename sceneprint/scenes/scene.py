@@ -58,14 +58,7 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class LineSet:
-    """Strips of lines.
-
-    Parameters
-    ----------
-    strips : each (M, 3) metres
-    colours : of each strip
-    width_px : on the screen
-    """
+    """Strips of lines, each (M, 3) metres and of one colour."""
 
     strips: Sequence[Floats]
     colours: Sequence[Colour]
@@ -74,13 +67,7 @@ class LineSet:
 
 @dataclass(frozen=True, eq=False)
 class TextLabel:
-    """A short text in space.
-
-    Parameters
-    ----------
-    position : (3,) metres
-    text, colour : of it
-    """
+    """A short text in space."""
 
     position: Floats
     text: str
@@ -147,12 +134,7 @@ class SceneWriter(Protocol):
 
 
 class SceneStream:
-    """A scene while it is written, which knows what each moment replaces.
-
-    Parameters
-    ----------
-    writer : of the scene's file
-    """
+    """A scene while it is written, which knows what each moment replaces."""
 
     def __init__(self, writer: SceneWriter) -> None:
         self._writer = writer

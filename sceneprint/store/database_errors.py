@@ -31,13 +31,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def unusable(what: str, error: OSError) -> UnusableStore:
-    """A file or folder that cannot be written, in our words.
-
-    Parameters
-    ----------
-    what : happened, with the place
-    error : of the system
-    """
+    """A file or folder that cannot be written, in our words."""
     text = f"{what} ({error.strerror})."
     if error.errno in _FULL:
         return StoreFull(f"{text} The disk is full: free some space.")

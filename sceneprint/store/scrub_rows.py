@@ -45,12 +45,7 @@ def read_scrub(connection: Connection) -> ScrubRow | None:
 
 
 def claim_slice(connection: Connection) -> ScrubRow | None:
-    """Take the next slice; None where it is not due.
-
-    Parameters
-    ----------
-    connection : of a writing transaction
-    """
+    """Take the next slice; None where it is not due."""
     now, row = read_clock(connection), read_scrub(connection)
     if row is None:
         row = ScrubRow(1, 0, now + SLICE_S, now, None, 0, 0, 0)

@@ -290,12 +290,7 @@ class IncomingBytes:
 
 
 class Uploads:
-    """Takes frames into maps; safe to share between threads.
-
-    Parameters
-    ----------
-    store, bell : see there
-    """
+    """Takes frames into maps; safe to share between threads."""
 
     def __init__(self, store: Store, bell: Wakeup) -> None:
         self._store, self._bell = store, bell

@@ -120,12 +120,7 @@ _Work = Callable[[Connection], Any]
 
 
 class Grouping(_Group[_Work]):
-    """Writes of many threads to one database; safe to share between them.
-
-    Parameters
-    ----------
-    database, map_number : see `Database.write`
-    """
+    """Writes of many threads to one database; safe to share between them."""
 
     def __init__(self, database: Database, map_number: int | None = None) -> None:
         super().__init__()
@@ -189,10 +184,6 @@ def _do(one: _Waiting[_Work], connection: Connection) -> None:
 class NewFrames(_Group[NewFrame]):
     """New frames of many threads, whatever their maps, taken together by one statement of
     PostgreSQL; safe to share between threads.
-
-    Parameters
-    ----------
-    database : on PostgreSQL
     """
 
     def __init__(self, database: Database) -> None:

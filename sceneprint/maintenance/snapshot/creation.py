@@ -98,13 +98,7 @@ def copied_blobs(blobs: Blobs, digests: Iterable[str]) -> Iterator[CopiedBlob | 
 
 
 def total_bytes(blobs: Blobs, digests: Iterable[str], count: int) -> int:
-    """Bytes of all blobs, missing ones left out; about, where there are many.
-
-    Parameters
-    ----------
-    blobs, digests : which
-    count : of the digests
-    """
+    """Bytes of all blobs, missing ones left out; about, where there are many."""
     step = max(-(-count // _MEASURED), 1)
     with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="measure") as pool:
         sizes = pool.map(blobs.size, filter(is_digest, islice(digests, 0, None, step)))
