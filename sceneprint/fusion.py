@@ -77,7 +77,6 @@ def fuse(
     Parameters
     ----------
     views : each with pose T_parent_view, in one parent frame
-    p : see FusionParameters
 
     Returns
     -------

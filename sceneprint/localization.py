@@ -134,7 +134,6 @@ def localize(
     views_of : see ViewsOf; None: pairs alone decide
     prior : what the robot believed before
     p : default: those of the model that made the artifacts
-    overlap_p : see there
 
     Returns
     -------
@@ -190,8 +189,6 @@ def decide(
     ----------
     frames : of the query, with the matches of their candidates
     ranking : R of the last frame
-    database : see QueryDatabase
-    p : see LocalizationParameters
 
     Returns
     -------
@@ -246,7 +243,6 @@ def views_of_rows(
     poses : T_parent_sensor (4, 4) of every row
     open_geometry : artifact of a row, or None
     parents : parent frame of every row; default: one for all
-    p, overlap_p : see there
     ahead : of every row, whether its sensor looks along z; default: all do
     rendered : of every row, whether it is a view rendered from a surface; default: none is
     """
@@ -297,7 +293,6 @@ def rival_rows(
     tried : rows that were validated
     posed : describes those of some rows that have a pose
     query_ahead : whether the query's sensor looks along z
-    p : see there
 
     Returns
     -------
@@ -345,7 +340,6 @@ def _estimate_of(
     Parameters
     ----------
     parent, prior, places : of `judged_places`; one place or more
-    p : see LocalizationParameters
     blind : whether nothing is known of free space
     """
     if all(place.evidence is None for place in places):

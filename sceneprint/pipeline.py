@@ -144,7 +144,6 @@ def retrieve(
 
     Parameters
     ----------
-    query : see Signature
     database : N signatures
     model : of all of them
     size : how many; default: by the density of the map, see `ranking_size`
@@ -302,7 +301,6 @@ class PairMatch:
     ----------
     index : row of the database
     distance, similarity : of the signatures
-    validation : see Validation
     """
 
     index: int

@@ -380,7 +380,6 @@ def _evidence(
     suggested : see `_suggested`
     views : the map's frames
     rival, rival_weight : best score, and largest weight, of another place
-    p : see LocalizationParameters
     """
     weight = _weight(group, p)[1]
     strong = _weight([v for v in group if v.match.validation.strength == "strong"], p)[0]

@@ -111,7 +111,6 @@ def see(frame: AnyFrame, p: ModelParameters) -> Surface:
     Parameters
     ----------
     frame : depth, or a cloud, in metres
-    p : of the model
 
     Returns
     -------
@@ -138,7 +137,6 @@ def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy
     Parameters
     ----------
     seen : of `see`
-    p : of the model
     name : of the frame, for errors
 
     Raises
@@ -218,7 +216,6 @@ def float_signature(levels: list[LevelStatistics], model: Model, name: str = "")
     Parameters
     ----------
     levels : one or more, finest first
-    model : see Model
     name : of the frame, for errors
 
     Raises

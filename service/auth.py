@@ -92,7 +92,6 @@ class Context:
 
     Parameters
     ----------
-    engine, gate, metrics : see there
     uploads : the gate of uploads and of edits of many frames, which wait for the disk and for other
         writers: of their own, so that no query waits behind them
     keys : whether callers must show one

@@ -236,7 +236,6 @@ def add_transform(
     found : fields of a record
     given : the query string
     name, frame : of the two parameters
-    field : of the record
 
     Raises
     ------
@@ -668,7 +667,6 @@ def guarded(asking: Caller, key: str | None, *parts: object) -> IdempotentReques
     Parameters
     ----------
     asking : who asks: keys of two callers have nothing to do with each other
-    key : of the header
     parts : of the request, all that makes it another one: route, map, content, metadata; bytes,
         records, or what JSON can say
     """

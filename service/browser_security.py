@@ -83,7 +83,6 @@ def stranger(
 
     Parameters
     ----------
-    headers : of the request
     allows : whether pages of another origin may ask nevertheless
     path : of the request: links of others may lead to pages of the service
     """

@@ -171,7 +171,6 @@ class LocalExchange(httpx.SyncByteStream):
 
     Parameters
     ----------
-    loop : of the application
     body : of the request; read in the thread that asks
     """
 

@@ -136,7 +136,6 @@ class SharedLooks:
 
         Parameters
         ----------
-        name : of the look
         look : called in a thread where no result of this name is young enough
         """
         arrived = time.monotonic()
@@ -254,7 +253,6 @@ class RateState:
 
     Parameters
     ----------
-    name : of the limit
     quota : requests that a rested caller may make at once
     window_s : seconds after which an empty bucket is full again
     left : requests that may be made now

@@ -353,7 +353,6 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
 
     Parameters
     ----------
-    settings : see Settings
     ready : called once it answers, with its address, and whether its store is read-only
 
     Raises

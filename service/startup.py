@@ -27,7 +27,6 @@ class Front:
 
     Parameters
     ----------
-    settings : see Settings
     load : makes the application, in a thread
     failed : called where it could not be made or begun; `error` says why
     """

@@ -53,7 +53,6 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
 
     Parameters
     ----------
-    settings : see Settings
     parent : process id of the one that started this
     trace : for what it reads when this process dies
     """

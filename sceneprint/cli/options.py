@@ -462,7 +462,6 @@ def open_for(options: argparse.Namespace, settings: Settings, *, psi: bool = Fal
     Parameters
     ----------
     options : of `add_model_options`
-    settings : see Settings
     psi : sign with psi itself; of the preset `paper` where no model is named
 
     Raises
@@ -488,7 +487,6 @@ def prepare_presets(
 
     Parameters
     ----------
-    settings : see Settings
     say : what tells of each step, as it takes a while (default: lines on standard error)
     clouds : compile what clouds need as well; else the first cloud waits for that
     stop : once it is set, nothing more is compiled or built

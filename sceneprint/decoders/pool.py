@@ -291,7 +291,6 @@ class _Slot:
         Parameters
         ----------
         request : task and its parameters
-        data : of an upload
         checked : makes the result of a reply that it has looked at; any error: a lie
         compiled : whether kernels are needed
 

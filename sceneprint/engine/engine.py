@@ -414,7 +414,6 @@ def open_engine(
 
     Parameters
     ----------
-    settings : see Settings
     patience_s : seconds to wait at most
     may_go_on : waits so many seconds, and says whether to try again; default: it always is
 

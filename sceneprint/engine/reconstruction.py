@@ -75,7 +75,6 @@ class JobView:
 
     Parameters
     ----------
-    map, frame_id : of the match
     rank, strength : of the answer; None of the query itself
     transform : (4, 4) T_query_match
     """
@@ -99,7 +98,6 @@ def fused(
     views : at least one, in the order of the ranking
     query : its own geometry; None where it is not known
     own : the query, where it is a stored frame
-    wanted : see NewReconstruction
     model_id : whose artifacts stand in for uploads that are lost
     parent_frame : what the query's camera frame is called
     asked_at : when the answer was given, seconds since 1970
@@ -255,7 +253,6 @@ class ReconstructionJobs:
 
         Parameters
         ----------
-        stored : the answer
         wanted : which of its views, and to what
 
         Raises

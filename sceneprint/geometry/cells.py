@@ -306,7 +306,6 @@ def frame_verdicts(
     Parameters
     ----------
     positions : (N, 3) of the cells, metres in the parent frame
-    surface : of the frame
     T_parent_sensor : (4, 4)
     p : tolerances, of the model
 

@@ -196,7 +196,6 @@ def _made_of(function: Callable[..., Any], known: dict[str, Any]) -> str:
 
     Parameters
     ----------
-    function : the kernel
     known : names of its module and their values when it was decorated
     """
     told = []

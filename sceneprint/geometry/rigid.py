@@ -274,7 +274,6 @@ def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAv
     Parameters
     ----------
     poses : (n, 4, 4) T_parent_sensor of one sensor in one parent frame, best first
-    p : see AveragingParameters
 
     Raises
     ------

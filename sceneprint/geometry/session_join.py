@@ -196,9 +196,7 @@ def verdicts(
 
     Parameters
     ----------
-    edges : see Edges
     source, target : the runs of their frames; the same one twice for loop closures
-    p : see CycleParameters
     within_run : whether both are the same run
     """
     p = p or CycleParameters()
@@ -449,7 +447,6 @@ def join(votes: Votes, seed: int = 0, p: JoiningParameters | None = None) -> Ses
     ----------
     votes : see Votes; at least one
     seed : of the lot, 0 or more
-    p : see JoiningParameters
 
     Raises
     ------

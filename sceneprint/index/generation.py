@@ -55,7 +55,6 @@ class Generation:
 
     Parameters
     ----------
-    manifest : see GenerationManifest
     segments : that together hold each frame once
     inodes : of the files by their names: another may have taken a name since
     """

@@ -268,7 +268,6 @@ class GenerationManifest:
 
     Parameters
     ----------
-    number : of the generation
     revision : of the map, up to which the generation holds its frames
     model_id : of the model that signed them
     dimension : D, bytes of a signature

@@ -185,7 +185,6 @@ class Segment:
         size : of the answer
         gone : (g,) rising, of frames that may not be found
         among : (a,) rising, of those that may; None: all others
-        metric : of their model
         exact : compare every frame that may be found
 
         Returns
@@ -365,7 +364,6 @@ def write_segment(
 
     Parameters
     ----------
-    folder : of the map
     sources : of which at least one has frames
     clean : leave nothing of frames that are gone
     flat_bytes : of signatures, above which there are sketches

@@ -253,7 +253,6 @@ def train(
     ----------
     name : what to call the model
     model_p, mixture_p : its parameters, such as those of a preset: see `preset_parameters`
-    p : see TrainingParameters
     references : frames of one's own beside the rooms, each with the name of its place
     jobs : processes that make and segment frames; with one, this process does
     report : called as the stages advance
@@ -327,7 +326,6 @@ def calibrated(model: Model, lessons: Sequence[Lesson], p: TrainingParameters) -
     ----------
     model : with projection and mixture
     lessons : of at least two places
-    p : see TrainingParameters
     """
     signer = open_signer(model, cached=False)
     first = {lesson.place: lesson for lesson in reversed(lessons)}

@@ -63,7 +63,6 @@ class Scrub:
     Parameters
     ----------
     settings : `scrub_mb_per_s` is the rate of all workers of the store together
-    store : see Store
     """
 
     def __init__(self, settings: Settings, store: Store) -> None:

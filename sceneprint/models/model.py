@@ -93,8 +93,6 @@ class Model:
     Parameters
     ----------
     name : what people call it; not part of its identity
-    parameters : see ModelParameters
-    projection, mixture, compression : see there
     quantiser_step : one unit of a byte of psi
     psi_unrelated_distance : the median L1 distance of psi of unrelated training frames, in units
         of a byte

@@ -102,7 +102,6 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
     Parameters
     ----------
     p : as read from a file
-    n_components : of the mixture
     n_compressed : bytes of a descriptor
 
     Raises
@@ -198,7 +197,6 @@ def save_model(model: Model, path: Path) -> None:
 
     Parameters
     ----------
-    model : see Model
     path : of the file; its folder must exist
     """
     data = write_model(model)
@@ -242,7 +240,6 @@ def parse_model(data: bytes, name: str) -> Model:
 
     Parameters
     ----------
-    data : the file
     name : of the file, for errors
 
     Raises
@@ -405,7 +402,6 @@ def open_table(
 
     Parameters
     ----------
-    model : see Model
     cache_dir : folder of derived files; created where missing
     progress : called while the table is being built
     """
@@ -451,7 +447,6 @@ def build_table(model: Model, progress: Progress | None = None) -> PairTable:
 
     Parameters
     ----------
-    model : see Model
     progress : called with bins done and their total
     """
     return PairTable(_build(model, progress))

@@ -325,7 +325,6 @@ def association_scene(client: Client, told: Association, text: str, most: int) -
     Parameters
     ----------
     client : to fetch with
-    told : the association
     text : about it, for people
     most : frames whose points are drawn
     """

@@ -139,8 +139,6 @@ class Store:
 
     Parameters
     ----------
-    database, blobs : see there
-    geometry_bytes : see GeometryCache
     decoders : that bytes of uploads are decoded by
     """
 
@@ -181,9 +179,7 @@ def open_store(
 
     Parameters
     ----------
-    url : of the database
     blobs : folder, or URL of an object store
-    geometry_bytes : see GeometryCache
     decoders : see Store; default: one upload at a time in this process
 
     Raises

@@ -128,7 +128,6 @@ def spent_lines(
 
     Parameters
     ----------
-    connection : of the database
     before : seconds since 1970; older lines may go. Where a clock was set back, an older line
         behind a younger one stays until that is old too
     limit : most numbers

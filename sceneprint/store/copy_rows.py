@@ -48,8 +48,6 @@ def indexed_rows(connection: Connection, row: MapRow, after: int, limit: int) ->
 
     Parameters
     ----------
-    connection : of the database
-    row : of the map
     after : number of the last frame before
     limit : at most so many
     """
@@ -115,7 +113,6 @@ def add_copied(connection: Connection, row: MapRow, found: Sequence[CopiedFrame]
     Parameters
     ----------
     connection : of a writing transaction
-    row : of the map
     found : of which the map has none that is not deleted
     """
     gone = select(frames.c.id).where(

@@ -185,7 +185,6 @@ def explain_error(url: URL, error: object, broken: bool) -> UnusableStore | None
 
     Parameters
     ----------
-    url : of the database
     error : of psycopg
     broken : whether it is of a kind that no other statement would have been spared
     """

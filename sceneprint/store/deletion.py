@@ -81,7 +81,6 @@ def delete_frames(
     Parameters
     ----------
     connection : of a writing transaction
-    row : of the map
     numbers : of its frames, a few hundred at most; those that are deleted already are left out
     reason : data of the events where nobody requested the deletion
     deletion : of the tombstones that are made; None: the frames are purged at once
@@ -390,7 +389,6 @@ def remove_ended(connection: Connection, map_number: int, before: float, limit: 
     Parameters
     ----------
     connection : of a writing transaction of the map
-    map_number : of the map
     before : seconds since 1970
     limit : at most so many of each state
 

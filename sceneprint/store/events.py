@@ -312,7 +312,6 @@ def floors(connection: Connection, kept: int) -> dict[str | None, int]:
 
     Parameters
     ----------
-    connection : of the database
     kept : newest events that stay of each map
     """
     oldest = connection.execute(select(func.min(events.c.number))).scalar()
@@ -339,7 +338,6 @@ def floor_of(connection: Connection, wanted: Wanted, kept: int, after: int) -> i
 
     Parameters
     ----------
-    connection : of the database
     wanted : whose maps are looked at, and not its kinds
     kept : see `floors`
     after : only whether the answer is greater is asked for: most often that is known at once
@@ -383,7 +381,6 @@ def spent_numbers(
 
     Parameters
     ----------
-    connection : of the database
     kept : newest events of each map that stay
     anchors : numbers that stay too
     limit : at most so many

@@ -93,8 +93,6 @@ def passing(
 
     Parameters
     ----------
-    connection : of the database
-    map_number : of the map
     wanted : the filter
     taken : the query, with session and time where the filter asks for distance from its session
     """
@@ -185,8 +183,6 @@ def list_frames(
 
     Parameters
     ----------
-    connection : of the database
-    map_number : of the map
     beyond : the frame that the page before ended with, by its number unless in the order they were
         taken; None for the first page
     limit : most frames
@@ -328,8 +324,6 @@ def list_runs(
 
     Parameters
     ----------
-    connection : of the database
-    map_number : of the map
     after : session and robot of the last run of the page before; "" where there is none, which no
         name is
     limit : most runs
@@ -417,8 +411,6 @@ def poses_of_run(
 
     Parameters
     ----------
-    connection : of the database
-    map_number : of the map
     run : whose; with `most`, so many of them at most, evenly taken. Only their rows are read: an
         index holds what the choice needs.
     stamp : see `stamps_of_run`
@@ -503,7 +495,6 @@ class PathFrame:
 
     Parameters
     ----------
-    number, id : of the frame
     robot, session, captured_at, name, sequence : as far as is known
     parent : that its pose leads to
     pose : T_parent_sensor, or None
@@ -615,7 +606,6 @@ class FrameUp:
 
     Parameters
     ----------
-    number, map_number : of the frame
     parent, pose : its parent frame and T_parent_sensor, 4 rows of 4; None without a pose
     up : unit vector in its sensor's axes, as it was sent
     map_up : unit vector in the parent frames of its map
@@ -689,7 +679,6 @@ def spread_frames(connection: Connection, most: int) -> list[int]:
 
     Parameters
     ----------
-    connection : of the database
     most : numbers; fewer where those next to each other were deleted
     """
     ends = select(func.min(frames.c.number), func.max(frames.c.number))

@@ -53,7 +53,6 @@ def renew_upload(
 
     Parameters
     ----------
-    number : of the frame
     blob, size : of the upload
     reason : that is left of the frame's
     """
@@ -136,7 +135,6 @@ def _weigh(connection: Connection, number: int, state: FrameState | None, size: 
     Parameters
     ----------
     connection : of a writing transaction
-    number : of the frame
     state : that it comes to; None: it stays as it is
     size : bytes of its upload; None: as they are
     """
@@ -182,7 +180,6 @@ def write_frame(
     Parameters
     ----------
     connection : of a writing transaction
-    row : of the map
     frame : as it is
     values : by column; position and tags that are searched for follow `pose` and `tags`
     """

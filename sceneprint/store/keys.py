@@ -115,7 +115,6 @@ def rotate_key(connection: Connection, name: str, overlap_s: float) -> str:
     Parameters
     ----------
     connection : of a writing transaction
-    name : of the key
     overlap_s : seconds; 0: all secrets before end now
 
     Raises

@@ -114,7 +114,6 @@ def add_map(
     Parameters
     ----------
     connection : of a writing transaction
-    name, title, model_id : of the map
     limits : `quota_frames`, `quota_bytes`, `retention_days`, `up`, where they are given; quotas
         that are not are those of the map that had this name before: whoever may delete a map and
         make it anew does not get rid of its quota
@@ -220,7 +219,6 @@ def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = 
     Parameters
     ----------
     connection : of the transaction that would add it, or of a reading one for a first look
-    row : of the map
     size : bytes that it takes more
     new : whether the frame is not counted yet
 
@@ -276,7 +274,6 @@ def add_frame(
     Parameters
     ----------
     connection : of a writing transaction
-    map_number : of its map
     values : its columns but number, id, state and times
     frame_id : its id, which no frame of the map has that is not deleted; default: a new one
     """
@@ -424,9 +421,7 @@ def placed_frames(
 
     Parameters
     ----------
-    connection : of the database
     map_number, parent : whose frames
-    model_id : of their signatures
     centre : x, y, z of the point, metres
     within : half the width of the cube that they are in, metres
     most : of them

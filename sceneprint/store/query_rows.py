@@ -70,7 +70,6 @@ class NewQuery(_Query):
 
     Parameters
     ----------
-    id : of the answer
     at : when the query came, seconds since 1970
     map : name of the map that the row belongs to
     maps : names of all maps that were searched; None: only `map`
@@ -101,7 +100,6 @@ class QueryRow(_Query):
 
     Parameters
     ----------
-    number : of the row
     key : name of the key; None without one, and where it was revoked
     bytes : of the answer; 0 where it is not stored, or no longer
     kept_at : since when the answer is kept; None: it expires
@@ -204,7 +202,6 @@ def list_queries(
 
     Parameters
     ----------
-    connection : of the database
     wanted : which
     before : time and number of the row that the previous page ended with
     limit : at most so many

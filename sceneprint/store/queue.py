@@ -94,7 +94,6 @@ def list_jobs(
 
     Parameters
     ----------
-    connection : of the database
     before, limit : see above
     state, kind : of those that are wanted
     map_names : of those that are wanted; jobs of no map are not among them
@@ -518,7 +517,6 @@ def give_back(connection: Connection, held: JobRow, after_s: float = 0.0) -> Non
     Parameters
     ----------
     connection : of a writing transaction
-    held : the job
     after_s : seconds in which others go before it
 
     Raises
@@ -676,7 +674,6 @@ class JobFile:
     name : such as mesh.ply, once a job
     blob : that holds its bytes, and is there
     bytes : size
-    media_type : of its content
     """
 
     name: str
@@ -759,7 +756,6 @@ def remove_parts(
     Parameters
     ----------
     connection : of a writing transaction
-    job_number : of the job
     items : whether its items go
     files : names of the files that go; default: all
 

@@ -93,8 +93,6 @@ def unqueued(connection: Connection, row: MapRow, after: int, *, again: bool = F
 
     Parameters
     ----------
-    connection : of a transaction
-    row : of the map
     after : number of a frame
     again : also those whose jobs broke down in every try
     """

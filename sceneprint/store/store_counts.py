@@ -53,7 +53,6 @@ def count_events(
 
     Parameters
     ----------
-    connection : of the database
     kinds : those of `KINDS` of the API
     at : when the first interval begins, seconds since 1970
     width_s : of an interval, seconds

@@ -161,7 +161,6 @@ class FusedFrame:
 
     Parameters
     ----------
-    number : of the frame
     parent, pose : T_parent_sensor, 4 rows of 4, and where it leads
     session, captured_at : as far as is known
     geometry : blob of its artifact
@@ -622,7 +621,6 @@ def frames_seeing(
 
     Parameters
     ----------
-    connection : of the database
     surface, parent : whose
     places : of tiles of the finest level
     spot : x, y, z, metres

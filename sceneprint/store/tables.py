@@ -591,7 +591,6 @@ def rows_of_statement(
 
     Parameters
     ----------
-    connection : of the database
     statement : makes it for a dialect, with `among_numbers`, and returns the same one each time
     numbers : however many
     values : its other parameters

@@ -55,8 +55,6 @@ def list_deletions(
 
     Parameters
     ----------
-    connection : of the database
-    map_number : of the map
     seconds : for which deleted frames can be restored
     limit : maximum number
     before : number of the deletion that the page before ended with
@@ -124,7 +122,6 @@ def restore_frame(connection: Connection, row: MapRow, frame: FrameRow) -> None:
     Parameters
     ----------
     connection : of a writing transaction of the map
-    row : of the map
     frame : a tombstone whose content has not come again
 
     Raises

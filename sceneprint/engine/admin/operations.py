@@ -244,7 +244,6 @@ class Audit:
 
     Parameters
     ----------
-    store : see Store
     kept_days : after which a line is removed
     """
 
@@ -330,8 +329,6 @@ def create_key(
 
     Parameters
     ----------
-    store : see Store
-    name : of the key
     grants : scope by name of a map, `*` for all; default: admin of all
     expires_at : when it opens nothing any more, with a zone; default: never
     tenant : whom it belongs to; default: one of the key's name
@@ -394,8 +391,6 @@ def rotate_key(store: Store, name: str, overlap_s: float = OVERLAP_S) -> MadeKey
 
     Parameters
     ----------
-    store : see Store
-    name : of the key
     overlap_s : seconds; 0: the one before ends now
 
     Raises

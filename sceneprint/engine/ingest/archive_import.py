@@ -294,7 +294,6 @@ class Imports:
 
     Parameters
     ----------
-    store, tasks, uploads : see there
     most_bytes : of an archive, as it is sent
     """
 

@@ -58,7 +58,6 @@ def read_upload(data: bytes, meta: FrameMeta, decoders: Decoders) -> Read:
 
     Parameters
     ----------
-    data, meta : of the upload
     decoders : one of which decodes it
 
     Raises
@@ -168,7 +167,6 @@ def columns(
 
     Parameters
     ----------
-    meta : see FrameMeta
     pose, base : T_parent_sensor, and see Read
     """
     parent = None
@@ -311,7 +309,6 @@ def pose_matrix(pose: GivenTransform, what: str = "") -> Floats:
 
     Parameters
     ----------
-    pose : see GivenTransform
     what : to begin an error with, where it is no pose
 
     Raises

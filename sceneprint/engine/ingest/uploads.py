@@ -67,9 +67,6 @@ def find_duplicate(
 
     Parameters
     ----------
-    connection : of the database
-    row : of the map
-    content : of the upload
     known : its metadata, by column
     frame_id : that the caller wants for it; None: any frame of that content is it
 

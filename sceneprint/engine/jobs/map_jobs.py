@@ -38,7 +38,6 @@ class MapJobs(Generic[Record]):
 
     Parameters
     ----------
-    store, tasks : see there
     record : of the API, with the request in `asked` and the result in `result`
     kind : of the jobs, such as associate
     noun : name of such a job in errors and in the field of its id, such as association
@@ -58,7 +57,6 @@ class MapJobs(Generic[Record]):
 
         Parameters
         ----------
-        map_name : of the job
         request : what it computes
         total : number of its steps, if known
 
@@ -153,7 +151,6 @@ def page_of_items(
 
     Parameters
     ----------
-    cursor, limit : of the page
     read : the items from a place on, BLOCK of them where there are so many
     make : records of those items of a block that pass, by its first place
     number : place of a record

@@ -87,7 +87,6 @@ def run(
 
     Parameters
     ----------
-    store, signers, readers : see there
     work : of `claim`
     lease_s : seconds for which each renewal holds
     longest_s : seconds after which it is renewed no more: what takes so long does not end
@@ -293,9 +292,7 @@ def look(database: Database, readers: Readers, row: MapRow, made: StoredSignatur
 
     Parameters
     ----------
-    database, readers : see there
     row : of the map, as it was
-    made : of the frame
 
     Returns
     -------

@@ -187,8 +187,6 @@ def pull_map(
     Parameters
     ----------
     client : of the service; its key may read the map
-    store : of the robot
-    map_name : of the map
     progress : told of frames fetched and frames to fetch
 
     Raises

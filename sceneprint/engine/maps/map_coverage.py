@@ -108,7 +108,6 @@ class CoverageJobs(MapJobs[MapCoverage]):
         Parameters
         ----------
         map_name, job_id : of the coverage job
-        cursor, limit : of the page
         outcome : of the frames; default: of any
 
         Raises

@@ -59,8 +59,6 @@ class IndexedFrame:
     Parameters
     ----------
     row : its map
-    frame : see FrameRow
-    label : of the model
     artifact : blob of its geometry
     """
 

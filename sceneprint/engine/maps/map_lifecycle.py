@@ -118,7 +118,6 @@ def edit_frame(
 
     Parameters
     ----------
-    store : see Store
     map_name, frame_id : of the frame, in whatever state
     patch : fields of FrameEdit: what is left out stays, None removes
     if_match : tags of `frame_tag`; None to change it however it is by now
@@ -271,8 +270,6 @@ def begin_reencoding(store: Store, map_name: str, model: str | Path | Model) -> 
 
     Parameters
     ----------
-    store : see Store
-    map_name : of the map
     model : a preset or a model file, or one that was read
 
     Raises
@@ -328,7 +325,6 @@ class Reencodings:
 
     Parameters
     ----------
-    store : see Store
     upkeep : that publishes the index of the next model before the switch
     """
 

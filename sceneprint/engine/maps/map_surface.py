@@ -142,10 +142,8 @@ class MapSurfaces:
 
         Parameters
         ----------
-        map_name : of the map
         parent : default: the parent frame of most frames
         level : 0 for the finest
-        cursor, limit : of the page
 
         Raises
         ------
@@ -206,11 +204,9 @@ class MapSurfaces:
 
         Parameters
         ----------
-        map_name : of the map
         spot : x, y, z in the parent frame, metres
         radius : a frame saw the spot if it saw a point so near, metres; default: two cells
         parent : default: the parent frame of most frames
-        cursor, limit : of the page
 
         Raises
         ------
@@ -286,7 +282,6 @@ class MapSurfaces:
 
         Parameters
         ----------
-        map_name : of the map
         parent : default: the parent frame of most frames
         width : of the longer side, pixels
         low, high : only what lies between these heights, metres along up
@@ -420,7 +415,6 @@ class SurfaceUpkeep:
 
     Parameters
     ----------
-    store, bell : of the engine
     auto : whether frames that came are fused unasked; deleted ones are always taken out
     """
 

@@ -53,8 +53,6 @@ def delete_selection(
 
     Parameters
     ----------
-    store : see Store
-    map_name : of the map
     wanted : which frames
     tombstones : that the frames become
     seconds : after which no further block is begun
@@ -197,8 +195,6 @@ def delete_session(
 
     Parameters
     ----------
-    store : see Store
-    map_name, session : of the frames
     tombstones : that the frames become
     robot : only those that it took; None for those of all robots
     seconds : after which no further block is begun

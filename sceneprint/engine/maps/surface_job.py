@@ -488,8 +488,6 @@ def parent_records(
 
     Parameters
     ----------
-    connection : of the database
-    row : of the map
     known : records by parent frame; up and axes of these are not looked for again
     """
     counts = stored.count_fused(connection, row.number)

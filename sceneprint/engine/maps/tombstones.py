@@ -46,7 +46,6 @@ class Tombstones:
 
     Parameters
     ----------
-    store : see Store
     seconds : for which deleted frames can be restored; 0: no deletion can be undone
     wake : called when frames wait to be signed
     """
@@ -113,7 +112,6 @@ class Tombstones:
 
         Parameters
         ----------
-        map_name : of the map
         deletion_id : of a deletion of `list_all`
         seconds : after which no further block is begun
 

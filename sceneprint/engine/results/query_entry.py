@@ -175,7 +175,6 @@ def query_record(row: QueryRow, days: float, may_read: Callable[[str], bool]) ->
 
     Parameters
     ----------
-    row : see QueryRow
     days : that queries are stored
     may_read : whether the caller may read a map: the names of others are left out
     """

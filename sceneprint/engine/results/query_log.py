@@ -109,7 +109,6 @@ class QueryLog:
 
     Parameters
     ----------
-    store, files : see there
     settings : for how long queries are stored, and the room for answers
     """
 
@@ -139,7 +138,6 @@ class QueryLog:
 
         Parameters
         ----------
-        row : of the query
         answer : to be stored with it, if there is room
         shown : numbers of the frames that the answer shows
         """
@@ -275,7 +273,6 @@ class QueryLog:
         ----------
         wanted : which; of which maps, `names` says
         names : of maps, missing ones are passed over; None: of all
-        cursor, limit : of the page
         may_read : whether the caller may read a map: the names of others are left out
 
         Raises

@@ -258,7 +258,6 @@ class Inspection:
 
         Parameters
         ----------
-        query_id : of the answer
         may_read : whether the caller may read a map: the names of others are left out
         """
         stored, record = self._log.find(query_id), self._log.record(query_id, may_read)

@@ -90,7 +90,6 @@ class _Attempt:
 
     Parameters
     ----------
-    prepared : the frame
     searched : its R
     selection : C, or None where it was not asked for
     among, scales : distances within R, and what C was selected by
@@ -123,11 +122,9 @@ def answer(
 
     Parameters
     ----------
-    store : see Store
     places : the maps, one or more of one model
     model : of all of them
     prepared, query : the frame, and the options of the query
-    deadline : see Deadline
     earlier : earlier frames of the same sequence, which vote for the pose of `prepared`
 
     Raises
@@ -431,13 +428,11 @@ def answer_status(
 
     Parameters
     ----------
-    query : see there
     estimate : of `placed`; None where no match has a pose
     tried : of `validated`
     matches : those that were tried and are still there
     counts : of all maps
     geometry : of the query; None where it was not validated
-    p : of the model
     posed : whether an accepted match has a pose in the map
     """
     if "validate" not in query.stages:

@@ -70,7 +70,6 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
 
     Parameters
     ----------
-    store : see Store
     maps : their names
     ask : signs the query with the model of the rows, and answers it from maps of that model
 
@@ -137,7 +136,6 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
 
     Parameters
     ----------
-    store, signers : of the engine
     a, b : the frames
     how : whether they are aligned, and with what; the frames it names are `a` and `b`
 
@@ -242,7 +240,6 @@ class Queries:
         Parameters
         ----------
         maps : their names, each once
-        data, meta : the frame
         query : how to ask
         since : when the request came, by `time.perf_counter`; default: now
         sent : the query as the log lists it; None: the log does not list it
@@ -270,7 +267,6 @@ class Queries:
 
         Parameters
         ----------
-        map_name : of the map
         frames : samples and meta of each in the order they were taken: their poses, in one parent
             frame of any name, are the odometry
         query : how to ask, for each of them

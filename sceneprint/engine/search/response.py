@@ -115,7 +115,6 @@ def match_records(
 
     Parameters
     ----------
-    candidates : see Candidates
     chosen : positions in R of the candidates
     matches : of `associate`
     """
@@ -378,9 +377,7 @@ class ExplainedQuery:
 
     Parameters
     ----------
-    store : see Store
     searched, prepared, query, candidates, tried : of the query
-    model : of the maps
     deadline : no frame is validated for this after it
     """
 

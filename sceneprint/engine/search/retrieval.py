@@ -54,7 +54,6 @@ class Readers:
 
     Parameters
     ----------
-    signers : see Signers
     indexes : folder of all indexes
     shared : indexes of the fleet, of which maps that are asked are fetched
     """
@@ -329,7 +328,6 @@ class MapSearch:
 
     Parameters
     ----------
-    place : the map
     dead : frames that may not be found: deleted ones, and the query itself
     among : frames that pass the filter; None without one
     size : frames that can be found
@@ -395,7 +393,6 @@ def search_maps(
 
     Parameters
     ----------
-    store : see Store
     places : the maps, one or more of one model
     asked, query : what is sought, and how
     model : of all of them

@@ -155,7 +155,6 @@ class SharedIndexes:
 
         Parameters
         ----------
-        row : of the map
         clean : all but the newest at once, and not after some time
         """
         name = index_folder(self._indexes, row).name
@@ -248,7 +247,6 @@ class SharedIndexes:
 
         Parameters
         ----------
-        row : of the map
         needed : even where there is no room for it beside what is in use
 
         Returns

@@ -33,7 +33,6 @@ def known_ups(connection: Connection, numbers: Iterable[int]) -> dict[int, Float
 
     Parameters
     ----------
-    connection : of the database
     numbers : of frames; the more there are, the better a map's up is learnt
 
     Returns
@@ -52,7 +51,6 @@ def parent_up(connection: Connection, numbers: Iterable[int]) -> Floats | None:
 
     Parameters
     ----------
-    connection : of the database
     numbers : of frames whose poses lead to one parent frame
 
     Returns

@@ -105,12 +105,8 @@ def validated(
 
     Parameters
     ----------
-    store : see Store
-    searched : see Searched
     chosen : positions in R of the candidates
     geometry : of the query; None where validation was not asked for
-    query, deadline : see there
-    p : of the model
     up : (3,) in the query's sensor, where it is known
     known : validations of an earlier pass, by number
     k : accepted matches after which to stop
@@ -185,12 +181,10 @@ def placed(
 
     Parameters
     ----------
-    store, searched : see there
     geometries : of candidates, by number, as far as they are open
     rows : of the candidates, by number; those without a pose suggest none
     query_frames : frames of the query with their matches
     prior : what the robot believed before; its parent as `parent_key` writes it
-    model : of the maps
     query : where it asks for anything of a match, a pose needs the vote of one; in mode `paper` the
         map's frames are not asked
 

@@ -105,7 +105,6 @@ def collect_quarantined(store: Store, folder: Path) -> int:
 
     Parameters
     ----------
-    store : see Store
     folder : with `blob-DIGEST` and `signature-FRAME-MODEL.bin`
 
     Returns
@@ -133,7 +132,6 @@ def collect_doomed_blobs(
 
     Parameters
     ----------
-    store : see Store
     before : only what was doomed before this time, seconds since 1970: of what is younger,
         somebody may be at it
     seconds : after which the rest is left for another time

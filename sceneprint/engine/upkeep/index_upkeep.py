@@ -132,7 +132,6 @@ class Upkeep:
 
     Parameters
     ----------
-    store, signers : see there
     settings : `indexes` is the folder of all indexes; a generation may lack `tail_frames` frames,
         and as many deletions; after `scrub_s` seconds all files are read again, to see that they
         are sound; an index that lacks a deletion of `deleted_rows_days` ago cannot be brought up

@@ -63,7 +63,6 @@ class Retention:
 
     Parameters
     ----------
-    store : see Store
     rows_days : for which rows of deleted and redundant frames stay
     """
 
@@ -172,7 +171,6 @@ class Purging:
 
     Parameters
     ----------
-    store, upkeep, query_log, tombstones, reconstructions, differences : of the engine
     purge_s : seconds after which nothing may be left
     quarantine : folder of damaged bytes that were set aside
     """

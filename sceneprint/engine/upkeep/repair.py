@@ -134,9 +134,7 @@ def take_upload(store: Store, map_name: str, frame_id: str, data: bytes) -> list
 
     Parameters
     ----------
-    store : see Store
     map_name, frame_id : of a frame that has the content of the upload
-    data : the upload
 
     Returns
     -------

@@ -368,7 +368,6 @@ def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParam
     ----------
     source, target : patches of the two frames
     pairs : (M, 2) int32 correspondences, index in source and in target
-    p : see ConsensusParameters
 
     Returns
     -------
@@ -404,7 +403,6 @@ def floor_error(frame: Geometry, up: Floats, p: GravityParameters) -> float:
     Parameters
     ----------
     frame : of which `up` (3,) was told
-    p : see GravityParameters
     """
     facing = frame.surface.normals[frame.surface.valid][:: p.floor_stride].astype(float)
     if not len(facing):
@@ -423,7 +421,6 @@ def contradiction(
     tilt : of the transform, radians
     query, match : the two frames
     ups : of query and match, both known
-    p : see GravityParameters
     """
     wrong = [
         name
@@ -472,9 +469,7 @@ class FrameSamples:
 
     Parameters
     ----------
-    geometry : of the frame
     points : (N, 6) float32 of its surface, of `sampled`
-    planes : see PlaneView
     up : (3,) unit vector in the sensor's coordinates, where it is known
     """
 
@@ -542,7 +537,6 @@ def align(
     ----------
     source, target : of two frames
     rng : of the patches drawn
-    p, overlap_p : see there
     matching : what correspondences are found by
 
     Returns

@@ -393,7 +393,6 @@ def refine(
     source : (N, 6) float32 points and normals, of `overlap.sampled` with the stride of `p`
     target : (h, w) surface, or points in no order
     T_target_source : (4, 4) where to start
-    p : see RefinementParameters
     kind : of the source's camera, `camera.kind_of`: by what its points weigh
 
     Returns
@@ -513,7 +512,6 @@ def pair_covariance(
     ----------
     there, back : the last refinement of each direction, or None where it was lost
     T : (4, 4) T_match_query
-    p : see CovarianceParameters
 
     Returns
     -------

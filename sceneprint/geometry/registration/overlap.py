@@ -496,7 +496,6 @@ def agreements(
     source : (N, 6) float32 of `sampled`
     target : (h, w) surface, or points in no order, which show no violations
     transforms : (n, 4, 4) T_target_source
-    p : see AgreementParameters
     weights : (N,) of the points; default: 1 each
 
     Returns
@@ -567,7 +566,6 @@ class PlaneView:
 
     Parameters
     ----------
-    surface, patches : of the frame
     points : (P, 6) float32, means and normals of the patches
     weights : (P,) float32, of which those of one plane add up to 1
     """

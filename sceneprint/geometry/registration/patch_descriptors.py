@@ -241,7 +241,6 @@ def patch_descriptors(patches: Patches, p: PatchDescriptorParameters) -> Floats3
     Parameters
     ----------
     patches : P of them
-    p : see PatchDescriptorParameters
 
     Returns
     -------
@@ -412,7 +411,6 @@ def correspondences(
     source : (P, d) uint8 descriptors
     target : (P', d) uint8
     rng : which patches are drawn depends on it alone
-    p : see MatchingParameters
     gate : only patches at about the same angle to up correspond; None: any
 
     Returns

@@ -139,7 +139,6 @@ def plan_of(
     Parameters
     ----------
     surface : valid points; at least one
-    p : see PlanParameters
     axis : (3,) near which up is looked for; default: the axis that the scanner turns about
     up : (3,) unit vector in the scanner's coordinates, where it is known; it is taken as it is
     """
@@ -285,7 +284,6 @@ def plan_hypotheses(plans: Plans, p: PlanParameters) -> Floats:
     Parameters
     ----------
     plans : of source and target, as often as there are guesses which way is up
-    p : see PlanParameters
 
     Returns
     -------

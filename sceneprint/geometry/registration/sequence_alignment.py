@@ -67,7 +67,6 @@ def coarse(patches: Patches, p: SequenceParameters) -> Patches:
     Parameters
     ----------
     patches : P of them
-    p : see SequenceParameters
 
     Returns
     -------
@@ -171,7 +170,6 @@ def neighbour_sequences(patches: Patches, about: Patches, p: SequenceParameters)
     ----------
     patches : P, whose sequences
     about : the neighbours, see `coarse`
-    p : see SequenceParameters
     """
     symbols = np.zeros((len(patches), p.n_neighbours, 4))
     lengths = np.zeros(len(patches), np.int32)
@@ -294,7 +292,6 @@ def sequence_correspondences(
     ----------
     source, target : patches of the two frames
     rng : which patches are drawn depends on it alone
-    p : see SequenceParameters
 
     Returns
     -------

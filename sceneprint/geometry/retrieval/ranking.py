@@ -384,7 +384,6 @@ def diversify(
     to_query : (R,) distances to the query, rising: the ranking
     among : (R, R) distances within the ranking
     k : how many to select
-    p : see DiversityParameters
 
     Returns
     -------

@@ -101,7 +101,6 @@ def statistics_of_counts(
     Parameters
     ----------
     counts : of one level
-    table : of the model
     n_components : G
     """
     d, sums = FEATURE_DIMENSION, np.zeros((n_components, 32))
@@ -276,7 +275,6 @@ def whiten(psi: Floats, whitening: Whitening) -> Bytes:
     Parameters
     ----------
     psi : (D,) of the levels of the whitening
-    whitening : of the model
 
     Returns
     -------
@@ -306,7 +304,6 @@ def fit_whitening(psi: Ints16, levels: tuple[int, ...], p: WhiteningParameters) 
     ----------
     psi : (n, D) units of training frames; see `psi_units`
     levels : that psi consists of
-    p : see WhiteningParameters
 
     Returns
     -------

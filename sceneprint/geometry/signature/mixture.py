@@ -98,7 +98,6 @@ def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[M
     Parameters
     ----------
     features : (M, 12)
-    p : see MixtureParameters
     seed : of the K-Means++ start
 
     Raises
@@ -127,7 +126,6 @@ def em_step(features: Floats, mixture: Mixture, p: MixtureParameters) -> Mixture
     ----------
     features : (M, 12)
     mixture : G components
-    p : see MixtureParameters
     """
     zeroth, first, second = moments(features, mixture)
     count = np.maximum(zeroth, 1e-9)[:, None]

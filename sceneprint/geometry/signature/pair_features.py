@@ -47,7 +47,6 @@ def neighbour_pairs(patches: Patches, p: PropertyParameters) -> NDArray[np.int64
     Parameters
     ----------
     patches : P of them
-    p : see PropertyParameters
 
     Returns
     -------
@@ -94,7 +93,6 @@ def properties(invariant: Floats, p: PropertyParameters) -> Floats:
     Parameters
     ----------
     invariant : (M, 4) as `invariants` returns them
-    p : see PropertyParameters
 
     Returns
     -------
@@ -133,7 +131,6 @@ def pair_properties(patches: Patches, pairs: NDArray[np.int64], p: PropertyParam
     ----------
     patches : P of them
     pairs : (M, 2) as `neighbour_pairs` returns them
-    p : see PropertyParameters
 
     Returns
     -------
@@ -174,7 +171,6 @@ def project(properties: Floats, projection: Projection) -> Floats:
     Parameters
     ----------
     properties : (M, 13)
-    projection : see Projection
 
     Returns
     -------
@@ -439,7 +435,6 @@ def part(
     Parameters
     ----------
     first, last : bins
-    layout, p, projection, mixture : of the model
     """
     invariant = bin_centres(layout, first, last, p)
     features = project(properties(invariant, p), projection).astype(np.float32)
@@ -600,7 +595,6 @@ def count_pairs(
     ----------
     means, normals : (P, 3) float64, metres and unit length
     weights : (P,) of the patches
-    layout, p : of the model
     """
     distance, angle, dihedral, starts = _look_up(layout, p)
     counts = np.zeros(layout.n_bins, np.float32)

@@ -178,7 +178,6 @@ def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
     Parameters
     ----------
     surface : (h, w) points in metres and normals
-    p : see SegmentationParameters
 
     Returns
     -------
@@ -418,7 +417,6 @@ def hierarchy(surface: Surface, finest: Ints32, p: HierarchyParameters) -> Hiera
     ----------
     surface : (h, w) points in metres and normals
     finest : (h, w) int32 labels of the finest level
-    p : see HierarchyParameters
 
     Returns
     -------
@@ -459,7 +457,6 @@ def patch_weights(patches: Patches, p: WeightParameters) -> Floats:
     Parameters
     ----------
     patches : P of them
-    p : see WeightParameters
 
     Returns
     -------

@@ -62,7 +62,6 @@ def within_range(cloud: Cloud, p: CloudParameters) -> Floats32:
     Parameters
     ----------
     cloud : points about the viewpoint, metres
-    p : see CloudParameters
 
     Raises
     ------

@@ -124,7 +124,6 @@ def of_views(mesh: TriangleMesh, views: Sequence[DepthFrame], tolerance: float) 
 
     Parameters
     ----------
-    mesh : of the views
     views : in order
     tolerance : how far a fused surface may lie from what one view measured, metres
     """
@@ -140,7 +139,6 @@ def added_areas(mesh: TriangleMesh, first: Ints32, views: int) -> Floats:
 
     Parameters
     ----------
-    mesh : of the views
     first : (N,) of `of_views`
     views : their number
     """

@@ -97,7 +97,6 @@ def inverse_depth(frame: DepthFrame, p: DepthParameters) -> tuple[Floats32, Intr
     Parameters
     ----------
     frame : depth (H, W) in metres
-    p : see DepthParameters
 
     Returns
     -------
@@ -344,8 +343,6 @@ def surface(q: Floats32, intrinsics: Intrinsics, p: NormalParameters) -> Surface
     Parameters
     ----------
     q : (h, w) float32, 1/z in 1/metres; 0 where missing
-    intrinsics : of this map
-    p : see NormalParameters
 
     Returns
     -------

@@ -395,7 +395,6 @@ def voxels(cloud: Cloud, p: CloudParameters) -> Voxels:
     Parameters
     ----------
     cloud : points about the viewpoint, metres
-    p : see CloudParameters
 
     Raises
     ------

@@ -71,7 +71,6 @@ def synthesise_room(
     along_path : whether the frames follow one hand-held path; else they are independent
     step : along a path, take only each `step`-th view
     noise : the sensor; None gives ideal depth
-    intrinsics : the camera
 
     Raises
     ------

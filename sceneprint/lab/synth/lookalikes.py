@@ -132,7 +132,6 @@ def synthesise_lookalike(
     seed, index : the site is number `index` of its kind in the collection `seed`
     queries : how many of them
     noise : the sensor; None gives ideal depth
-    intrinsics : the camera
 
     Raises
     ------

@@ -176,9 +176,7 @@ def kinect_noise(
     ----------
     depth : (H, W) metres, 0 missing; ideal
     cosine : (H, W) |cos| of incidence, [0, 1]
-    intrinsics : the camera
     rng : source of all noise
-    parameters : the sensor
     loss : (H, W) share of samples lost on the surface seen, [0, 1]; None is none
 
     Returns
@@ -457,7 +455,6 @@ def scan(
     ----------
     caster : the scene, metres
     T_world_sensor : (4, 4) pose
-    sensor : see Spinning and Rosette
     rng : of noise and losses, and of the directions of a Rosette
 
     Returns

@@ -299,7 +299,6 @@ def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STE
 
     Parameters
     ----------
-    premises : see there
     n : how many
     rng : of places, heights and wobble
     step : metres

@@ -66,7 +66,6 @@ class FindingOutcome:
 
     Parameters
     ----------
-    finding : see Finding
     done : what the repair did; None where none was asked for, or there is none
     error : why it could not be repaired
     """
@@ -94,7 +93,6 @@ def fsck(
     repair : whether to repair what is found; else nothing is changed
     quick : look only at what is there, and read nothing large
     grace_s : see GRACE_S
-    progress : see Progress
     counts : filled with how much was looked at
 
     Yields

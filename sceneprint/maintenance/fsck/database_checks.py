@@ -311,7 +311,6 @@ def check_server(folder: Folder, restore: str) -> Iterator[Finding]:
 
     Parameters
     ----------
-    folder : see Folder
     restore : what to do about it
     """
     if folder.quick:

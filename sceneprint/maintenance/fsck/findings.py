@@ -48,7 +48,6 @@ class Finding:
     ----------
     kind : what it is, in kebab-case
     what : which record or file
-    severity : see Severity
     means : what it means
     would : what a repair would do; None where there is nothing to be done
     map, frame_id, path : that it is about, where it is about one
@@ -77,7 +76,6 @@ class Folder:
     map_name : the map to look at; None: all, and what belongs to none
     quick : see only what is there, and read nothing large
     grace_s : seconds since its last change in which a file may be somebody's unfinished work
-    progress : see Progress
     counts : how much was looked at, by its name
     """
 

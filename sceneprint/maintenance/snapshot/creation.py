@@ -142,8 +142,6 @@ class Snapshot:
 
     Parameters
     ----------
-    path : of the archive
-    manifest : of it
     damaged : the blobs that are not in it
     """
 

@@ -252,7 +252,6 @@ def read_manifest(data: bytes, place: str) -> SnapshotManifest:
 
     Parameters
     ----------
-    data : of the member
     place : of the archive, for messages
 
     Raises

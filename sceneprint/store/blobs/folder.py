@@ -89,7 +89,6 @@ class FileLocks(Locks):
 
     Parameters
     ----------
-    path : of it
     make : make a file there where there is none
     """
 
