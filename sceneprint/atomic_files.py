@@ -45,7 +45,10 @@ def public_mode(folder: Path) -> int | None:
 
 def nearest_folder(folder: Path) -> Path:
     """The folder, or the first above it that is there: both are on one disk, once it is made.
-    Raises OSError if a folder above it may not be entered.
+
+    Raises
+    ------
+    OSError : a folder above it may not be entered.
     """
     folder = folder.absolute()
     return next(one for one in (folder, *folder.parents) if one.is_dir())
@@ -62,8 +65,11 @@ def warn_if_public(folder: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """See before long work that `write_whole` will be able to write there. Raises OSError if it is
-    a folder, or its folder takes no files.
+    """See before long work that `write_whole` will be able to write there.
+
+    Raises
+    ------
+    OSError : it is a folder, or its folder takes no files.
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -96,8 +102,11 @@ def whole_file(path: Path) -> Iterator[Path]:
     """A path beside it for a library that writes files itself, such as in several steps.
 
     What lies there when the block ends takes the file's place; where nothing does, or the block
-    fails, all stays as it was, and nothing is left behind. Raises OSError if it cannot be put
-    there.
+    fails, all stays as it was, and nothing is left behind.
+
+    Raises
+    ------
+    OSError : it cannot be put there.
     """
     part = _beside(path)
     try:
@@ -132,8 +141,11 @@ def write_durable(path: Path, data: bytes, *, folder_is_new: bool = True) -> Non
 def make_folder(folder: Path) -> None:
     """Make a folder where it is missing, and those above it; they survive the loss of power.
 
-    Only their owner may read what is made here; the permissions of others stay as they are. Raises
-    OSError if it cannot be made, or is a file.
+    Only their owner may read what is made here; the permissions of others stay as they are.
+
+    Raises
+    ------
+    OSError : it cannot be made, or is a file.
     """
     if folder.is_dir():
         return

@@ -88,6 +88,10 @@ class Vista:
 def vista_of(surface: Surface) -> Vista:
     """How to draw a surface: as its camera saw it, as one looks about its viewpoint, or, of points
     in no order, from the side of their least extent, which is above in a building.
+
+    Parameters
+    ----------
+    surface : (h, w) points, metres
     """
     points = surface.points.reshape(-1, 3).astype(np.float64)
     count = np.arange(len(points), dtype=np.int32).reshape(surface.valid.shape)
@@ -178,6 +182,10 @@ def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
     """Depth by a colour map of equal steps to the eye: near is yellow, far is violet. Of a cloud
     its range, or seen from above its height: high is yellow.
 
+    Parameters
+    ----------
+    surface : (h, w) points, metres
+
     Returns
     -------
     colours : (h', w', 3) uint8, as `vista_of` has the pixels; dark grey where nothing is known
@@ -210,6 +218,10 @@ def viridis(shares: Floats) -> Bytes:
 
 def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
     """Unit normals in the sensor's axes: red, green, blue are 127.5 (1 + x, y, z).
+
+    Parameters
+    ----------
+    surface : (h, w) normals
 
     Returns
     -------

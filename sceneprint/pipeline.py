@@ -89,8 +89,11 @@ def sign(frame: AnyFrame, signer: Signer) -> Signature:
 
 
 def prepare(frame: AnyFrame, signer: Signer) -> tuple[Signature, Geometry]:
-    """Signature and geometry artifact of a frame, of one look at its surface. Raises UselessFrame
-    like `sign`.
+    """Signature and geometry artifact of a frame, of one look at its surface.
+
+    Raises
+    ------
+    UselessFrame : see `sign`.
     """
     p = signer.model.parameters
     seen = see(frame, p)
@@ -130,8 +133,11 @@ def _scan(cloud: Cloud, p: CloudParameters) -> Surface:
 
 
 def distance(a: Signature, b: Signature) -> int:
-    """Distance of two stored signatures in their model's metric: -s(X, Y) of Sec. III-C. Raises
-    ModelMismatch if they are of two models.
+    """Distance of two stored signatures in their model's metric: -s(X, Y) of Sec. III-C.
+
+    Raises
+    ------
+    ModelMismatch : they are of two models.
     """
     _same_model(a, b)
     return int(distances(a.vector, b.vector[None], a.metric)[0])
@@ -168,6 +174,13 @@ def diversify(
     p: DiversityParameters | None = None,
 ) -> Selection:
     """C: `k` of R that are near the query and unlike each other, Sec. III-D.
+
+    Parameters
+    ----------
+    ranking : R
+    database : that R is of
+    k : how many to select
+    p : see DiversityParameters
 
     Returns
     -------
@@ -218,8 +231,11 @@ def validate_guided(
 ) -> PairValidation | None:  # fmt: skip
     """Check a transform (4, 4) that other matches and the map's poses predict: Sec. III-E.
 
-    See `sceneprint.geometry.validation.validation.validate_guided`. Raises ModelMismatch like
-    `validate`.
+    See `sceneprint.geometry.validation.validation.validate_guided`.
+
+    Raises
+    ------
+    ModelMismatch : see `validate`.
     """
     _same_model(query, match)
     return check_predicted(query, match, T_match_query, seed, p or _numbers_of(query), ups)
@@ -230,8 +246,11 @@ def validate_without_up(
 ) -> PairValidation | None:
     """Ask the surfaces alone, of a query that found nothing with `up`: Sec. III-E.
 
-    See `sceneprint.geometry.validation.validation.validate_without_up`. Raises ModelMismatch like
-    `validate`.
+    See `sceneprint.geometry.validation.validation.validate_without_up`.
+
+    Raises
+    ------
+    ModelMismatch : see `validate`.
     """
     _same_model(query, match)
     return check_up(query, match, seed, p or _numbers_of(query), ups)

@@ -187,8 +187,11 @@ class Settings(BaseSettings):
 
     @property
     def served_blobs(self) -> Path | str:
-        """As `blobs`, for a service whose workers are other processes. Raises UnusableStore if they
-        would be kept inside one process.
+        """As `blobs`, for a service whose workers are other processes.
+
+        Raises
+        ------
+        UnusableStore : they would be kept inside one process.
         """
         if str(self.blobs).startswith("memory:"):
             raise UnusableStore(

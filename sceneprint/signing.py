@@ -71,7 +71,13 @@ class Signature:
 
 @dataclass(frozen=True, eq=False)
 class Signer:
-    """A model made ready to sign: with its pair table opened."""
+    """A model made ready to sign: with its pair table opened.
+
+    Parameters
+    ----------
+    model : see Model
+    table : of this model
+    """
 
     model: Model
     table: PairTable
@@ -158,7 +164,13 @@ def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy
 
 
 def patches_for_validation(seen: Surface, p: ModelParameters) -> Patches:
-    """The patches of one size that correspondences are sought among: Sec. III-E."""
+    """The patches of one size that correspondences are sought among: Sec. III-E.
+
+    Parameters
+    ----------
+    seen : of `see`
+    p : of the model
+    """
     if isinstance(seen, Voxels):
         spacing, most = p.cloud.validation_seed_px, p.cloud.maximum_validation_patches
         return patches_of(seen, supervoxels(seen, spacing, most, p.validation_segmentation))

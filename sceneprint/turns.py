@@ -147,7 +147,12 @@ class TurnOrder(Generic[Waiter]):
 
 
 class ThreadTurns:
-    """Turns of threads."""
+    """Turns of threads.
+
+    Parameters
+    ----------
+    count, beside : see TurnOrder
+    """
 
     def __init__(self, count: int, beside: int | None = None) -> None:
         self._order: TurnOrder[threading.Lock] = TurnOrder(count, beside)

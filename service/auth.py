@@ -181,8 +181,12 @@ class Caller:
         return allows(self.grants, scope, map_name)
 
     def require(self, map_name: str, scope: Scope) -> None:
-        """See that the caller may do that with a map. Raises UnknownMap if it may not even read it,
-        Forbidden if it may read it, and not that.
+        """See that the caller may do that with a map.
+
+        Raises
+        ------
+        UnknownMap : it may not even read it.
+        Forbidden : it may read it, and not that.
         """
         if not self.may("read", map_name):
             raise unknown_map(map_name)
@@ -200,8 +204,12 @@ class Caller:
             raise _forbidden(self, scope, "all maps")
 
     def require_job(self, job: Job, scope: Scope = "read") -> Job:
-        """The job, where the caller may do that with it. Raises UnknownJob if it may not see it,
-        Forbidden if it may see it, and not that.
+        """The job, where the caller may do that with it.
+
+        Raises
+        ------
+        UnknownJob : it may not see it.
+        Forbidden : it may see it, and not that.
         """
         of = EVERY if job.map is None else job.map
         if not self.may("read" if job.map is not None else "admin", of):
@@ -355,8 +363,11 @@ async def guest(
     request: Request, here: Here,
     given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Caller | None:  # fmt: skip
-    """For routes that answer anybody, and tell more to some: None where no key was shown. Raises
-    KeyRequired if one was shown that is unknown, revoked or expired.
+    """For routes that answer anybody, and tell more to some: None where no key was shown.
+
+    Raises
+    ------
+    KeyRequired : one was shown that is unknown, revoked or expired.
     """
     if given is None and requires_key(request, here):
         return None

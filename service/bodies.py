@@ -161,8 +161,11 @@ def unspoolable(error: OSError) -> UnusableStore:
 
 
 def query_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
-    """The query string of a request that is not a form. Raises InvalidRequest if it has something
-    twice, or that is not known.
+    """The query string of a request that is not a form.
+
+    Raises
+    ------
+    InvalidRequest : it has something twice, or that is not known.
     """
     given: dict[str, str] = {}
     for name, value in request.query_params.multi_items():
@@ -427,8 +430,11 @@ def texts_of(form: FormData) -> dict[str, str]:
 
 
 def priority_of(fields: Mapping[str, str]) -> int:
-    """The field `priority` of an upload; 0 where there is none. Raises InvalidRequest unless it is
-    a whole number within MOST_PRIORITY of 0.
+    """The field `priority` of an upload; 0 where there is none.
+
+    Raises
+    ------
+    InvalidRequest : no whole number within MOST_PRIORITY of 0.
     """
     text = fields.get("priority", "0")
     number = int(text) if re.fullmatch(r"[+-]?[0-9]{1,3}", text.strip(), re.ASCII) else None

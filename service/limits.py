@@ -74,7 +74,12 @@ def share(room: int) -> int:
 
 
 class Turns:
-    """Turns of requests: see TurnOrder."""
+    """Turns of requests: see TurnOrder.
+
+    Parameters
+    ----------
+    count, beside, clock, rests : see TurnOrder
+    """
 
     def __init__(
         self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic,

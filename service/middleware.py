@@ -53,7 +53,15 @@ _MOST_AT_ONCE = 900
 
 
 class RequestMiddleware:
-    """Gives each request an id, refuses strangers, limits bodies, guards answers, and logs them."""
+    """Gives each request an id, sends strangers away, stops bodies, guards answers, and notes it.
+
+    Parameters
+    ----------
+    app : the application
+    settings : see Settings
+    origins : whose pages may ask
+    metrics : to count in
+    """
 
     def __init__(
         self, app: ASGIApp, settings: Settings, origins: Origins, metrics: Metrics

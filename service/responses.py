@@ -25,8 +25,11 @@ _QUALITY = re.compile(r";\s*q\s*=\s*(\d+(?:\.\d*)?)", re.ASCII)
 
 
 def expected(request: Request) -> Collection[str] | None:
-    """Entity tags of If-Match, one of which the resource must have; None for any. Raises
-    InvalidRequest for a header without a tag.
+    """Entity tags of If-Match, one of which the resource must have; None for any.
+
+    Raises
+    ------
+    InvalidRequest : a header that holds no tag.
     """
     header = ", ".join(request.headers.getlist("if-match")).strip()
     if header in ("", "*"):

@@ -211,8 +211,11 @@ UNENCRYPTED_BYTES = 64 << 10
 
 
 def tls_context(settings: Settings) -> ssl.SSLContext | None:
-    """How the service proves who it is; None: it speaks plain HTTP. Raises InvalidRequest if
-    certificate or key cannot be read, or do not belong together.
+    """How the service proves who it is; None: it speaks plain HTTP.
+
+    Raises
+    ------
+    InvalidRequest : certificate or key cannot be read, or do not belong together.
     """
     if settings.tls_cert is None or settings.tls_key is None:
         return None
@@ -330,8 +333,11 @@ GRACE_S = 20
 
 
 def listen(settings: Settings) -> socket.socket:
-    """A socket on the address of the settings. Raises UnusableStore if the address is not of this
-    machine, or taken.
+    """A socket on the address of the settings.
+
+    Raises
+    ------
+    UnusableStore : the address is not of this machine, or taken.
     """
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     # the protocol named, or asyncio leaves Nagle on and every answer waits 40 ms for an ACK

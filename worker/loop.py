@@ -85,7 +85,13 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
 
 
 class Worker:
-    """What one process has at hand."""
+    """What one process has at hand.
+
+    Parameters
+    ----------
+    engine, trace, stop : see there
+    listener : of the engine's bell
+    """
 
     def __init__(self, engine: Engine, listener: Listening, trace: Trace, stop: StopSignal) -> None:
         self._engine, self._listener, self._trace, self._stop = engine, listener, trace, stop

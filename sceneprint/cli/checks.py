@@ -42,7 +42,13 @@ class Check:
 
 
 def disk_check(subject: str, free: int) -> Check:
-    """Whether there is room for frames to come."""
+    """Whether there is room for frames to come.
+
+    Parameters
+    ----------
+    subject : whose disk it is
+    free : bytes left on it
+    """
     text = f"{free / 1e9:.1f} GB free; a frame takes about 0.25 MB"
     if free < LEAST_FREE:
         return Check("WRONG", subject, f"{text}. Free some space, or uploads will be rejected.")
@@ -69,8 +75,16 @@ _MOST_NAMES = 5
 
 
 def service_checks(client: Client, url: str) -> Iterator[Check]:
-    """Ask a service that answers for all that it tells. Raises SceneprintError if it ceased to
-    answer.
+    """Ask a service that answers for all that it tells.
+
+    Parameters
+    ----------
+    client : of the service
+    url : its address, for people
+
+    Raises
+    ------
+    SceneprintError : it ceased to answer.
     """
     try:
         status = client.status()

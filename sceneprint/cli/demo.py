@@ -470,8 +470,11 @@ def serving(data: Path, workers: int) -> Iterator[str]:
 
 
 def _first_line(pipe: IO[bytes]) -> str:
-    """The first line; what there is of it where the other end is closed. Raises Unreachable if none
-    came in time.
+    """The first line; what there is of it where the other end is closed.
+
+    Raises
+    ------
+    Unreachable : none came in time.
     """
     got, until = b"", time.monotonic() + START_S
     with DefaultSelector() as selector:

@@ -167,7 +167,12 @@ def _order(options: argparse.Namespace) -> Literal["asc", "desc", "taken"]:
 def _show_frames(
     client: Client, stream: SceneStream, frames: list[Frame], options: argparse.Namespace
 ) -> None:
-    """Write the scene of frames that are listed. Raises InvalidRequest if none has a pose."""
+    """Write the scene of frames that are listed.
+
+    Raises
+    ------
+    InvalidRequest : none has a pose.
+    """
     from sceneprint.scenes.map_scene import frames_scene
 
     posed = [one for one in frames if one.pose is not None]

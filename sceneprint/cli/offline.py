@@ -81,8 +81,11 @@ class Signed:
 
 
 def named_frames(options: argparse.Namespace) -> list[tuple[str, FrameReference]]:
-    """All frames below the paths, under names that are unique among them. Raises DatasetError if
-    nothing is found at a path, or one path was given twice.
+    """All frames below the paths, under names that are unique among them.
+
+    Raises
+    ------
+    DatasetError : nothing is found at a path, or one path was given twice.
     """
     frames: dict[str, FrameReference] = {}
     files: set[Path] = set()

@@ -80,8 +80,11 @@ def add_filter_options(command: argparse.ArgumentParser) -> None:
 
 
 def filter_of(options: argparse.Namespace) -> dict[str, Any] | None:
-    """The filter that the options describe, as JSON has it; None where there is none. Raises
-    InvalidRequest if one of --region and --region-frame is there without the other.
+    """The filter that the options describe, as JSON has it; None where there is none.
+
+    Raises
+    ------
+    InvalidRequest : one of --region and --region-frame without the other.
     """
     region = None
     if (options.region is None) != (options.region_frame is None):
@@ -245,8 +248,11 @@ def share_of(text: str) -> float:
 
 
 def require_database(settings: Settings) -> None:
-    """See that a data folder has a database: a mistyped --data would make a new, empty one. Raises
-    UnusableStore if it has none.
+    """See that a data folder has a database: a mistyped --data would make a new, empty one.
+
+    Raises
+    ------
+    UnusableStore : it has none.
     """
     if settings.database_url is None and not (settings.data_dir / "sceneprint.db").is_file():
         raise UnusableStore(
@@ -272,8 +278,11 @@ def add_service_options(command: argparse.ArgumentParser) -> None:
 
 
 def open_client(options: argparse.Namespace) -> Client:
-    """A client of the service that the options name. Raises Unreachable if the address is not
-    valid.
+    """A client of the service that the options name.
+
+    Raises
+    ------
+    Unreachable : the address is none.
     """
     from sceneprint_client import Client
 
@@ -542,8 +551,12 @@ def add_scene_options(command: argparse.ArgumentParser) -> None:
 
 
 def check_scene(options: argparse.Namespace) -> None:
-    """Check before any work that the scene can be written. Raises MissingDependency if a package
-    that it needs is not installed, OSError if the file cannot be written.
+    """Check before any work that the scene can be written.
+
+    Raises
+    ------
+    MissingDependency : a package that it needs is not installed.
+    OSError : the file cannot be written.
     """
     if options.mcap is not None:
         from sceneprint.scenes.mcap_writer import require_foxglove
@@ -553,8 +566,11 @@ def check_scene(options: argparse.Namespace) -> None:
 
 
 def check_kept(options: argparse.Namespace) -> None:
-    """Check that the service stores the answers, from which a scene is drawn. Raises InvalidRequest
-    if it does not.
+    """Check that the service stores the answers, from which a scene is drawn.
+
+    Raises
+    ------
+    InvalidRequest : it does not.
     """
     if options.mcap is not None and options.no_keep:
         raise InvalidRequest("A scene is made of stored answers. Leave --no-keep out.")

@@ -85,8 +85,12 @@ def add_overlay_options(command: argparse.ArgumentParser) -> None:
 
 
 def check_overlay(options: argparse.Namespace, frames: int) -> None:
-    """See before the first query that the overlay can be written. Raises DatasetError if several
-    frames would go to one file, OSError if the file cannot be written.
+    """See before the first query that the overlay can be written.
+
+    Raises
+    ------
+    DatasetError : several frames would go to one file.
+    OSError : the file cannot be written.
     """
     if options.overlay is None:
         return
@@ -223,8 +227,11 @@ def _answer_scene(
 
 
 def query_frames(options: argparse.Namespace) -> list[FrameReference]:
-    """The frames to look up: all, or that of `--frame`. Raises DatasetError if nothing is found at
-    the path, or there is no such frame.
+    """The frames to look up: all, or that of `--frame`.
+
+    Raises
+    ------
+    DatasetError : nothing is found at the path, or no such frame.
     """
     path = options.path
     references = [frame for one in sequences_at(path, options) for frame in one.frames]

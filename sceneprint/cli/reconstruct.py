@@ -130,7 +130,12 @@ def _query(client: Client, options: argparse.Namespace) -> Answer:
 
 
 def _only(path: Path) -> FrameReference:
-    """Return the only frame at a path. Raises DatasetError if there is none, or several."""
+    """Return the only frame at a path.
+
+    Raises
+    ------
+    DatasetError : none, or several.
+    """
     found = [frame for sequence in find_sequences(path) for frame in sequence.frames]
     if len(found) != 1:
         raise DatasetError(f"{path}: {len(found)} frames found. Name a single frame file.")

@@ -61,8 +61,11 @@ def add_workers_option(command: argparse.ArgumentParser) -> None:
 
 
 def settings_of(options: argparse.Namespace) -> Settings:
-    """Settings of the environment, and what the options say instead. Raises InvalidRequest for a
-    value that is not valid.
+    """Settings of the environment, and what the options say instead.
+
+    Raises
+    ------
+    InvalidRequest : a value that is none.
     """
     from pydantic import ValidationError
 

@@ -299,8 +299,11 @@ def add_database_option(command: argparse.ArgumentParser) -> None:
 
 
 def named_database(options: argparse.Namespace) -> Settings:
-    """Settings of the environment, and the database that `--database` names. Raises InvalidRequest
-    if its URL has a password, which everybody on the machine could see.
+    """Settings of the environment, and the database that `--database` names.
+
+    Raises
+    ------
+    InvalidRequest : its URL has a password, which everybody on the machine could see.
     """
     from pydantic import SecretStr
     from sqlalchemy import make_url

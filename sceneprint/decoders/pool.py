@@ -137,8 +137,12 @@ class DecoderProcess:
         )
 
     def run(self, request: dict[str, Any], data: bytes, seconds: float) -> dict[str, Any]:
-        """Have it do a task; its reply, unchecked. The array is in `array_of`. Raises DecoderEnded
-        if it died of the task, DecoderFailure if it took too long.
+        """Have it do a task; its reply, unchecked. The array is in `array_of`.
+
+        Raises
+        ------
+        DecoderEnded : it died of the task.
+        DecoderFailure : it took too long.
         """
         self._shared[: len(data)] = data
         try:

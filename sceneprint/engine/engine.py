@@ -94,8 +94,11 @@ def decoders_of(settings: Settings) -> Decoders:
 
 
 class Engine:
-    """Maps, frames, queries and jobs over one store; safe to share between threads. Raises
-    UnusableStore or NewerSchema if the store cannot be opened.
+    """Maps, frames, queries and jobs over one store; safe to share between threads.
+
+    Raises
+    ------
+    UnusableStore, NewerSchema : the store cannot be opened.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -306,8 +309,11 @@ class Engine:
             return frame_records(connection, row, [frame])[0]
 
     def delete_frame(self, map_name: str, frame_id: str) -> None:
-        """Delete a frame, effective at once; `tombstones` can restore it for some time. Raises
-        UnknownMap or UnknownFrame if there is none, or it was deleted before.
+        """Delete a frame, effective at once; `tombstones` can restore it for some time.
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : there is none, or it was deleted before.
         """
         with self.store.database.write() as connection:
             row = stored_maps.find_map(connection, map_name)

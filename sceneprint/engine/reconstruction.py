@@ -299,8 +299,12 @@ class ReconstructionJobs:
             return _reconstruction_record(job, queue.files_of(connection, job.number))
 
     def mesh(self, job_id: str) -> queue.JobFile:
-        """Return the file of the surface. Raises UnknownJob if there is no such reconstruction,
-        NotIndexed if it has not made it.
+        """Return the file of the surface.
+
+        Raises
+        ------
+        UnknownJob : there is no such reconstruction.
+        NotIndexed : it has not made it.
         """
         with self._store.database.read() as connection:
             job = _find(connection, job_id)

@@ -29,7 +29,13 @@ KERNELS_S = 20.0
 
 
 class Signers:
-    """Signers by the id of their model; the model's file is the one in the database."""
+    """Signers by the id of their model; the model's file is the one in the database.
+
+    Parameters
+    ----------
+    database : that holds the models
+    cache_dir : of pair tables
+    """
 
     def __init__(self, database: Database, cache_dir: Path) -> None:
         self.database, self._cache_dir = database, cache_dir
@@ -47,8 +53,11 @@ class Signers:
         self._compiled.set()
 
     def require_kernels(self, wait_s: float | None = None) -> None:
-        """See that nobody has to compile. Raises Busy if kernels are still being compiled after
-        these seconds (default: KERNELS_S).
+        """See that nobody has to compile.
+
+        Raises
+        ------
+        Busy : kernels are still being compiled after these seconds (default: KERNELS_S).
         """
         if not self._compiled.wait(KERNELS_S if wait_s is None else wait_s):
             raise Busy(
@@ -57,8 +66,12 @@ class Signers:
             )
 
     def __call__(self, model_id: str) -> Signer:
-        """The signer of a model that a map refers to. Raises UnreadableModel if another version of
-        sceneprint stored it, Busy if kernels are still being compiled.
+        """The signer of a model that a map refers to.
+
+        Raises
+        ------
+        UnreadableModel : another version of sceneprint stored it.
+        Busy : kernels are still being compiled.
         """
         self.require_kernels()
         with self._lock:  # building a table takes seconds: once is enough

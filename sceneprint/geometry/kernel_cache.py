@@ -78,7 +78,12 @@ class _Locations(CompileResultCacheImpl):
 
 
 class KernelCache(FunctionCache):
-    """The machine code of one kernel on disk."""
+    """The machine code of one kernel on disk.
+
+    Parameters
+    ----------
+    function : the kernel
+    """
 
     _impl_class = _Locations
 

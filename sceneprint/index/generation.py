@@ -105,8 +105,11 @@ class Generation:
         return any(len(one.gone) or len(one.places.found(rising)) for one in self.segments)
 
     def vectors_of(self, keys: Keys) -> Bytes:
-        """Signatures (r, D) of some frames, a copy. Raises ValueError if there is no such frame in
-        it.
+        """Signatures (r, D) of some frames, a copy.
+
+        Raises
+        ------
+        ValueError : there is no such frame in it.
         """
         result = np.empty((len(keys), self.manifest.dimension), np.uint8)
         missing = np.ones(len(keys), np.bool_)
@@ -166,7 +169,17 @@ def open_generation(
     folder: Path, manifest: GenerationManifest, known: Generation | None = None,
     sound: Mapping[str, int] | None = None,
 ) -> Generation:  # fmt: skip
-    """Open the files of a generation. Raises DamagedIndex if one of them is missing or damaged."""
+    """Open the files of a generation.
+
+    Parameters
+    ----------
+    folder, manifest : of the generation
+    known, sound : see `newest`
+
+    Raises
+    ------
+    DamagedIndex : one of them is missing or damaged.
+    """
     verified = {**(known.inodes if known is not None else {}), **(sound or {})}
     inodes = {name: _inode(folder / name) for name, _ in manifest.files}
     if known is not None and known.manifest == manifest and known.inodes == inodes:
@@ -282,8 +295,11 @@ def signatures_of(keys: Keys, generation: Generation | None, tail: Tail) -> Byte
 
 
 def check_lengths(dimension: int, generation: Generation | None, tail: Tail) -> None:
-    """See that signatures of generation and tail have that many bytes. Raises ValueError if they
-    have not.
+    """See that signatures of generation and tail have that many bytes.
+
+    Raises
+    ------
+    ValueError : they have not.
     """
     found = {tail.signatures.shape[1]}
     if generation is not None:
@@ -486,7 +502,10 @@ def clear(folder: Path, but: int | None = None) -> bool:
 
 def remove_all_but(folder: Path, manifest: GenerationManifest) -> None:
     """Publish a generation whose files are in a folder, and remove all others; while building.
-    Raises OSError if it cannot be written.
+
+    Raises
+    ------
+    OSError : it cannot be written.
     """
     _clean(folder, {write_manifest(folder, manifest)})
 

@@ -142,8 +142,11 @@ def check(folder: Path, name: str, size: int) -> Iterator[None]:
 
 
 def mapped(path: Path) -> mmap.mmap | bytes:
-    """A file in memory that processes share, also after it is unlinked. Raises DamagedIndex if it
-    is missing or unreadable.
+    """A file in memory that processes share, also after it is unlinked.
+
+    Raises
+    ------
+    DamagedIndex : missing or unreadable.
     """
     try:
         with path.open("rb") as file:
@@ -183,7 +186,12 @@ Block = tuple[Keys, Bytes]
 
 
 def check_block(keys: Keys, signatures: Bytes, length: int) -> None:
-    """Raise ValueError if these are not keys and signatures of that many bytes."""
+    """See that these are keys and signatures of that many bytes.
+
+    Raises
+    ------
+    ValueError : they are not.
+    """
     if keys.dtype != np.int64 or signatures.dtype != np.uint8:
         raise ValueError(f"keys of {keys.dtype} and signatures of {signatures.dtype}")
     if keys.ndim != 1 or length < 1 or signatures.shape != (len(keys), length):
@@ -330,8 +338,11 @@ def newest_number(folder: Path) -> int | None:
 
 
 def write_manifest(folder: Path, manifest: GenerationManifest) -> Path:
-    """Write a manifest durably, last of all: everything it names must be there. Raises OSError if
-    it cannot be written.
+    """Write a manifest durably, last of all: everything it names must be there.
+
+    Raises
+    ------
+    OSError : it cannot be written.
     """
     path = folder / manifest_name(manifest)
     write_durable(path, encode_manifest(manifest))
@@ -368,7 +379,17 @@ def read_manifest(path: Path) -> GenerationManifest:
 
 
 def decode_manifest(path: Path, data: bytes) -> GenerationManifest:
-    """A manifest from its bytes. Raises DamagedIndex if they are none, or of another schema."""
+    """A manifest from its bytes.
+
+    Parameters
+    ----------
+    path : to show
+    data : of `encode_manifest`
+
+    Raises
+    ------
+    DamagedIndex : they are none, or of another schema.
+    """
     try:
         record: dict[str, Any] = json.loads(data)
         if record.pop("schema_version") != SCHEMA_VERSION:

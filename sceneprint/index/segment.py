@@ -332,8 +332,11 @@ def segment_sources(
 def spool_blocks(
     folder: Path, blocks: Iterable[Block], dimension: int | None
 ) -> tuple[Keys, Bytes]:
-    """Keys (n,) and signatures (n, D) as they come: in a file without a name, not in memory. Raises
-    ValueError if they are none, or of several lengths, or have a key twice.
+    """Keys (n,) and signatures (n, D) as they come: in a file without a name, not in memory.
+
+    Raises
+    ------
+    ValueError : they are none, or of several lengths, or have a key twice.
     """
     keys, path = [np.empty(0, np.int64)], unfinished(folder)
     with os.fdopen(create_private(path), "w+b") as file:

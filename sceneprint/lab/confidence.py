@@ -41,7 +41,12 @@ class JudgedQuery:
 
 
 def judged_queries(answers: Iterable[SiteAnswer]) -> list[JudgedQuery]:
-    """Return the candidate poses of every answer that has any."""
+    """Return the candidate poses of every answer that has any.
+
+    Parameters
+    ----------
+    answers : of `ask_site`
+    """
     return [
         JudgedQuery(
             one.site, one.kind, one.query,

@@ -75,9 +75,12 @@ PRESET_WHITENINGS = {
 def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
     """Parameters of a preset.
 
-    `depth` suits depth cameras indoors, and is what to take by default. `lidar` has longer lengths,
-    for scanners that see tens of metres. `paper` has the sizes of Sec. III-F. Raises TrainingError
-    if there is no such preset.
+    `depth` suits depth cameras indoors, and is what to take by default. `lidar` has longer
+    lengths, for scanners that see tens of metres. `paper` has the sizes of Sec. III-F.
+
+    Raises
+    ------
+    TrainingError : no such preset.
     """
     if preset not in PRESET_SIZES:
         raise TrainingError(
@@ -189,6 +192,10 @@ def preset_answer(preset: str) -> AnswerParameters:
 
     Penalties of the confidence are those that the preset was shipped with: they are learnt from
     answers, which need a model.
+
+    Parameters
+    ----------
+    preset : one of PRESETS
     """
     confidence = read_model(preset).answer.confidence
     if preset != "lidar":
@@ -344,6 +351,11 @@ def whitened(
     jobs: int, report: Report,
 ) -> Model:  # fmt: skip
     """The model with a whitening, fitted to more rooms than the rest, and frames of one's own.
+
+    Parameters
+    ----------
+    model : calibrated
+    p, references, jobs, report : see `train`
 
     Raises
     ------

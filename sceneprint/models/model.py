@@ -221,8 +221,11 @@ def to_mapping(parameters: ModelParameters) -> dict[str, Any]:
 
 
 def parameters_of(values: Any) -> ModelParameters:
-    """What `to_mapping` made, read back. Raises UnreadableModel if fields are missing, unknown or
-    no numbers.
+    """What `to_mapping` made, read back.
+
+    Raises
+    ------
+    UnreadableModel : fields are missing, unknown or no numbers.
     """
     if not isinstance(values, dict):
         raise UnreadableModel(f"The model's parameters are {values!r}. Fetch or train it again.")

@@ -88,7 +88,12 @@ MAXIMUM_DIMENSION = 1024
 
 
 def check_whitening(levels: tuple[object, ...], n_levels: int, dimension: int) -> None:
-    """Raise ValueError if a whitening is not of levels that there are, or not short."""
+    """See that a whitening is of levels that there are, and short.
+
+    Raises
+    ------
+    ValueError : it is not.
+    """
     known = [level for level in range(n_levels) if level in levels]
     if not known or list(levels) != known or any(isinstance(level, bool) for level in levels):
         raise ValueError(f"a whitening of levels {list(levels)} of {n_levels}")
@@ -465,8 +470,15 @@ def _build(model: Model, progress: Progress | None) -> Floats32:
 
 
 def is_sound_table(path: Path) -> bool:
-    """Whether a cached table has the bytes that were written, whatever model it is of. Raises
-    OSError if it cannot be read.
+    """Whether a cached table has the bytes that were written, whatever model it is of.
+
+    Parameters
+    ----------
+    path : of the file
+
+    Raises
+    ------
+    OSError : it cannot be read.
     """
     with path.open("rb") as file:
         head = file.read(HEAD)

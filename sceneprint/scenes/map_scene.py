@@ -73,8 +73,11 @@ class PosedRun:
 
 
 def map_runs(client: Client, map_name: str) -> list[PosedRun]:
-    """The runs of a map with poses, each through at most TRACK_POSES of them. Raises UnknownMap if
-    there is no such map.
+    """The runs of a map with poses, each through at most TRACK_POSES of them.
+
+    Raises
+    ------
+    UnknownMap : no such map.
     """
     runs, unnamed = [], False
     for session in itertools.islice(client.sessions(map_name), MOST_LISTED):
@@ -230,8 +233,11 @@ def frames_scene(client: Client, frames: Sequence[Frame], up: Floats | None, mos
 
 
 def frame_scene(client: Client, frame: Frame) -> Moment:
-    """One frame of a map at all times, in its parent frame, or its own where it has no pose. Raises
-    NotIndexed if it has no geometry yet.
+    """One frame of a map at all times, in its parent frame, or its own where it has no pose.
+
+    Raises
+    ------
+    NotIndexed : nothing has been made of it, or not yet.
     """
     optical = frame.kind == "depth"
     points = client.frame_points(frame.map, frame.frame_id).points

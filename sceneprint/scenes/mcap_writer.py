@@ -55,7 +55,12 @@ _POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 4)])
 
 
 def require_foxglove() -> None:
-    """See that foxglove-sdk is there. Raises MissingDependency if it is not installed."""
+    """See that foxglove-sdk is there.
+
+    Raises
+    ------
+    MissingDependency : it is not installed.
+    """
     try:
         import foxglove  # noqa: F401
     except ImportError as cause:

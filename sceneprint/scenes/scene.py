@@ -58,7 +58,14 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class LineSet:
-    """Strips of lines, each (M, 3) metres and of one colour."""
+    """Strips of lines.
+
+    Parameters
+    ----------
+    strips : each (M, 3) metres
+    colours : of each strip
+    width_px : on the screen
+    """
 
     strips: Sequence[Floats]
     colours: Sequence[Colour]
@@ -67,7 +74,13 @@ class LineSet:
 
 @dataclass(frozen=True, eq=False)
 class TextLabel:
-    """A short text in space."""
+    """A short text in space.
+
+    Parameters
+    ----------
+    position : (3,) metres
+    text, colour : of it
+    """
 
     position: Floats
     text: str
@@ -134,7 +147,12 @@ class SceneWriter(Protocol):
 
 
 class SceneStream:
-    """A scene while it is written, which knows what each moment replaces."""
+    """A scene while it is written, which knows what each moment replaces.
+
+    Parameters
+    ----------
+    writer : of the scene's file
+    """
 
     def __init__(self, writer: SceneWriter) -> None:
         self._writer = writer

@@ -82,8 +82,12 @@ class GeometryCache:
         self._bytes = 0
 
     def read(self, digest: str) -> Geometry:
-        """The artifact of a digest, which callers must not change. Raises DamagedBlob if it is
-        missing, or not what it was, UnreadableGeometry if it is no artifact of this version.
+        """The artifact of a digest, which callers must not change.
+
+        Raises
+        ------
+        DamagedBlob : it is missing, or not what it was.
+        UnreadableGeometry : it is no artifact of this version.
         """
         with self._lock:
             entry = self._entries.get(digest)

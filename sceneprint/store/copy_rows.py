@@ -100,7 +100,14 @@ def date_map(connection: Connection, row: MapRow, created_at: float) -> MapRow:
 
 @dataclass(frozen=True, eq=False)
 class CopiedFrame:
-    """A frame as it is elsewhere; `values` by column of COPIED."""
+    """A frame as it is elsewhere.
+
+    Parameters
+    ----------
+    id : of the frame
+    values : by column of COPIED
+    made : its signature
+    """
 
     id: str
     values: Mapping[str, Any]

@@ -261,7 +261,10 @@ def current_revision(connection: Connection) -> str | None:
     """Revision of a database that this version knows; None: nobody has made a schema in it.
 
     Of a later version's schema that this one may write to, it is the revision of this version.
-    Raises NewerSchema if a later version of sceneprint wrote it, and this one may not use it.
+
+    Raises
+    ------
+    NewerSchema : a later version of sceneprint wrote it, and this one may not use it.
     """
     found, (head, known) = schema_range_of(connection), known_revisions()
     if found is None:
@@ -348,7 +351,12 @@ class Database:
         return self.is_sqlite and read_only_file(self._engine.url) is not None
 
     def require_writable(self) -> None:
-        """See that it may be written. Raises ReadOnlyStore if it may be read alone."""
+        """See that it may be written.
+
+        Raises
+        ------
+        ReadOnlyStore : it may be read alone.
+        """
         if self._sealed is not None:
             raise self._sealed.refusal()
 
@@ -554,8 +562,11 @@ class Database:
         """A connection to PostgreSQL that commits each statement at once, for whom it is opened.
 
         What lasts as long as a connection does, such as LISTEN and locks of a session, needs one
-        that nobody else is given. Who asked closes it, and asks within `explained`. Raises
-        UnusableStore if the server cannot be reached.
+        that nobody else is given. Who asked closes it, and asks within `explained`.
+
+        Raises
+        ------
+        UnusableStore : the server cannot be reached.
         """
         if self.is_sqlite:
             raise ValueError(f"{self.shown} has no connections but those of its file")
@@ -589,7 +600,10 @@ def _close_connection(connection: Any, _record: object) -> None:
 
 def is_there(url: str) -> bool:
     """Whether the database of a URL is a file that is there, or a server's that has a schema.
-    Raises UnusableStore if the server cannot be asked.
+
+    Raises
+    ------
+    UnusableStore : the server cannot be asked.
     """
     try:
         parsed = database_url(url)
@@ -606,8 +620,11 @@ def is_there(url: str) -> bool:
 
 
 def reach_database(given: str) -> Database:
-    """A database as it is: no schema is made or looked at, and a server is not yet asked. Raises
-    UnusableStore if the URL is none of a database that is known.
+    """A database as it is: no schema is made or looked at, and a server is not yet asked.
+
+    Raises
+    ------
+    UnusableStore : the URL is none of a database that is known.
     """
     url = database_url(given)
     if url.get_backend_name() == "sqlite":

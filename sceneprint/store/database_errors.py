@@ -31,7 +31,13 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def unusable(what: str, error: OSError) -> UnusableStore:
-    """A file or folder that cannot be written, in our words."""
+    """A file or folder that cannot be written, in our words.
+
+    Parameters
+    ----------
+    what : happened, with the place
+    error : of the system
+    """
     text = f"{what} ({error.strerror})."
     if error.errno in _FULL:
         return StoreFull(f"{text} The disk is full: free some space.")

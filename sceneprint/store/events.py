@@ -139,7 +139,10 @@ def anchor_of_now(database: Database, map_name: str) -> str:
     """The last event of a map, as a mark of the state that it has now.
 
     It is later than all that was committed before this is called: what is pending has no number.
-    Raises UnusableStore if the events that are pending cannot be numbered now.
+
+    Raises
+    ------
+    UnusableStore : the events that are pending cannot be numbered now.
     """
     _number_pending(database)
     with database.read() as connection:

@@ -80,8 +80,11 @@ def set_state(
 def delete_frame(
     connection: Connection, row: MapRow, frame: FrameRow, deletion: int | None = None
 ) -> list[str]:
-    """Delete one frame; parameters and result as of `delete_frames`. Raises UnknownFrame if it was
-    deleted before.
+    """Delete one frame; parameters and result as of `delete_frames`.
+
+    Raises
+    ------
+    UnknownFrame : it was deleted before.
     """
     if frame.state == FrameState.DELETED:
         raise UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted before.")

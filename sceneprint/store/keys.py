@@ -69,8 +69,12 @@ def create_key(
 ) -> str:  # fmt: skip
     """Make a key and return its secret, which is stored nowhere; for the rest see KeyRow.
 
-    Without `tenant` it belongs to one of its own name. Raises Conflict if there is a key of that
-    name, UnknownTenant if there is no such tenant.
+    Without `tenant` it belongs to one of its own name.
+
+    Raises
+    ------
+    Conflict : there is a key of that name.
+    UnknownTenant : there is no such tenant.
     """
     if connection.execute(select(keys.c.id).where(keys.c.name == name)).first() is not None:
         raise Conflict(f"There is a key named {name!r}. Choose another name.")
@@ -163,7 +167,12 @@ def list_keys(
 
 
 def revoke_key(connection: Connection, name: str) -> None:
-    """Forget a key. Raises UnknownKey if there is none of that name."""
+    """Forget a key.
+
+    Raises
+    ------
+    UnknownKey : there is none of that name.
+    """
     gone = delete(keys).where(keys.c.name == name).returning(keys.c.tenant)
     tenant = connection.execute(gone).scalar()
     if tenant is None:
@@ -249,8 +258,11 @@ class IdempotentRequest:
     fingerprint: str
 
     def found(self, connection: Connection) -> dict[str, Any] | None:
-        """What `keep` was given when the same was asked before; None where it was not. Raises
-        IdempotencyConflict if something else was asked with this key.
+        """What `keep` was given when the same was asked before; None where it was not.
+
+        Raises
+        ------
+        IdempotencyConflict : something else was asked with this key.
         """
         row = connection.execute(
             select(idempotency.c.fingerprint, idempotency.c.data).where(
@@ -278,8 +290,11 @@ class IdempotentRequest:
         """Remember what came of it, in the transaction that stores that.
 
         One statement, as others wait meanwhile. What was remembered before gives way: it is older
-        than a day, or of a map that was deleted since. Raises Overtaken if another request with
-        this key was stored since `found`, of another map.
+        than a day, or of a map that was deleted since.
+
+        Raises
+        ------
+        Overtaken : another request with this key was stored since `found`, of another map.
         """
         values, own = self.columns(data), ("actor", "key")
         kind: Any = sqlite if connection.dialect.name == "sqlite" else postgresql

@@ -53,7 +53,12 @@ from sceneprint_client.api import FrameState
 
 
 def find_map(connection: Connection, name: str) -> MapRow:
-    """The map of a name. Raises UnknownMap if there is none."""
+    """The map of a name.
+
+    Raises
+    ------
+    UnknownMap : there is none.
+    """
     row = connection.execute(_map_of_name(), {"name": name}).first()
     if row is None:
         raise unknown_map(name)
@@ -303,7 +308,12 @@ def position(pose: Sequence[Sequence[float]] | None) -> dict[str, float | None]:
 
 
 def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
-    """The frame of an id in a map, deleted ones too. Raises UnknownFrame if there is none."""
+    """The frame of an id in a map, deleted ones too.
+
+    Raises
+    ------
+    UnknownFrame : there is none.
+    """
     found = _first(connection, frames.c.map_number == row.number, frames.c.id == frame_id)
     if found is None:
         raise UnknownFrame(

@@ -57,7 +57,10 @@ class OpaqueIds:
 
     def event(self, given: str, place: str = "after") -> int:
         """The number of the event that an id stands for; 0 for START, which is before all of them.
-        Raises InvalidRequest if it is the id of no event of this store.
+
+        Raises
+        ------
+        InvalidRequest : it is the id of no event of this store.
         """
         number = self.open("event", given)
         if number is None:
@@ -70,7 +73,10 @@ class OpaqueIds:
 
     def row(self, kind: Kind, cursor: str | None) -> int | None:
         """The number of the row that a page before ended with, by its cursor; None for the first.
-        Raises InvalidRequest if it was not given out.
+
+        Raises
+        ------
+        InvalidRequest : it was not given out.
         """
         if cursor is None:
             return None
@@ -94,8 +100,11 @@ class OpaqueIds:
         return self._cipher.encrypt(_MOMENT.pack(*moments[limit - 1]), [kind.encode()]).hex()
 
     def moment(self, kind: Kind, cursor: str | None) -> tuple[float, int] | None:
-        """Time and number of the row that a page before ended with; None for the first page. Raises
-        InvalidRequest if it was not given out.
+        """Time and number of the row that a page before ended with; None for the first page.
+
+        Raises
+        ------
+        InvalidRequest : it was not given out.
         """
         if cursor is None:
             return None
@@ -132,8 +141,11 @@ class OpaqueIds:
 
 
 def row_of(cursor: str | None) -> int | None:
-    """The place that a cursor stands for in a list that is numbered by itself. Raises
-    InvalidRequest if it was not given out.
+    """The place that a cursor stands for in a list that is numbered by itself.
+
+    Raises
+    ------
+    InvalidRequest : it was not given out.
     """
     if cursor is None:
         return None

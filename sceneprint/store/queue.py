@@ -133,7 +133,12 @@ def list_jobs(
 
 
 def find_job(connection: Connection, job_id: str) -> JobRow:
-    """The job of an id. Raises UnknownJob if there is none."""
+    """The job of an id.
+
+    Raises
+    ------
+    UnknownJob : there is none.
+    """
     row = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().first()
     if row is None:
         raise unknown_job(job_id)
@@ -443,13 +448,21 @@ def _last_turn(connection: Connection) -> int:
 
 
 def renew(connection: Connection, held: JobRow, lease_s: float) -> None:
-    """Extend a lease. Raises LostLease if the job has been given to another worker, or is over."""
+    """Extend a lease.
+
+    Raises
+    ------
+    LostLease : the job has been given to another worker, or is over.
+    """
     _hold(connection, held, leased_until=now(connection) + lease_s)
 
 
 def check_held(connection: Connection, held: JobRow) -> None:
     """See that a claim is still the latest, in the transaction that stores a part of its work.
-    Raises LostLease like `renew`.
+
+    Raises
+    ------
+    LostLease : as `renew`.
     """
     # locked until the commit: else a claim might come in between where the lease is over
     own = select(jobs.c.number).where(*_own(held)).with_for_update()
@@ -479,7 +492,11 @@ def go_on(
     """Queue a long job again after a part of it, behind those that wait.
 
     However many tries it took, they count no more: it came further. It is not claimed within
-    `after_s` seconds. Raises LostLease like `renew`.
+    `after_s` seconds.
+
+    Raises
+    ------
+    LostLease : as `renew`.
     """
     # one try, and not none: its number is less than that of all that came since, and it would
     # go before them with every part
@@ -490,8 +507,11 @@ def go_on(
 
 
 def fail(connection: Connection, held: JobRow, error: str, traceback: str) -> JobState:
-    """Queue a job that broke down for another try, or let it be dead. Raises LostLease like
-    `renew`.
+    """Queue a job that broke down for another try, or let it be dead.
+
+    Raises
+    ------
+    LostLease : as `renew`.
     """
     # not as it was claimed: an earlier worker may have died over the job since
     known = select(jobs.c.failures).where(jobs.c.number == held.number)
@@ -630,8 +650,11 @@ def _out_of_tries(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
 
 
 def cancel(connection: Connection, job: JobRow) -> None:
-    """Cancel a job; a worker that is at it learns so when it brings its result. Raises JobOver if
-    there is nothing left to cancel.
+    """Cancel a job; a worker that is at it learns so when it brings its result.
+
+    Raises
+    ------
+    JobOver : there is nothing left to cancel.
     """
     if job.state.over:
         raise JobOver(f"Job {job.id} is {job.state}: {job.state.sentence} Nothing is left to do.")

@@ -45,7 +45,12 @@ def read_scrub(connection: Connection) -> ScrubRow | None:
 
 
 def claim_slice(connection: Connection) -> ScrubRow | None:
-    """Take the next slice; None where it is not due."""
+    """Take the next slice; None where it is not due.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    """
     now, row = read_clock(connection), read_scrub(connection)
     if row is None:
         row = ScrubRow(1, 0, now + SLICE_S, now, None, 0, 0, 0)

@@ -279,8 +279,11 @@ def _gone(map_number: int, revision: int) -> tuple[ColumnElement[bool], ...]:
 
 
 def stored_vector(connection: Connection, number: int, model_id: str) -> bytes | None:
-    """The signature of a frame, or None where it has none. Raises DamagedSignature if its bytes are
-    not those that were stored.
+    """The signature of a frame, or None where it has none.
+
+    Raises
+    ------
+    DamagedSignature : its bytes are not those that were stored.
     """
     own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
     asked = select(signatures.c.vector, signatures.c.checksum).where(own)

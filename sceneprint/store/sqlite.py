@@ -51,8 +51,11 @@ class ReadOnlyFile:
         self._path = path
 
     def connect(self) -> sqlite3.Connection:
-        """Open it in the way that is right at this moment. Raises UnusableStore if it was not
-        closed, and cannot be recovered without writing.
+        """Open it in the way that is right at this moment.
+
+        Raises
+        ------
+        UnusableStore : it was not closed, and cannot be recovered without writing.
         """
         has_log, has_index = self._log(), self._beside("-shm").exists()
         if (has_log and not has_index) or self._beside("-journal").exists():
@@ -74,8 +77,11 @@ class ReadOnlyFile:
         return found.st_mtime_ns, found.st_size, found.st_ino
 
     def check(self, before: object) -> None:
-        """See at the end of a transaction that nobody has written meanwhile. Raises UnusableStore
-        if somebody has.
+        """See at the end of a transaction that nobody has written meanwhile.
+
+        Raises
+        ------
+        UnusableStore : somebody has.
         """
         if self.state() != before:
             raise UnusableStore(

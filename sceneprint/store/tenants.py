@@ -15,7 +15,14 @@ from sceneprint.store.tables import jobs, keys, tenants
 
 @dataclass(frozen=True)
 class TenantRow:
-    """A tenant."""
+    """A tenant.
+
+    Parameters
+    ----------
+    name : unique
+    created_at : seconds since 1970
+    keys : how many it has
+    """
 
     name: str
     created_at: float
@@ -45,8 +52,12 @@ def create_tenant(connection: Connection, name: str) -> None:
 
 
 def delete_tenant(connection: Connection, name: str) -> None:
-    """Delete a tenant that has no key; its jobs that wait keep their turn. Raises UnknownTenant if
-    there is none of that name, Conflict if it has a key.
+    """Delete a tenant that has no key; its jobs that wait keep their turn.
+
+    Raises
+    ------
+    UnknownTenant : there is none of that name.
+    Conflict : it has a key.
     """
     if not has_tenant(connection, name):
         raise unknown_tenant(name)
@@ -59,8 +70,11 @@ def delete_tenant(connection: Connection, name: str) -> None:
 
 
 def join_tenant(connection: Connection, key_name: str, tenant: str | None) -> str:
-    """The tenant of a new key: the one that is named, or one of the key's own name. Raises
-    UnknownTenant if there is none of the name that was given.
+    """The tenant of a new key: the one that is named, or one of the key's own name.
+
+    Raises
+    ------
+    UnknownTenant : there is none of the name that was given.
     """
     if tenant is not None:
         if not has_tenant(connection, tenant):

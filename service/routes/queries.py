@@ -450,8 +450,11 @@ async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
 
 
 def require_readable(query_id: str, here: Context, asking: Caller) -> QueryRow:
-    """Return the row of a query, if the caller may read all maps that it names. Raises UnknownQuery
-    if its answer is not stored, or the caller may not see it: the text is the same.
+    """Return the row of a query, if the caller may read all maps that it names.
+
+    Raises
+    ------
+    UnknownQuery : its answer is not stored, or the caller may not see it: the text is the same.
     """
     row = here.engine.query_log.find_row(query_id)
     maps = [*row.searched, *([] if row.frame_map is None else [row.frame_map])]

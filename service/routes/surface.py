@@ -166,8 +166,11 @@ async def get_surface_plan(
 
 
 def _numbers(name: str, text: str, count: int) -> list[float]:
-    """Numbers that a parameter lists. Raises InvalidRequest if they are not so many, or none that
-    are sensible.
+    """Numbers that a parameter lists.
+
+    Raises
+    ------
+    InvalidRequest : they are not so many, or none that are sensible.
     """
     try:
         found = [float(part) for part in text.split(",")]

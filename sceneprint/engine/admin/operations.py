@@ -305,8 +305,11 @@ class Audit:
     def page(
         self, wanted: AuditFilter, cursor: str | None = None, limit: int = 100
     ) -> Page[AuditLine]:
-        """Return a page of lines, the newest first. Raises InvalidRequest for a cursor that was not
-        given out.
+        """Return a page of lines, the newest first.
+
+        Raises
+        ------
+        InvalidRequest : a cursor that was not given out.
         """
         seals = self._store.seals
         before = seals.row("audit", cursor)
@@ -357,8 +360,12 @@ def create_key(
 
 
 def create_tenant(store: Store, name: str) -> None:
-    """Create a tenant without keys. Raises InvalidRequest if the name is empty, too long, not
-    printable or taken by us, Conflict if there is a tenant of that name.
+    """Create a tenant without keys.
+
+    Raises
+    ------
+    InvalidRequest : the name is empty, too long, not printable or taken by us.
+    Conflict : there is a tenant of that name.
     """
     _check_name(name, "tenant")
     with store.database.write() as connection:
@@ -410,7 +417,12 @@ def rotate_key(store: Store, name: str, overlap_s: float = OVERLAP_S) -> MadeKey
 
 
 def list_keys(store: Store, cursor: str | None = None, limit: int = 100) -> Page[Key]:
-    """Keys by name. Raises InvalidRequest for a cursor that was not given out."""
+    """Keys by name.
+
+    Raises
+    ------
+    InvalidRequest : a cursor that was not given out.
+    """
     after = None if cursor is None else _name_of(cursor)
     with store.database.read() as connection:
         found = stored.list_keys(connection, after, limit + 1)

@@ -186,7 +186,12 @@ _MOST_PIXELS = 640
 
 
 class _MapBytes:
-    """Passes the file of a map on as it is."""
+    """Passes the file of a map on as it is.
+
+    Parameters
+    ----------
+    name : of the file
+    """
 
     def __init__(self, name: str) -> None:
         self._name, self._head, self._size = name, b"", 0
@@ -405,8 +410,11 @@ class Imports:
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100
     ) -> Page[ImportItem]:
         """What came of the members of an archive, or the views of a map, so far, in their order.
-        Raises UnknownMap or UnknownJob if there is none, InvalidRequest for a cursor that was not
-        given out.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : there is none.
+        InvalidRequest : a cursor that was not given out.
         """
         self.get(map_name, job_id)
         first = row_of(cursor) or 0

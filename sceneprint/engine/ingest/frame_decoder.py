@@ -101,8 +101,12 @@ def _failed(error: errors.DecoderFailure) -> str:
 
 
 def read_stored(data: bytes, row: FrameRow, decoders: Decoders) -> AnyFrame:
-    """The frame of an upload that was let in before. Raises DamagedBlob if a decoder fails at it,
-    as it did not before, Busy if no decoder gets free, or none can be started.
+    """The frame of an upload that was let in before.
+
+    Raises
+    ------
+    DamagedBlob : a decoder fails at it, as it did not before.
+    Busy : no decoder gets free, or none can be started.
     """
     try:
         with decoders.place() as decoder:

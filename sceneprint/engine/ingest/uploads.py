@@ -287,7 +287,12 @@ class IncomingBytes:
 
 
 class Uploads:
-    """Takes frames into maps; safe to share between threads."""
+    """Takes frames into maps; safe to share between threads.
+
+    Parameters
+    ----------
+    store, bell : see there
+    """
 
     def __init__(self, store: Store, bell: Wakeup) -> None:
         self._store, self._bell = store, bell

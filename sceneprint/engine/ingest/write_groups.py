@@ -120,7 +120,12 @@ _Work = Callable[[Connection], Any]
 
 
 class Grouping(_Group[_Work]):
-    """Writes of many threads to one database; safe to share between them."""
+    """Writes of many threads to one database; safe to share between them.
+
+    Parameters
+    ----------
+    database, map_number : see `Database.write`
+    """
 
     def __init__(self, database: Database, map_number: int | None = None) -> None:
         super().__init__()
@@ -184,6 +189,10 @@ def _do(one: _Waiting[_Work], connection: Connection) -> None:
 class NewFrames(_Group[NewFrame]):
     """New frames of many threads, whatever their maps, taken together by one statement of
     PostgreSQL; safe to share between threads.
+
+    Parameters
+    ----------
+    database : on PostgreSQL
     """
 
     def __init__(self, database: Database) -> None:

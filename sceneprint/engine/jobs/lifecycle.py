@@ -35,7 +35,13 @@ LEFT_S = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """A job in hand."""
+    """A job in hand.
+
+    Parameters
+    ----------
+    job : as it was claimed
+    frame, map : that it is about
+    """
 
     job: JobRow
     frame: FrameRow
@@ -177,8 +183,11 @@ def list_jobs(
     store: Store, state: JobState | None = None, cursor: str | None = None, limit: int = 100,
     kind: str | None = None, map_names: Collection[str] | None = None,
 ) -> Page[Job]:  # fmt: skip
-    """A page of jobs, the newest first; see `queue.list_jobs`. Raises InvalidRequest for a cursor
-    that was not given out.
+    """A page of jobs, the newest first; see `queue.list_jobs`.
+
+    Raises
+    ------
+    InvalidRequest : a cursor that was not given out.
     """
     before = store.seals.row("job", cursor)
     with store.database.read() as connection:
@@ -200,8 +209,12 @@ def cancel(store: Store, job_id: str) -> Job:
     """Cancel a job that is not over; of one that is cancelled already nothing changes.
 
     A worker that holds it goes on to the end, and its result is refused. The archive of an import
-    is removed at once. Raises UnknownJob if there is none, JobOver if there is nothing left to give
-    up.
+    is removed at once.
+
+    Raises
+    ------
+    UnknownJob : there is none.
+    JobOver : there is nothing left to give up.
     """
     with store.database.write() as connection:
         job = queue.find_job(connection, job_id)
@@ -271,8 +284,11 @@ def retry_dead(
 ) -> RetriedJobs:  # fmt: skip
     """Try again a page of dead jobs, the newest first; those that were tried since stay.
 
-    Each is a commit of its own: what was tried again before a fault is. Raises InvalidRequest for a
-    cursor that was not given out.
+    Each is a commit of its own: what was tried again before a fault is.
+
+    Raises
+    ------
+    InvalidRequest : a cursor that was not given out.
     """
     page = list_jobs(store, JobState.DEAD, cursor, limit, map_names=map_names)
     retried, refused = [], []

@@ -72,8 +72,12 @@ class MapJobs(Generic[Record]):
         return begun
 
     def list_all(self, map_name: str, cursor: str | None = None, limit: int = 100) -> Page[Record]:
-        """Return the jobs of a map, the newest first. Raises UnknownMap if there is no such map,
-        InvalidRequest for a cursor that was not given out.
+        """Return the jobs of a map, the newest first.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : a cursor that was not given out.
         """
         seals = self._store.seals
         before = seals.row("job", cursor)
@@ -90,8 +94,11 @@ class MapJobs(Generic[Record]):
             return self.record(self.find(connection, map_name, job_id), map_name)
 
     def remove(self, map_name: str, job_id: str) -> None:
-        """Delete a job with its results; one that is not over is given up. Raises UnknownMap or
-        UnknownJob if there is none.
+        """Delete a job with its results; one that is not over is given up.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : there is none.
         """
         with self._store.database.write() as connection:
             blobs = remove_job(connection, self.find(connection, map_name, job_id))
@@ -99,8 +106,12 @@ class MapJobs(Generic[Record]):
         collect_deleted_blobs(self._store, blobs)
 
     def find(self, connection: Connection, map_name: str, job_id: str) -> JobRow:
-        """Return the row of a job of a map. Raises UnknownMap if there is no such map, UnknownJob
-        if the map has no job of this kind and id.
+        """Return the row of a job of a map.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        UnknownJob : the map has no job of this kind and id.
         """
         row = find_map(connection, map_name)
         message = (

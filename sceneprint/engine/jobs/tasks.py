@@ -140,7 +140,12 @@ class Tasks:
         self._handlers: dict[str, Handler] = {}
 
     def register(self, kind: str, handler: Handler) -> None:
-        """Let jobs of a kind be done by this process."""
+        """Let jobs of a kind be done by this process.
+
+        Parameters
+        ----------
+        kind, handler : see there
+        """
         self._handlers[kind] = handler
 
     def begin(

@@ -73,8 +73,12 @@ class MapCopies:
         self._store = store
 
     def listing(self, map_name: str, cursor: str | None, limit: int) -> MapListing:
-        """A map, and a part of the list of its indexed frames. Raises UnknownMap if there is none
-        of that name, InvalidRequest for a cursor that was not given out.
+        """A map, and a part of the list of its indexed frames.
+
+        Raises
+        ------
+        UnknownMap : there is none of that name.
+        InvalidRequest : a cursor that was not given out.
         """
         after = self._store.seals.row("frame", cursor) or 0
         with self._store.database.read() as connection:
@@ -113,9 +117,12 @@ class MapCopies:
         )
 
     def artifact(self, map_name: str, digest: str) -> bytes:
-        """The artifact of one of its indexed frames. Raises UnknownMap or NotFound if there is no
-        such map, or none of its frames has it, DamagedBlob if it is damaged, or was removed just
-        now.
+        """The artifact of one of its indexed frames.
+
+        Raises
+        ------
+        UnknownMap, NotFound : there is no such map, or none of its frames has it.
+        DamagedBlob : it is damaged, or was removed just now.
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
@@ -161,8 +168,11 @@ _MARK = "map-copy.json"
 
 
 def claim_folder(folder: Path) -> None:
-    """Let a data folder be one for copies of maps. Raises InvalidRequest if it holds something
-    else.
+    """Let a data folder be one for copies of maps.
+
+    Raises
+    ------
+    InvalidRequest : it holds something else.
     """
     if (folder / _MARK).is_file():
         return
@@ -229,8 +239,11 @@ def pull_map(
 
 
 def _fetch_artifact(client: Client, store: Store, map_name: str, digest: str) -> int:
-    """Have an artifact here, durable; returns the bytes that were fetched. Raises DamagedBlob if
-    the service sent other bytes than it named.
+    """Have an artifact here, durable; returns the bytes that were fetched.
+
+    Raises
+    ------
+    DamagedBlob : the service sent other bytes than it named.
     """
     if store.blobs.holds(digest):
         return 0
@@ -244,8 +257,11 @@ def _fetch_artifact(client: Client, store: Store, map_name: str, digest: str) ->
 
 
 def _list_all(client: Client, map_name: str) -> tuple[MapListing, list[ListedFrame], bool]:
-    """All indexed frames of a map, and whether it was quiet while they were listed. Raises Conflict
-    if it became another map meanwhile.
+    """All indexed frames of a map, and whether it was quiet while they were listed.
+
+    Raises
+    ------
+    Conflict : it became another map meanwhile.
     """
     first = part = client.map_listing(map_name, limit=MOST_LISTED)
     found, is_quiet = list(first.items), True
@@ -335,8 +351,11 @@ def _copied(one: FrameRowRecord, listing: MapListing) -> CopiedFrame:
 def _prepared(
     store: Store, connection: Connection, listing: MapListing, blobs: list[str]
 ) -> MapRow:
-    """The map in the store, made where it is not there; one of before goes. Raises Conflict if it
-    has frames that were uploaded here, and are nowhere else.
+    """The map in the store, made where it is not there; one of before goes.
+
+    Raises
+    ------
+    Conflict : it has frames that were uploaded here, and are nowhere else.
     """
     rows = {one.name: one for one in list_maps(connection)}
     before, row = rows.get(listing.name), _here(connection, listing)

@@ -85,8 +85,12 @@ class CoverageJobs(MapJobs[MapCoverage]):
         )  # fmt: skip
 
     def begin(self, map_name: str, asked: NewMapCoverage) -> MapCoverage:
-        """Queue a coverage job. Raises UnknownMap if there is no such map, InvalidRequest if there
-        is no frame to query.
+        """Queue a coverage job.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : there is no frame to query.
         """
         with self._store.database.read() as connection:
             total = len(frames_to_query(connection, find_map(connection, map_name), asked))
@@ -247,8 +251,11 @@ _SKIPPED = (UnknownFrame, InvalidRequest, DamagedBlob, DamagedSignature, Unreada
 
 
 def frames_to_query(connection: Connection, row: MapRow, asked: NewMapCoverage) -> list[int]:
-    """Numbers of the frames that a coverage job queries, in its order. Raises InvalidRequest if
-    there is none.
+    """Numbers of the frames that a coverage job queries, in its order.
+
+    Raises
+    ------
+    InvalidRequest : there is none.
     """
     numbers = numbers_of_runs(connection, row.number, asked.session, asked.robot)[:: asked.every]
     if not numbers:

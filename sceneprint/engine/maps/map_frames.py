@@ -73,8 +73,12 @@ class IndexedFrame:
 
 
 def find_indexed(store: Store, map_name: str, frame_id: str) -> IndexedFrame:
-    """The indexed frame of an id. Raises UnknownMap or UnknownFrame if there is none, or it was
-    deleted, NotIndexed if it has no geometry yet.
+    """The indexed frame of an id.
+
+    Raises
+    ------
+    UnknownMap, UnknownFrame : there is none, or it was deleted.
+    NotIndexed : nothing has been made of it, or not yet.
     """
     with store.database.read() as connection:
         row = find_map(connection, map_name)
@@ -114,8 +118,12 @@ def geometry_of(store: Store, signers: Signers, found: IndexedFrame) -> Geometry
 
 
 def check_unchanged(store: Store, found: IndexedFrame) -> None:
-    """See that a frame is still what it was when it was found. Raises UnknownFrame or NotIndexed if
-    it was deleted, or lost what was made of it, Busy if its map came to have another model.
+    """See that a frame is still what it was when it was found.
+
+    Raises
+    ------
+    UnknownFrame, NotIndexed : it was deleted, or lost what was made of it.
+    Busy : its map came to have another model.
     """
     now = find_indexed(store, found.row.name, found.frame.id)
     if (now.frame.number, now.artifact) != (found.frame.number, found.artifact):
@@ -134,7 +142,11 @@ def list_frames(
     store: Store, map_name: str, wanted: FrameListing, cursor: str | None, limit: int
 ) -> Page[Frame]:
     """Frames of a map in the order they came, the newest first, or in the order they were taken.
-    Raises UnknownMap if there is no such map, InvalidRequest for a cursor that was not given out.
+
+    Raises
+    ------
+    UnknownMap : no such map.
+    InvalidRequest : a cursor that was not given out.
     """
     beyond = _position_of(store, cursor, wanted)
     with store.database.read() as connection:
@@ -178,8 +190,12 @@ def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> Take
 
 
 def list_sessions(store: Store, map_name: str, cursor: str | None, limit: int) -> Page[Session]:
-    """Sessions of a map by their name and robot; frames that name none are one, the first. Raises
-    UnknownMap if there is no such map, InvalidRequest for a cursor that was not given out.
+    """Sessions of a map by their name and robot; frames that name none are one, the first.
+
+    Raises
+    ------
+    UnknownMap : no such map.
+    InvalidRequest : a cursor that was not given out.
     """
     after = None if cursor is None else _names_of(cursor)
     with store.database.read() as connection:
@@ -552,7 +568,11 @@ class FrameFiles:
 
 def placed(frame: FrameRow, within: CloudFrame) -> tuple[str, list[list[float]]]:
     """What some coordinates of a frame are called, and the (4, 4) that leads there from its
-    sensor's. Raises InvalidRequest if its pose, or where the sensor sits on its base, is not known.
+    sensor's.
+
+    Raises
+    ------
+    InvalidRequest : its pose, or where the sensor sits on its base, is not known.
     """
     optical = sensor_of(frame)
     name, matrix = {

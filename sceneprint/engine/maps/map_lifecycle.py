@@ -165,8 +165,11 @@ def edit_map(
 
 
 def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
-    """Columns of a frame as a patch wants them; those that it does not touch are left out. Raises
-    InvalidRequest or InvalidPose like `edit_frame`.
+    """Columns of a frame as a patch wants them; those that it does not touch are left out.
+
+    Raises
+    ------
+    InvalidRequest, InvalidPose : see `edit_frame`.
     """
     meta = _merged(frame, patch)
     if meta.pose is not None and meta.pose.of != "sensor":
@@ -303,8 +306,12 @@ def begin_reencoding(store: Store, map_name: str, model: str | Path | Model) -> 
 
 
 def cancel_reencoding(store: Store, map_name: str) -> Map:
-    """Let a map keep the model it has, and remove what was made for the other. Raises UnknownMap if
-    there is no such map, Conflict if no other model is on its way.
+    """Let a map keep the model it has, and remove what was made for the other.
+
+    Raises
+    ------
+    UnknownMap : no such map.
+    Conflict : no other model is on its way.
     """
     with store.database.write() as connection:
         row = find_map(connection, map_name)

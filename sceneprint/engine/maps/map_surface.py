@@ -118,7 +118,10 @@ class MapSurfaces:
 
     def remove(self, map_name: str) -> None:
         """Remove the surface of a map; workers do not build it again until somebody asks for it.
-        Raises UnknownMap if there is no such map.
+
+        Raises
+        ------
+        UnknownMap : no such map.
         """
         with self._store.database.write() as connection:
             row = find_map(connection, map_name)

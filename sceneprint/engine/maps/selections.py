@@ -120,7 +120,12 @@ def edit_selection(
 
 
 def edited_tags(frame: FrameRow, edit: FramesEdit | SessionEdit) -> list[str]:
-    """The tags of a frame after an edit. Raises InvalidRequest if they are too many."""
+    """The tags of a frame after an edit.
+
+    Raises
+    ------
+    InvalidRequest : they are too many.
+    """
     gone = set(edit.remove_tags)
     tags = [tag for tag in frame.tags if tag not in gone]
     tags += [tag for tag in dict.fromkeys(edit.add_tags) if tag not in tags]

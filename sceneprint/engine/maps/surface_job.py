@@ -82,8 +82,11 @@ def surface_points(geometry: Geometry) -> Floats:
 
 
 def tile_cells(store: Store, tile: TileRow, scale: TimeScale | None) -> Cells:
-    """A tile as it is given out, its sums encoded where it is of the finest level. Raises
-    DamagedBlob if it is lost, or not what it was.
+    """A tile as it is given out, its sums encoded where it is of the finest level.
+
+    Raises
+    ------
+    DamagedBlob : it is lost, or not what it was.
     """
     data = store.blobs.get(tile.blob or "")
     if tile.level:

@@ -70,8 +70,12 @@ class Tombstones:
         return None if found is None else self._record(found)
 
     def list_all(self, map_name: str, cursor: str | None, limit: int) -> Page[FrameDeletion]:
-        """Return the deletions of a map that can be undone, the newest first. Raises UnknownMap if
-        there is none, InvalidRequest for a cursor that was not given out.
+        """Return the deletions of a map that can be undone, the newest first.
+
+        Raises
+        ------
+        UnknownMap : there is none.
+        InvalidRequest : a cursor that was not given out.
         """
         before = self._store.seals.row("deletion", cursor)
         with self._store.database.read() as connection:

@@ -291,8 +291,11 @@ class QueryLog:
         return Page[QueryRecord](items=items, next_cursor=more)
 
     def find_row(self, query_id: str) -> QueryRow:
-        """Return the row of a query whose answer can be looked at. Raises UnknownQuery if there is
-        none, or it expired, or a map or the frame of it was deleted.
+        """Return the row of a query whose answer can be looked at.
+
+        Raises
+        ------
+        UnknownQuery : there is none, or it expired, or a map or the frame of it was deleted.
         """
         row = self._current(query_id)
         if row is None:  # it may be on its way, from this process or from another one

@@ -141,8 +141,12 @@ class Pairs:
         )  # fmt: skip
 
     def opened(self, pair: StoredPair) -> tuple[Geometry, Geometry]:
-        """The artifacts of the query and of the match. Raises DamagedBlob if the match's is
-        damaged and cannot be made again, UnknownFrame if the match was deleted meanwhile.
+        """The artifacts of the query and of the match.
+
+        Raises
+        ------
+        DamagedBlob : the match's is damaged, and so is its upload. Else it is made again.
+        UnknownFrame : the match was deleted meanwhile.
         """
         query = geometry_of_query(pair.stored)
         try:
@@ -288,9 +292,12 @@ class Inspection:
         return picture(colours, width, {"view": view, "model": stored.answer.model, **text})
 
     def cloud(self, query_id: str) -> bytes:
-        """The query's points and normals as PLY, in the coordinates of its sensor. Raises
-        UnknownQuery if its answer is not stored, or no longer, NotIndexed if it was asked without
-        validation, for which alone its points are made.
+        """The query's points and normals as PLY, in the coordinates of its sensor.
+
+        Raises
+        ------
+        UnknownQuery : its answer is not stored, or no longer.
+        NotIndexed : it was asked without validation, for which alone its points are made.
         """
         stored = self._log.find(query_id)
         points, normals = points_of(geometry_of_query(stored).surface)
@@ -465,8 +472,12 @@ class PointClouds:
         return Output(tag, make)
 
     def query(self, query_id: str, limit: int = LIMIT) -> Output[bytes]:
-        """Points of a query in its sensor's frame, with normals and patches. Raises UnknownQuery if
-        its answer is not stored, or no longer, NotIndexed if it was asked without validation.
+        """Points of a query in its sensor's frame, with normals and patches.
+
+        Raises
+        ------
+        UnknownQuery : its answer is not stored, or no longer.
+        NotIndexed : it was asked without validation.
         """
         stored = self._log.find(query_id)
         check_geometry(stored)

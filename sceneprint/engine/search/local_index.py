@@ -147,7 +147,10 @@ class AppendBuffer:
 
     def reserve(self, more: int) -> None:
         """Make room for that many more at once: growing step by step would copy all each time.
-        Raises UnusableStore if there is no room on the disk.
+
+        Raises
+        ------
+        UnusableStore : there is no room on the disk.
         """
         n = len(self)
         if n + more > self._capacity:
@@ -266,7 +269,14 @@ def trusted(connection: Connection, row: MapRow, found: Published | None) -> Pub
 
 
 class Reader:
-    """One map, searched by many threads."""
+    """One map, searched by many threads.
+
+    Parameters
+    ----------
+    connection, row : see `view`
+    folder : of its index
+    model : of its signatures
+    """
 
     def __init__(self, connection: Connection, row: MapRow, folder: Path, model: Model) -> None:
         self._folder, self._model = folder, model

@@ -100,8 +100,11 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
 
 
 def check_model(one: str, other: str) -> None:
-    """See that signatures are of one model before they are compared. Raises ModelMismatch if they
-    are not.
+    """See that signatures are of one model before they are compared.
+
+    Raises
+    ------
+    ModelMismatch : they are not.
     """
     if one != other:
         raise ModelMismatch(
@@ -223,7 +226,14 @@ def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
 
 
 class Queries:
-    """Asks one or more maps of one model."""
+    """Asks one or more maps of one model.
+
+    Parameters
+    ----------
+    store, signers, readers : of the engine
+    query_log : where answers are stored
+    cores : that queries share
+    """
 
     def __init__(
         self, store: Store, signers: Signers, readers: Readers, query_log: QueryLog, cores: Cores
@@ -313,6 +323,11 @@ class Queries:
         since: float | None = None, sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
         """Repeat a query whose answer is stored, an upload without its file.
+
+        Parameters
+        ----------
+        maps, query, since, sent : see `upload`
+        stored : the earlier answer
 
         Raises
         ------

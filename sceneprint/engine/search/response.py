@@ -392,8 +392,11 @@ class ExplainedQuery:
 
 
 def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
-    """Explain at which stage a frame dropped out, and how it would align. Raises UnknownFrame if no
-    map that is asked has one of that id.
+    """Explain at which stage a frame dropped out, and how it would align.
+
+    Raises
+    ------
+    UnknownFrame : no map that is asked has one of that id.
     """
     part, row = _locate_frame(asking, frame_id)
     absent = _absent(asking, part, row)

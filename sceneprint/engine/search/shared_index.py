@@ -215,7 +215,13 @@ class SharedIndexes:
     # what is here
 
     def want(self, row: MapRow, generation: Generation | None) -> None:
-        """Look for a newer generation of a map that is asked, in the background, if it is time."""
+        """Look for a newer generation of a map that is asked, in the background, if it is time.
+
+        Parameters
+        ----------
+        row : of the map
+        generation : that is used here
+        """
         folder = index_folder(self._indexes, row)
         since = 0 if generation is None else generation.revision
         with self._lock:

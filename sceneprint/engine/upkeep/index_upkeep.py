@@ -398,8 +398,11 @@ class Upkeep:
         return stale
 
     def sweep(self, *, now: bool = False) -> None:
-        """Remove shared indexes of maps that are gone, and of models that they had. Raises
-        UnusableStore if the object store cannot be used.
+        """Remove shared indexes of maps that are gone, and of models that they had.
+
+        Raises
+        ------
+        UnusableStore : the object store cannot be used.
         """
         if self._shared is not None:
             self._shared.sweep(lambda: self._known_folders(()), now=now)

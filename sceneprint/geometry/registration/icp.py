@@ -497,6 +497,11 @@ def transported(covariance: Floats, R: Floats, lever: Floats) -> Floats:
     * T_c_a T_a_b: (R_c_a, 0)
     * T_a_b T_b_d, as of a robot's base: (identity, R t_b_d)
     * the inverse T_b_a: (R^T, -R^T t)
+
+    Parameters
+    ----------
+    covariance : (6, 6)
+    R, lever : see `adjoint`
     """
     A = adjoint(R, lever)
     moved: Floats = A @ covariance @ A.T
@@ -545,6 +550,11 @@ def free_directions(covariance: Floats, p: CovarianceParameters | None = None) -
 
     A lone plane has three: two shifts within it, and the turn about its normal; a corridor has
     one, along it; a corner none.
+
+    Parameters
+    ----------
+    covariance : (6, 6)
+    p : see CovarianceParameters
     """
     p = p or CovarianceParameters()
     scale = _scale(p)

@@ -312,9 +312,13 @@ def ranking_size(n_map: int) -> int:
     In a map twice as dense the same place fills twice the ranks, so that a fixed number holds
     nothing but near-duplicates, of which no selection can be diverse: among the nearest 50 of 300
     frames of one room diversification gained 10 % of seen volume, among 125 of them 27 % (Sec.
-    III-D). A share of the map keeps the stretch of places in R. The lower bound leaves a small map
-    whole; the upper bounds the pairwise distances, and a larger map has more places, not more views
-    of this one. Raises ValueError for a negative number.
+    III-D). A share of the map keeps the stretch of places in R. The lower bound leaves a small
+    map whole; the upper bounds the pairwise distances, and a larger map has more places, not
+    more views of this one.
+
+    Raises
+    ------
+    ValueError : a negative number.
     """
     if n_map < 0:
         raise ValueError(f"a map of {n_map} frames")

@@ -115,6 +115,11 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
     A pixel shows the nearest surface in its direction. Small gaps, as between the rings of a
     spinning sensor, are closed where both sides lie on one plane.
 
+    Parameters
+    ----------
+    cloud : with a viewpoint
+    p : see CloudParameters
+
     Returns
     -------
     surface : its camera is a Sphere, cropped to what is seen, whose pole is the axis (z, y, x
@@ -166,6 +171,11 @@ def spread_points(cloud: Cloud, image: Surface, p: CloudParameters) -> Surface:
     A range image has a pixel each 0.9 degrees or so, which 30 m away is half a metre of wall and
     several metres of ground. Where finer pixels fix no plane, as between rings far apart, the
     points of the image itself are taken.
+
+    Parameters
+    ----------
+    cloud, p : of the image
+    image : of `range_image`
 
     Returns
     -------

@@ -65,6 +65,11 @@ def scattered_poses(room: Room, n: int, rng: np.random.Generator) -> list[Floats
 
     Half of them look at some object from 0.7 to 3 m, half look about from anywhere.
 
+    Parameters
+    ----------
+    room : the scene
+    n : how many views
+
     Returns
     -------
     poses : n T_world_camera, (4, 4)
@@ -210,6 +215,11 @@ def trajectory(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
 
     The camera wanders between a few viewpoints, 3 to 8 cm or 1 to 3 degrees a frame,
     whichever takes longer; its hand trembles a little.
+
+    Parameters
+    ----------
+    room : the scene
+    n : how many frames
 
     Returns
     -------

@@ -169,7 +169,14 @@ GONE = "nothing: it was well again, or gone, when it was to be repaired"
 
 
 def sign_from_upload(folder: Folder, connection: Connection, number: int) -> str:
-    """Let a frame that has no signature be signed from its upload; failed where that is gone."""
+    """Let a frame that has no signature be signed from its upload; failed where that is gone.
+
+    Parameters
+    ----------
+    folder : see Folder
+    connection : of a writing transaction
+    number : of the frame
+    """
     found = connection.execute(
         update(frames)
         .where(frames.c.number == number)
@@ -279,8 +286,11 @@ def opened_blobs(settings: Settings, database: Database | None = None) -> Iterat
 
 
 def require_folder(place: Path) -> None:
-    """See that a folder of blobs is there: a disk that is not mounted is not made up for. Raises
-    UnusableStore if it is not.
+    """See that a folder of blobs is there: a disk that is not mounted is not made up for.
+
+    Raises
+    ------
+    UnusableStore : it is not.
     """
     if not place.is_dir():
         raise UnusableStore(

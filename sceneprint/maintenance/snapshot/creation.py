@@ -98,7 +98,13 @@ def copied_blobs(blobs: Blobs, digests: Iterable[str]) -> Iterator[CopiedBlob | 
 
 
 def total_bytes(blobs: Blobs, digests: Iterable[str], count: int) -> int:
-    """Bytes of all blobs, missing ones left out; about, where there are many."""
+    """Bytes of all blobs, missing ones left out; about, where there are many.
+
+    Parameters
+    ----------
+    blobs, digests : which
+    count : of the digests
+    """
     step = max(-(-count // _MEASURED), 1)
     with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="measure") as pool:
         sizes = pool.map(blobs.size, filter(is_digest, islice(digests, 0, None, step)))

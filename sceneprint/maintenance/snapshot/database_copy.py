@@ -275,9 +275,12 @@ class Source:
 
 @contextmanager
 def open_source(url: str) -> Iterator[Source]:
-    """A database that may be in use; nothing is written to it. Raises SnapshotError if it is a
-    SQLite database in memory, UnusableStore or NewerSchema if it is missing, cannot be read, or is
-    of another schema.
+    """A database that may be in use; nothing is written to it.
+
+    Raises
+    ------
+    SnapshotError : it is a SQLite database in memory.
+    UnusableStore, NewerSchema : it is missing, cannot be read, or is of another schema.
     """
     path = _file_of(url)
     if path is not None:
@@ -290,8 +293,11 @@ def open_source(url: str) -> Iterator[Source]:
 
 
 def _file_of(url: str) -> Path | None:
-    """The file of a SQLite database; None: it is another, or `look_at` says what is wrong. Raises
-    SnapshotError if it is in no file.
+    """The file of a SQLite database; None: it is another, or `look_at` says what is wrong.
+
+    Raises
+    ------
+    SnapshotError : it is in no file.
     """
     try:
         parsed = make_url(url)

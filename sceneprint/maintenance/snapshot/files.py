@@ -64,7 +64,12 @@ class ArchiveWriter:
         self._file, self._mtime, self._progress = file, mtime, progress
 
     def add(self, name: str, size: int, chunks: Iterator[bytes]) -> None:
-        """Append a member. Raises ValueError if the chunks are not of that size."""
+        """Append a member.
+
+        Raises
+        ------
+        ValueError : the chunks are not of that size.
+        """
         member = tarfile.TarInfo(name)
         member.size, member.mtime, member.mode = size, self._mtime, 0o600
         self._file.write(member.tobuf(tarfile.GNU_FORMAT))
@@ -112,8 +117,11 @@ class ArchiveReader:
         self.size = os.fstat(file.fileno()).st_size
 
     def next(self) -> tuple[str, int] | None:
-        """Name and size of the next member; None at the end of the archive. Raises DamagedSnapshot
-        if neither is there, or the member is no plain file.
+        """Name and size of the next member; None at the end of the archive.
+
+        Raises
+        ------
+        DamagedSnapshot : neither is there, or the member is no plain file.
         """
         block = self._read(tarfile.BLOCKSIZE)
         if not any(block):
@@ -238,7 +246,10 @@ class SnapshotManifest(_Record):
 
 def manifest_bytes(manifest: SnapshotManifest) -> bytes:
     """A manifest as the member of that name: JSON with a checksum of itself, filled with blanks.
-    Raises ValueError if it is longer than the place that is kept for it.
+
+    Raises
+    ------
+    ValueError : it is longer than the place that is kept for it.
     """
     record: dict[str, Any] = json.loads(manifest.model_dump_json())
     text = json.dumps(record | {"sha256": _checksum(record)}, indent=1).encode()
@@ -358,8 +369,11 @@ def full_disk_explained(place: Path) -> Iterator[None]:
 
 
 def put_new(made: Path, path: Path) -> None:
-    """Give a file its name where nothing has it; it survives the loss of power after that. Raises
-    FileExistsError if something has it.
+    """Give a file its name where nothing has it; it survives the loss of power after that.
+
+    Raises
+    ------
+    FileExistsError : something has it.
     """
     try:
         os.link(made, path)

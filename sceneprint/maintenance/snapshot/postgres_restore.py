@@ -90,8 +90,11 @@ def take_secrets(connection: Connection, file: sqlite3.Connection) -> None:
 
 
 def check_empty(connection: Connection) -> None:
-    """See that a database of our schema, or of none, holds nothing that would be lost. Raises
-    SnapshotError if it does.
+    """See that a database of our schema, or of none, holds nothing that would be lost.
+
+    Raises
+    ------
+    SnapshotError : it does.
     """
     for table in metadata.sorted_tables:
         if table.name in _OF_ITSELF:

@@ -216,7 +216,16 @@ _STAGING = ".restoring-"
 
 
 class RestoreTarget:
-    """A data folder to be made. Raises SnapshotError if it holds something, or is no folder."""
+    """A data folder to be made.
+
+    Parameters
+    ----------
+    folder : missing or empty
+
+    Raises
+    ------
+    SnapshotError : it holds something, or is no folder.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = Path(os.path.realpath(folder))  # a link stays one

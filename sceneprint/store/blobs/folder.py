@@ -270,14 +270,21 @@ class Blobs(ABC):
 
     @abstractmethod
     def get(self, digest: str) -> bytes:
-        """The bytes of a digest, checked against it. Raises DamagedBlob if they are missing, or
-        others than were stored, UnusableStore if the store is away.
+        """The bytes of a digest, checked against it.
+
+        Raises
+        ------
+        DamagedBlob : they are missing, or others than were stored.
+        UnusableStore : the store is away.
         """
 
     @abstractmethod
     def open(self, digest: str) -> BinaryIO:
         """A blob as a file that can be sought in, unchecked; FileNotFoundError where it is missing.
-        Raises OSError or UnusableStore if it cannot be read, now or later.
+
+        Raises
+        ------
+        OSError, UnusableStore : it cannot be read, now or later.
         """
 
     @abstractmethod
@@ -296,8 +303,11 @@ class Blobs(ABC):
     def ensure(self, digest: str, data: bytes) -> None:
         """Put a blob once more where a removal took it before the commit of what refers to it.
 
-        After that commit, no removal begins that takes it. Raises StoreLocked or UnusableStore like
-        `holds` and `put`.
+        After that commit, no removal begins that takes it.
+
+        Raises
+        ------
+        StoreLocked, UnusableStore : see `holds`; also from `put`.
         """
         if not self.holds(digest):
             self.put(data)
@@ -309,8 +319,11 @@ class Blobs(ABC):
     def kept(self) -> AbstractContextManager[None]:
         """See that no blob is removed meanwhile; waits for who is removing some.
 
-        The lock of a process that dies is free at once, however it dies. Raises UnusableStore if it
-        cannot be locked.
+        The lock of a process that dies is free at once, however it dies.
+
+        Raises
+        ------
+        UnusableStore : it cannot be locked.
         """
         return self._locks.kept()
 
@@ -381,8 +394,12 @@ class Blobs(ABC):
         return False
 
     def check(self) -> None:  # noqa: B027
-        """See that a store on the network answers, or did two seconds ago; a folder has nothing to
-        be asked. Raises UnusableStore if it does not.
+        """See that a store on the network answers, or did two seconds ago; a folder has nothing
+        to be asked.
+
+        Raises
+        ------
+        UnusableStore : it does not.
         """
 
     def close(self) -> None:
@@ -395,8 +412,16 @@ PART = re.compile(r"\.[0-9a-f]{12}\.part")
 
 
 class FolderBlobs(Blobs):
-    """A folder of blobs, in 256 folders by their first two digits; `make` creates a missing one.
-    Raises UnusableStore if it cannot be made.
+    """A folder of blobs, in 256 folders by their first two digits.
+
+    Parameters
+    ----------
+    folder : made where missing
+    make : whether it is
+
+    Raises
+    ------
+    UnusableStore : it cannot be made.
     """
 
     def __init__(self, folder: Path, *, make: bool = True) -> None:

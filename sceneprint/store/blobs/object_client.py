@@ -499,8 +499,11 @@ def _retries(most: int) -> RetryConfig:
 
 
 def check_objects(objects: Objects) -> float:
-    """Write, read and remove a small object; returns the seconds it took. Raises UnusableStore if
-    one of that is not possible, or what is read is not what was written.
+    """Write, read and remove a small object; returns the seconds it took.
+
+    Raises
+    ------
+    UnusableStore : one of that is not possible, or what is read is not what was written.
     """
     key, data = f"check/{os.urandom(8).hex()}", os.urandom(64)
     begun = time.perf_counter()

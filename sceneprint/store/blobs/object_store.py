@@ -163,8 +163,11 @@ class ObjectBlobs(Blobs):
         self._answered = -math.inf
 
     def claim(self, *, anew: bool = True) -> None:
-        """See that the prefix is this store's, and mark it where it is nobody's yet. Raises
-        UnusableStore if it is another's, or the object store cannot be used.
+        """See that the prefix is this store's, and mark it where it is nobody's yet.
+
+        Raises
+        ------
+        UnusableStore : it is another's, or the object store cannot be used.
         """
         if not self._claimed:
             self._claimed = BucketOwner(self.objects).claim(self._owner(), anew=anew)

@@ -104,8 +104,11 @@ def connect_options(url: URL) -> dict[str, str]:
 
 
 def configure(connection: Any, _record: object = None) -> None:
-    """Tell a connection of psycopg what all of them are told. Raises UnusableStore if the server is
-    too old, or its database is not of UTF-8.
+    """Tell a connection of psycopg what all of them are told.
+
+    Raises
+    ------
+    UnusableStore : the server is too old, or its database is not of UTF-8.
     """
     version = connection.info.server_version // 10_000
     encoding = connection.info.parameter_status("server_encoding")
