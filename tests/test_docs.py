@@ -7,6 +7,7 @@ import inspect
 import json
 import os
 import re
+import shlex
 import socket
 import subprocess
 import sys
@@ -29,7 +30,7 @@ ARCHITECTURE = (ROOT / "docs/architecture.md").read_text()
 MODEL = (ROOT / "docs/model.md").read_text()
 PAGES = [
     *map(ROOT.joinpath, ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
-    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
     *map(ROOT.joinpath, ("client/README.md", "ros2/sceneprint_ros/README.md")),
 ]
 GEOMETRY = sorted((ROOT / "sceneprint/geometry").rglob("*.py"))
@@ -172,8 +173,10 @@ def test_readme_has_two_commands_one_example_and_at_most_700_words() -> None:
 
 
 def test_the_index_of_the_documentation_names_every_page() -> None:
-    linked = set(re.findall(r"\]\((\w+\.md)\)", (ROOT / "docs/README.md").read_text()))
-    assert linked == {page.name for page in (ROOT / "docs").glob("*.md")} - {"README.md"}
+    docs = ROOT / "docs"
+    linked = set(re.findall(r"\]\(([\w/]+\.md)\)", (docs / "README.md").read_text()))
+    pages = {page.relative_to(docs).as_posix() for page in docs.rglob("*.md")}
+    assert linked == pages - {"README.md"}
 
 
 def test_documented_commands_are_known() -> None:
@@ -183,6 +186,49 @@ def test_documented_commands_are_known() -> None:
     known = parser()
     for command in commands:
         assert known.parse_args(command).command == command[0]
+
+
+def test_commands_of_sensors_and_of_troubleshooting_are_known() -> None:
+    pages = [ROOT / "docs/troubleshooting.md", *sorted((ROOT / "docs/sensors").glob("*.md"))]
+    known = parser()
+    for page in pages:
+        text = page.read_text()
+        lines = [
+            *commands_of(text),
+            *re.findall(r"`(sceneprint (?!bag)[^`]+)`", text.replace("\n", " ")),
+        ]
+        own = [shlex.split(line, comments=True)[1:] for line in lines if line[:11] == "sceneprint "]
+        assert own, page
+        for arguments in own:
+            assert known.parse_args(arguments).command == arguments[0]
+
+
+def test_troubleshooting_quotes_messages_of_the_code() -> None:
+    """Messages are block quotes, and code with blanks in tables; an ellipsis stands for names."""
+    page = (ROOT / "docs/troubleshooting.md").read_text()
+    quoted = re.findall(r"^> (.*)$", page, re.MULTILINE)
+    rows = "\n".join(re.findall(r"^\|.*", page, re.MULTILINE))
+    quoted += re.findall(r"\| `([^`|]* [^`|]*)` (?=\|)", rows)
+    assert len(quoted) > 30
+    printed = "\n".join(messages_of_the_code())
+    unknown = [
+        message
+        for message in quoted
+        if not re.search(".*".join(map(re.escape, re.split(r" *… *", message))), printed)
+    ]
+    assert unknown == []
+
+
+def messages_of_the_code() -> Iterator[str]:
+    """Texts of string literals, a line each; what is put into one at run time is left out."""
+    for folder in ("sceneprint", "service", "client/sceneprint_client"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text())):
+                parts = node.values if isinstance(node, ast.JoinedStr) else [node]
+                text = "".join(
+                    str(one.value) if isinstance(one, ast.Constant) else " " for one in parts
+                )
+                yield " ".join(text.split())
 
 
 @pytest.mark.thorough
