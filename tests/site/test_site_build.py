@@ -13,11 +13,16 @@ from functools import partial
 from html.parser import HTMLParser
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
 import pytest
 
+from tools.site.hooks import RANKED_LAST
 from tools.site.reference import generated_pages
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 ROOT = Path(__file__).resolve().parents[2]
 #: What axe finds in the theme's own markup (two landmarks of one name, tables that scroll and that
@@ -68,7 +73,11 @@ def read(site: Path) -> dict[Path, PageReader]:
 
 def test_every_page_is_there(site: Path, read: dict[Path, PageReader]) -> None:
     pages = {path.relative_to(site).as_posix() for path in read}
-    written = {f"{path.stem}.html" for path in (ROOT / "docs").glob("*.md")} - {"README.html"}
+    docs = ROOT / "docs"
+    written = {
+        path.relative_to(docs).with_suffix(".html").as_posix() for path in docs.rglob("*.md")
+    }
+    written -= {"README.html"}
     generated = {one.path.replace(".md", ".html") for one in generated_pages()}
     outside = {
         "CHANGELOG.html", "CONTRIBUTING.html", "examples/index.html",
@@ -143,34 +152,110 @@ def address(site: Path) -> Iterator[str]:
     server.server_close()
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize(("scheme", "width"), [("light", 1280), ("dark", 1280), ("light", 390)])
-def test_pages_are_read_and_searched_in_a_browser(address: str, scheme: str, width: int) -> None:
-    from axe_playwright_python.sync_playwright import Axe
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
     from playwright.sync_api import sync_playwright
 
     names = ("chromium", "chromium-browser", "google-chrome")
     chromium = next((path for name in names if (path := shutil.which(name))), None)
     if chromium is None:
         pytest.skip("needs Chromium: apt install chromium")
-    asked: list[str] = []
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page(
-            color_scheme=scheme, viewport={"width": width, "height": 900}  # type: ignore[arg-type]
-        )  # fmt: skip
-        page.on("request", lambda request: asked.append(request.url))
-        for path in ("index.html", "architecture.html", "reference/http/jobs.html"):
-            page.goto(f"{address}/{path}")
-            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), path
-            found = Axe().run(page).response["violations"]
-            ours = [one for one in found if one["id"] not in KNOWN]
-            assert [(one["id"], one["nodes"][0]["html"]) for one in ours] == [], path
-        page.locator("label[for=__search]:visible, input.md-search__input:visible").first.click()
-        page.keyboard.type("ambiguous")
-        results = page.locator(".md-search-result__item")
-        results.first.wait_for()
-        titles = results.locator("h1").all_inner_texts()
-        browser.close()
+        one = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        yield one
+        one.close()
+
+
+#: What newcomers type, and the pages of which one has to be among the first three results.
+QUESTIONS = {
+    "realsense": "sensors/realsense",
+    "zed_node": "sensors/zed",
+    "azure kinect depth image": "sensors/azure_kinect",
+    "orbbec gemini launch": "sensors/orbbec",
+    "oak-d stereo": "sensors/oak",
+    "zed point cloud": "sensors/zed",
+    "iphone lidar": "sensors/iphone",
+    "velodyne topic": "sensors/velodyne",
+    "ouster timestamp": "sensors/ouster",
+    "livox custommsg": "sensors/livox",
+    "hesai imu": "sensors/hesai",
+    "tf_static missing": "troubleshooting",
+    "no poses": "troubleshooting",
+    "not_found every time": "troubleshooting",
+    "ambiguous everywhere": "troubleshooting",
+    "wrong frame": "troubleshooting",
+    "depth scale": "troubleshooting",
+    "infrared instead of depth": "troubleshooting",
+    "jobs stay queued": "troubleshooting",
+    "api key refused": "troubleshooting",
+    "507": "troubleshooting",
+    "gpu": "troubleshooting",
+    "first query slow": "troubleshooting",
+    "two robots one map": "associations",
+    "upload rosbag": "recordings",
+    "install": "getting_started",
+    "nav2": "ros2/sceneprint_ros/index",
+    "covariance": "uncertainty",
+}
+#: Asks the worker that the page itself searches with; its messages are numbered in this order.
+ASK = """async (questions) => {
+    const [SETUP, , QUERY] = [0, 1, 2];
+    const {base, search} = JSON.parse(document.getElementById("__config").textContent);
+    const root = new URL(`${base}/`, location);
+    const worker = new Worker(new URL(search, root));
+    const ask = (type, data) => new Promise((resolve, reject) => {
+        worker.onmessage = (event) => resolve(event.data.data);
+        worker.onerror = reject;
+        worker.postMessage({type, data});
+    });
+    const index = await (await fetch(new URL("search/search_index.json", root))).json();
+    await ask(SETUP, {...index, options: {suggest: false}});
+    const found = {};
+    for (const question of questions) {
+        const {items} = await ask(QUERY, question);
+        found[question] = items.map(([page]) => page.location.split(".html")[0]);
+    }
+    return found;
+}"""
+
+
+def test_the_search_leads_newcomers_to_the_right_page(address: str, browser: Browser) -> None:
+    page = browser.new_page()
+    page.goto(f"{address}/index.html")
+    found = page.evaluate(ASK, [*QUESTIONS, "evaluation"])
+    page.close()
+    firsts = {question: found[question][:3] for question in QUESTIONS}
+    assert {one: firsts[one] for one in QUESTIONS if QUESTIONS[one] not in firsts[one]} == {}
+    # pages of measurements are found, after all others
+    last = found["evaluation"]
+    measured = [one for one in last if f"docs/{one}.md" in RANKED_LAST]
+    assert "evaluation" in measured
+    assert last[-len(measured) :] == measured
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("scheme", "width"), [("light", 1280), ("dark", 1280), ("light", 390)])
+def test_pages_are_read_and_searched_in_a_browser(
+    address: str, browser: Browser, scheme: str, width: int
+) -> None:
+    from axe_playwright_python.sync_playwright import Axe
+
+    asked: list[str] = []
+    page = browser.new_page(
+        color_scheme=scheme, viewport={"width": width, "height": 900}  # type: ignore[arg-type]
+    )  # fmt: skip
+    page.on("request", lambda request: asked.append(request.url))
+    for path in ("index.html", "architecture.html", "reference/http/jobs.html"):
+        page.goto(f"{address}/{path}")
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), path
+        found = Axe().run(page).response["violations"]
+        ours = [one for one in found if one["id"] not in KNOWN]
+        assert [(one["id"], one["nodes"][0]["html"]) for one in ours] == [], path
+    page.locator("label[for=__search]:visible, input.md-search__input:visible").first.click()
+    page.keyboard.type("ambiguous")
+    results = page.locator(".md-search-result__item")
+    results.first.wait_for()
+    titles = results.locator("h1").all_inner_texts()
+    page.close()
     assert "Trust: what an answer promises" in titles
     assert {urlsplit(url).netloc for url in asked if url[:5] != "data:"} == {address[7:]}

@@ -34,6 +34,16 @@ INDEX = "docs/README.md"
 REFERENCE = "Reference"
 #: The last tab: pages about the project itself.
 PROJECT = {"Contribute": "CONTRIBUTING.md", "Changelog": "CHANGELOG.md"}
+#: Pages of measurements, and about the project's inside: a search finds them after all others.
+RANKED_LAST = {
+    f"docs/{name}.md"
+    for name in (
+        "architecture", "dependencies", "evaluation", "model", "paper", "performance",
+        "reliability", "style",
+    )
+}  # fmt: skip
+#: What their scores are multiplied by: a match in a title counts a thousand times one in the text.
+_LAST = 1e-4
 _ROW = re.compile(r"^\| \[([^\]]+)\]\(([^)#]+\.md)\) \|", re.MULTILINE)
 _MERMAID = re.compile(r"^```mermaid\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 #: What pages look like, by the name on the site.
@@ -162,6 +172,8 @@ def on_page_markdown(text: str, page: Page, config: MkDocsConfig, files: Files) 
         page.meta["hide"] = ["navigation"]  # the page itself is one
     if path == PROJECT["Changelog"] or not path.endswith(".md"):
         page.meta["search"] = {"exclude": True}  # what is true today would be found after it
+    if path in RANKED_LAST:
+        page.meta["search"] = {"boost": _LAST}
     # git hosts need a backslash before a bar within a table; Python-Markdown takes it as it is
     text = outside_fences(text, lambda part: re.sub(r"`[^`\n]*`", _without_escapes, part))
     return with_figures(text, path)
