@@ -169,6 +169,7 @@ def browser() -> Iterator[Browser]:
 #: What newcomers type, and the pages of which one has to be among the first three results.
 QUESTIONS = {
     "realsense": "sensors/realsense",
+    "image_rect_raw": "sensors/realsense",
     "zed_node": "sensors/zed",
     "azure kinect depth image": "sensors/azure_kinect",
     "orbbec gemini launch": "sensors/orbbec",

@@ -44,6 +44,8 @@ RANKED_LAST = {
 }  # fmt: skip
 #: What their scores are multiplied by: a match in a title counts a thousand times one in the text.
 _LAST = 1e-4
+#: And those of the HTTP operations and their records, so that names come after the text of guides.
+_LISTED = 1e-2
 _ROW = re.compile(r"^\| \[([^\]]+)\]\(([^)#]+\.md)\) \|", re.MULTILINE)
 _MERMAID = re.compile(r"^```mermaid\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 #: What pages look like, by the name on the site.
@@ -165,6 +167,8 @@ def on_page_markdown(text: str, page: Page, config: MkDocsConfig, files: Files) 
     del config, files
     path = _Build.sources.get(page.file.src_uri)
     if path is None:
+        if page.file.src_uri.startswith("reference/http/"):
+            page.meta["search"] = {"boost": _LISTED}
         return text
     text = with_deep_lists(rewritten(text, path))
     if path == INDEX:
