@@ -447,6 +447,13 @@ def priority_of(fields: Mapping[str, str]) -> int:
     return number
 
 
+def json_body(record: str, *, required: bool = True) -> dict[str, Any]:
+    """Return `openapi_extra` of an operation that reads a record as JSON by hand."""
+    schema = {"$ref": f"#/components/schemas/{record}"}
+    content = {"application/json": {"schema": schema}}
+    return {"requestBody": {"required": required, "content": content}}
+
+
 async def read_json(request: Request) -> Any:
     """What the body is as JSON.
 
@@ -678,18 +685,14 @@ def guarded(asking: Caller, key: str | None, *parts: object) -> IdempotentReques
     """
     if key is None:
         return None
-    return IdempotentRequest(asking.name, key, _fingerprint(parts))
+    plain = json.dumps([_plain(part) for part in parts], sort_keys=True)
+    return IdempotentRequest(asking.name, key, hashlib.sha256(plain.encode()).hexdigest())
 
 
 def mark_replayed(response: Response, *, replayed: bool) -> None:
     """Say that an answer is that of an earlier request."""
     if replayed:
         response.headers["Idempotent-Replayed"] = "true"
-
-
-def _fingerprint(parts: tuple[object, ...]) -> str:
-    plain = [_plain(part) for part in parts]
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
 def _plain(part: object) -> object:

@@ -307,7 +307,8 @@ class TokenBucket:
             return None
         with self._lock:
             now = self._clock()
-            tokens = self._tokens(caller, now)
+            tokens, seen = self._buckets.pop(caller, (self._burst, now))
+            tokens = min(tokens + (now - seen) * self._per_s, self._burst)
             cost = min(cost, self._burst)
             allowed = tokens >= cost
             tokens -= cost * allowed
@@ -320,11 +321,6 @@ class TokenBucket:
             math.ceil(((1 - tokens % 1) if allowed else (cost - tokens)) / self._per_s),
             allowed,
         )
-
-    def _tokens(self, caller: str, now: float) -> float:
-        """What a caller has now; `_keep` puts its bucket back."""
-        tokens, seen = self._buckets.pop(caller, (self._burst, now))
-        return min(tokens + (now - seen) * self._per_s, self._burst)
 
     def _keep(self, caller: str, tokens: float, now: float) -> None:
         self._buckets[caller] = (tokens, now)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 from urllib.parse import quote
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
@@ -30,7 +30,7 @@ from sceneprint_client.api.admin import (
     Stats,
 )
 from service.auth import Asking, Guest, Here, administers, may_admin, reads_every, v1_router
-from service.bodies import media_type, read_json
+from service.bodies import json_body, media_type, read_json
 from service.problems import declared, invalid
 
 router = APIRouter(tags=["operations"])
@@ -115,10 +115,6 @@ def metrics(here: Here) -> Response:
 
 keys_router = v1_router(tag="keys")
 
-KEY_BODY: dict[str, Any] = {
-    "required": True,
-    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewKey"}}},
-}
 Cursor = Annotated[str | None, Query(description="`next_cursor` of the page before.")]
 Limit = Annotated[int, Query(ge=1, le=1000)]
 
@@ -127,7 +123,7 @@ Limit = Annotated[int, Query(ge=1, le=1000)]
     "/keys",
     status_code=201,
     responses=declared(400, 404, 409, 413, 415, 422),
-    openapi_extra={"requestBody": KEY_BODY},
+    openapi_extra=json_body("NewKey"),
     dependencies=[Depends(administers)],
 )
 async def create_key(request: Request, here: Here, response: Response) -> MadeKey:
@@ -235,11 +231,6 @@ def _new(given: object) -> NewKey:
 
 operations_router = v1_router(tag="operations")
 
-MODEL_BODY: dict[str, Any] = {
-    "required": True,
-    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewModel"}}},
-}
-
 
 @operations_router.get("/stats", responses=declared(404, 422))
 def stats(
@@ -272,7 +263,7 @@ def models(here: Here, asking: Asking) -> Page[ModelInfo]:
     "/maps/{map_name}/reencoding",
     status_code=202,
     responses=declared(400, 404, 409, 413, 415, 422),
-    openapi_extra={"requestBody": MODEL_BODY},
+    openapi_extra=json_body("NewModel"),
     dependencies=[Depends(may_admin)],
 )
 async def reencode(map_name: str, request: Request, here: Here, asking: Asking) -> Map:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Depends, Query, Request, Response
 
@@ -15,22 +15,17 @@ from sceneprint_client.api.coverage import (
     NewMapCoverage,
 )
 from service.auth import Here, may_read, may_write, v1_router
-from service.bodies import read_record
+from service.bodies import json_body, read_record
 from service.problems import declared
 
 router = v1_router("/maps/{map_name}/coverage", "coverage", may_read)
-
-_BODY: dict[str, Any] = {
-    "required": False,
-    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewMapCoverage"}}},
-}
 
 
 @router.post(
     "",
     status_code=202,
     responses=declared(400, 404, 413, 415, 422),
-    openapi_extra={"requestBody": _BODY},
+    openapi_extra=json_body("NewMapCoverage", required=False),
     dependencies=[Depends(may_write)],
 )
 async def begin_coverage(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Depends, Query, Request, Response
 
@@ -12,23 +12,18 @@ from sceneprint.formats.export import MEDIA_TYPE
 from sceneprint_client.api import Page
 from sceneprint_client.api.sessions import Difference, NewDifference
 from service.auth import Here, may_read, may_write, v1_router
-from service.bodies import read_record
+from service.bodies import json_body, read_record
 from service.problems import declared
 from service.responses import file_responses, is_known, send_file
 
 router = v1_router("/maps/{map_name}/differences", "differences", may_read)
-
-_BODY: dict[str, Any] = {
-    "required": True,
-    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewDifference"}}},
-}
 
 
 @router.post(
     "",
     status_code=202,
     responses=declared(400, 404, 413, 415, 422),
-    openapi_extra={"requestBody": _BODY},
+    openapi_extra=json_body("NewDifference"),
     dependencies=[Depends(may_write)],
 )
 async def begin_difference(

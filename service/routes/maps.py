@@ -14,24 +14,18 @@ from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint_client.api import Frame, Map, NewMap, Page
 from sceneprint_client.api.listing import OPERATORS
 from service.auth import Asking, Here, may_admin, may_read, may_write, v1_router
-from service.bodies import media_type, read_json
+from service.bodies import json_body, media_type, read_json
 from service.problems import declared, invalid
 from service.responses import expected
 
 router = v1_router("/maps", "maps")
 
 
-BODY: dict[str, Any] = {
-    "required": True,
-    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewMap"}}},
-}
-
-
 @router.post(
     "",
     status_code=201,
     responses={200: {"model": Map}, **declared(400, 409, 413, 415, 422)},
-    openapi_extra={"requestBody": BODY},
+    openapi_extra=json_body("NewMap"),
 )
 async def create_map(request: Request, here: Here, asking: Asking, response: Response) -> Map:
     """Make a map. One that is there as wanted is answered with 200."""

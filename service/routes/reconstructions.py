@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Any
 
 from fastapi import Request, Response
 
@@ -13,27 +12,18 @@ from sceneprint.errors import DamagedBlob
 from sceneprint.store.queue import unknown_job
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
 from service.auth import Asking, Caller, Context, Here, v1_router
-from service.bodies import read_record
+from service.bodies import json_body, read_record
 from service.problems import declared
 from service.responses import files, is_known, send_file
 
 router = v1_router(tag="reconstructions")
-
-_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": False,
-        "content": {
-            "application/json": {"schema": {"$ref": "#/components/schemas/NewReconstruction"}}
-        },
-    }
-}
 
 
 @router.post(
     "/queries/{query_id}/reconstruction",
     status_code=202,
     responses=declared(400, 404, 413, 415, 422),
-    openapi_extra=_BODY,
+    openapi_extra=json_body("NewReconstruction", required=False),
 )
 async def reconstruct(
     query_id: str, request: Request, here: Here, asking: Asking, response: Response

@@ -27,9 +27,9 @@ from sceneprint_client.api.results import (
     View,
 )
 from service.auth import Asking, Caller, Context, Here, v1_router
-from service.bodies import read_record
+from service.bodies import json_body, read_record
 from service.problems import declared
-from service.routes.queries import JSON, require_readable
+from service.routes.queries import require_readable
 
 router = v1_router("/queries/{query_id}", "queries")
 
@@ -177,15 +177,10 @@ async def get_query_preview(
     return Response(data, 200, {"Cache-Control": "private, no-cache"}, PNG)
 
 
-_KEEP: dict[str, Any] = {
-    "requestBody": {
-        "required": False,
-        "content": {JSON: {"schema": {"$ref": "#/components/schemas/KeepOptions"}}},
-    }
-}
-
-
-@router.put("/keep", responses=declared(400, 404, 413, 415, 422), openapi_extra=_KEEP)
+@router.put(
+    "/keep", responses=declared(400, 404, 413, 415, 422),
+    openapi_extra=json_body("KeepOptions", required=False),
+)  # fmt: skip
 async def keep_answer(query_id: str, request: Request, here: Here, asking: Asking) -> QueryRecord:
     """Keep the answer until it is released.
 

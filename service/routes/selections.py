@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Depends, Query, Request
 
@@ -18,7 +18,7 @@ from sceneprint_client.api.listing import (
     FramesRestored,
 )
 from service.auth import Here, may_read, may_write, v1_router
-from service.bodies import read_record
+from service.bodies import json_body, read_record
 from service.problems import declared
 
 router = v1_router("/maps/{map_name}", "frames")
@@ -26,13 +26,8 @@ router = v1_router("/maps/{map_name}", "frames")
 _STATUSES = declared(400, 404, 413, 415, 422)
 
 
-def _body(name: str) -> dict[str, Any]:
-    schema = {"$ref": f"#/components/schemas/{name}"}
-    return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
-
-
 @router.post(
-    "/frames/delete", responses=_STATUSES, openapi_extra=_body("FrameSelection"),
+    "/frames/delete", responses=_STATUSES, openapi_extra=json_body("FrameSelection"),
     dependencies=[Depends(may_write)],
 )  # fmt: skip
 async def delete_frames(map_name: str, request: Request, here: Here) -> FramesDeleted:
@@ -51,7 +46,7 @@ async def delete_frames(map_name: str, request: Request, here: Here) -> FramesDe
 
 
 @router.post(
-    "/frames/edit", responses=_STATUSES, openapi_extra=_body("FramesEdit"),
+    "/frames/edit", responses=_STATUSES, openapi_extra=json_body("FramesEdit"),
     dependencies=[Depends(may_write)],
 )  # fmt: skip
 async def edit_frames(map_name: str, request: Request, here: Here) -> FramesEdited:

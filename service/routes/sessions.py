@@ -15,7 +15,7 @@ from sceneprint_client.api.base import Label
 from sceneprint_client.api.listing import Run, Session, SessionChange, SessionEdit, Trajectory
 from sceneprint_client.api.sessions import Association, Edge, Graph, GraphFormat, NewAssociation
 from service.auth import Here, may_read, may_write, v1_router
-from service.bodies import read_record
+from service.bodies import json_body, read_record
 from service.problems import declared
 from service.responses import preferred_media_type
 
@@ -77,12 +77,7 @@ async def delete_session_frames(
 @router.patch(
     "/sessions",
     responses=declared(400, 404, 413, 415, 422),
-    openapi_extra={
-        "requestBody": {
-            "required": True,
-            "content": {_JSON: {"schema": {"$ref": "#/components/schemas/SessionEdit"}}},
-        }
-    },
+    openapi_extra=json_body("SessionEdit"),
     dependencies=[Depends(may_write)],
 )
 async def patch_session(
@@ -133,10 +128,6 @@ async def get_trajectory(
 
 associations_router = v1_router("/maps/{map_name}/associations", "associations", may_read)
 
-BODY: dict[str, Any] = {
-    "required": True,
-    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewAssociation"}}},
-}
 _TEXT_SCHEMA = {"schema": {"type": "string"}}
 _GRAPH: dict[int | str, dict[str, Any]] = {
     200: {
@@ -152,7 +143,7 @@ _Overlap = Annotated[float, Query(ge=0.0, le=1.0, description="Least overlap of 
     "",
     status_code=202,
     responses=declared(400, 404, 413, 415, 422),
-    openapi_extra={"requestBody": BODY},
+    openapi_extra=json_body("NewAssociation"),
     dependencies=[Depends(may_write)],
 )
 async def begin_association(
