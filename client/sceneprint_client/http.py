@@ -360,6 +360,11 @@ class ServiceConnection:
         """What it answers, as a record."""
         return read_record(kind, self._send(method, path, **request))
 
+    def _begin(self, kind: type[Record], path: str, wanted: BaseModel) -> Record:
+        """The job that a record asks for."""
+        document = wanted.model_dump(mode="json", exclude_unset=True)
+        return self._ask(kind, "POST", path, json=document)
+
     def _bytes(self, path: str, **request: Any) -> bytes:
         """What it answers to a GET, as it comes."""
         return self._send("GET", path, **request).content

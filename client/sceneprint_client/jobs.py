@@ -268,7 +268,7 @@ class JobMethods(ServiceConnection):
         def send() -> httpx.Response:
             archive.seek(0)
             return self._http.request(
-                "POST", path, content=_chunks(archive), params=parameters,
+                "POST", path, content=iter(lambda: archive.read(_CHUNK), b""), params=parameters,
                 timeout=self._timeout_s, headers={"Content-Type": "application/octet-stream"},
             )  # fmt: skip
 
@@ -322,10 +322,7 @@ class JobMethods(ServiceConnection):
             NewAssociation, "The association", sessions=sessions, k=k, candidates=candidates,
             seed=seed, min_overlap=min_overlap, **fields,
         )  # fmt: skip
-        begun = self._ask(
-            Association, "POST", f"{map_path(map_name)}/associations",
-            json=wanted.model_dump(mode="json", exclude_unset=True),
-        )  # fmt: skip
+        begun = self._begin(Association, f"{map_path(map_name)}/associations", wanted)
         return self.wait_for_association(begun, timeout_s=timeout_s, progress=progress)
 
     def wait_for_association(
@@ -453,10 +450,7 @@ class JobMethods(ServiceConnection):
         if like is not None:
             width = None if like.result is None else like.result.cell_m
             wanted = like.asked.model_copy(update=given(cell_m=width))
-        begun = self._ask(
-            MapCoverage, "POST", f"{map_path(map_name)}/coverage",
-            json=wanted.model_dump(mode="json", exclude_unset=True),
-        )  # fmt: skip
+        begun = self._begin(MapCoverage, f"{map_path(map_name)}/coverage", wanted)
         return self.wait_for_coverage(begun, timeout_s=timeout_s, progress=progress)
 
     def wait_for_coverage(
@@ -535,10 +529,7 @@ class JobMethods(ServiceConnection):
             NewDifference, "The difference", before=before, after=after,
             **given(parent_frame=parent_frame),
         )  # fmt: skip
-        begun = self._ask(
-            Difference, "POST", f"{map_path(map_name)}/differences",
-            json=wanted.model_dump(mode="json", exclude_unset=True),
-        )  # fmt: skip
+        begun = self._begin(Difference, f"{map_path(map_name)}/differences", wanted)
         return self._until_over(
             begun, lambda: self.difference(map_name, begun.difference_id), timeout_s, progress
         )
@@ -600,10 +591,7 @@ class JobMethods(ServiceConnection):
             include_query=include_query, voxel_m=voxel_m, output=output,
         )  # fmt: skip
         query_id = query if isinstance(query, str) else query.query_id
-        begun = self._ask(
-            Reconstruction, "POST", f"{query_path(query_id)}/reconstruction",
-            json=wanted.model_dump(mode="json", exclude_unset=True),
-        )  # fmt: skip
+        begun = self._begin(Reconstruction, f"{query_path(query_id)}/reconstruction", wanted)
         if wait_s is None:
             return begun
         return self._until_over(begun, lambda: self.reconstruction(begun.job_id), wait_s)
@@ -642,11 +630,6 @@ def _of_map(options: ImportOptions | None, name: str | None) -> ImportOptions:
             (("as", "not `map`"),),
         )
     return options
-
-
-def _chunks(file: BinaryIO) -> Iterator[bytes]:
-    while chunk := file.read(_CHUNK):
-        yield chunk
 
 
 def _check_overlap(least: float) -> None:
