@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import disk, readiness, registration, scan, search, service
+from benchmarks import registration, scan
 from benchmarks.machine import peak_megabytes_of_signing
 from benchmarks.pairs import FramePair, pairs_among
-from sceneprint.formats.artifact import write_geometry
-from sceneprint.formats.dataset import Camera, find_sequences, write_depth_png, write_intrinsics
+from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics
 from sceneprint.models import Model
-from sceneprint.pipeline import open_signer, prepare
 from sceneprint.types import DepthFrame, Floats, Intrinsics
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
@@ -73,89 +71,6 @@ def test_without_open3d_the_row_says_so(
     assert figures.ours == pytest.approx(sum(figures.stages.values()))
     text = "\n".join(registration.table(figures))
     assert "Open3D | not measured: FPFH needs Open3D, which cannot be imported" in text
-
-
-@pytest.fixture
-def few_clients(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two processes query and not four."""
-    monkeypatch.setattr(service, "CLIENTS", 2)
-    monkeypatch.setattr(service, "CROWD", 2)
-
-
-@pytest.mark.thorough
-@pytest.mark.usefixtures("few_clients")
-def test_service_and_library_do_the_same_work(building: Path) -> None:
-    """`measure` compares every answer with the library's."""
-    with service.frames_of(building, 8) as frames:
-        found = service.measure(frames, 2, seconds=1.0, map_frames=0)
-    assert (found.frames, found.queries) == (6, 2)
-    assert list(found.stages) == [
-        "decode", "sign, with geometry", "retrieve", "diversify", "validate", "locate"
-    ]  # fmt: skip
-    assert 0 < found.cpu[0] <= found.cpu[1] <= found.cpu[2]
-    assert list(found.throughput) == [1, 2]
-    assert all(0 < one.p50 <= one.p99 for one in found.throughput.values())
-    assert all(0 <= one.least <= 1 for one in found.throughput.values())
-    assert found.ratio > 0
-    assert 0 < found.idle[0] <= found.idle[1]
-    assert 0 < found.loaded[0] <= found.loaded[1]
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("flat_bytes", [search.FLAT, search.SKETCHES])
-def test_a_search_is_compared_with_the_scan_of_all(flat_bytes: int) -> None:
-    found = search.measure(frames=1000, length=64, flat_bytes=flat_bytes, runs=2)
-    assert (found.frames, found.signature_bytes) == (980, 64)  # one of each place is asked for
-    assert min(found.publish, found.append, found.open, found.exact, found.search) > 0
-    assert found.ratio > 0
-    assert (found.probes > 0) == (flat_bytes == search.SKETCHES)
-    assert found.recall >= 0.995
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("flat_bytes", [search.FLAT, search.SKETCHES])
-def test_a_map_that_grew_is_compared_with_one_published_at_once(flat_bytes: int) -> None:
-    found = search.measure_growth(frames=1300, length=64, flat_bytes=flat_bytes, runs=3)
-    assert (found.frames, found.segments) == (127 * (1300 * 49 // 50 // 127), 4)
-    assert 4 < found.written < 12  # sketches are written too
-    assert 0 < found.share < 0.2
-    assert found.append_ratio == found.append / found.whole > 0
-    assert min(found.largest, found.search, found.one, found.search_ratio) > 0
-    assert found.recall == found.recall_one == 1
-    (row,) = [line for line in search.growth_table([found]) if line.startswith("| 1,")]
-    assert row.startswith(f"| {found.frames:,} | 64 | 4 | {found.written:.1f} |")
-
-
-@pytest.mark.thorough
-def test_disk_of_a_frame(room_frames: tuple[DepthFrame, ...], tmp_path: Path) -> None:
-    folder = tmp_path / "frames"
-    folder.mkdir()
-    write_intrinsics(folder, Camera(room_frames[0].intrinsics, 1000.0, along_ray=False))
-    for i, frame in enumerate(room_frames):
-        write_depth_png(folder / f"{i}.png", frame.depth, 1000.0)
-    frames = [f for s in find_sequences(folder) for f in s.frames]
-    assert len(frames) == 6
-    found = disk.measure(frames, "depth", tmp_path / "data")
-    assert (found.frames, found.signature_bytes) == (5, 448)
-    assert found.uploads == np.mean([frame.path.stat().st_size for frame in frames[1:]])
-    assert 0 <= found.database < 50_000  # five frames fill a page or none
-    assert found.database * 5 % 4096 == 0
-    signer = open_signer("depth")
-    sizes = [len(write_geometry(prepare(f.read(), signer)[1])) for f in frames[1:]]
-    assert found.artifacts == np.mean(sizes)
-
-
-@pytest.mark.thorough
-def test_a_start_is_measured_with_and_without_the_index(building: Path) -> None:
-    with service.frames_of(building, 25) as frames:
-        found = readiness.measure(frames[0], list(frames[1:]), 60, "depth")
-    assert (found.frames, found.signature_bytes) == (60, 448)
-    assert 0 < found.ready < found.first
-    assert 20 < found.memory < 2000
-    assert found.bare > 0
-    assert set(found.signed) == {1, 2}
-    assert min(found.signed.values()) > 0
-    assert f"**{found.signed[2] / found.signed[1]:.2f}** times" in readiness.table(found)[-2]
 
 
 @pytest.mark.parametrize("preset", ["paper", "depth"])
