@@ -17,7 +17,7 @@ from functools import cache
 from importlib import util
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import hypothesis
 import numpy as np
@@ -28,7 +28,9 @@ from xdist.scheduler import LoadFileScheduling
 from benchmarks.fleet.postgres import NoServer, Server
 from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.waiting import until as wait_until
+from sceneprint.cli import main
 from sceneprint.cli.demo import write_building
+from sceneprint.formats.dataset import write_depth_png
 from sceneprint.formats.export import write_ply
 from sceneprint.geometry.registration.patch_descriptors import (
     Compression,
@@ -46,6 +48,7 @@ from sceneprint.settings import Settings
 from sceneprint.store import open_database
 from sceneprint.store.tables import metadata
 from sceneprint.types import DepthFrame
+from sceneprint_client.api import CameraIntrinsics
 
 #: Folders whose files share what is dear to begin, such as a service with its workers: all of one
 #: run in one process, one after another. The longest are first, and are begun first.
@@ -467,6 +470,45 @@ def room_frames(room_views: Callable[..., SynthRoom]) -> tuple[DepthFrame, ...]:
         for room in rooms
         for i, frame in enumerate(room.frames)
     )
+
+
+@pytest.fixture(scope="session")
+def small_image(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[DepthFrame, int, int], tuple[bytes, CameraIntrinsics]]:
+    """Makes an image of every fourth sample of a frame, from a row and column on."""
+    path = tmp_path_factory.mktemp("png") / "small.png"
+
+    def make(frame: DepthFrame, y: int, x: int) -> tuple[bytes, CameraIntrinsics]:
+        k = frame.intrinsics
+        write_depth_png(path, np.ascontiguousarray(frame.depth[y::4, x::4]), 1000.0)
+        camera = CameraIntrinsics(
+            width=160, height=120, fx=k.fx / 4, fy=k.fy / 4, cx=(k.cx - x) / 4, cy=(k.cy - y) / 4
+        )
+        return path.read_bytes(), camera
+
+    return make
+
+
+class Said(NamedTuple):
+    """What a command printed."""
+
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def run_command(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
+    """Runs a command in this process and checks its exit code."""
+
+    def run(*arguments: object, expect: int = 0) -> Said:
+        capsys.readouterr()
+        code = main([str(one) for one in arguments])
+        said = Said(*capsys.readouterr())
+        assert code == expect, said
+        return said
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -5,24 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import pytest
 
-from sceneprint.cli import main
 from sceneprint.cli.demo import serving
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
 from sceneprint.types import DepthFrame
 
-
-class Said(NamedTuple):
-    """What a command printed."""
-
-    stdout: str
-    stderr: str
-
-
-Run = Callable[..., Said]
+Run = Callable[..., Any]
 
 
 @pytest.fixture(scope="session")
@@ -37,20 +28,10 @@ def service_url(data_folder: Path, folder_stack: ExitStack) -> str:
 
 
 @pytest.fixture
-def sceneprint(
-    service_url: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Run:
+def sceneprint(service_url: str, run_command: Run, monkeypatch: pytest.MonkeyPatch) -> Run:
     """Runs a command in this process against the service and checks its exit code."""
     monkeypatch.setenv("SCENEPRINT_URL", service_url)
-
-    def run(*arguments: object, expect: int = 0) -> Said:
-        capsys.readouterr()
-        code = main([str(one) for one in arguments])
-        said = Said(*capsys.readouterr())
-        assert code == expect, said
-        return said
-
-    return run
+    return run_command
 
 
 @pytest.fixture(scope="session")

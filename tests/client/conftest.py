@@ -9,9 +9,11 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,8 +27,10 @@ from sceneprint.formats.dataset import (
     write_intrinsics,
     write_pose,
 )
+from sceneprint.lab.synth import SynthRoom
 from sceneprint.types import DepthFrame
 from sceneprint_client import Client, http
+from sceneprint_client.api import FrameMeta
 
 #: Largest body the service of these tests takes, bytes.
 UPLOAD_BYTES = 2 << 20
@@ -98,6 +102,36 @@ def references(
         assert frame.pose is not None
         write_pose(folder / f"frame-{number % 3:06d}.pose.txt", frame.pose)
     return tuple(one for sequence in find_sequences(root) for one in sequence.frames)
+
+
+@pytest.fixture(scope="session")
+def walk(
+    room_views: Callable[..., SynthRoom], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[..., list[tuple[bytes, FrameMeta]]]:
+    """Makes frames along a path, a second apart, of one session or of two in turn."""
+    path = tmp_path_factory.mktemp("walk") / "depth.png"
+
+    def make(
+        count: int = 4, sessions: str = "a", parent: str | None = None, **options: Any
+    ) -> list[tuple[bytes, FrameMeta]]:
+        found = []
+        frames = room_views(21, 0, count, along_path=True, **options).frames
+        for i, frame in enumerate(frames):
+            write_depth_png(path, frame.depth, 1000.0)
+            k = frame.intrinsics
+            assert frame.pose is not None
+            pose = {"parent_frame": parent, "matrix": frame.pose.tolist()}
+            fields = {
+                "intrinsics": {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy,
+                               "cx": k.cx, "cy": k.cy},
+                "session": sessions[i % len(sessions)], "robot": "ann",
+                "pose": {name: value for name, value in pose.items() if value is not None},
+                "captured_at": datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=i),
+            }  # fmt: skip
+            found.append((path.read_bytes(), FrameMeta.model_validate(fields)))
+        return found
+
+    return make
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import httpx
@@ -14,40 +13,10 @@ import pytest
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
 from sceneprint.errors import InvalidRequest, UnknownJob, UnknownMap
-from sceneprint.formats.dataset import write_depth_png
-from sceneprint.lab.synth import SynthRoom
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 
 MAP = "associated"
-
-
-@dataclass(frozen=True)
-class Sent:
-    """One frame of either run, and its meta."""
-
-    data: bytes
-    meta: FrameMeta
-
-
-@pytest.fixture(scope="module")
-def sent(
-    tmp_path_factory: pytest.TempPathFactory, room_views: Callable[..., SynthRoom]
-) -> list[Sent]:
-    """Six frames along a path, some two degrees apart, one to each of two runs in turn."""
-    path, found = tmp_path_factory.mktemp("sent") / "depth.png", []
-    for i, frame in enumerate(room_views(21, 0, 12, along_path=True, step=2).frames):
-        write_depth_png(path, frame.depth, 1000.0)
-        k = frame.intrinsics
-        assert frame.pose is not None
-        fields = {
-            "intrinsics": {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy,
-                           "cx": k.cx, "cy": k.cy},
-            "session": "ab"[i % 2], "robot": "ann", "pose": {"matrix": frame.pose.tolist()},
-            "captured_at": datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=i),
-        }  # fmt: skip
-        found.append(Sent(path.read_bytes(), FrameMeta.model_validate(fields)))
-    return found
 
 
 @dataclass(frozen=True)
@@ -58,17 +27,17 @@ class Filled:
     numbers: dict[str, int]
 
 
-def filled(client: Client, sent: list[Sent]) -> Filled:
-    client.create_map(MAP, model="depth")
-    ids = [client.upload(MAP, one.data, one.meta, wait_s=PATIENCE_S).frame_id for one in sent]
-    assert {frame.state for frame in client.frames(MAP)} == {"indexed"}
-    return Filled(client, {frame_id: i for i, frame_id in enumerate(ids)})
-
-
 @pytest.fixture(scope="module")
-def associated(service_url: str, sent: list[Sent]) -> Iterator[Filled]:
-    with Client(service_url) as remote:
-        yield filled(remote, sent)
+def associated(
+    service_url: str, walk: Callable[..., list[tuple[bytes, FrameMeta]]]
+) -> Iterator[Filled]:
+    """Six frames along a path, some two degrees apart, one to each of two runs in turn."""
+    with Client(service_url) as client:
+        client.create_map(MAP, model="depth")
+        sent = walk(12, sessions="ab", step=2)
+        ids = [client.upload(MAP, *frame, wait_s=PATIENCE_S).frame_id for frame in sent]
+        assert {frame.state for frame in client.frames(MAP)} == {"indexed"}
+        yield Filled(client, {frame_id: i for i, frame_id in enumerate(ids)})
 
 
 def test_edges_and_graphs(associated: Filled) -> None:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime, timedelta
 
 import httpx
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, JobOver, NotIndexed, UnknownJob, UnknownMap
-from sceneprint.formats.dataset import write_depth_png
-from sceneprint.lab.synth import SynthRoom
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.coverage import (
@@ -24,24 +21,12 @@ MAP = "covered"
 
 @pytest.fixture(scope="module")
 def covered(
-    service_url: str, tmp_path_factory: pytest.TempPathFactory, room_views: Callable[..., SynthRoom]
+    service_url: str, walk: Callable[..., list[tuple[bytes, FrameMeta]]]
 ) -> Iterator[Client]:
     """A client of a map with four frames along a path, a second apart."""
-    path = tmp_path_factory.mktemp("covered") / "depth.png"
     with Client(service_url) as client:
         client.create_map(MAP, model="depth")
-        jobs = []
-        for i, frame in enumerate(room_views(21, 0, 4, along_path=True).frames):
-            write_depth_png(path, frame.depth, 1000.0)
-            k = frame.intrinsics
-            assert frame.pose is not None
-            fields = {
-                "intrinsics": {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy,
-                               "cx": k.cx, "cy": k.cy},
-                "session": "a", "robot": "ann", "pose": {"matrix": frame.pose.tolist()},
-                "captured_at": datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=i),
-            }  # fmt: skip
-            jobs.append(client.upload(MAP, path, FrameMeta.model_validate(fields)).job_id)
+        jobs = [client.upload(MAP, *frame).job_id for frame in walk()]
         assert {job.state for job in client.wait(jobs)} == {JobState.SUCCEEDED}
         yield client
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
 
 from sceneprint.errors import InvalidRequest, UnknownJob
-from sceneprint.formats.dataset import write_depth_png
-from sceneprint.lab.synth import SynthRoom
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.sessions import SAME
@@ -21,31 +18,18 @@ MAP = "changed"
 
 @pytest.fixture(scope="module")
 def changed(
-    service_url: str, tmp_path_factory: pytest.TempPathFactory, room_views: Callable[..., SynthRoom]
+    service_url: str, walk: Callable[..., list[tuple[bytes, FrameMeta]]]
 ) -> Iterator[Client]:
     """A client of a map with sessions a and b, of two frames each along one path."""
-    path = tmp_path_factory.mktemp("changed") / "depth.png"
     with Client(service_url) as client:
         client.create_map(MAP, model="depth")
-        jobs = []
-        for i, frame in enumerate(room_views(21, 0, 4, along_path=True).frames):
-            write_depth_png(path, frame.depth, 1000.0)
-            k = frame.intrinsics
-            assert frame.pose is not None
-            fields = {
-                "intrinsics": {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy,
-                               "cx": k.cx, "cy": k.cy},
-                "session": "ab"[i % 2],
-                "pose": {"parent_frame": "room", "matrix": frame.pose.tolist()},
-            }  # fmt: skip
-            jobs.append(client.upload(MAP, path, FrameMeta.model_validate(fields)).job_id)
+        frames = walk(sessions="ab", parent="room")
+        jobs = [client.upload(MAP, *frame).job_id for frame in frames]
         assert {job.state for job in client.wait(jobs)} == {JobState.SUCCEEDED}
         yield client
 
 
-def test_a_difference_is_told_listed_and_deleted(
-    changed: Client, service_url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_difference_is_told_listed_and_deleted(changed: Client, service_url: str) -> None:
     steps: list[tuple[int, int]] = []
     told = changed.compare_sessions(MAP, "a", "b", progress=lambda *step: steps.append(step))
     assert told.state is JobState.SUCCEEDED
@@ -72,9 +56,7 @@ def test_a_difference_is_told_listed_and_deleted(
         changed.difference(*of)
 
 
-def test_what_cannot_be_compared_is_refused(
-    changed: Client, capsys: pytest.CaptureFixture[str], service_url: str
-) -> None:
+def test_what_cannot_be_compared_is_refused(changed: Client, service_url: str) -> None:
     with pytest.raises(InvalidRequest, match="Name two sessions"):
         changed.compare_sessions(MAP, "a", "a")
     with pytest.raises(InvalidRequest, match="no indexed frame with a pose of session 'z'"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime, timedelta
 
 import httpx
 import numpy as np
@@ -13,8 +12,6 @@ from PIL import Image
 
 from benchmarks.waiting import until
 from sceneprint.errors import InvalidRequest, NotFound, UnknownMap
-from sceneprint.formats.dataset import write_depth_png
-from sceneprint.lab.synth import SynthRoom
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.surface import SurfaceTile
@@ -26,28 +23,15 @@ PATH = f"/v1/maps/{MAP}/surface"
 
 
 @pytest.fixture(scope="module")
-def fused(
-    service_url: str, tmp_path_factory: pytest.TempPathFactory, room_views: Callable[..., SynthRoom]
-) -> Iterator[Client]:
+def fused(service_url: str, walk: Callable[..., list[tuple[bytes, FrameMeta]]]) -> Iterator[Client]:
     """A client of a map with four posed frames and their surface, and of one without poses."""
-    path = tmp_path_factory.mktemp("fused") / "depth.png"
     with Client(service_url) as client:
         for name in (MAP, PLAIN):
             client.create_map(name, model="depth")
-        jobs = []
-        for i, frame in enumerate(room_views(21, 0, 4, along_path=True).frames):
-            write_depth_png(path, frame.depth, 1000.0)
-            k = frame.intrinsics
-            assert frame.pose is not None
-            fields = {
-                "intrinsics": {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy,
-                               "cx": k.cx, "cy": k.cy},
-                "session": "a", "robot": "ann",
-                "captured_at": datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=i),
-            }  # fmt: skip
-            posed = fields | {"pose": {"parent_frame": "room", "matrix": frame.pose.tolist()}}
-            jobs.append(client.upload(MAP, path, FrameMeta.model_validate(posed)).job_id)
-        jobs.append(client.upload(PLAIN, path, FrameMeta.model_validate(fields)).job_id)
+        frames = walk(parent="room")
+        jobs = [client.upload(MAP, *frame).job_id for frame in frames]
+        data, meta = frames[-1]
+        jobs.append(client.upload(PLAIN, data, meta.model_copy(update={"pose": None})).job_id)
         assert {job.state for job in client.wait(jobs)} == {JobState.SUCCEEDED}
         before = client.surface(MAP)
         assert (before.state, before.frames, before.frames_left) == ("none", 0, 4)
@@ -133,9 +117,7 @@ def test_a_tile_is_kept_for_ever_and_a_plan_asked_for_again(
     assert (image.mode, image.size) == ("RGBA", (parent.plan.width, parent.plan.height))
 
 
-def test_a_deleted_surface_comes_back_when_asked_for(
-    fused: Client, service_url: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_deleted_surface_comes_back_when_asked_for(fused: Client) -> None:
     before = fused.surface(MAP)
     tile = next(fused.surface_tiles(MAP))
     fused.delete_surface(MAP)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
 
 from benchmarks.fleet.postgres import Server
-from sceneprint.formats.dataset import write_depth_png
 from sceneprint.store import Store, open_store
 from sceneprint.types import DepthFrame
-from sceneprint_client.api import CameraIntrinsics, FrameMeta
+from sceneprint_client.api import FrameMeta
 
 
 class Small(NamedTuple):
@@ -24,18 +22,12 @@ class Small(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def small(
-    room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory
-) -> list[Small]:
-    """Frames of their own content: every fourth sample from another corner each."""
-    path, found = tmp_path_factory.mktemp("png") / "a.png", []
+def small(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]) -> list[Small]:
+    """Frames of their own content: from another corner each."""
+    found = []
     for number in range(12):
-        frame, (y, x) = room_frames[number % 6], divmod(number, 4)
-        k = frame.intrinsics
-        write_depth_png(path, np.ascontiguousarray(frame.depth[y::4, x::4]), 1000.0)
-        lens = CameraIntrinsics(width=160, height=120, fx=k.fx / 4, fy=k.fy / 4,
-                                cx=(k.cx - x) / 4, cy=(k.cy - y) / 4)  # fmt: skip
-        found.append(Small(path.read_bytes(), FrameMeta(intrinsics=lens)))
+        data, lens = small_image(room_frames[number % 6], *divmod(number, 4))
+        found.append(Small(data, FrameMeta(intrinsics=lens)))
     return found
 
 

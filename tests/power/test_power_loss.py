@@ -23,7 +23,7 @@ from sceneprint.index.generation_files import GenerationManifest
 from sceneprint.settings import Settings
 from sceneprint.store import FolderBlobs
 from sceneprint.types import Bytes
-from sceneprint_client.api import CameraIntrinsics, FrameMeta, JobState, NewMap
+from sceneprint_client.api import FrameMeta, JobState, NewMap
 
 LENGTH = 64
 Recorded = Callable[..., Any]
@@ -289,14 +289,6 @@ def test_old_generations_removed_too_early_are_found_out(
 
 
 @pytest.fixture(scope="module")
-def small_upload(room_frames: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    from sceneprint.formats.dataset import write_depth_png
-
-    path = tmp_path_factory.mktemp("png") / "a.png"
-    frame = room_frames[0]
-    k = frame.intrinsics
-    write_depth_png(path, np.ascontiguousarray(frame.depth[::4, ::4]), 1000.0)
-    camera = CameraIntrinsics(
-        width=160, height=120, fx=k.fx / 4, fy=k.fy / 4, cx=k.cx / 4, cy=k.cy / 4
-    )
-    return path.read_bytes(), FrameMeta(intrinsics=camera)
+def small_upload(room_frames: Any, small_image: Any) -> Any:
+    data, camera = small_image(room_frames[0], 0, 0)
+    return data, FrameMeta(intrinsics=camera)

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,15 +22,7 @@ from sceneprint.formats.recording import bag
 from sceneprint_client import Client
 from sceneprint_client.api import Frame
 
-
-class Said(NamedTuple):
-    """What a command printed."""
-
-    stdout: str
-    stderr: str
-
-
-Run = Callable[..., Said]
+Run = Callable[..., Any]
 FRAMES = 8
 
 
@@ -41,20 +33,10 @@ def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.fixture
-def sceneprint(
-    service_url: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Run:
+def sceneprint(service_url: str, run_command: Run, monkeypatch: pytest.MonkeyPatch) -> Run:
     """Runs a command in this process against the service and checks its exit code."""
     monkeypatch.setenv("SCENEPRINT_URL", service_url)
-
-    def run(*arguments: object, expect: int = 0) -> Said:
-        capsys.readouterr()
-        code = main([str(one) for one in arguments])
-        said = Said(*capsys.readouterr())
-        assert code == expect, said
-        return said
-
-    return run
+    return run_command
 
 
 @pytest.fixture(scope="module")

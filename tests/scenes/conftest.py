@@ -6,13 +6,12 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.cli import main
 from sceneprint.cli.demo import serving
 from sceneprint.formats.dataset import (
     Camera,
@@ -132,29 +131,14 @@ def client(
         yield client
 
 
-class Said(NamedTuple):
-    """What a command printed."""
-
-    stdout: str
-    stderr: str
-
-
 @pytest.fixture
 def sceneprint(
-    service_url: str, client: Client, capsys: pytest.CaptureFixture[str],
+    service_url: str, client: Client, run_command: Callable[..., Any],
     monkeypatch: pytest.MonkeyPatch,
-) -> Callable[..., Said]:  # fmt: skip
+) -> Callable[..., Any]:  # fmt: skip
     """Runs a command in this process against the service and checks its exit code."""
     monkeypatch.setenv("SCENEPRINT_URL", service_url)
-
-    def run(*arguments: object, expect: int = 0) -> Said:
-        capsys.readouterr()
-        code = main([str(one) for one in arguments])
-        said = Said(*capsys.readouterr())
-        assert code == expect, said
-        return said
-
-    return run
+    return run_command
 
 
 def moved(T: Any, points: Any) -> Any:

@@ -18,9 +18,9 @@ from sceneprint.formats.dataset import Camera, FrameReference
 from sceneprint.types import Intrinsics
 from sceneprint_client import Client
 
-from .conftest import MAP, WALK, Logged, Said, drawn_at, mcap_rows, moved, moves_of
+from .conftest import MAP, WALK, Logged, drawn_at, mcap_rows, moved, moves_of
 
-Run = Callable[..., Said]
+Run = Callable[..., Any]
 
 
 def values(rows: list[Logged], path: str, component: str) -> Any:

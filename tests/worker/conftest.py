@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S, until
 from sceneprint.engine import Engine
-from sceneprint.formats.dataset import write_depth_png
 from sceneprint.settings import Settings
-from sceneprint_client.api import Added, CameraIntrinsics, FrameMeta, NewMap
+from sceneprint_client.api import Added, FrameMeta, NewMap
 
 LEASE_S = 1.5  # a busy machine renews one late at times
 
@@ -79,16 +77,12 @@ class Crew:
 
 
 @pytest.fixture(scope="module")
-def frames(room_frames, tmp_path_factory) -> list[tuple[bytes, FrameMeta]]:
-    """Small frames of their own content: every fourth sample from another corner each."""
-    path, found = tmp_path_factory.mktemp("png") / "a.png", []
+def frames(room_frames, small_image) -> list[tuple[bytes, FrameMeta]]:
+    """Small frames of their own content: from another corner each."""
+    found = []
     for number in range(64):
-        frame, (y, x) = room_frames[number // 16], divmod(number % 16, 4)
-        k = frame.intrinsics
-        write_depth_png(path, np.ascontiguousarray(frame.depth[y::4, x::4]), 1000.0)
-        lens = CameraIntrinsics(width=160, height=120, fx=k.fx / 4, fy=k.fy / 4,
-                                cx=(k.cx - x) / 4, cy=(k.cy - y) / 4)  # fmt: skip
-        found.append((path.read_bytes(), FrameMeta(intrinsics=lens)))
+        data, lens = small_image(room_frames[number // 16], *divmod(number % 16, 4))
+        found.append((data, FrameMeta(intrinsics=lens)))
     return found
 
 

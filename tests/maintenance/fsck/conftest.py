@@ -11,19 +11,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from sqlalchemy import NullPool, create_engine, make_url
 
 from sceneprint.engine import Engine
 from sceneprint.engine.maps.tombstones import Tombstones
-from sceneprint.formats.dataset import write_depth_png
 from sceneprint.maintenance.fsck.check import FindingOutcome, fsck
 from sceneprint.models import Model, open_table, write_model
 from sceneprint.settings import Settings
 from sceneprint.store.maps import add_map, keep_model
 from sceneprint.types import DepthFrame
-from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, JobState, Query
+from sceneprint_client.api import FrameMeta, GivenPose, JobState, Query
 
 #: Frames of `hall`, all signed; the first index holds half of them, the second all.
 HALL = 12
@@ -98,25 +96,17 @@ class House:
 
 
 @pytest.fixture(scope="session")
-def uploads(
-    room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory
-) -> list[Upload]:
-    """24 small frames with poses: every fourth sample from each of four corners of six views."""
-    path, found = tmp_path_factory.mktemp("png") / "frame.png", []
+def uploads(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]) -> list[Upload]:
+    """24 small frames with poses: from each of four corners of six views."""
+    found = []
     for number, frame in enumerate(room_frames):
-        k = frame.intrinsics
         assert frame.pose is not None
         for place in range(4):
-            y, x = divmod(place, 2)
-            write_depth_png(path, np.ascontiguousarray(frame.depth[y::4, x::4]), 1000.0)
-            camera = CameraIntrinsics(
-                width=160, height=120, fx=k.fx / 4, fy=k.fy / 4,
-                cx=(k.cx - x) / 4, cy=(k.cy - y) / 4,
-            )  # fmt: skip
+            data, camera = small_image(frame, *divmod(place, 2))
             pose = GivenPose(parent_frame=frame.name[:-2], matrix=frame.pose.tolist())
             tags = ["all", f"view-{number}"]
             meta = FrameMeta(intrinsics=camera, pose=pose, tags=tags)
-            found.append(Upload(path.read_bytes(), meta))
+            found.append(Upload(data, meta))
     return found
 
 

@@ -5,25 +5,21 @@ from __future__ import annotations
 import hashlib
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.cli import main
 from sceneprint.engine import Engine
-from sceneprint.formats.dataset import write_depth_png
 from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.settings import Settings
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import (
     Answer,
-    CameraIntrinsics,
     FrameMeta,
     GivenPose,
     JobState,
@@ -53,23 +49,15 @@ class Upload:
 
 
 @pytest.fixture(scope="session")
-def uploads(
-    room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory
-) -> list[Upload]:
-    """24 small frames with poses: every fourth sample from each of four corners of six views."""
-    path, found = tmp_path_factory.mktemp("png") / "frame.png", []
+def uploads(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]) -> list[Upload]:
+    """24 small frames with poses: from each of four corners of six views."""
+    found = []
     for frame in room_frames:
-        k = frame.intrinsics
         assert frame.pose is not None
         for place in range(4):
-            y, x = divmod(place, 2)
-            write_depth_png(path, np.ascontiguousarray(frame.depth[y::4, x::4]), 1000.0)
-            camera = CameraIntrinsics(
-                width=160, height=120, fx=k.fx / 4, fy=k.fy / 4,
-                cx=(k.cx - x) / 4, cy=(k.cy - y) / 4,
-            )  # fmt: skip
+            data, camera = small_image(frame, *divmod(place, 2))
             pose = GivenPose(parent_frame=frame.name[:-2], matrix=frame.pose.tolist())
-            found.append(Upload(path.read_bytes(), FrameMeta(intrinsics=camera, pose=pose)))
+            found.append(Upload(data, FrameMeta(intrinsics=camera, pose=pose)))
     return found
 
 
@@ -153,25 +141,15 @@ def answers() -> Callable[[Path, list[Upload]], list[Answer]]:
     return of
 
 
-class Said(NamedTuple):
-    """What a command printed."""
-
-    stdout: str
-    stderr: str
-
-
 @pytest.fixture
 def sceneprint(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Callable[..., Said]]:
+    run_command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Any]:
     """Runs a command in this process and checks its exit code."""
     monkeypatch.delenv("SCENEPRINT_DATABASE_URL", raising=False)
 
-    def run(*arguments: object, expect: int = 0) -> Said:
-        capsys.readouterr()
-        code = main([str(one) for one in arguments])
-        said = Said(*capsys.readouterr())
-        assert code == expect, said
+    def run(*arguments: object, expect: int = 0) -> Any:
+        said = run_command(*arguments, expect=expect)
         if expect == 2:
             assert said.stdout == ""
             assert said.stderr.count("\n") == 1
