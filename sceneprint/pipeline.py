@@ -423,9 +423,7 @@ def associate(
 
 
 def searched(matches: Sequence[PairMatch]) -> dict[int, PairValidation] | None:
-    """Validations that were searched for, by row, for `associate` to search for the rest as well;
-    None where nothing was guided.
-    """
+    """Validations that were searched for, by row; None where nothing was guided."""
     if not any(match.validation.guided for match in matches):
         return None
     return {m.index: m.validation for m in matches if not m.validation.guided}

@@ -108,9 +108,7 @@ class TurnOrder(Generic[Waiter]):
                 self._resting[tenant] = now + min(now - began, ACTIVE_S)
 
     def rest_s(self) -> float | None:
-        """Seconds until the first of those whom `admit` found resting has rested: call it again
-        then; None: it found none.
-        """
+        """Seconds until `admit` should be called again for those who rested; None for none."""
         return None if self._rested_at is None else max(self._rested_at - self._clock(), 0.0)
 
     def waiters(self) -> list[Waiter]:

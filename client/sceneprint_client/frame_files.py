@@ -393,9 +393,7 @@ def _named_as(known: FrameMeta, name: str, sequence: int | None) -> FrameMeta:
 
 
 def _meta_without_array(meta: MetaInput | None) -> FrameMeta | None:
-    """What is known of a frame whose size no array tells; TypeError for four numbers alone, and
-    for what is no metadata.
-    """
+    """The metadata of a frame that is no array; TypeError for what is no metadata."""
     if meta is None or isinstance(meta, FrameMeta):
         return meta
     if isinstance(meta, CameraIntrinsics):

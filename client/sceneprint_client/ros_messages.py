@@ -340,9 +340,7 @@ def cloud_points(message: Any) -> NDArray[np.float32]:
 
 
 def cloud_table(message: Any) -> NDArray[np.void]:
-    """Records (rows, columns) of x, y and z in the bytes of a PointCloud2, which are not copied;
-    raises as `cloud_points`.
-    """
+    """The x, y and z of a PointCloud2 in place (rows, columns); raises as `cloud_points`."""
     width, height = int(message.width), int(message.height)
     step, row = int(message.point_step), int(message.row_step)
     data = memoryview(message.data).cast("B")

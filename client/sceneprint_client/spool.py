@@ -314,7 +314,7 @@ class Spool:
             first = database.execute(
                 "SELECT stamp FROM frames WHERE reason IS NULL ORDER BY id LIMIT 1"
             ).fetchone()
-        oldest = None if first is None else _moment(first[0])
+        oldest = None if first is None else datetime.fromtimestamp(first[0], timezone.utc)
         return SpoolStatus(**dict(zip(names, row, strict=True)), oldest=oldest)
 
     def refusals(self) -> list[SpoolRefusal]:
@@ -558,9 +558,7 @@ def _require_sendable(data: bytes, meta: FrameMeta) -> None:
 
 
 def separation(a: SpoolPlace, b: SpoolPlace) -> float:
-    """How far apart two frames are: metres / 1 + degrees / 30 + seconds / 60; without the pose of
-    one, seconds / 60 alone.
-    """
+    """Metres / 1 + degrees / 30 + seconds / 60 between two frames; without poses, seconds alone."""
     apart = abs(a.stamp - b.stamp) / SECONDS
     if a.T is None or b.T is None:
         return apart
@@ -673,10 +671,6 @@ def _persist(target: _Target, send: Callable[[], T]) -> T:
             if not error.retry_after_s or time.monotonic() + pause > target.until:
                 raise
         time.sleep(pause)
-
-
-def _moment(stamp: float) -> datetime:
-    return datetime.fromtimestamp(stamp, timezone.utc)
 
 
 def _error_of(item: BatchItem) -> errors.SceneprintError:

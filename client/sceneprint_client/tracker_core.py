@@ -345,9 +345,7 @@ class TrackerCore:
         return p.drift * way, turned
 
     def _apart(self, a: _Mark, b: _Mark) -> bool:
-        """Return whether two answers are independent: each view of one differs from each of the
-        other.
-        """
+        """Return whether each view of one answer differs from each view of the other."""
         A, B = (np.stack([one.T_odom_sensor, *one.earlier]) for one in (a, b))
         steps = np.linalg.norm(A[:, None, :3, 3] - B[None, :, :3, 3], axis=2)
         # the trace of a rotation is 1 + 2 cos(angle)
@@ -426,7 +424,8 @@ class TrackerCore:
         p = self.parameters
         own = [i for i, vote in enumerate(self._votes) if vote.number == self._answers]
         if not own:
-            waits = "several places are possible; " if self._disputed() else ""
+            disputed = any(len(one.friends) < len(self._votes) for one in self._votes)
+            waits = "several places are possible; " if disputed else ""
             return "ambiguous" if waits else "lost", waits + observation.reason
         apart = cache(self._apart)  # each vote asks it of the same places
         totals = [self._weight(vote.friends, apart, found=False) for vote in self._votes]
@@ -442,9 +441,6 @@ class TrackerCore:
         if observation.status == "ambiguous" or rival_found > 0:
             return "ambiguous", "several places are possible; " + observation.reason
         return "lost", "one view suggests a place; move, and look again"
-
-    def _disputed(self) -> bool:
-        return any(len(one.friends) < len(self._votes) for one in self._votes)
 
     def _believe(self, mark: _Mark, best: int) -> None:
         """Take the pose of the best place: of its newest vote `found`, carried by odometry."""

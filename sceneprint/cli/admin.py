@@ -66,7 +66,7 @@ def add_keys(commands: Any) -> None:
     )
     command.add_argument(
         "--overlap",
-        type=_overlap,
+        type=lambda text: timedelta() if text == "0" else duration(text),
         metavar="TIME",
         help="how long the old secret still works, such as 30m or 7d, up to 30d; 0 ends it at once "
         "(default: 1h)",
@@ -150,10 +150,6 @@ def _key_line(key: Key) -> str:
     if key.last_used_at is not None:
         text += f", used {key.last_used_at:%Y-%m-%dT%H:%MZ}"
     return text
-
-
-def _overlap(text: str) -> timedelta:
-    return timedelta() if text == "0" else duration(text)
 
 
 # `sceneprint tenants`: whom keys belong to.

@@ -342,7 +342,8 @@ def machine(settings: Settings) -> Iterator[Check]:
     ----------
     settings : whose folders are looked at
     """
-    yield _python()
+    version = ".".join(map(str, sys.version_info[:3]))  # an older than 3.11 cannot install this
+    yield Check("ok", "python", f"{version}, sceneprint {__version__}")
     yield _sqlite_version()
     yield _kernels()
     yield from _tables(settings.cache_dir)
@@ -355,11 +356,6 @@ def machine(settings: Settings) -> Iterator[Check]:
     yield _decoders(settings)
     yield _embree()
     yield _open3d()
-
-
-def _python() -> Check:
-    version = ".".join(map(str, sys.version_info[:3]))  # an older than 3.11 cannot install this
-    return Check("ok", "python", f"{version}, sceneprint {__version__}")
 
 
 def _sqlite_version() -> Check:

@@ -596,9 +596,7 @@ def open_scene(options: argparse.Namespace) -> Iterator[SceneStream | None]:
 
 
 def stamps_of(references: Sequence[FrameFile]) -> list[int | None]:
-    """When frames were taken, nanoseconds since 1970; all None unless each is later than the one
-    before.
-    """
+    """Nanoseconds since 1970 of frames; all None unless each is later than the one before."""
     stamps = [one.timestamp for one in references]
     known = [t for t in stamps if t is not None and 0 <= t < 2**63 * 1e-9]
     rising = all(a < b for a, b in itertools.pairwise(known))

@@ -20,7 +20,7 @@ from sceneprint.cli.options import (
     open_client,
 )
 from sceneprint.errors import DatasetError
-from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint.formats.dataset import find_sequences
 
 if TYPE_CHECKING:
     from sceneprint_client import Client
@@ -126,20 +126,10 @@ def _query(client: Client, options: argparse.Namespace) -> Answer:
         return client.query(
             options.map, frame_id=options.frame, k=options.k, seed=options.seed, filter=wanted
         )
-    return client.query(options.map, _only(path), k=options.k, seed=options.seed, filter=wanted)
-
-
-def _only(path: Path) -> FrameReference:
-    """Return the only frame at a path.
-
-    Raises
-    ------
-    DatasetError : none, or several.
-    """
-    found = [frame for sequence in find_sequences(path) for frame in sequence.frames]
-    if len(found) != 1:
-        raise DatasetError(f"{path}: {len(found)} frames found. Name a single frame file.")
-    return found[0]
+    frames = [frame for sequence in find_sequences(path) for frame in sequence.frames]
+    if len(frames) != 1:
+        raise DatasetError(f"{path}: {len(frames)} frames found. Name a single frame file.")
+    return client.query(options.map, frames[0], k=options.k, seed=options.seed, filter=wanted)
 
 
 def _waited(client: Client, job: Reconstruction, views: int) -> Reconstruction:

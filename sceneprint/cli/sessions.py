@@ -80,7 +80,10 @@ def run_sessions(options: argparse.Namespace) -> int:
         raise InvalidRequest("--deletions and --undo apply to the whole map. Name no session.")
     with open_client(options) as client:
         if options.undo is not None:
-            _undo(client, options.map, options.undo)
+            undone = client.restore_deletion(options.map, options.undo)
+            print(f"restored {undone.frames} frames")
+            for one in undone.refused:
+                print(f"not restored: {one.frame_id}: {one_line(one.reason)}")
         elif options.deletions:
             _deletions(client.deletions(options.map), as_json=options.json)
         elif options.delete:
@@ -114,13 +117,6 @@ def _delete_session(client: Client, options: argparse.Namespace) -> None:
             f"undo until {newest.until:%H:%M} UTC: sceneprint sessions {options.map} --undo "
             f"{newest.deletion_id}"
         )
-
-
-def _undo(client: Client, map_name: str, deletion_id: str) -> None:
-    done = client.restore_deletion(map_name, deletion_id)
-    print(f"restored {done.frames} frames")
-    for one in done.refused:
-        print(f"not restored: {one.frame_id}: {one_line(one.reason)}")
 
 
 def _deletions(deletions: Iterable[FrameDeletion], *, as_json: bool) -> None:

@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 from dataclasses import asdict
-from datetime import UTC, datetime
+from datetime import UTC
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +125,9 @@ def _status(spool: Spool, options: argparse.Namespace) -> int:
         reasons = [{"name": one.name, "reason": one.reason} for one in refusals]
         print(json.dumps(asdict(now) | {"oldest": oldest, "refusals": reasons}))
         return 0
-    age = "" if now.oldest is None else f", the oldest of {_time(now.oldest)}"
+    age = ""
+    if now.oldest is not None:
+        age = f", the oldest of {now.oldest.astimezone(UTC):%Y-%m-%d %H:%M:%SZ}"
     print(
         f"{now.waiting} frames wait{age}; {now.bytes / 1e6:.1f} of {now.most_bytes / 1e6:.1f} MB\n"
         f"{now.uploaded} uploaded, {now.refused} refused, {now.thinned} thinned, "
@@ -138,10 +140,6 @@ def _status(spool: Spool, options: argparse.Namespace) -> int:
 
 def _name(refusal: SpoolRefusal) -> str:
     return one_line(refusal.name or "a frame")
-
-
-def _time(moment: datetime) -> str:
-    return moment.astimezone(UTC).strftime("%Y-%m-%d %H:%M:%SZ")
 
 
 def _sync(spool: Spool, options: argparse.Namespace) -> int:

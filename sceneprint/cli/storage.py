@@ -399,7 +399,10 @@ def run_restore(options: argparse.Namespace) -> int:
     archive: Path = options.archive
     with ended_by_signals():
         if options.verify_only:
-            snapshot, done = _verified(archive)
+            from sceneprint.maintenance.snapshot.restoration import verify_snapshot
+
+            with byte_progress("verify") as progress:
+                snapshot, done = verify_snapshot(archive, progress), "is complete"
         elif settings.database_url is not None:
             snapshot, done = _filled(archive, settings)
         else:
@@ -413,13 +416,6 @@ def run_restore(options: argparse.Namespace) -> int:
         "restored store to see whose they are."
     )
     return 1 if name_damaged(snapshot, advice) else 0
-
-
-def _verified(archive: Path) -> tuple[Snapshot, str]:
-    from sceneprint.maintenance.snapshot.restoration import verify_snapshot
-
-    with byte_progress("verify") as progress:
-        return verify_snapshot(archive, progress), "is complete"
 
 
 def _filled(archive: Path, settings: Settings) -> tuple[Snapshot, str]:

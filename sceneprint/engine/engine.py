@@ -201,9 +201,7 @@ class Engine:
         collect_deleted_blobs(self.store, blobs)
 
     def reencode(self, name: str, model: str | Path | Model) -> Map:
-        """Have a map signed with another model, to which it then switches; see
-        `map_lifecycle.begin_reencoding`.
-        """
+        """Have a map signed with another model; see `map_lifecycle.begin_reencoding`."""
         told = map_lifecycle.begin_reencoding(self.store, name, model)
         self.bell.ring()
         return told

@@ -219,9 +219,7 @@ def verdicts(
 
 
 def _drifted_so_far(edges: LoopEdges, run: RobotPath, p: CycleParameters) -> NDArray[np.bool_]:
-    """Which edges of a run lie no farther from its odometry than the way between their frames
-    allows.
-    """
+    """Which edges of a run lie as near its odometry as the way between their frames allows."""
     here, there = run.poses[edges.source], run.poses[edges.target]
     # where the run has the source, and where the edge puts it, in the run's frame
     put = there @ edges.transforms

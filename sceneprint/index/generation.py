@@ -193,15 +193,13 @@ def open_generation(
     open_ones = {} if known is None else {one.record: one for one in known.segments}
     segments = tuple(
         open_ones[record]
-        if record in open_ones and known is not None and _same(known.inodes, inodes, record)
+        if record in open_ones
+        and known is not None
+        and all(known.inodes[name] == inodes[name] for name, _ in record.files)
         else open_segment(folder, record, manifest.dimension)
         for record in manifest.segments
     )
     return Generation(manifest, segments, inodes)
-
-
-def _same(known: Mapping[str, int], inodes: Mapping[str, int], record: SegmentFiles) -> bool:
-    return all(known[name] == inodes[name] for name, _ in record.files)
 
 
 def _inode(path: Path) -> int:

@@ -130,7 +130,8 @@ class AnswerScene:
         ------
         UnknownQuery : the answer is not stored, or no longer.
         """
-        for map_name in _maps_of(answer):
+        named = dict.fromkeys(one.map for one in placed(answer.matches))
+        for map_name in answer.maps if len(answer.maps) == 1 else named:
             if map_name not in self._drawn:
                 self._draw_map(map_name, several=len(answer.maps) > 1)
         drawing = _Drawing(self._client, answer, name, camera, self._limits)
@@ -170,14 +171,6 @@ def short_name(frame_id: str, name: str | None = None) -> str:
 def placed(matches: Sequence[Match]) -> list[Match]:
     """Matches whose transform the evidence supports."""
     return [one for one in matches if one.validation.status in ("accepted", "ambiguous")]
-
-
-def _maps_of(answer: Answer) -> list[str]:
-    """The maps that an answer places something in; where only one was asked, that one."""
-    if len(answer.maps) == 1:
-        return answer.maps
-    named = [one.map for one in placed(answer.matches)]
-    return list(dict.fromkeys(named))
 
 
 class _Drawing:

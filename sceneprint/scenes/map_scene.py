@@ -196,9 +196,7 @@ def evenly_taken(runs: Sequence[PosedRun], most: int) -> list[tuple[str, str, Fl
 
 
 def placed_points(client: Client, map_name: str, frame_id: str, T: Floats, limit: int) -> Floats:
-    """At most so many points (N, 3) of a frame, moved by its pose; none where it is not indexed,
-    or was deleted meanwhile.
-    """
+    """At most so many points (N, 3) of an indexed frame, moved by its pose."""
     try:
         return moved(T, client.frame_points(map_name, frame_id, limit=limit).points)
     except (NotFound, NotIndexed):

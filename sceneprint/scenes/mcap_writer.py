@@ -169,7 +169,7 @@ class McapWriter:
         self._waiting.clear()
 
     def _write(self, entities: Sequence[SceneEntity], gone: Collection[SceneEntity]) -> None:
-        now = self._timestamp()
+        now = self._messages.Timestamp(*divmod(self._log_time, 1_000_000_000))
         for one in gone:
             self._frames.pop(one.path, None)
         self._write_frames(entities, now)
@@ -274,9 +274,7 @@ class McapWriter:
         return cloud
 
     def _frame_of(self, path: EntityPath) -> str:
-        """The frame that coordinates at a path are in: of the nearest placement above, or the
-        space.
-        """
+        """The frame of coordinates at a path: of the nearest placement above, or the space."""
         for end in range(len(path), 0, -1):
             if path[:end] in self._frames:
                 return self._frames[path[:end]]
@@ -295,10 +293,6 @@ class McapWriter:
             translation=self._vector(T[:3, 3]), rotation=self._quaternion(T),
         )  # fmt: skip
         return transform
-
-    def _timestamp(self) -> Timestamp:
-        seconds, nanoseconds = divmod(self._log_time, 1_000_000_000)
-        return self._messages.Timestamp(seconds, nanoseconds)
 
     def _vector(self, at: Floats) -> Vector3:
         x, y, z = at.tolist()

@@ -160,9 +160,7 @@ class SceneStream:
         self._there: dict[EntityPath, SceneEntity] = {}
 
     def write(self, moment: Moment) -> None:
-        """Add a moment; it takes the place of the one before, and not of what is there at all
-        times.
-        """
+        """Add a moment in the place of the one before; what is there at all times stays."""
         self.is_empty = False
         gone: list[SceneEntity] = []
         if moment.index is not None:

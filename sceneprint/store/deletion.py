@@ -307,9 +307,7 @@ def doom_found(connection: Connection, *found: Select[tuple[str]]) -> None:
 def doomed_blobs(
     connection: Connection, limit: int, before: float | None = None, after: str = ""
 ) -> list[str]:
-    """Blobs that are noted, at most so many after one of them; those noted before a time, if one
-    is given.
-    """
+    """Noted blobs, at most so many after one of them; with a time, those noted before it."""
     asked = select(doomed.c.blob).where(doomed.c.blob > after).order_by(doomed.c.blob).limit(limit)
     if before is not None:
         asked = asked.where(doomed.c.at < before)

@@ -461,9 +461,7 @@ def inherited(connection: Connection, name: str) -> dict[str, float | None]:
 
 
 def last_event(connection: Connection, name: str) -> int:
-    """Number of the last event of a map that is gone; of one that is not known, the least number
-    after which it has none.
-    """
+    """Number of the last event of a deleted map, or from which on it has none."""
     asked = select(former_maps.c.number).where(former_maps.c.name == name)
     found = connection.execute(asked).scalar()
     if found is not None:

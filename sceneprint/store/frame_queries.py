@@ -111,9 +111,7 @@ def passing(
 def _common_conditions(
     wanted: Filter | FrameListing | Run, tags: Sequence[str] = ()
 ) -> list[ColumnElement[bool]]:
-    """What must hold of robot, session, tags and time; of a column that is null, no comparison
-    does.
-    """
+    """Conditions on robot, session, tags and time; none holds of a column that is null."""
     c, found = frames.c, list[ColumnElement[bool]]()
     for column, names in ((c.robot, wanted.robot), (c.session, wanted.session)):
         if isinstance(names, str):
@@ -274,9 +272,7 @@ def _known_as(map_number: int, prefix: str) -> ColumnElement[bool]:
 
 
 def _begins(column: Column[Any], prefix: str) -> list[ColumnElement[bool]]:
-    """That a text begins so, as a range that an index serves: texts are in the order of their code
-    points on both databases.
-    """
+    """That a text begins so, as a range that an index of either database serves."""
     kept = prefix.rstrip(_LAST)
     if not kept:
         return [column >= prefix]
@@ -372,9 +368,7 @@ def list_runs(
 def count_run(
     connection: Connection, map_number: int, run: Run
 ) -> list[tuple[str | None, str | None, int]]:
-    """Robots, parent frames and numbers of the frames of a session; `run.parent_frame` does not
-    matter.
-    """
+    """Robots, parent frames and numbers of the frames of a session in any parent frame."""
     found = connection.execute(
         select(frames.c.robot, frames.c.pose_parent, func.count())
         .where(*_of_session(map_number, run))
@@ -543,9 +537,7 @@ def parents_of_session(connection: Connection, map_number: int, session: str) ->
 def posed_in_session(
     connection: Connection, map_number: int, session: str, parent: str
 ) -> list[int]:
-    """Numbers of a session's indexed frames with poses in a parent frame, in the order in which
-    they were taken.
-    """
+    """Numbers of a session's indexed frames with poses in a parent frame, as taken."""
     own = (*_posed_in(map_number, session), frames.c.pose_parent == parent)
     return list(
         connection.execute(select(frames.c.number).where(*own).order_by(*TAKEN_ORDER)).scalars()

@@ -109,9 +109,7 @@ def is_frame_id(connection: Connection, frame_id: str) -> bool:
 
 
 def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
-    """Those of some blobs, a thousand at most, that a frame which is there or a tombstone, a
-    signature, a job or a tile refers to.
-    """
+    """Those of at most a thousand blobs that a row of any kind refers to."""
     has_upload = or_(frames.c.state.not_in(ROOMLESS), frames.c.deletion.is_not(None))
     referring = (
         (frames.c.blob, has_upload),

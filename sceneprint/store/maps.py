@@ -412,9 +412,7 @@ def _pose_of_text(text: str) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class PlacedFrame:
-    """A posed frame: its number, T_parent_sensor (4, 4), the blob of its geometry, whether it is a
-    point cloud, and its tags.
-    """
+    """Number, T_parent_sensor (4, 4), geometry, kind (point cloud?) and tags of a posed frame."""
 
     number: int
     pose: Floats

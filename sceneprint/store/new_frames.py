@@ -180,9 +180,7 @@ def _received(connection: Connection, one: NewFrame) -> bool:
 
 @cache
 def _room_taken() -> ReturningUpdate[tuple[int]]:
-    """Count a frame more, if its map is the one that was looked at still, has room, and lacks the
-    content.
-    """
+    """Count one frame more, if its map is still the same, has room, and lacks the content."""
     number, size = bindparam("map_number", type_=WHOLE), bindparam("size", type_=WHOLE)
     content = bindparam("content", type_=TEXT)
     alike = frames.c.map_number == number, frames.c.content_id == content

@@ -356,9 +356,7 @@ def unpurged_frames(connection: Connection, numbers: set[int]) -> set[int]:
 
 
 def drop_answers(connection: Connection, numbers: Sequence[int]) -> list[str]:
-    """Remove stored answers, a few hundred at most, and queries that are not listed; returns the
-    ids of the answers.
-    """
+    """Remove at most a few hundred answers, and their unlisted queries; returns their ids."""
     own = among(connection, _c.number, numbers)
     stored = list(connection.execute(select(_c.id).where(own, _STORED)).scalars())
     connection.execute(delete(queries).where(own, ~_c.listed))

@@ -142,9 +142,7 @@ def signed_up_to(connection: Connection, row: MapRow, revision: int) -> list[int
 
 
 def touch(connection: Connection, row: MapRow, numbers: list[int]) -> None:
-    """Give indexed frames the next revisions of their map, so that an index that lacks them learns
-    of them.
-    """
+    """Give indexed frames the next revisions of their map, so that indexes learn of them."""
     for number in numbers:
         revision = next_revision(connection, row.number)
         connection.execute(

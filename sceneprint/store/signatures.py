@@ -301,9 +301,7 @@ def stored_vector(connection: Connection, number: int, model_id: str) -> bytes |
 def patch_counts(
     connection: Connection, number: int, model_id: str
 ) -> tuple[list[int], list[int]] | None:
-    """Patches and ordered pairs of each level that went into the signature of a frame, the finest
-    first; None where it has none.
-    """
+    """Patches and ordered pairs of each level of a signature, the finest first, if known."""
     asked = select(signatures.c.n_patches, signatures.c.n_pairs).where(
         signatures.c.frame_number == number, signatures.c.model_id == model_id
     )

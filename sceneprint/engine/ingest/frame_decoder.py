@@ -140,9 +140,7 @@ def _read_stored(data: bytes, row: FrameRow, decoder: Decoder) -> AnyFrame:
 
 
 def viewpoint_of(row: FrameRow) -> tuple[float, float, float] | None:
-    """Where a stored cloud was seen from, in its own coordinates; None where it has no such place,
-    and of a depth image.
-    """
+    """The viewpoint of a stored cloud in its coordinates; None of a depth image."""
     if row.cloud is None or row.cloud["viewpoint"] is None:
         return None
     x, y, z = row.cloud["viewpoint"]
@@ -150,9 +148,7 @@ def viewpoint_of(row: FrameRow) -> tuple[float, float, float] | None:
 
 
 def content_id(read: Read) -> str:
-    """Hash of what the geometry reads: samples in metres and camera, or points and viewpoint; not
-    how they were packed.
-    """
+    """Hash of samples and camera, or points and viewpoint; not of how they were packed."""
     if isinstance(read.frame, Cloud):
         viewpoint = None if read.cloud is None else read.cloud["viewpoint"]
         digest = hashlib.sha256(f"cloud {json.dumps(viewpoint)}\n".encode())

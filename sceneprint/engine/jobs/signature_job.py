@@ -275,9 +275,7 @@ def _replace_signature(store: Store, work: lifecycle.Work, made: StoredSignature
 
 @dataclass(frozen=True)
 class Look:
-    """The frame of a map that is nearest as of one revision, and how far its signature is; None in
-    an empty map.
-    """
+    """The nearest frame of a map as of a revision, and its distance; None in an empty map."""
 
     revision: int
     nearest: tuple[int, int] | None

@@ -45,8 +45,7 @@ from sceneprint_client.api import Job, JobState
 
 
 class Swept(StoreError):
-    """A deletion removed a file between its making and the commit that would have referred to it;
-    nothing was stored."""
+    """A deletion removed a file before the commit that would have referred to it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,7 +282,8 @@ class Tasks:
             else:
                 queue.go_on(connection, task.job, outcome.progress, outcome.after_s)
             self._check(outcome.files)
-            self._check_blobs(outcome.blobs)
+            if not all(map(self._store.blobs.holds, outcome.blobs)):
+                raise Swept("A deletion elsewhere swept the same bytes before they were stored.")
             # after the job: it may be gone, and nothing can be of one that is
             queue.append_items(connection, job.number, outcome.items)
             before = queue.files_of(connection, job.number)
@@ -300,11 +300,6 @@ class Tasks:
                 raise Swept(
                     f"A deletion elsewhere swept the same {one.name} before its job was stored."
                 )
-
-    def _check_blobs(self, blobs: Collection[str]) -> None:
-        for blob in blobs:
-            if not self._store.blobs.holds(blob):
-                raise Swept("A deletion elsewhere swept the same bytes before they were stored.")
 
     def _fail(self, task: LongJob, reason: str) -> JobState | None:
         try:

@@ -123,17 +123,19 @@ class CoverageJobs(MapJobs[MapCoverage]):
             job = self.find(connection, map_name, job_id)
 
             def made(at: int, block: Sequence[dict[str, Any]]) -> list[CoverageFrame]:
-                stops = stops_of(connection, _numbers(block))
+                named = {one for item in block for one in (item["frame"], *item["look_alikes"])}
+                stops = stops_of(connection, named)
                 return [
                     _frame_record(at + i, item, stops)
                     for i, item in enumerate(block)
                     if item["frame"] in stops and outcome in (None, item["outcome"])
                 ]
 
-            items, more = page_of_items(
-                cursor, limit, lambda at: _frame_items(connection, job, at, BLOCK), made,
-                lambda frame: frame.number,
-            )  # fmt: skip
+            def read(at: int) -> list[dict[str, Any]]:
+                left = BLOCK if job.result is None else max(job.result["frames"] - at, 0)
+                return items_of(connection, job.number, at, min(left, BLOCK))
+
+            items, more = page_of_items(cursor, limit, read, made, lambda frame: frame.number)
         return Page[CoverageFrame](items=items, next_cursor=more)
 
     def changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
@@ -205,20 +207,6 @@ def _plans(connection: Connection, job: JobRow) -> list[CoveragePlan]:
     """Plans of a job that has succeeded: the items behind those of its frames."""
     found = items_of(connection, job.number, (job.result or {})["frames"])
     return [CoveragePlan.model_validate(one) for one in found]
-
-
-def _frame_items(
-    connection: Connection, job: JobRow, first: int, limit: int
-) -> list[dict[str, Any]]:
-    """Items of queried frames, from number `first` on."""
-    if job.result is not None:
-        limit = max(min(limit, job.result["frames"] - first), 0)
-    return items_of(connection, job.number, first, limit)
-
-
-def _numbers(items: Sequence[dict[str, Any]]) -> set[int]:
-    """Numbers of the frames that items name."""
-    return {number for item in items for number in (item["frame"], *item["look_alikes"])}
 
 
 def _frame_record(number: int, item: dict[str, Any], stops: dict[int, PathFrame]) -> CoverageFrame:
@@ -413,9 +401,7 @@ def outcome_of(answer: Answer, stop: PathFrame, asked: NewMapCoverage) -> dict[s
 def _difference(
     pose: Transform | None, own: Floats | None, parent: str | None
 ) -> tuple[float, float] | None:
-    """Metres and radians between a pose that was found and a frame's own; None where they cannot
-    be compared.
-    """
+    """Metres and radians between a found pose and a frame's own, if they can be compared."""
     if pose is None or own is None or pose.parent_frame != parent:
         return None
     return difference(np.array(pose.matrix), own)

@@ -166,9 +166,7 @@ def _position_cursor(store: Store, last: FrameRow, wanted: FrameListing) -> str:
 
 
 def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> TakenPosition | None:
-    """The frame that a page before ended with; InvalidRequest for a cursor that no page of such a
-    list gave out.
-    """
+    """The last frame of the page before; InvalidRequest for a cursor of no such list."""
     if cursor is None:
         return None
     if wanted.order != "taken":
@@ -203,7 +201,9 @@ def list_sessions(store: Store, map_name: str, cursor: str | None, limit: int) -
         found = list_runs(connection, row.number, after, limit + 1)
     more = len(found) > limit
     items = [_session(run) for run in found[:limit]]
-    return Page[Session](items=items, next_cursor=_cursor(found[limit - 1]) if more else None)
+    last = found[limit - 1] if more else None
+    cursor = None if last is None else _packed([last.session or "", last.robot or ""])
+    return Page[Session](items=items, next_cursor=cursor)
 
 
 def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
@@ -314,10 +314,6 @@ def _session(run: Held) -> Session:
         parent_frames=[name for name, _ in run.parents.most_common(_MOST_NAMES)],
         tags=[name for name, _ in run.tags.most_common(_MOST_NAMES)],
     )
-
-
-def _cursor(run: Held) -> str:
-    return _packed([run.session or "", run.robot or ""])
 
 
 def _names_of(cursor: str) -> tuple[str, str]:

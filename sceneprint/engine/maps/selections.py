@@ -259,8 +259,10 @@ def edit_session(
             last = 0 if at is None else find_frame(connection, row, at).number
             numbers = session_frames(connection, row.number, session, robot, last, AT_ONCE)
             if numbers:
-                at = _edit_frames(connection, row, numbers, edit)
-                last = numbers[-1]
+                for number in numbers:
+                    frame = frame_of(connection, number)
+                    write_frame(connection, row, frame, _values(frame, edit))
+                at, last = frame.id, number
             left = count_session(connection, row.number, session, robot, last)
         done += len(numbers)
         if not left or time.monotonic() >= until:
@@ -271,14 +273,6 @@ def edit_session(
         map=row.name, session=edit.session or session, robot=edit.robot or robot, frames=done,
         remaining=left, last_frame_id=at if left else None,
     )  # fmt: skip
-
-
-def _edit_frames(connection: Connection, row: MapRow, numbers: list[int], edit: SessionEdit) -> str:
-    """Edit some frames; the id of the last."""
-    for number in numbers:
-        frame = frame_of(connection, number)
-        write_frame(connection, row, frame, _values(frame, edit))
-    return frame.id
 
 
 def _values(frame: FrameRow, edit: SessionEdit) -> dict[str, object]:

@@ -129,7 +129,8 @@ class Tombstones:
         while left and (not last or time.monotonic() < until):
             with self._store.database.write() as connection:
                 row = find_map(connection, map_name)
-                found = self._deletion(connection, row, deletion_id)
+                number = int(deletion_id) if _NUMBER.fullmatch(deletion_id) else 0
+                found = find_deletion(connection, row.number, self._seconds, number)
                 if found is None:
                     if not last:
                         raise _unknown_deletion(row, deletion_id)
@@ -179,10 +180,6 @@ class Tombstones:
             over = read_clock(connection) - self._seconds
             oldest = oldest_tombstones(connection, row.number)
         return [number for number, _, at in oldest if everything or at <= over]
-
-    def _deletion(self, connection: Connection, row: MapRow, deletion_id: str) -> Deletion | None:
-        number = int(deletion_id) if _NUMBER.fullmatch(deletion_id) else 0
-        return find_deletion(connection, row.number, self._seconds, number)
 
     def _record(self, one: Deletion) -> FrameDeletion:
         return FrameDeletion(

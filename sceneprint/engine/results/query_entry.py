@@ -200,9 +200,7 @@ def query_record(row: QueryRow, days: float, may_read: Callable[[str], bool]) ->
 
 
 def unknown_query(query_id: str) -> UnknownQuery:
-    """Return the error for an answer that never existed, has expired, or that the caller may not
-    see: the text is the same.
-    """
+    """Return the error for an answer that is not there, or that the caller may not see."""
     return UnknownQuery(
         f"There is no answer {query_id!r:.80}: it never existed, or it expired. Send the query "
         "again, without `keep=false`."

@@ -447,9 +447,7 @@ def _triples(rows: Floats) -> list[Triple]:
 
 
 class PointClouds:
-    """Points of frames, queries and matches as bytes that a page draws; see
-    `sceneprint.formats.export`.
-    """
+    """Points of frames, queries and matches as bytes; see `sceneprint.formats.export`."""
 
     def __init__(self, store: Store, signers: Signers, pairs: Pairs, query_log: QueryLog) -> None:
         self._store, self._signers, self._pairs, self._log = store, signers, pairs, query_log
@@ -457,9 +455,7 @@ class PointClouds:
     def frame(
         self, map_name: str, frame_id: str, within: CloudFrame = "optical", limit: int = LIMIT
     ) -> Output[bytes]:
-        """Points of a frame, with normals and patches. Parameters and errors as of
-        `FrameFiles.cloud`.
-        """
+        """Points, normals and patches of a frame; see `FrameFiles.cloud`."""
         found = find_indexed(self._store, map_name, frame_id)
         name, matrix = placed(found.frame, within)
 

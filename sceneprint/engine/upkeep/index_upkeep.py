@@ -167,7 +167,9 @@ class Upkeep:
         rows = [row for row in listed if self._has_index(row.model_id)]
         with self._store.database.read() as connection:
             due = [row for row in rows if self._due(connection, row)]
-        published = sum(self._tried(row) for row in due if self._is_ours(row))
+        # of maps that no other host was at a moment ago
+        now, elsewhere = time.monotonic(), self._elsewhere
+        published = sum(self._tried(row) for row in due if now >= elsewhere.get(row.number, 0.0))
         self._clean(listed)
         damaged = self._scrubber.step([index_folder(self._indexes, row) for row in rows])
         for row in rows:
@@ -230,10 +232,6 @@ class Upkeep:
         except (OSError, ValueError, UnusableStore, DamagedIndex) as error:
             log.error("index publication failed", extra={"map": row.name, "error": str(error)})
             return None
-
-    def _is_ours(self, row: MapRow) -> bool:
-        """Whether no other host was at a map's index a moment ago."""
-        return time.monotonic() >= self._elsewhere.get(row.number, 0.0)
 
     def _tried(self, row: MapRow, *, anyway: bool = False) -> bool:
         try:

@@ -136,9 +136,7 @@ def _spread(
     lies: Floats, places: Ints32, count: int, radius: float, n_flat: int, n_high: int,
     n_angles: int, weights: Floats, starts: Ints32,
 ) -> None:  # fmt: skip
-    """Weights (4, n) of patches in the bins of distance and height at a scale, and where these
-    start.
-    """
+    """Weights (4, n) of patches in bins of distance and height, and where these start."""
     flat, height, area = lies[1], lies[2], lies[5]
     for k in range(count):
         i = np.uint64(places[k])

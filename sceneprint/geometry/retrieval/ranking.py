@@ -410,7 +410,10 @@ def diversify(
         return Selection(np.empty(0, np.intp), np.empty(0))
     sigma = _sigma(among, p)
     omega = p.omega * float(to_query[-1] - to_query[0])
-    return _greedy(_log_quality(to_query, omega), among, sigma, min(k, n))
+    quality = _log_quality(to_query, omega)
+    taken, gains = greedy(quality, similar(among, sigma).__getitem__, min(k, n))
+    order = np.argsort(taken)
+    return Selection(taken[order], gains[order])
 
 
 def remaining(
@@ -448,13 +451,6 @@ def _log_quality(to_query: Floats, omega: float) -> Floats:
         return np.zeros(len(to_query))
     quality: Floats = (to_query[0] - to_query) / omega
     return quality
-
-
-def _greedy(log_quality: Floats, among: Floats, sigma: float, k: int) -> Selection:
-    similarity = similar(among, sigma)
-    taken, gains = greedy(log_quality, similarity.__getitem__, k)
-    order = np.argsort(taken)
-    return Selection(taken[order], gains[order])
 
 
 def similar(distances: Floats, sigma: float) -> Floats:

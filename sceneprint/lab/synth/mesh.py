@@ -426,14 +426,11 @@ def wall_mesh(wall: Wall, top: Ceiling) -> SyntheticMesh:
 
 def _lining(o: Opening) -> SyntheticMesh:
     """Sides and back of a recess, in the wall's frame (along, inward, up)."""
-    front = np.array([(u, 0.0, v) for u, v in _ring(o)])
+    ring = ((o.start, o.low), (o.end, o.low), (o.end, o.high), (o.start, o.high))
+    front = np.array([(u, 0.0, v) for u, v in ring])
     back = front - (0.0, o.deep, 0.0)
     sides = [np.stack([front[k - 1], front[k], back[k], back[k - 1]]) for k in range(4)]
     return join([_quads(sides), _quads([back]).with_loss(o.loss)])
-
-
-def _ring(o: Opening) -> list[tuple[float, float]]:
-    return [(o.start, o.low), (o.end, o.low), (o.end, o.high), (o.start, o.high)]
 
 
 def _quads(corners: list[Floats]) -> SyntheticMesh:

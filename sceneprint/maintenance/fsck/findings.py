@@ -105,7 +105,8 @@ class Folder:
         """Numbers of all frames that are looked at, in blocks; tells the progress of `subject`."""
         done, after = 0, 0
         with self.store.database.read() as connection:
-            own = self._map_number(connection)
+            named = self.map_name
+            own = None if named is None else find_map(connection, named).number
             here = [] if own is None else [frames.c.map_number == own]
             asked = select(func.count(frames.c.number)).where(*here)
             total = int(connection.execute(asked).scalar_one())
@@ -120,9 +121,6 @@ class Folder:
             yield block
             done, after = done + len(block), block[-1]
             self.progress(subject, done, max(total, done))
-
-    def _map_number(self, connection: Connection) -> int | None:
-        return None if self.map_name is None else find_map(connection, self.map_name).number
 
 
 def each(

@@ -156,7 +156,8 @@ def copy_server(database: Database, to: Path, written: Written) -> None:
     UnusableStore : it cannot be read to its end, or the file not be written.
     """
     try:
-        _make_empty(to)
+        url = URL.create("sqlite", database=str(to))
+        open_database(url.render_as_string(hide_password=False)).close()
         with closing(sqlite3.connect(to, isolation_level=None)) as file:
             # until it is whole nobody needs it: the archive that it becomes a part of is synced
             file.execute("PRAGMA journal_mode = OFF")
@@ -195,12 +196,6 @@ def rows_of_server(connection: Connection, form: Form) -> Iterator[Row]:
     with closing(connection.exec_driver_sql(form.of_server(), execution_options=options)) as found:
         while block := found.fetchmany(form.block):
             yield from block
-
-
-def _make_empty(path: Path) -> None:
-    open_database(
-        URL.create("sqlite", database=str(path)).render_as_string(hide_password=False)
-    ).close()
 
 
 def _without_indexes(file: sqlite3.Connection) -> list[str]:
