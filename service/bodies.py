@@ -475,6 +475,26 @@ async def read_json(request: Request) -> Any:
         raise MalformedBody(f"The body is not JSON ({error}). Send a JSON object.") from error
 
 
+async def read_json_object(
+    request: Request, what: str, types: Sequence[str], otherwise: str = ""
+) -> dict[str, Any]:
+    """A JSON object that is sent as one of some types; errors as of `read_record`.
+
+    FastAPI would read and parse all of it before it asks for a key.
+    """
+    if media_type(request) not in types:
+        raise UnsupportedType(
+            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
+            f"{' or '.join(types)}{otherwise}."
+        )
+    document = await read_json(request)
+    if not isinstance(document, dict):
+        raise InvalidRequest(
+            f"{what} is not a JSON object. See /docs for its fields.", (("", "not an object"),)
+        )
+    return document
+
+
 async def read_record(
     request: Request, kind: type[_Record], what: str, *, optional: bool = False
 ) -> _Record:
@@ -497,16 +517,8 @@ async def read_record(
         "transfer-encoding" not in headers
     ):  # fmt: skip
         return kind()
-    if media_type(request) != "application/json":
-        raise UnsupportedType(
-            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
-            f"application/json{', or no body' if optional else ''}."
-        )
-    document = await read_json(request)
-    if not isinstance(document, dict):
-        raise InvalidRequest(
-            f"{what} is not a JSON object. See /docs for its fields.", (("", "not an object"),)
-        )
+    types = ("application/json",)
+    document = await read_json_object(request, what, types, ", or no body" if optional else "")
     try:
         return kind.model_validate(document)
     except ValidationError as error:

@@ -9,13 +9,12 @@ from urllib.parse import quote
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 
 from sceneprint import __version__
 from sceneprint.engine import Engine
 from sceneprint.engine.admin import operations
 from sceneprint.engine.maps import map_lifecycle
-from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint.store.audit_log import AuditFilter
 from sceneprint.store.events import newest_number
 from sceneprint_client.api import Map, Page
@@ -30,8 +29,8 @@ from sceneprint_client.api.admin import (
     Stats,
 )
 from service.auth import Asking, Guest, Here, administers, may_admin, reads_every, v1_router
-from service.bodies import json_body, media_type, read_json
-from service.problems import declared, invalid
+from service.bodies import json_body, read_record
+from service.problems import declared
 
 router = APIRouter(tags=["operations"])
 
@@ -128,12 +127,7 @@ Limit = Annotated[int, Query(ge=1, le=1000)]
 )
 async def create_key(request: Request, here: Here, response: Response) -> MadeKey:
     """Make a key. Its secret is in this answer and nowhere else; a lost one is revoked."""
-    if media_type(request) != "application/json":
-        raise UnsupportedType(
-            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
-            "application/json."
-        )
-    new = _new(await read_json(request))
+    new = await read_record(request, NewKey, "The key")
     make = partial(here.engine.create_key, new.name, new.grants, new.expires_at, new.tenant)
     made = await here.run(make)
     response.headers["Location"] = f"/v1/keys/{quote(made.name, safe='')}"
@@ -215,18 +209,6 @@ def list_changes(
     return here.engine.audit.page(AuditFilter(actor, map_name, action), cursor, limit)
 
 
-def _new(given: object) -> NewKey:
-    if not isinstance(given, dict):
-        raise InvalidRequest(
-            "The key is not a JSON object. See /docs for its fields.",
-            (("", "not an object"),),
-        )
-    try:
-        return NewKey.model_validate(given)
-    except ValidationError as error:
-        raise invalid(error, "The key") from error
-
-
 # How the service does, what maps can be signed with, and changing that.
 
 operations_router = v1_router(tag="operations")
@@ -272,12 +254,7 @@ async def reencode(map_name: str, request: Request, here: Here, asking: Asking) 
     Queries go on with the model that the map has until then. `reencoding` of the map tells how
     far it is. Asked again, it tries again what broke down.
     """
-    if media_type(request) != "application/json":
-        raise UnsupportedType(
-            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
-            "application/json."
-        )
-    wanted = _wanted(await read_json(request))
+    wanted = await read_record(request, NewModel, "The model")
     may_read = None if asking.reads_every else partial(asking.may, "read")
     find = here.engine.operations.catalogue.find
     return await here.run(lambda: here.engine.reencode(map_name, find(wanted.model, may_read)))
@@ -291,15 +268,3 @@ async def reencode(map_name: str, request: Request, here: Here, asking: Asking) 
 def cancel_reencoding(map_name: str, here: Here) -> Map:
     """Let a map keep the model that it has; what was made for the other is removed."""
     return map_lifecycle.cancel_reencoding(here.engine.store, map_name)
-
-
-def _wanted(given: object) -> NewModel:
-    if not isinstance(given, dict):
-        raise InvalidRequest(
-            "The body is not a JSON object. Send one with the field `model`.",
-            (("", "not an object"),),
-        )
-    try:
-        return NewModel.model_validate(given)
-    except ValidationError as error:
-        raise invalid(error, "The model") from error

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request, Response
-from pydantic import ValidationError
 
 from sceneprint.engine.maps.map_lifecycle import edit_frame, edit_map
-from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint_client.api import Frame, Map, NewMap, Page
 from sceneprint_client.api.listing import OPERATORS
 from service.auth import Asking, Here, may_admin, may_read, may_write, v1_router
-from service.bodies import json_body, media_type, read_json
-from service.problems import declared, invalid
+from service.bodies import json_body, read_json_object, read_record
+from service.problems import declared
 from service.responses import expected
 
 router = v1_router("/maps", "maps")
@@ -29,13 +26,7 @@ router = v1_router("/maps", "maps")
 )
 async def create_map(request: Request, here: Here, asking: Asking, response: Response) -> Map:
     """Make a map. One that is there as wanted is answered with 200."""
-    # read by hand: FastAPI would read and parse all of it before it asks for a key
-    if media_type(request) != "application/json":
-        raise UnsupportedType(
-            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
-            "application/json."
-        )
-    new = _new(await read_json(request))
+    new = await read_record(request, NewMap, "The map")
     asking.require_new(new.name)
     if OPERATORS & new.model_fields_set:
         asking.require_every("admin")
@@ -66,18 +57,6 @@ def get_map(map_name: str, here: Here, response: Response) -> Map:
 def delete_map(map_name: str, here: Here) -> None:
     """Remove a map with all that is in it, for good."""
     here.engine.delete_map(map_name)
-
-
-def _new(given: object) -> NewMap:
-    if not isinstance(given, dict):
-        raise InvalidRequest(
-            "The map is not a JSON object. See /docs for its fields.",
-            (("", "not an object"),),
-        )
-    try:
-        return NewMap.model_validate(given)
-    except ValidationError as error:
-        raise invalid(error, "The map") from error
 
 
 # Metadata of frames and maps, edited.
@@ -123,7 +102,7 @@ async def patch_frame(
     map_name: str, frame_id: str, request: Request, here: Here, response: Response
 ) -> Frame:
     """Change the metadata of a frame (JSON merge patch, RFC 7396); filters see it at once."""
-    patch, tags = await _patch(request), expected(request)
+    patch, tags = await read_json_object(request, "The edit", _KINDS), expected(request)
     frame = await here.run(edit_frame, here.engine.store, map_name, frame_id, patch, tags)
     response.headers["ETag"] = f'"{frame.etag}"'
     return frame
@@ -144,25 +123,10 @@ async def patch_map(
 
     Quotas are the operator's: `quota_frames` and `quota_bytes` ask for `admin` for `*`.
     """
-    patch, tags = await _patch(request), expected(request)
+    patch, tags = await read_json_object(request, "The edit", _KINDS), expected(request)
     if OPERATORS & patch.keys():
         asking.require_every("admin")
     edit = partial(edit_map, here.engine.store, map_name, patch, tags, dry_run=dry_run)
     edited = await here.run(edit)
     response.headers["ETag"] = f'"{edited.etag}"'
     return edited
-
-
-async def _patch(request: Request) -> Mapping[str, Any]:
-    if media_type(request) not in _KINDS:
-        raise UnsupportedType(
-            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
-            f"{MERGE_PATCH} or application/json."
-        )
-    given = await read_json(request)
-    if not isinstance(given, dict):
-        raise InvalidRequest(
-            "The edit is not a JSON object. See /docs for its fields.",
-            (("", "not an object"),),
-        )
-    return given
