@@ -7,7 +7,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from datetime import timedelta
 from importlib import import_module
@@ -148,26 +148,25 @@ def _at_least(text: str, least: int) -> int:
     return number
 
 
-def positive_number(text: str) -> float:
-    """Return a number above 0."""
+def number_within(text: str, allowed: Callable[[float], bool], what: str) -> float:
+    """Return a number that is allowed, which NaN is not; `what` says which those are."""
     try:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not 0 < number < math.inf:  # false for NaN as well
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    if not allowed(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
     return number
+
+
+def positive_number(text: str) -> float:
+    """Return a number above 0."""
+    return number_within(text, lambda number: 0 < number < math.inf, "a number above 0")
 
 
 def metres(text: str) -> float:
     """A positive distance."""
-    try:
-        distance = float(text)
-    except ValueError:
-        distance = math.nan
-    if not 0 < distance <= 1e4:  # false for NaN as well
-        raise argparse.ArgumentTypeError(f"{text!r} is not a distance of up to 10000 m")
-    return distance
+    return number_within(text, lambda number: 0 < number <= 1e4, "a distance of up to 10000 m")
 
 
 _SECONDS = {"m": 60, "h": 3600, "d": 86400, "w": 7 * 86400}

@@ -13,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from sceneprint.cli import positive_number
+from sceneprint.cli import number_within, positive_number
 from sceneprint.cli.options import one_line
 from sceneprint.formats.dataset import FrameSequence, find_recordings, find_sequences
 from sceneprint.formats.recording import BagOutline, RecordingOptions, bag_outline
@@ -77,13 +77,7 @@ def add_recording_options(command: argparse.ArgumentParser) -> None:
 
 
 def _from_zero(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not 0 <= number < math.inf:  # false for NaN as well
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 up")
-    return number
+    return number_within(text, lambda number: 0 <= number < math.inf, "a number from 0 up")
 
 
 @contextmanager

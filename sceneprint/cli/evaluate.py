@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
-from sceneprint.cli import positive, positive_number, whole_number
+from sceneprint.cli import number_within, positive, positive_number, whole_number
 from sceneprint.cli.bag import add_recording_options, sequences_at
 from sceneprint.cli.options import add_judging_options, add_model_options, open_for
 from sceneprint.errors import DatasetError
@@ -162,13 +162,7 @@ def _add_method(command: argparse.ArgumentParser) -> None:
 
 def _share(text: str) -> float:
     """A number above 0, up to 1."""
-    try:
-        share = float(text)
-    except ValueError:
-        share = -1.0
-    if not 0 < share <= 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a share above 0, up to 1")
-    return share
+    return number_within(text, lambda number: 0 < number <= 1, "a share above 0, up to 1")
 
 
 def run_evaluate(options: argparse.Namespace) -> int:
@@ -440,13 +434,7 @@ def _frames(text: str) -> int:
 
 def _limit(text: str) -> float:
     """A number above 0, up to 180."""
-    try:
-        limit = float(text)
-    except ValueError:
-        limit = -1.0
-    if not 0 < limit <= 180:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0, up to 180")
-    return limit
+    return number_within(text, lambda number: 0 < number <= 180, "a number above 0, up to 180")
 
 
 def run_evaluate_pairs(options: argparse.Namespace) -> int:
