@@ -378,3 +378,12 @@ def _opened(
 def open_house() -> Callable[..., Any]:
     """Opens a service in a folder, on SQLite where no database is given, with some keys."""
     return _opened
+
+
+@pytest.fixture
+def house(request: Any, tmp_path: Path, store_url: str) -> Iterator[Any]:
+    """A service with the maps alpha and bravo, and with the keys of the test's module."""
+    with _opened(tmp_path, store_url, request.module.KEYS) as opened:
+        for name in ("alpha", "bravo"):
+            opened.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
+        yield opened

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from hashlib import sha256
 from typing import Any
-
-import pytest
 
 from sceneprint.engine.maps.map_copy import copy_tag, row_values
 from sceneprint.models import read_model
@@ -17,14 +14,6 @@ KEYS: dict[str, dict[str, Scope]] = {
     "boss": {"*": "admin"}, "reader": {"alpha": "read"}, "other": {"bravo": "admin"},
 }  # fmt: skip
 ALPHA = "/v1/maps/alpha"
-
-
-@pytest.fixture
-def house(tmp_path, store_url, open_house) -> Iterator[Any]:
-    with open_house(tmp_path, store_url, KEYS) as opened:
-        for name in ("alpha", "bravo"):
-            opened.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
-        yield opened
 
 
 def test_a_reader_copies_what_is_indexed_and_nothing_else(house, small_shots, refused):

@@ -6,10 +6,7 @@ On both databases; a service without workers, whose jobs are done here.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from typing import Any
-
-import pytest
 
 from sceneprint_client.api.admin import Scope
 
@@ -18,14 +15,6 @@ KEYS: dict[str, dict[str, Scope]] = {
     "both": {"alpha": "read", "bravo": "read"},
 }  # fmt: skip
 ALPHA = "/v1/maps/alpha"
-
-
-@pytest.fixture
-def house(tmp_path, store_url, open_house) -> Iterator[Any]:
-    with open_house(tmp_path, store_url, KEYS) as opened:
-        for name in ("alpha", "bravo"):
-            opened.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
-        yield opened
 
 
 def listed(house: Any, key: str, **params: Any) -> list[dict[str, Any]]:

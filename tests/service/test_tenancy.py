@@ -6,10 +6,8 @@ On both databases, over HTTP with keys; a service without workers, whose jobs ar
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
-
-import pytest
 
 from sceneprint_client.api.admin import Scope
 
@@ -17,14 +15,6 @@ KEYS: dict[str, dict[str, Scope]] = {
     "boss": {"*": "admin"}, "tenant": {"alpha": "admin", "later": "admin"},
     "robot": {"alpha": "write"}, "other": {"bravo": "admin"},
 }  # fmt: skip
-
-
-@pytest.fixture
-def house(tmp_path, store_url, open_house) -> Iterator[Any]:
-    with open_house(tmp_path, store_url, KEYS) as opened:
-        for name in ("alpha", "bravo"):
-            opened.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
-        yield opened
 
 
 def test_a_quota_is_the_operators(house, refused: Callable[..., dict[str, Any]]) -> None:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from sceneprint import cli
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.lab.evaluation.protocol import overlaps, view_of
 from sceneprint.lab.synth import KINECT, Room, render, synthesise_lookalike
@@ -35,15 +33,6 @@ from sceneprint.types import Floats, Intrinsics
 SEED = 5
 #: a Kinect's field of view in few samples
 SMALL = Intrinsics(160, 120, 146.25, 146.25, 79.5, 59.5)
-
-
-def run(*arguments: object, expect: int = 0) -> tuple[str, str]:
-    """What the command prints: its output and its errors."""
-    out, told = io.StringIO(), io.StringIO()
-    with redirect_stdout(out), redirect_stderr(told):
-        code = cli.main([str(one) for one in arguments])
-    assert code == expect, told.getvalue()
-    return out.getvalue(), told.getvalue()
 
 
 def turned(T: Floats, yaw: float) -> Floats:
@@ -175,9 +164,13 @@ def test_bays_repeat() -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("kind", "scenes"), [("object", 1), ("kitchens", 2)])
-def test_the_layout_is_read_back(kind: str, scenes: int, tmp_path: Path) -> None:
+def test_the_layout_is_read_back(
+    kind: str, scenes: int, tmp_path: Path, run_command: Callable[..., Any]
+) -> None:
     out = tmp_path / "sites"
-    said, _ = run("synth", out, "--lookalikes", kind, "--rooms", 1, "--views", 3, "--seed", SEED)
+    said, _ = run_command(
+        "synth", out, "--lookalikes", kind, "--rooms", 1, "--views", 3, "--seed", SEED
+    )
     assert f"1 sites of 3 queries in {out}" in said
     site = synthesise_lookalike(kind, SEED, 0, queries=3)
     found = find_sequences(out)
@@ -193,7 +186,9 @@ def test_the_layout_is_read_back(kind: str, scenes: int, tmp_path: Path) -> None
             np.testing.assert_allclose(back.pose, frame.pose, atol=1e-6)
 
 
-def test_lookalikes_have_paths_of_their_own(tmp_path: Path) -> None:
-    _, told = run("synth", tmp_path / "x", "--lookalikes", "object", "--path", expect=2)
+def test_lookalikes_have_paths_of_their_own(
+    tmp_path: Path, run_command: Callable[..., Any]
+) -> None:
+    _, told = run_command("synth", tmp_path / "x", "--lookalikes", "object", "--path", expect=2)
     assert "--lookalikes and --path: look-alike sites have paths of their own." in told
     assert not (tmp_path / "x").exists()

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import math
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from sceneprint import cli
 from sceneprint.cli.offline import LOOKALIKES
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.lab.synth import synthesise_lookalike_survey
@@ -40,15 +39,6 @@ SMALL = Spinning(rings=8, azimuth_step=0.05).perfect()
 
 def positions(clouds: tuple[object, ...]) -> Floats:
     return np.array([cloud.pose[:3, 3] for cloud in clouds])  # type: ignore[attr-defined]
-
-
-def run(*arguments: object, expect: int = 0) -> tuple[str, str]:
-    """What the command prints: its output and its errors."""
-    out, told = io.StringIO(), io.StringIO()
-    with redirect_stdout(out), redirect_stderr(told):
-        code = cli.main([str(one) for one in arguments])
-    assert code == expect, told.getvalue()
-    return out.getvalue(), told.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -202,9 +192,11 @@ def test_a_rosette_scans_as_a_spinning_scanner_does() -> None:
 @pytest.mark.parametrize(
     ("kind", "scenes"), [("bays", 1), pytest.param("absent", 2, marks=pytest.mark.thorough)]
 )
-def test_the_layout_is_read_back(kind: str, scenes: int, tmp_path: Path) -> None:
+def test_the_layout_is_read_back(
+    kind: str, scenes: int, tmp_path: Path, run_command: Callable[..., Any]
+) -> None:
     out = tmp_path / "sites"
-    said, _ = run("synth", out, "--lookalikes", kind, "--sensor", "lidar", "--rooms", 1,
+    said, _ = run_command("synth", out, "--lookalikes", kind, "--sensor", "lidar", "--rooms", 1,
                   "--views", 2, "--seed", SEED)  # fmt: skip
     assert f"1 sites of 2 queries in {out}" in said
     site = synthesise_lookalike_survey(kind, SEED, 0, queries=2)
@@ -220,7 +212,11 @@ def test_the_layout_is_read_back(kind: str, scenes: int, tmp_path: Path) -> None
         np.testing.assert_allclose(back.pose, clouds[1].pose, atol=1e-6)
 
 
-def test_a_kind_of_the_other_sensor_is_refused(tmp_path: Path) -> None:
-    _, told = run("synth", tmp_path / "x", "--lookalikes", "object", "--sensor", "lidar", expect=2)
+def test_a_kind_of_the_other_sensor_is_refused(
+    tmp_path: Path, run_command: Callable[..., Any]
+) -> None:
+    _, told = run_command(
+        "synth", tmp_path / "x", "--lookalikes", "object", "--sensor", "lidar", expect=2
+    )
     assert "--lookalikes object: there is no such kind for --sensor lidar. Choose from bays" in told
     assert not (tmp_path / "x").exists()
