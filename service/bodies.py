@@ -32,9 +32,16 @@ from sceneprint.errors import (
 from sceneprint.formats.depth_file import size_of
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint_client.api import FrameMeta
-from sceneprint_client.api.base import CloudFormat, novelty_of
+from sceneprint_client.api.base import novelty_of
 from sceneprint_client.api.frames import MOST_OF_BATCH, MOST_PRIORITY, Batch
-from sceneprint_client.files import HEAD, format_of
+from sceneprint_client.formats import (
+    HEAD,
+    CloudFormat,
+    format_of,
+    formats_of,
+    media_types_of,
+    titles_of,
+)
 from service.auth import Caller
 from service.limits import IN_MEMORY
 from service.problems import invalid
@@ -47,10 +54,7 @@ _Record = TypeVar("_Record", bound=BaseModel)
 # curl --data-binary @scan.ply -H 'Content-Type: application/ply' '...?robot=spot'
 
 #: Types of a body that is a frame; its first bytes decide which of them it is.
-TYPES = (
-    "image/png", "application/x-npy", "application/ply", "application/x-ros-pointcloud2",
-    "application/octet-stream",
-)  # fmt: skip
+TYPES = media_types_of("depth", "cloud")
 
 _CAMERA = ("fx", "fy", "cx", "cy", "width", "height", "distortion")
 _PLAIN = (
@@ -299,11 +303,9 @@ FRAME_BODY: dict[str, Any] = {
                     "frame": {
                         "type": "string",
                         "format": "binary",
-                        "description": "A depth image: 16-bit greyscale PNG in stored units (0 and "
-                        "65535 where missing), or a two-dimensional NPY: float in metres, or "
-                        "uint16 in stored units. Or a "
-                        "point cloud: PLY, PCD, LAS, LAZ, NPY of shape (N, 3), KITTI's .bin, or "
-                        "PointCloud2 as ROS 2 serialises it.",
+                        "description": "A depth image: "
+                        + ", ".join(f"{one.title} ({one.content})" for one in formats_of("depth"))
+                        + f". Or a point cloud: {titles_of('cloud', last='or')}.",
                     },
                     "meta": {"$ref": "#/components/schemas/FrameMeta"},
                 },

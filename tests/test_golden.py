@@ -26,6 +26,7 @@ from sceneprint.formats.dataset import make_frame
 from sceneprint.settings import Settings
 from sceneprint.types import DepthFrame, Floats, Intrinsics
 from service.app import create_app
+from tools.site.format_pages import formats_module, formats_page
 
 GOLDEN = Path(__file__).parent / "golden"
 UPDATE = os.environ.get("SCENEPRINT_UPDATE_GOLDEN") == "1"
@@ -70,6 +71,15 @@ def assert_golden(name: str, lines: Sequence[str]) -> None:
     """Assert that a file of tests/golden has exactly these lines."""
     kept = golden(name, lines)
     assert kept == lines, "\n".join(unified_diff(kept, lines, name, "now", n=0, lineterm=""))
+
+
+# The table of formats ---------------------------------------------------------------------------
+
+
+def test_formats_of_docs_and_dashboard() -> None:
+    assert_golden("../../docs/formats.md", formats_page().splitlines())
+    module = "../../service/dashboard/pages/frames/formats.js"
+    assert_golden(module, formats_module().splitlines())
 
 
 # The document of the API ------------------------------------------------------------------------

@@ -1,7 +1,6 @@
-"""Files of frames: read up to a limit, and told apart by their first bytes or their names.
+"""Files of frames: their content up to a limit, headers of NPY files, and messages of ROS 2.
 
 path  --read_bytes | read_text | read_object-->  content
-bytes  --format_of-->  CloudFormat
 bytes  --npy_header-->  NpyHeader: type, shape, order, where the numbers begin
 bytes  --read_point_cloud-->  SerializedCloud
 """
@@ -10,18 +9,17 @@ from __future__ import annotations
 
 import ast
 import json
-import re
 import stat
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
-from sceneprint_client.api.base import MAXIMUM_SAMPLES, CloudFormat
+from sceneprint_client.api.base import MAXIMUM_SAMPLES
 from sceneprint_client.errors import FrameError, SceneprintError, UnreadableCloud
 
 #: Bytes that are read at once.
@@ -114,13 +112,9 @@ def data_lines(text: str) -> Iterator[tuple[int, str]]:
             yield number, content
 
 
-# Which format a file has.
-
 #: Longest files of a depth image and of points that are read, bytes.
 MAXIMUM_IMAGE_BYTES = 8 * MAXIMUM_SAMPLES + 65_536
 MAXIMUM_CLOUD_BYTES = 512 << 20
-#: First bytes of a file that tell what it is.
-HEAD = 10_016
 
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -210,66 +204,7 @@ def _dtype(
     return np.dtype(described)
 
 
-PLY_SIGNATURE = b"ply"
 LAS_SIGNATURE = b"LASF"
-_PCD_BEGINNING = re.compile(rb"(?:VERSION|FIELDS|COLUMNS)[ \t]")
-_BLANK_LINES = re.compile(rb"[\r\n]*")
-_LONGEST_COMMENT = 200  #: bytes, of a line before the header
-_MAXIMUM_PCD_HEADER = 65_536  #: bytes
-
-#: Suffixes of file names, in lower case. A .npy may be a depth image as well: its shape tells.
-SUFFIXES: dict[str, CloudFormat] = {
-    ".ply": "ply", ".pcd": "pcd", ".bin": "kitti", ".npy": "npy", ".las": "las", ".laz": "las",
-    ".cdr": "pointcloud2",
-}  # fmt: skip
-
-
-#: Suffixes of recordings of ROS, whose messages are many frames.
-RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
-#: Suffixes of files of other systems that hold frames with poses: E57, Record3D, RTAB-Map.
-EXPORT_SUFFIXES = (".e57", ".r3d", ".db")
-
-
-def format_of(data: bytes) -> CloudFormat | None:
-    """What the first bytes of a file tell, or None; a KITTI scan has nothing that tells it.
-
-    Parameters
-    ----------
-    data : the file, or its first 10,016 bytes
-    """
-    if data.startswith(NPY_SIGNATURE):
-        try:
-            header = npy_header(data, UnreadableCloud, "", "")
-        except UnreadableCloud:
-            return None
-        return "npy" if header.shape[1] in (3, 4) else None
-    if data[: len(PLY_SIGNATURE) + 1] in (b"ply\n", b"ply\r", b"ply "):
-        return "ply"
-    if data.startswith(LAS_SIGNATURE):
-        return "las"
-    if is_point_cloud(data):
-        return "pointcloud2"
-    return "pcd" if is_pcd(data) else None
-
-
-def is_pcd(data: bytes) -> bool:
-    """Whether a file begins as PCD files do."""
-    head, at = data[:_MAXIMUM_PCD_HEADER], 0
-    while (found := _BLANK_LINES.match(head, at)) is not None:
-        at = found.end()
-        if head[at : at + 1] != b"#":
-            break
-        end = head.find(b"\n", at, at + _LONGEST_COMMENT + 2)
-        if end < 0:
-            return False
-        at = end + 1
-    return _PCD_BEGINNING.match(head, at) is not None
-
-
-def is_cloud(file: str) -> bool:
-    """Whether a file of that name holds points whatever is beside it; a .npy may be depth."""
-    suffix = PurePath(file).suffix.lower()
-    return suffix in SUFFIXES and suffix != ".npy"
 
 
 # Messages of ROS 2 as its middleware serialises them: PointCloud2 in CDR, of either byte order.
@@ -315,24 +250,6 @@ class SerializedCloud:
     point_step: int
     row_step: int
     data: memoryview
-
-
-def is_point_cloud(head: bytes) -> bool:
-    """Whether a file begins as a serialised PointCloud2 with x, y and z does.
-
-    Parameters
-    ----------
-    head : the file, or its first 10,016 bytes
-    """
-    if not _is_encapsulated(head):
-        return False
-    try:
-        reader = _Reader(head)
-        _read_header(reader)
-        names = [one.name for one in _read_fields(reader)]
-    except UnreadableCloud:
-        return False
-    return {"x", "y", "z"} <= set(names)
 
 
 def read_point_cloud(data: bytes) -> SerializedCloud:

@@ -35,17 +35,12 @@ from sceneprint_client.errors import (
     UnreadableFrame,
 )
 from sceneprint_client.files import (
-    EXPORT_SUFFIXES,
-    HEAD,
     MAXIMUM_CLOUD_BYTES,
     MAXIMUM_IMAGE_BYTES,
-    RECORDING_SUFFIXES,
-    SUFFIXES,
-    format_of,
-    is_cloud,
     naming,
     read_bytes,
 )
+from sceneprint_client.formats import HEAD, format_named, format_of, is_cloud
 from sceneprint_client.sidecars import (
     CLOUDS_FILE,
     Camera,
@@ -130,8 +125,7 @@ class FrameFile:
     @property
     def row(self) -> tuple[str, ...] | None:
         """Names of the values of a row, of a .bin file whose rows are described."""
-        is_kitti = SUFFIXES.get(self.path.suffix.lower()) == "kitti"
-        return self.cloud.row if self.cloud is not None and is_kitti else None
+        return self.cloud.row if self.cloud is not None and is_kitti(self.path) else None
 
     @property
     def pose(self) -> NDArray[np.float64] | None:
@@ -193,6 +187,12 @@ def find_pose_file(folder: Path, stem: str) -> Path | None:
     for place in [folder, folder.parent] if "depth" in folder.name.lower() else [folder]:
         found += [place / below / one for below in POSE_FOLDERS for one in listed]
     return next((one for one in found if one.is_file()), None)
+
+
+def is_kitti(path: Path) -> bool:
+    """Return whether a file is a KITTI scan by its name, which alone shows it."""
+    found = format_named(path.name, "cloud")
+    return found is not None and found.name == "kitti"
 
 
 def _is_npy_of_points(file: Path) -> bool:
@@ -329,7 +329,7 @@ def _of_cloud(reference: FrameFile) -> dict[str, Any]:
     file_format = source.file_format
     if reference.row is not None:
         file_format = None  # it is sent as NPY, whose content says so
-    elif file_format is None and SUFFIXES.get(reference.path.suffix.lower()) == "kitti":
+    elif file_format is None and is_kitti(reference.path):
         file_format = "kitti"
     known: dict[str, Any] = {"format": file_format, "units_per_metre": source.units_per_metre}
     if source.viewpoint is None:
@@ -541,15 +541,12 @@ def _named(path: Path) -> FrameFile:
     file = path.resolve() if ".." in path.parts else path.absolute()
     if not file.is_file():
         raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
-    if file.suffix.lower() in RECORDING_SUFFIXES:
+    several = format_named(file.name, "recording", "capture")
+    if several is not None:
         raise DatasetError(
-            f"{path}: This is a recording of ROS, and one frame is wanted. Upload it with "
-            "`sceneprint upload`, or send the frames that sceneprint.find_sequences returns."
-        )
-    if file.suffix.lower() in EXPORT_SUFFIXES:
-        raise DatasetError(
-            f"{path}: The file may hold several frames, and one is wanted. Upload it with "
-            "`sceneprint upload`, or send the frames that sceneprint.find_sequences returns."
+            f"{path}: The file ({several.title}) may hold several frames, and one is wanted. "
+            "Upload it with `sceneprint upload`, or send the frames that "
+            "sceneprint.find_sequences returns."
         )
     return find_frame_file(file)
 

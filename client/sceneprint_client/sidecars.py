@@ -16,9 +16,10 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint_client.api.base import CloudFormat, Intrinsics
+from sceneprint_client.api.base import Intrinsics
 from sceneprint_client.errors import DatasetError, InvalidIntrinsics, InvalidPose
 from sceneprint_client.files import naming, read_object, read_text
+from sceneprint_client.formats import CloudFormat
 from sceneprint_client.poses import TOLERANCE, rigid_transform
 
 #: A place, metres, or a direction.

@@ -17,6 +17,7 @@ from sceneprint.cli import number_within, positive_number
 from sceneprint.cli.options import one_line
 from sceneprint.formats.dataset import FrameSequence, find_recordings, find_sequences
 from sceneprint.formats.recording import BagOutline, RecordingOptions, bag_outline
+from sceneprint_client.formats import titles_of
 from sceneprint_client.frame_files import meta_of
 from sceneprint_client.sidecars import Camera
 
@@ -26,7 +27,7 @@ _DEFAULT = RecordingOptions()
 def add_recording_options(command: argparse.ArgumentParser) -> None:
     """`--topic` and its like."""
     group = command.add_argument_group(
-        "recordings of ROS", "for .mcap, .db3 and .bag files and rosbag2 folders"
+        "recordings of ROS", f"for {titles_of('recording', last='or')} files, and rosbag2 folders"
     )
     group.add_argument(
         "--topic", metavar="NAME", help="topic of depth images or points (default: the only one)"

@@ -28,7 +28,7 @@ from sceneprint_client.api.frames import (
     camera_fields,
     offset_fields,
 )
-from sceneprint_client.files import is_cloud
+from sceneprint_client.formats import is_cloud, titles_of
 
 if TYPE_CHECKING:
     from sceneprint.cli.upload import Tally
@@ -195,7 +195,7 @@ def add_map_options(command: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--as-map",
         action="store_true",
-        help="PATH is a cloud or mesh of a whole place (PCD, PLY, LAS, LAZ, OBJ, STL, glTF, E57): "
+        help=f"PATH is a cloud or mesh of a whole place ({titles_of('map', last='or')}): "
         "views of it are rendered, and become the frames of the map. --up takes the axis of the "
         "file that points up: x, y, z or, as in --up=-y, its opposite",
     )

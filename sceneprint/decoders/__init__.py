@@ -14,7 +14,7 @@ from typing import Protocol
 
 from sceneprint.formats.depth_file import Samples, decode_samples
 from sceneprint.formats.points.cloud import ReadPoints, read_points
-from sceneprint_client.api.base import CloudFormat
+from sceneprint_client.formats import CloudFormat
 from sceneprint_client.sidecars import Position, Unsaid
 
 

@@ -30,6 +30,7 @@ from sceneprint.formats.depth_file import decode_samples, encode_npy, encode_png
 from sceneprint.formats.points import pcd, ply, rows
 from sceneprint.formats.points.cloud import read_points
 from sceneprint.geometry.kernel import Kernel
+from sceneprint_client.formats import formats_of, function_at
 from sceneprint_client.sidecars import UNSAID
 
 #: Bytes of the shared memory: the largest upload; arrays that are made of it are smaller.
@@ -129,6 +130,8 @@ def load_decoders(kernels: bool) -> None:
         decode_samples(data)
     for data, form in array_samples():
         read_points(data, form, UNSAID, 1.0)
+    for one in formats_of("depth", "cloud"):
+        function_at(one.reader)
     with suppress(ImportError):  # an extra; a LAZ file says what is missing
         import lazrs  # noqa: F401
     for wrong in (b"\x89PNG\r\n\x1a\n" + bytes(40), b"\x93NUMPY\x01\x00\x02\x00{}", b"no image"):

@@ -38,8 +38,8 @@ from sceneprint.formats.points.cloud import FARTHEST_M, ReadPoints
 from sceneprint.formats.points.rows import MAXIMUM_POINTS
 from sceneprint.turns import ThreadTurns
 from sceneprint.types import MAXIMUM_SAMPLES, Floats32
-from sceneprint_client.api.base import CloudFormat
 from sceneprint_client.files import MAXIMUM_IMAGE_BYTES
+from sceneprint_client.formats import CloudFormat
 from sceneprint_client.sidecars import Position, Unsaid
 
 log = logging.getLogger(__name__)

@@ -32,7 +32,8 @@ from sceneprint.formats.surface_file.reading import (
     surface_format,
 )
 from sceneprint.types import Floats, Floats32, Ints32, ReferenceSurface
-from sceneprint_client.files import HEAD, naming
+from sceneprint_client.files import naming
+from sceneprint_client.formats import HEAD
 
 _PROGRAM = "sceneprint.decoders.surface_process"
 #: Most notes of a file, and characters of one.

@@ -41,7 +41,8 @@ from sceneprint.formats.dataset.sequences import find_each
 from sceneprint.formats.exports.nerfstudio import TRANSFORMS, ScaledNpy
 from sceneprint.formats.exports.polycam import CAMERAS
 from sceneprint.formats.exports.record3d import DEPTH_SUFFIX, FRAMES
-from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, MAXIMUM_IMAGE_BYTES, is_cloud
+from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, MAXIMUM_IMAGE_BYTES
+from sceneprint_client.formats import is_cloud, titles_of
 from sceneprint_client.frame_files import POSE_FOLDERS, rows_as_npy
 from sceneprint_client.sidecars import CLOUDS_FILE, INTRINSICS_FILE
 
@@ -655,8 +656,8 @@ def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iter
             raise UnreadableArchive(
                 "There is no depth image or cloud in the archive, or only in archives within it. "
                 "Pack a 7-Scenes scene or sequence, a TUM RGB-D folder (depth.txt), or a folder of "
-                "16-bit PNG or float NPY images, with its intrinsics.json; one of PLY, PCD, "
-                "KITTI .bin, LAS or LAZ clouds; or an export of Polycam or nerfstudio."
+                f"depth images ({titles_of('depth')}) with its intrinsics.json; one of clouds "
+                f"({titles_of('cloud')}); or an export of Polycam or nerfstudio."
             )
         yield archive
 

@@ -32,6 +32,7 @@ from sceneprint_client.files import (
     npy_header,
     read_bytes,
 )
+from sceneprint_client.formats import format_at, function_at, titles_of
 from sceneprint_client.poses import rigid_transform
 from sceneprint_client.ros_messages import TRANSPORT_BYTES, inverse_depth
 
@@ -63,13 +64,7 @@ def decode_png(data: bytes) -> NDArray[np.uint16]:
     UnreadableFrame : the file is empty, damaged, truncated, animated, too large, or has
         another kind of pixels.
     """
-    if not data:
-        raise UnreadableFrame("The file is empty. Copy or write it again.")
-    if len(data) > MAXIMUM_IMAGE_BYTES:
-        raise UnreadableFrame(
-            f"The file has {len(data)} bytes, the limit is {MAXIMUM_IMAGE_BYTES}. "
-            "Send the image at a lower resolution."
-        )
+    check_length(data)
     if not data.startswith(PNG_SIGNATURE):
         raise UnreadableFrame("This is no PNG. Write the depth as a 16-bit greyscale PNG.")
 
@@ -91,6 +86,25 @@ def decode_png(data: bytes) -> NDArray[np.uint16]:
                 "Write it as a plain PNG."
             )
     return _samples(header, _inflate(bytes(pixels), header))
+
+
+def check_length(data: bytes) -> None:
+    """Refuse a file that is empty or too long for a depth image."""
+    if not data:
+        raise UnreadableFrame("The file is empty. Copy or write it again.")
+    if len(data) > MAXIMUM_IMAGE_BYTES:
+        raise UnreadableFrame(
+            f"The file has {len(data)} bytes, the limit is {MAXIMUM_IMAGE_BYTES}. "
+            "Send the image at a lower resolution."
+        )
+
+
+def png_size(head: bytes) -> tuple[int, int]:
+    """Return the width and height of a PNG; UnreadableFrame if its header is cut off."""
+    if len(head) < 24:
+        raise UnreadableFrame(_TRUNCATED)
+    width, height = struct.unpack_from(">II", head, 16)
+    return width, height
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
@@ -229,13 +243,13 @@ _A = (1.0, 1e8)
 _DEEPEST_M = (0.1, 1e3)
 
 
-def has_transport_header(data: bytes) -> bool:
-    """Whether bytes are the data of a compressedDepth message, of which a PNG is the rest."""
-    return data.startswith(PNG_SIGNATURE, TRANSPORT_BYTES)
+def transported_size(head: bytes) -> tuple[int, int]:
+    """Return the width and height of the PNG in a compressedDepth message; as `png_size`."""
+    return png_size(head[TRANSPORT_BYTES:])
 
 
-def _decode_transported(data: bytes) -> Samples:
-    """Samples of a 16UC1 image as they are, metres of one of 32FC1, by what the header says."""
+def decode_transported(data: bytes) -> Samples:
+    """Return the samples of a 16UC1 image, or the metres of one of 32FC1, as its header says."""
     samples = decode_png(data[TRANSPORT_BYTES:])
     a, b = struct.unpack_from("<ff", data, 4)
     # of 16UC1 images the transport leaves these numbers unset: most often zero, or tiny
@@ -279,13 +293,7 @@ def decode_npy(data: bytes) -> Samples:
     UnreadableFrame : the file is empty, no NPY, too large, of another type or shape, holds
         Python objects, or its size contradicts its header.
     """
-    if not data:
-        raise UnreadableFrame("The file is empty. Copy or write it again.")
-    if len(data) > MAXIMUM_IMAGE_BYTES:
-        raise UnreadableFrame(
-            f"The file has {len(data)} bytes, the limit is {MAXIMUM_IMAGE_BYTES}. "
-            "Send the image at a lower resolution."
-        )
+    check_length(data)
     if not data.startswith(NPY_SIGNATURE):
         raise UnreadableFrame("This is no NPY file. Write the depth with numpy.save.")
     header = _header(data)
@@ -305,8 +313,10 @@ def decode_npy(data: bytes) -> Samples:
         return np.array(samples, dtype=np.float32, order="C")
 
 
-def image_size(head: bytes) -> tuple[int, int]:
-    """Width and height that the header of an NPY file tells; UnreadableFrame if it is none."""
+def npy_size(head: bytes) -> tuple[int, int]:
+    """Return the width and height that the header of an NPY file announces; UnreadableFrame if it
+    is no depth image.
+    """
     height, width = _header(head).shape
     return width, height
 
@@ -399,7 +409,7 @@ def read_frame(
     name: str = "",
     pose: Floats | None = None,
 ) -> DepthFrame:
-    """Return the frame of a PNG or NPY file; its content tells which, not its name.
+    """Return the frame of a depth image; its content shows the format, not its name.
 
     Parameters
     ----------
@@ -428,7 +438,7 @@ def decode_frame(
     pose: Floats | None = None,
     samples_of: Callable[[bytes], Samples] | None = None,
 ) -> DepthFrame:
-    """Return the frame of the bytes of a PNG or NPY file.
+    """Return the frame of the bytes of a depth image.
 
     Parameters
     ----------
@@ -437,8 +447,7 @@ def decode_frame(
 
     Raises
     ------
-    UnreadableFrame : neither PNG nor NPY; and as `decode_png`, `decode_npy`, `check_depth` and
-        `make_frame`.
+    UnreadableFrame : as `decode_samples`, `check_depth` and `make_frame`.
     """
     with naming(name):
         samples = (samples_of or decode_samples)(data)
@@ -450,25 +459,21 @@ def decode_frame(
 
 
 def decode_samples(data: bytes) -> Samples:
-    """Return the samples (H, W) of a PNG, NPY or compressedDepth image: uint16 in stored units, or
-    float32 metres.
+    """Return the samples (H, W) of a depth image: uint16 in stored units, or float32 metres.
 
     Raises
     ------
-    UnreadableFrame : none of these; and as `decode_png` and `decode_npy`.
+    UnreadableFrame : its first bytes show no format of depth; and as the reader of its format.
     """
-    if not data:
-        raise UnreadableFrame("The file is empty. Copy or write it again.")
-    if data.startswith(PNG_SIGNATURE):
-        return decode_png(data)
-    if data.startswith(NPY_SIGNATURE):
-        return decode_npy(data)
-    if has_transport_header(data):
-        return _decode_transported(data)
-    raise UnreadableFrame(
-        "This is neither PNG nor NPY. Write the depth as a 16-bit greyscale PNG, or as a "
-        "float32 array in metres or a uint16 array in stored units with numpy.save."
-    )
+    check_length(data)
+    found = format_at(data, "depth")
+    if found is None:
+        raise UnreadableFrame(
+            f"This is none of {titles_of('depth')}. Write the depth as a 16-bit greyscale PNG, or "
+            "as a float32 array in metres or a uint16 array in stored units with numpy.save."
+        )
+    samples: Samples = function_at(found.reader)(data)
+    return samples
 
 
 def _metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
@@ -504,20 +509,14 @@ def _metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
 
 
 def size_of(head: bytes) -> tuple[int, int] | None:
-    """Width and height of the image of a PNG or NPY file, pixels; None where it is neither.
-
-    Parameters
-    ----------
-    head : first HEAD bytes of the file (sceneprint_client.files): of a PNG 24 are enough
+    """Return the width and height of a depth image by its first `HEAD` bytes; None if they do not
+    show them.
     """
-    if has_transport_header(head):
-        head = head[TRANSPORT_BYTES:]
-    if head.startswith(PNG_SIGNATURE) and len(head) >= 24:
-        width, height = struct.unpack_from(">II", head, 16)
-        return width, height
-    if head.startswith(NPY_SIGNATURE):
-        try:
-            return image_size(head)
-        except UnreadableFrame:  # whoever decodes it says why
-            pass
-    return None
+    found = format_at(head, "depth")
+    if found is None:
+        return None
+    try:
+        size: tuple[int, int] = function_at(found.size)(head)
+    except UnreadableFrame:  # whoever decodes it says why
+        return None
+    return size

@@ -8,12 +8,10 @@ from typing import Annotated
 from fastapi import Depends, Query, Request, Response
 
 from sceneprint.engine.maps.map_frames import (
-    BYTES,
     JSON,
     NPY,
     PLY,
     PNG,
-    POINTCLOUD2,
     Output,
     upload_type,
 )
@@ -29,7 +27,7 @@ from sceneprint_client.api.results import (
     PointsSide,
     View,
 )
-from sceneprint_client.files import HEAD
+from sceneprint_client.formats import BYTES, HEAD, media_types_of
 from service.auth import Asking, Context, Here, may_read, v1_router
 from service.responses import (
     file_responses,
@@ -126,7 +124,6 @@ async def get_patches(map_name: str, frame_id: str, request: Request, here: Here
     "/signature",
     response_class=Response,
     responses=file_responses(
-        BYTES,
         NPY,
         model=FrameSignature,
         description="By Accept: JSON with the bytes as base64, the bytes, or an NPY file.",
@@ -148,7 +145,7 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
 @router.get(
     "/upload",
     response_class=Response,
-    responses=files((PNG, NPY, PLY, POINTCLOUD2, BYTES), "Byte for byte as it came.", 409),
+    responses=files(media_types_of("depth", "cloud"), "Byte for byte as it came.", 409),
 )
 async def get_upload(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """The frame's upload: what you sent in is yours to take out."""
@@ -166,7 +163,7 @@ def _upload(request: Request, here: Context, found: Output[bytes], frame_id: str
         with suppress(FileNotFoundError):
             with blobs.open(blob) as file:
                 kind, suffix = upload_type(file.read(HEAD))
-            name = safe(f"{frame_id}.{suffix}")
+            name = safe(f"{frame_id}{suffix}")
             return send_file(request, lambda: blobs.open(blob), kind, found.tag, name)
     found.make()  # says what is wrong with it
     raise DamagedBlob(f"The upload of frame {frame_id} was restored just now. Try again.")

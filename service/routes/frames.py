@@ -28,6 +28,7 @@ from sceneprint_client.api.frames import (
     offset_fields,
 )
 from sceneprint_client.api.listing import FramePage
+from sceneprint_client.formats import media_types_of
 from service import bodies
 from service.auth import Asking, Caller, Context, Here, may_read, may_write, v1_router
 from service.bodies import (
@@ -281,10 +282,7 @@ async def _settled(
 imports_router = v1_router("/maps/{map_name}/imports", "imports")
 
 #: Types of a body that is an archive; its first bytes decide what it is.
-TYPES = (
-    "application/zip", "application/x-tar", "application/gzip", "application/x-bzip2",
-    "application/x-xz", "application/octet-stream",
-)  # fmt: skip
+TYPES = media_types_of("archive")
 #: Bytes that are written at once.
 _CHUNK = 1 << 20
 _TEXTS = (

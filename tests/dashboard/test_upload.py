@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import zipfile
@@ -13,6 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import FilePayload, Locator, Page, Response, expect
+
+from sceneprint.decoders.child_process import array_samples, text_samples
+from sceneprint.formats.depth_file import encode_npy
 
 LENS = {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0}
 
@@ -55,6 +59,38 @@ def open_upload(page: Page, station: Any, name: str, settle: Callable[[Page], No
     page.goto(f"{station.home}#/maps/{name}/upload")
     settle(page)
     return page.locator("input[name=files]")
+
+
+def test_the_page_recognises_the_formats_of_the_table(
+    page: Page, station: Any, settle: Callable[[Page], None]
+) -> None:
+    page.goto(f"{station.home}#/")
+    settle(page)
+    script = """async ([url, name, data]) => {
+        const { kindOf } = await import(url);
+        const bytes = Uint8Array.from(atob(data), (one) => one.charCodeAt(0));
+        return kindOf(new File([bytes], name));
+    }"""
+
+    def kind_of(name: str, data: bytes) -> dict[str, Any]:
+        url = f"{station.url}/dashboard/frames/kinds.js"
+        text = base64.b64encode(data).decode()
+        found: dict[str, Any] = page.evaluate(script, [url, name, text])
+        return found
+
+    size = {"width": 64, "height": 48}
+    pfm = b"Pf\n64 48\n-1\n" + bytes(4 * 64 * 48)
+    images = [("png", wall(0)), ("npy", encode_npy(np.ones((48, 64), np.uint16))), ("pfm", pfm)]
+    for name, data in images:
+        assert kind_of("a", data) == {"kind": "depth", "format": name, **size}
+    for data, name in (*array_samples(), *text_samples()):
+        file = "a.bin" if name == "kitti" else "a"
+        assert kind_of(file, data) == {"kind": "cloud", "format": name}
+    assert kind_of("a", b"ASTM-E57") == {"kind": "map", "format": "e57"}
+    assert kind_of("a.obj", b"v 0 0 0") == {"kind": "map", "format": "obj"}
+    assert kind_of("a", b"PK\3\4")["kind"] == kind_of("a.tar.gz", b"")["kind"] == "archive"
+    assert kind_of("a.png", b"")["kind"] == "depth"
+    assert kind_of("a.exe", b"MZ") == {"kind": "other"}
 
 
 def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(

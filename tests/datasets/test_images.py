@@ -79,7 +79,7 @@ def test_read_frame_by_content(tmp_path: Path) -> None:
         (b"", "empty"),
         (depth_file.PNG_SIGNATURE, "ends early"),
         (b"\x93NUMPY", "header"),
-        (b"P5", "neither"),
+        (b"P5", "none of PNG"),
     ],
 )
 def test_errors_of_a_file_name_it_on_one_line(data: bytes, message: str, tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_what_is_no_file(tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(UnreadableFrame, match="cannot be read"):
         read_frame(Path("nul\0.png"), CAMERA)
     (tmp_path / "a.jpg").write_bytes(b"\xff\xd8\xff\xe0JFIF")
-    with pytest.raises(UnreadableFrame, match=r"a\.jpg: .*neither PNG nor NPY"):
+    with pytest.raises(UnreadableFrame, match=r"a\.jpg: .*none of PNG, NPY"):
         read_frame(tmp_path / "a.jpg", CAMERA)
     with (tmp_path / "huge.png").open("wb") as file:
         file.truncate(10**12)  # sparse

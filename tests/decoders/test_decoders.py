@@ -246,3 +246,5 @@ def test_samples_come_back_in_the_size_of_a_large_image(pool: DecoderPool) -> No
     with pool.place() as slot:
         assert np.array_equal(slot.samples(encode_png(depth)), depth)
         assert slot.samples(_images()[0]).shape == (2, 2)
+        pfm = b"Pf\n2 2\n-1\n" + np.arange(4, dtype="<f4").tobytes()
+        np.testing.assert_array_equal(slot.samples(pfm), [[2, 3], [0, 1]])

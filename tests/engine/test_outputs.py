@@ -140,10 +140,10 @@ def test_a_signature_is_that_of_the_library(full: Engine, ids: Ids, prepared: Pr
 def test_an_upload_is_had_back_as_it_came(full: Engine, ids: Ids, uploads: Any) -> None:
     for name, sent in zip(ids(full), uploads, strict=True):
         assert full.outputs.upload("hall", name).make() == sent.data
-    assert upload_type(uploads[0].data) == ("image/png", "png")
+    assert upload_type(uploads[0].data) == ("image/png", ".png")
     buffer = io.BytesIO()
     np.save(buffer, uploads[0].frame.depth)
-    assert upload_type(buffer.getvalue()) == ("application/x-npy", "npy")
+    assert upload_type(buffer.getvalue()) == ("application/x-npy", ".npy")
 
 
 def every_output(engine: Engine, name: str) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Reader as Ros1Reader
 
 from sceneprint.errors import DatasetError, UnreadableFrame
 from sceneprint.formats.dataset import find_sequences
@@ -227,6 +228,48 @@ def test_images_that_are_no_depth_are_named(tmp_path: Path, ros: SimpleNamespace
     assert "Images are /camera/color/image_raw ('rgb8'), /metres ('32FC1; png" in str(caught.value)
     with pytest.raises(DatasetError, match=r"/metres .* has no depth images"):
         find_sequences(path, RecordingOptions(topic="/metres"))
+
+
+def mcap_of(bag: Path, profile: str) -> bytes:
+    """Return the messages of a ROS 1 bag in MCAP, without an index, as its specification says."""
+
+    def text(value: str) -> bytes:
+        return struct.pack("<I", len(value)) + value.encode()
+
+    def record(kind: int, content: bytes) -> bytes:
+        return struct.pack("<BQ", kind, len(content)) + content
+
+    magic = b"\x89MCAP0\r\n"
+    data = magic + record(1, text(profile) + text("by hand"))
+    with Ros1Reader(bag) as reader:
+        for one in reader.connections:
+            name = one.msgtype.replace("/msg/", "/")
+            data += record(
+                3, struct.pack("<H", one.id + 1) + text(name) + text("ros1msg") + text("")
+            )
+            channel = struct.pack("<HH", one.id + 1, one.id + 1)
+            data += record(4, channel + text(one.topic) + text("ros1") + text(""))
+        for one, log_ns, body in reader.messages():
+            data += record(5, struct.pack("<HIQQ", one.id + 1, 0, log_ns, log_ns) + bytes(body))
+    return data + record(15, bytes(4)) + record(2, bytes(20)) + magic
+
+
+@pytest.mark.parametrize("profile", ["ros1", ""])
+def test_messages_of_ros_1_in_mcap(tmp_path: Path, ros: SimpleNamespace, profile: str) -> None:
+    def fill(writer: Any) -> None:
+        for t in (0.0, 1.0):
+            writer.camera_info(t)
+            writer.image(t, IMAGE)
+
+    bag = ros.write(tmp_path, fill, "ros1")
+    path = tmp_path / "other" / "run.mcap"
+    path.parent.mkdir()
+    path.write_bytes(mcap_of(bag, profile))
+    (expected,), (found,) = find_sequences(bag, ALL), find_sequences(path, ALL)
+    assert [one.timestamp for one in found.frames] == [one.timestamp for one in expected.frames]
+    assert found.frames[0].camera == expected.frames[0].camera
+    for one in found.frames:
+        np.testing.assert_array_equal(one.read_depth().depth, np.float32(2))
 
 
 def test_an_mcap_without_a_profile(tmp_path: Path, ros: SimpleNamespace) -> None:

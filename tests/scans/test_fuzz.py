@@ -11,7 +11,7 @@ import pytest
 
 from sceneprint.errors import FrameError
 from sceneprint.formats.points import decode_scan
-from sceneprint_client.api.base import CloudFormat
+from sceneprint_client.formats import CloudFormat
 
 Write = Callable[..., bytes]
 

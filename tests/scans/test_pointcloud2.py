@@ -13,7 +13,7 @@ import pytest
 
 from sceneprint.errors import FrameError, UnreadableCloud, UselessFrame
 from sceneprint.formats.points import decode_scan, format_of
-from sceneprint_client.files import is_point_cloud, read_point_cloud
+from sceneprint_client.files import read_point_cloud
 from sceneprint_client.ros_messages import cloud_points
 
 NAME = "sensor_msgs/msg/PointCloud2"
@@ -102,9 +102,9 @@ def test_other_files_are_no_clouds(serialize: Any, points: np.ndarray) -> None:
     flat = serialize(np.zeros(3, [("x", "<f4"), ("y", "<f4")]))
     empty = (b"", b"\0", b"\0\1\0\0", bytes(16), bytes(4096), b"\0\1\0\0" * 4)
     for other in (*empty, data[4:], flat):
-        assert not is_point_cloud(other)
+        assert format_of(other) is None
     kitti = np.hstack([points, np.ones((len(points), 1))]).astype("<f4").tobytes()
-    assert not is_point_cloud(kitti)
+    assert format_of(kitti) is None
     with pytest.raises(UnreadableCloud, match="This is no KITTI scan"):
         decode_scan(data, file_format="kitti")
 

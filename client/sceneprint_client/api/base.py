@@ -24,6 +24,7 @@ from pydantic import (
 )
 
 from sceneprint_client.errors import InvalidIntrinsics, InvalidRequest
+from sceneprint_client.formats import CloudFormat
 
 if sys.version_info >= (3, 11):
     from enum import StrEnum
@@ -367,8 +368,6 @@ MOST_TAGS = 32
 MOST_SEQUENCE = 2**53 - 1
 #: Place of a frame within its session.
 Place = Annotated[int, Field(ge=0, le=MOST_SEQUENCE)]
-#: How files of clouds are packed; all but KITTI's say so themselves.
-CloudFormat = Literal["ply", "pcd", "kitti", "npy", "las", "pointcloud2"]
 
 Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
 

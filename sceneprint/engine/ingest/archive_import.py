@@ -47,7 +47,7 @@ from sceneprint.types import Intrinsics
 from sceneprint_client.api import FrameState, Job, Page
 from sceneprint_client.api.base import GivenDirection
 from sceneprint_client.api.frames import ImportItem, ImportOptions
-from sceneprint_client.files import HEAD
+from sceneprint_client.formats import HEAD
 from sceneprint_client.frame_files import meta_of
 
 # Frames of an archive into a map, some at a time; what is wrong with one costs no other.

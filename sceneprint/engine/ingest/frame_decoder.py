@@ -17,14 +17,14 @@ from sceneprint import errors
 from sceneprint.decoders import Decoder, Decoders
 from sceneprint.errors import InvalidPose
 from sceneprint.formats.dataset import decode_frame, rigid_transform
-from sceneprint.formats.depth_file import has_transport_header
 from sceneprint.formats.points import UNSAID, decode_cloud, decode_scan, format_of
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import AnyFrame, Cloud, Floats, Intrinsics
 from sceneprint_client.api import CameraIntrinsics, FrameMeta
-from sceneprint_client.api.base import CloudFormat, GivenBase, GivenTransform
+from sceneprint_client.api.base import GivenBase, GivenTransform
 from sceneprint_client.api.frames import Kind
 from sceneprint_client.files import naming
+from sceneprint_client.formats import CloudFormat, format_at, titles_of
 from sceneprint_client.poses import rotation_of
 
 #: What the coordinates of a cloud as they were sent are called, where its viewpoint is elsewhere.
@@ -279,7 +279,7 @@ def _refuse(meta: FrameMeta, kind: str, defaults: dict[str, object]) -> None:
 
 def _without_camera(data: bytes) -> errors.SceneprintError:
     """Why an upload without intrinsics is not read."""
-    if data.startswith((b"\x89PNG", b"\x93NUMPY")) or has_transport_header(data):
+    if format_at(data, "depth") is not None:
         return errors.InvalidRequest(
             "The frame is a depth image, but its intrinsics are missing. Send width, height, "
             "fx, fy, cx and cy of the camera. If it is a point cloud as NPY, give it the shape "
@@ -289,8 +289,8 @@ def _without_camera(data: bytes) -> errors.SceneprintError:
     if not data:
         return errors.UnreadableFrame("The file is empty. Write it again.")
     return errors.UnreadableFrame(
-        "The file is neither a depth image (PNG or NPY) nor a point cloud (PLY, PCD, LAS, LAZ, "
-        "NPY, or PointCloud2 in CDR). For a KITTI file, set format=kitti."
+        f"The file is neither a depth image ({titles_of('depth', last='or')}) nor a point cloud "
+        f"({titles_of('cloud', last='or')}). For a KITTI file, set format=kitti."
     )
 
 

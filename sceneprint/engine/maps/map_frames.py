@@ -44,7 +44,7 @@ from sceneprint_client.api import Frame, FrameState, Page
 from sceneprint_client.api.base import MOST_SEQUENCE
 from sceneprint_client.api.listing import FrameListing, Run, Session, Trajectory
 from sceneprint_client.api.results import CloudFrame, FramePatches, FrameSignature, PatchLevel, View
-from sceneprint_client.files import is_point_cloud
+from sceneprint_client.formats import BYTES, format_at
 
 # An indexed frame as it was found, with what its map's model made of it.
 
@@ -341,16 +341,7 @@ def _unpacked(text: str) -> Any:
 
 T = TypeVar("T")
 
-PLY, PNG, NPY, BYTES, JSON = (
-    "application/ply", "image/png", "application/x-npy", "application/octet-stream",
-    "application/json",
-)  # fmt: skip
-POINTCLOUD2 = "application/x-ros-pointcloud2"
-#: How uploads begin, their media types, and what their names end with.
-_UPLOADS = (
-    (b"\x89PNG", PNG, "png"), (b"\x93NUMPY", NPY, "npy"), (b"ply", PLY, "ply"),
-    (b"# .PCD", BYTES, "pcd"), (b"VERSION", BYTES, "pcd"), (b"LASF", BYTES, "las"),
-)  # fmt: skip
+PLY, PNG, NPY, JSON = "application/ply", "image/png", "application/x-npy", "application/json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,11 +361,11 @@ class Output(Generic[T]):
 
 
 def upload_type(data: bytes) -> tuple[str, str]:
-    """Media type of an upload, and what its name ends with."""
-    for magic, media_type, suffix in _UPLOADS:
-        if data.startswith(magic):
-            return media_type, suffix
-    return (POINTCLOUD2, "cdr") if is_point_cloud(data) else (BYTES, "bin")
+    """Return the media type of an upload, and the suffix of its name."""
+    found = format_at(data, "depth", "cloud")
+    if found is None:  # a KITTI scan
+        return BYTES, ".bin"
+    return found.media_type, next(iter(found.suffixes), ".bin")
 
 
 def level_of(patches: Patches) -> PatchLevel:

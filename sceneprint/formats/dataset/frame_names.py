@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import re
 
+from sceneprint_client.formats import format_named
+
 #: What depth was aligned with, and the name of RGB-D data sets: nothing here says "no depth".
 _OF_DEPTH = re.compile(
     r"rgbd|rgb[-_]d(?![a-z])|(colou?r|rgb)_?aligned_?depth|depth_?(colou?r|rgb)_?aligned"
@@ -33,7 +35,7 @@ def is_beside_depth(name: str) -> bool:
 
 def is_image(file: str) -> bool:
     """Return whether the name of a file is that of an image that depth could be stored in."""
-    return file.lower().endswith((".png", ".npy"))
+    return format_named(file, "depth") is not None
 
 
 def is_depth(file: str) -> bool:

@@ -12,10 +12,10 @@ import numpy as np
 
 from sceneprint.errors import DatasetError, InvalidPose, UnreadableCloud
 from sceneprint.formats.depth_file import decode_frame
-from sceneprint.formats.points import SUFFIXES, Scan, decode_scan
+from sceneprint.formats.points import Scan, decode_scan
 from sceneprint.types import AnyFrame, DepthFrame, Floats
 from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, data_lines, naming, read_bytes, read_text
-from sceneprint_client.frame_files import FrameFile
+from sceneprint_client.frame_files import FrameFile, is_kitti
 from sceneprint_client.poses import SensorTrajectory
 from sceneprint_client.sidecars import CloudSource
 
@@ -76,9 +76,7 @@ def read_cloud(
         file.
     """
     data = read_bytes(path, MAXIMUM_CLOUD_BYTES, UnreadableCloud)
-    told = source.file_format
-    if told is None and SUFFIXES.get(path.suffix.lower()) == "kitti":
-        told = "kitti"  # the one that its content does not tell
+    told = source.file_format or ("kitti" if is_kitti(path) else None)
     with naming(str(path)):
         scan = decode_scan(
             data,
@@ -102,7 +100,7 @@ class Layout(Enum):
     TUM = "TUM RGB-D"
     #: Depth files of any name, PNG or NPY, in natural order; poses as `find_pose_file` finds them.
     PLAIN = "plain"
-    #: Files of points (PLY, PCD, KITTI .bin, LAS, LAZ) of any name; poses likewise.
+    #: Files of points (any format of clouds) of any name; poses likewise.
     CLOUDS = "clouds"
     #: Messages of a recording of ROS; poses of its transforms.
     RECORDING = "recording"

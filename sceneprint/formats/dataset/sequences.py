@@ -35,7 +35,8 @@ from sceneprint.formats.dataset.frame_reference import (
     read_trajectory,
 )
 from sceneprint.types import Floats, Floats32
-from sceneprint_client.files import RECORDING_SUFFIXES, data_lines, is_cloud, read_text
+from sceneprint_client.files import data_lines, read_text
+from sceneprint_client.formats import format_named, is_cloud, titles_of
 from sceneprint_client.frame_files import (
     NO_POSE_FILE,
     SEVEN_SCENES,
@@ -273,7 +274,7 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 
 def _may_be_cloud(file: str) -> bool:
-    return is_cloud(file) or file.lower().endswith(".npy")
+    return format_named(file, "cloud") is not None
 
 
 _DEPTH = 4  #: folders below the one given that are looked into
@@ -294,13 +295,12 @@ def find_sequences(
     """Return the sequences at a path or up to 4 folders below it; no frame is read.
 
     Understood are a 7-Scenes sequence or scene (with TrainSplit.txt, TestSplit.txt), a TUM
-    RGB-D folder, a folder of depth images (PNG or NPY), a folder of point clouds (PLY, PCD, KITTI
-    .bin, LAS, LAZ; NPY beside a clouds.json), one depth image or cloud, and folders of these. Files
-    and folders whose names say colour, infrared, confidence or labels are left out, and a note
-    names them. Clouds in a folder seq-01 that such a split file names are a sequence of a 7-Scenes
-    scene as well. A sequence is named by its place below the path, or by its own folder where that
-    is the path. A recording of ROS (.mcap, .db3, .bag, a rosbag2 folder) is one sequence, named
-    after it, or one for each part between which its stamps go back; so is each of a folder of
+    RGB-D folder, a folder of depth images, a folder of point clouds (NPY beside a clouds.json), one
+    depth image or cloud, and folders of these. Files and folders whose names say colour, infrared,
+    confidence or labels are left out, and a note names them. Clouds in a folder seq-01 that such a
+    split file names are a sequence of a 7-Scenes scene as well. A sequence is named by its place
+    below the path, or by its own folder where that is the path. A recording of ROS is one sequence,
+    named after it, or one for each part between which its stamps go back; so is each of a folder of
     recordings. Files and folders of other systems (RTAB-Map, E57, Polycam, Record3D, nerfstudio)
     are sequences too.
 
@@ -345,10 +345,10 @@ def find_sequences(
             f"{path}: There is no depth image or cloud here or up to {_DEPTH} folders below"
             f"{note and f' ({note})'}. Name "
             "a 7-Scenes scene or sequence (frame-000000.depth.png), a TUM RGB-D folder "
-            "(depth.txt), a folder of 16-bit PNG or float NPY depth images, one of PLY, PCD, "
-            "KITTI .bin, LAS or LAZ clouds, one such file, recordings of ROS (.mcap, .db3 or "
-            ".bag files, rosbag2 folders), an RTAB-Map database (.db), E57, or an export of "
-            "Polycam, Record3D or nerfstudio."
+            f"(depth.txt), a folder of depth images ({titles_of('depth')}), one of clouds "
+            f"({titles_of('cloud')}), one such file, recordings of ROS "
+            f"({titles_of('recording')}), a file of {titles_of('capture', last='or')}, or an "
+            "export of Polycam, Record3D or nerfstudio."
         )
     _check_parent_frames(found)
     return (replace(found[0], note="; ".join(filter(None, (found[0].note, note)))), *found[1:])
@@ -507,7 +507,7 @@ def _recordings_in(folder: Path, files: list[str], folders: list[str]) -> list[s
     """Names of the recordings of ROS among the files and folders of a folder."""
     from sceneprint.formats.recording import is_recording
 
-    found = [name for name in files if name.lower().endswith(RECORDING_SUFFIXES)]
+    found = [name for name in files if format_named(name, "recording")]
     found += [name for name in folders if is_recording(folder / name)]
     return sorted(found, key=natural)
 

@@ -10,10 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sceneprint.formats.dataset.frame_reference import FrameSequence, Layout
-from sceneprint.formats.exports import e57_scans, record3d
+from sceneprint.formats.exports import record3d
 from sceneprint.formats.exports.nerfstudio import TRANSFORMS, nerfstudio_sequence
 from sceneprint.formats.exports.polycam import is_polycam, polycam_sequence
 from sceneprint.formats.exports.rtabmap import is_rtabmap, rtabmap_sequences
+from sceneprint_client.formats import format_named, function_at
 from sceneprint_client.sidecars import INTRINSICS_FILE
 
 _OF_FOLDER: dict[Layout, Callable[[Path, str], FrameSequence]] = {
@@ -21,16 +22,12 @@ _OF_FOLDER: dict[Layout, Callable[[Path, str], FrameSequence]] = {
     Layout.NERFSTUDIO: nerfstudio_sequence,
     Layout.RECORD3D: record3d.record3d_sequence,
 }
-#: Suffixes of files that are always exports; an RTAB-Map database shows by its head.
-_OF_SUFFIX: dict[str, Callable[[Path, str], FrameSequence]] = {
-    e57_scans.SUFFIX: e57_scans.e57_sequence,
-    record3d.SUFFIX: record3d.record3d_sequence,
-}
 
 
 def is_export(path: Path) -> bool:
     """Return whether a path is one file that another system wrote, with frames in it."""
-    return path.suffix.lower() in _OF_SUFFIX or is_rtabmap(path)
+    found = format_named(path.name, "capture")
+    return found is not None and (found.name != "rtabmap" or is_rtabmap(path))
 
 
 def file_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, ...]:
@@ -46,8 +43,11 @@ def file_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, 
     DatasetError : the file is damaged, of a version that is not read, or holds no frame.
     """
     name = name or path.stem
-    read = _OF_SUFFIX.get(path.suffix.lower())
-    return rtabmap_sequences(path, name) if read is None else (read(path, name),)
+    found = format_named(path.name, "capture")
+    if found is None or found.name == "rtabmap":
+        return rtabmap_sequences(path, name)
+    sequence: FrameSequence = function_at(found.reader)(path, name)
+    return (sequence,)
 
 
 def folder_layout(folder: Path, files: list[str], folders: list[str]) -> Layout | None:

@@ -23,7 +23,6 @@ from sceneprint.formats.points.e57 import E57Scan, read_e57, with_viewpoint
 from sceneprint_client.files import naming
 from sceneprint_client.sidecars import CloudSource
 
-SUFFIX = ".e57"
 #: Farthest that a point may be from its scanner, metres; scanners write sky beyond.
 _FARTHEST_M = 5_000.0
 

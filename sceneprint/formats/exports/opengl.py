@@ -23,7 +23,7 @@ from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequ
 from sceneprint.formats.depth_file import size_of
 from sceneprint.types import Floats, Intrinsics
 from sceneprint_client.errors import printable
-from sceneprint_client.files import HEAD
+from sceneprint_client.formats import HEAD, titles_of
 from sceneprint_client.poses import rigid_transform
 from sceneprint_client.sidecars import Camera, Position
 
@@ -91,7 +91,7 @@ def depth_size(path: Path) -> tuple[int, int]:
 
     Raises
     ------
-    UnreadableFrame : the file cannot be read, or is neither PNG nor NPY.
+    UnreadableFrame : the file cannot be read, or is of no format of depth.
     """
     try:
         with path.open("rb") as file:
@@ -102,7 +102,7 @@ def depth_size(path: Path) -> tuple[int, int]:
         ) from cause
     size = size_of(head)
     if size is None or 0 in size:
-        raise UnreadableFrame(f"{path.name}: This is neither PNG nor NPY. Copy it again.")
+        raise UnreadableFrame(f"{path.name}: This is none of {titles_of('depth')}. Copy it again.")
     return size
 
 

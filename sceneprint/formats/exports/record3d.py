@@ -48,7 +48,6 @@ from sceneprint_client.files import naming, read_bytes
 from sceneprint_client.poses import rotation_of
 
 METADATA, FRAMES, DEPTH_SUFFIX = "metadata", "rgbd", ".depth"
-SUFFIX = ".r3d"
 _MAXIMUM_METADATA_BYTES = 64 << 20
 _MOST_FRAMES = 100_000
 _REMEDY = "In Record3D, export the capture as .r3d (shareable internal format)."

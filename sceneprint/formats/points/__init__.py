@@ -8,11 +8,10 @@ from sceneprint.formats.points.cloud import (
     decode_cloud,
     decode_scan,
 )
-from sceneprint_client.files import SUFFIXES, format_of
+from sceneprint_client.formats import format_of
 from sceneprint_client.sidecars import UNSAID, Unsaid
 
 __all__ = [
-    "SUFFIXES",
     "UNSAID",
     "Scan",
     "Unsaid",

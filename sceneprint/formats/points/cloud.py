@@ -17,21 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableCloud, UselessFrame
-from sceneprint.formats.points.las import read_las
-from sceneprint.formats.points.pcd import read_pcd
-from sceneprint.formats.points.ply import read_ply
 from sceneprint.formats.points.rows import MAXIMUM_POINTS, FileBytes, FilePoints, check_count, steps
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Cloud, Floats, Floats32
-from sceneprint_client.api.base import CloudFormat
 from sceneprint_client.files import (
-    HEAD,
     MAXIMUM_CLOUD_BYTES,
     NPY_SIGNATURE,
-    format_of,
     naming,
     npy_header,
     read_point_cloud,
+)
+from sceneprint_client.formats import (
+    HEAD,
+    CloudFormat,
+    format_of,
+    formats_of,
+    function_at,
+    titles_of,
 )
 from sceneprint_client.poses import rigid_transform
 from sceneprint_client.ros_messages import cloud_blocks, cloud_table
@@ -220,14 +222,7 @@ FARTHEST_M = 10_000.0
 #: Farthest that a viewpoint may be from the origin of its file, metres: half round the Earth.
 _FARTHEST_VIEWPOINT_M = 2e7
 
-_READERS = {
-    "ply": read_ply,
-    "pcd": read_pcd,
-    "kitti": read_kitti,
-    "npy": read_npy,
-    "las": read_las,
-    "pointcloud2": read_pointcloud2,
-}
+_READERS = {one.name: one.reader for one in formats_of("cloud")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,7 +295,7 @@ def decode_scan(
     pose: Floats | None = None,
     points_of: PointsOf | None = None,
 ) -> Scan:
-    """Return the cloud of a PLY, PCD, KITTI, NPY, LAS or LAZ file, or of a PointCloud2 in CDR.
+    """Return the cloud of a file's bytes, and how it was read.
 
     Parameters
     ----------
@@ -369,7 +364,7 @@ def read_points(
     units_per_metre: float,
 ) -> ReadPoints:
     """Read the points of a file; parameters and errors as of `decode_scan`, of a known format."""
-    raw = _READERS[file_format](data)
+    raw: FilePoints = function_at(_READERS[file_format])(data)
     place = _place(viewpoint, raw, units_per_metre)
     # lengths were checked: a header of twenty million points has bytes for them
     points = _from(raw, place or (0.0, 0.0, 0.0), units_per_metre)
@@ -391,9 +386,8 @@ def _format(data: bytes, told: CloudFormat | None) -> CloudFormat:
         raise UnreadableCloud("The file is empty. Copy or write it again.")
     if told is None and found is None:
         raise UnreadableCloud(
-            "This is none of PLY, PCD, LAS, LAZ, NPY of shape (N, 3) or (N, 4) and PointCloud2 in "
-            "CDR, by its first bytes. Write one of these; for a KITTI scan (.bin), say kitti as "
-            "its format."
+            f"This is none of {titles_of('cloud')} by its first bytes. Write one of these; for a "
+            "KITTI scan, say kitti as its format."
         )
     chosen = told or found
     assert chosen is not None

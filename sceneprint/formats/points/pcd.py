@@ -27,7 +27,7 @@ from sceneprint.formats.points.rows import (
 )
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Bytes, Floats
-from sceneprint_client.files import is_pcd
+from sceneprint_client.formats import HEAD, format_of
 from sceneprint_client.sidecars import Position
 
 # LZF, which binary_compressed PCD files are packed with (M. Lehmann's liblzf 3.6).
@@ -102,8 +102,6 @@ def _inflate(packed: Bytes, out: Bytes) -> int:
     return o
 
 
-#: How a PCD file begins: comments, then one of the first entries. Nothing is taken back (*+): a
-#: file of empty lines would cost memory for each.
 _MAXIMUM_HEADER = 65_536  #: bytes
 _MAXIMUM_FIELDS = 1000
 _MAXIMUM_COUNT = 65_536  #: values of a field
@@ -227,7 +225,7 @@ def _compressed(
 def _header(data: FileBytes) -> tuple[dict[str, list[str]], int]:
     """Entries by their names, and where the points begin."""
     head = data[:_MAXIMUM_HEADER]
-    if not is_pcd(head):
+    if format_of(head[:HEAD]) != "pcd":
         raise UnreadableCloud("This is no PCD file: it does not begin with VERSION or FIELDS.")
     entries, start = dict[str, list[str]](), 0
     while "DATA" not in entries:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from sceneprint.errors import DatasetError, MissingDependency, SceneprintError
 from sceneprint_client.errors import printable
-from sceneprint_client.files import RECORDING_SUFFIXES
+from sceneprint_client.formats import format_named
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -54,7 +54,7 @@ def is_recording(path: Path) -> bool:
     """Whether a path is a recording of ROS by its name, or a folder with a rosbag2's metadata."""
     if path.is_dir():
         return (path / _METADATA).is_file() and not (path / "intrinsics.json").is_file()
-    return path.suffix.lower() in RECORDING_SUFFIXES
+    return format_named(path.name, "recording") is not None
 
 
 @dataclass(frozen=True)
@@ -104,18 +104,22 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.is_ros1 = path.suffix.lower() == ".bag" and not path.is_dir()
+        is_bag = path.suffix.lower() == ".bag" and not path.is_dir()
         self._lock = threading.RLock()
         if not path.exists():
             raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
-        self._types = _types(ros1=self.is_ros1)
+        _types(ros1=is_bag)  # limits rosbags before it opens anything
         with _stated(path):
-            self._reader = _open_reader(path, ros1=self.is_ros1)
+            self._reader = _open_reader(path, ros1=is_bag)
         self._closes = weakref.finalize(self, _close, self._reader)
         with _stated(path):
-            self._connections: list[Connection] = list(self._reader.connections)
+            self._connections: list[Connection] = [
+                one for one in self._reader.connections if _serialization(one) in ("cdr", "ros1")
+            ]
+            self.is_ros1 = any(_serialization(one) == "ros1" for one in self._connections)
             self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time
             self.topics = _topics(self._connections)
+        self._types = _types(ros1=self.is_ros1)
 
     def close(self) -> None:
         """Close the file; later calls do nothing."""
@@ -217,11 +221,17 @@ def shared_bag(path: Path) -> Bag:
     return Bag(path)
 
 
+def _serialization(connection: Connection) -> str:
+    """Return how the messages of a topic are serialised; those of a ROS 1 bag do not say it."""
+    return str(getattr(connection.ext, "serialization_format", "ros1"))
+
+
 def _topics(connections: list[Connection]) -> tuple[BagTopic, ...]:
     """Topics by name; one with messages of several types is there with each."""
     counts: dict[tuple[str, str], int] = {}
     for one in connections:
-        key = (str(one.topic), str(one.msgtype))
+        package, _, name = one.msgtype.partition("/")  # of ROS 1 in MCAP: sensor_msgs/Image
+        key = (str(one.topic), f"{package}/msg/{name.removeprefix('msg/')}")
         counts[key] = counts.get(key, 0) + int(one.msgcount)
     return tuple(BagTopic(name, kind, n) for (name, kind), n in sorted(counts.items()))
 
@@ -286,7 +296,7 @@ def _types(*, ros1: bool) -> Typestore:
             "Run: pip install 'sceneprint[ros]'"
         ) from cause
     _limit_decompression()
-    _read_without_profile()
+    _read_any_profile()
     types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     if TRANSFORMS not in types.fielddefs:
         types.register(get_types_from_msg(_TRANSFORMS_FIELDS, TRANSFORMS))
@@ -310,50 +320,51 @@ def _limit_decompression() -> None:
     ros1.decompressors["lz4"] = lambda data: _inflate(_lz4(), data, MAXIMUM_CHUNK_BYTES)
 
 
-def _read_without_profile() -> None:
-    """Let MCAP files be read whose header has no profile; their schemas say what they hold."""
-    from rosbags.rosbag2 import reader
-    from rosbags.rosbag2.storage_mcap import McapReader
+def _read_any_profile() -> None:
+    """Let MCAP files be read whose header names another profile than ROS 2, such as none or ROS 1.
 
-    class ProfiledReader(McapReader):
-        """An MCAP file whose empty profile reads as "ros2"."""
+    Their channels say how messages are serialised, and the definitions in the file are not needed.
+    """
+    from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+    from rosbags.rosbag2 import reader
+    from rosbags.rosbag2 import storage_mcap as mcap
+
+    class ProfiledReader(mcap.McapReader):
+        """An MCAP file whose profile reads as "ros2"."""
 
         def _open(self) -> None:
             opened, self.bio = self.bio, _Profiled(self.bio)  # type: ignore[assignment]
             try:
                 super()._open()
-            except KeyError as cause:
-                raise ValueError(
-                    f"its messages are of {cause}, and only those of ROS 2 are read from MCAP"
-                ) from cause
             finally:
                 self.bio = opened
 
+    mcap.get_msgdef = lambda _: MessageDefinition(MessageDefinitionFormat.NONE, "")
     reader.DirectoryReader.STORAGE_PLUGINS["mcap"] = ProfiledReader  # type: ignore[index]
     reader.Reader.STORAGE_PLUGINS[".mcap"] = ProfiledReader  # type: ignore[index]
 
 
+_PROFILE = struct.pack("<I4s", 4, b"ros2")
+
+
 class _Profiled:
-    """A file of MCAP whose header, after 9 bytes, reads as one with a profile."""
+    """A file of MCAP in whose header, after 9 bytes of others and its length, a profile comes first."""
 
     def __init__(self, file: Any) -> None:
-        self._file, self._more = file, 0
+        self._file = file
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._file, name)
 
     def read(self, size: int = -1) -> bytes:
-        """Content from here on."""
+        """Return the content from here on."""
         place = self._file.tell()
-        data: bytes = self._file.read(size - self._more if place == 17 else size)
-        if place == 9 and self._file.read(4) == bytes(4):  # a profile of no characters
-            self._more = len(b"ros2")
-            data = struct.pack("<Q", struct.unpack("<Q", data)[0] + self._more)
-        if place == 9:
-            self._file.seek(17)
-        if place == 17 and self._more:
-            data = struct.pack("<I", self._more) + b"ros2" + data[4:]
-        return data
+        if place == 17:
+            return _PROFILE + bytes(self._file.read(size - len(_PROFILE)))
+        data: bytes = self._file.read(size)
+        return (
+            struct.pack("<Q", struct.unpack("<Q", data)[0] + len(_PROFILE)) if place == 9 else data
+        )
 
 
 def _zstd() -> Any:

@@ -11,14 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import PurePath
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 
 from sceneprint.errors import UnreadableCloud, UselessFrame
 from sceneprint.formats.points.cloud import FARTHEST_M, FEWEST_POINTS, read_npy
-from sceneprint.formats.points.e57 import E57_SIGNATURE, E57Scan, read_e57
+from sceneprint.formats.points.e57 import E57Scan, read_e57
 from sceneprint.formats.points.las import read_las
 from sceneprint.formats.points.pcd import read_pcd
 from sceneprint.formats.points.ply import read_ply
@@ -36,7 +35,8 @@ from sceneprint.formats.surface_file.raw_surface import (
 from sceneprint.geometry.surface.upright import estimate_units, estimate_up
 from sceneprint.types import Floats, Floats32, Ints32, ReferenceSurface
 from sceneprint_client.api.frames import Axis
-from sceneprint_client.files import HEAD, format_of, naming
+from sceneprint_client.files import naming
+from sceneprint_client.formats import HEAD, format_at, format_named, titles_of
 
 SurfaceFormat = Literal["pcd", "ply", "las", "npy", "e57", "obj", "stl", "glb", "gltf"]
 #: Where units or up come from: the options, the file, or the shape of the surface.
@@ -48,9 +48,6 @@ AXES: dict[str, Floats] = {
 }  # fmt: skip
 #: Farther than this from the origin of the file, the coordinates get an offset, metres.
 FAR_M = 1000.0
-#: Formats that the first bytes tell as they do of a frame's points, and those that names tell.
-_CLOUDS: dict[str | None, SurfaceFormat] = {"pcd": "pcd", "ply": "ply", "las": "las", "npy": "npy"}
-_SUFFIXES: dict[str, SurfaceFormat] = {".obj": "obj", ".stl": "stl", ".gltf": "gltf"}
 _STL_HEADER, _STL_TRIANGLE = 84, 50  #: bytes
 _BLOCK = 1 << 18
 #: Beyond every place on Earth in any unit that is read; products of it are still numbers.
@@ -128,25 +125,21 @@ def surface_format(head: bytes, name: str, size: int) -> SurfaceFormat:
     """
     if not size:
         raise UnreadableCloud("The file is empty. Copy or write it again.")
-    cloud = format_of(head)
-    if cloud in _CLOUDS:
-        return _CLOUDS[cloud]
-    if head.startswith(E57_SIGNATURE):
-        return "e57"
-    if head[:4] == b"glTF":
-        return "glb"
+    found = format_at(head, "map")
+    if found is not None:
+        return cast(SurfaceFormat, found.name)
     if len(head) >= _STL_HEADER:
         triangles = int.from_bytes(head[80:84], "little")
         if size == _STL_HEADER + _STL_TRIANGLE * triangles:
             return "stl"
-    by_name = _SUFFIXES.get(PurePath(name).suffix.lower())
-    if by_name is not None:
-        return by_name
+    by_name = format_named(name, "map")
+    if by_name is not None and not by_name.signature:
+        return cast(SurfaceFormat, by_name.name)
     if head.lstrip()[:6].lower() == b"solid " and b"facet" in head:
         return "stl"
     raise UnreadableCloud(
-        "This is none of PCD, PLY, LAS, LAZ, E57, NPY of shape (N, 3) or (N, 4), OBJ, STL and "
-        "glTF, by its first bytes and its name. Write the map as one of these."
+        f"This is none of {titles_of('map')} by its first bytes and its name. Write the map as "
+        "one of these."
     )
 
 
@@ -154,7 +147,7 @@ def read_surface(
     data: FileBytes, name: str, options: SurfaceOptions | None = None,
     file_format: SurfaceFormat | None = None,
 ) -> ReadSurface:  # fmt: skip
-    """Return the surface of a PCD, PLY, LAS, LAZ, E57, NPY, OBJ, STL or glTF file.
+    """Return the surface of a file of a whole map.
 
     Parameters
     ----------

@@ -1,21 +1,24 @@
 // What a file is: by its first bytes where they tell, else by its name; and what the small files
 // that lie beside frames say (intrinsics.json, clouds.json, NAME.pose.txt).
 
-/** @typedef {{kind: "depth"|"cloud"|"archive"|"map"|"camera"|"clouds"|"pose"|"other",
+import { FORMATS } from "./formats.js";
+
+/** @typedef {{kind: import("./formats.js").FileKind|"camera"|"clouds"|"pose"|"other",
  *             format?: string, width?: number, height?: number}} Source */
 
-// enough for the header of an NPY file, and for a tar's magic at byte 257
-const HEAD = 1024;
+// the service looks at as many first bytes
+const HEAD = 10_016;
 // a small file beside frames is a few hundred bytes; more is no such file
 const MOST_TEXT = 65_536;
-const SUFFIXES = {
-  ".png": "depth", ".npy": "depth", ".ply": "cloud", ".pcd": "cloud", ".las": "cloud",
-  ".laz": "cloud", ".bin": "cloud", ".cdr": "cloud", ".zip": "archive", ".tar": "archive", ".tgz": "archive",
-  ".gz": "archive", ".tbz2": "archive", ".bz2": "archive", ".txz": "archive", ".xz": "archive",
-  ".obj": "map", ".stl": "map", ".glb": "map", ".gltf": "map", ".e57": "map", // a mesh is a map that comes whole
-};
+const PATTERNS = FORMATS.filter((one) => one.signature)
+  .map(({ kind, name, signature }) => ({ kind, format: name, pattern: new RegExp(`^(?:${signature})`) }));
 /** What a file picker offers. */
-export const ACCEPT = [...Object.keys(SUFFIXES), ".json", ".txt"].join(",");
+export const ACCEPT = [...new Set(FORMATS.flatMap((one) => one.suffixes)), ".json", ".txt"].join(",");
+
+/** The formats of a kind as text. @param {import("./formats.js").FileKind} kind */
+export function titlesOf(kind) {
+  return [...new Set(FORMATS.filter((one) => one.kind === kind).map((one) => one.title))].join(", ");
+}
 
 /**
  * What a file is, by its first bytes or its name.
@@ -35,34 +38,27 @@ export async function kindOf(file) {
 }
 
 function byHead(head) {
-  const text = (from, to) => String.fromCharCode(...head.subarray(from, to));
-  const view = new DataView(head.buffer);
-  if (text(1, 4) === "PNG" && head.length >= 24) {
-    return { kind: "depth", format: "png", width: view.getUint32(16), height: view.getUint32(20) };
+  const text = String.fromCharCode(...head);
+  for (const { kind, format, pattern } of PATTERNS) {
+    const found = pattern.exec(text);
+    if (!found) continue;
+    const [width, height] = format === "png" ? sizeOfPng(head) : [Number(found[1]), Number(found[2])];
+    return kind === "depth" && width && height ? { kind, format, width, height } : { kind, format };
   }
-  if (text(1, 6) === "NUMPY") return arrayOf(text(0, head.length));
-  if (/^ply[\n\r ]/.test(text(0, 4))) return { kind: "cloud", format: "ply" };
-  if (text(0, 4) === "LASF") return { kind: "cloud", format: "las" };
-  if (/^(#.*\n)*\s*(VERSION|FIELDS)\b/.test(text(0, HEAD))) return { kind: "cloud", format: "pcd" };
-  if (text(0, 4) === "glTF" || text(0, 8) === "ASTM-E57") return { kind: "map" };
-  const packed = text(0, 2) === "PK" || text(0, 3) === "BZh" || text(257, 262) === "ustar"
-    || (head[0] === 0x1f && head[1] === 0x8b) || text(1, 5) === "7zXZ" && head[0] === 0xfd;
-  return packed ? { kind: "archive" } : null;
+  return null;
 }
 
-/** An array of three or four columns is a cloud, as the service takes it; any other an image. */
-function arrayOf(head) {
-  const shape = /'shape':\s*\((\d+),\s*(\d+)\)/.exec(head);
-  if (!shape) return { kind: "depth", format: "npy" };
-  const [height, width] = [Number(shape[1]), Number(shape[2])];
-  return width === 3 || width === 4
-    ? { kind: "cloud", format: "npy" } : { kind: "depth", format: "npy", width, height };
+function sizeOfPng(head) {
+  const view = new DataView(head.buffer);
+  return head.length < 24 ? [0, 0] : [view.getUint32(16), view.getUint32(20)];
 }
 
+/** @param {string} name @returns {Source} */
 function byName(name) {
-  const suffix = /\.[a-z0-9]+$/.exec(name)?.[0] ?? "";
-  const kind = SUFFIXES[suffix] ?? "other";
-  return suffix === ".bin" ? { kind, format: "kitti" } : { kind };
+  const found = FORMATS.find((one) => one.suffixes.some((suffix) => name.endsWith(suffix)));
+  if (!found) return { kind: "other" };
+  // what has a signature is none of that format if it does not begin so
+  return found.signature ? { kind: found.kind } : { kind: found.kind, format: found.name };
 }
 
 /**

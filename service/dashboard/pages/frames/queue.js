@@ -140,7 +140,7 @@ export class Queue {
   async sendFrame(item) {
     if (item.file.size === 0) throw new Error("The file is empty.");
     // the service would speak of the size of an image that this is not
-    if (item.source.kind === "depth" && !item.source.format) throw new Error("It is named like an image, but it is neither a PNG nor an NPY file.");
+    if (item.source.kind === "depth" && !item.source.format) throw new Error("Its name is that of a depth image, but its content is not.");
     const pose = item.pose ? await poseOf(item.pose) : null;
     const form = await formOf(item.file, this.saidOf(item), { source: item.source, pose, label: this.labelOf(item) });
     const answer = await send("POST", at("maps", this.map, "frames"), {

@@ -1,6 +1,6 @@
 // What is asked: a frame of the map by its id or from a small gallery, or a file that is dropped.
 import { cameraFields, hasCamera, remember, settings } from "../frames/source.js";
-import { ACCEPT, fieldsOf, kindOf } from "../frames/kinds.js";
+import { ACCEPT, fieldsOf, kindOf, titlesOf } from "../frames/kinds.js";
 import { h, put } from "../lib/dom.js";
 import { shortId } from "../lib/format.js";
 import { pickFrame } from "./picker.js";
@@ -35,7 +35,7 @@ export function chooser({ map, pictures, signal, onchoose }) {
     if (!one) return;
     const { kind } = await kindOf(one);
     if (kind !== "depth" && kind !== "cloud") {
-      put(wrong, `${one.name} is neither a depth image nor a point cloud. Drop a 16-bit PNG, NPY, PLY, PCD, LAS or KITTI file.`);
+      put(wrong, `${one.name} is neither a depth image (${titlesOf("depth")}) nor a point cloud (${titlesOf("cloud")}).`);
       return;
     }
     if (kind === "depth" && !hasCamera(given)) {

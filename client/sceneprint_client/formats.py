@@ -1,0 +1,286 @@
+"""The table of file formats. Command line, service, client, dashboard and docs read it.
+
+`tests/test_golden.py` writes `docs/formats.md` and the dashboard's `formats.js` from it.
+
+name of a file  --format_named-->  Format
+first bytes     --format_at-->  Format  --reader_of-->  function
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import import_module
+from pathlib import PurePath
+from typing import Any, Literal, cast
+
+#: A depth image; the points of a scan; a whole map; packed frames; a recording of ROS; a file of
+#: another system with frames and poses.
+Kind = Literal["depth", "cloud", "map", "archive", "recording", "capture"]
+#: Names of the formats of point clouds.
+CloudFormat = Literal["ply", "pcd", "kitti", "npy", "las", "pointcloud2"]
+
+#: Number of first bytes of a file that show its format.
+HEAD = 10_016
+BYTES = "application/octet-stream"
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of files.
+
+    Parameters
+    ----------
+    name : unique within its kind
+    kind : what such a file holds
+    title : what people call it
+    suffixes : of file names, in lower case
+    content : what is read of it, in Markdown
+    signature : regular expression for the first bytes, as Latin-1, which Python and JavaScript
+        read alike; empty if they do not show the format. Groups are width and height
+    media_type : of a file over HTTP
+    reader : MODULE:FUNCTION that takes the bytes, or, of a capture, the path and a name; empty if
+        one reader takes all of the kind
+    size : MODULE:FUNCTION that takes the first bytes of a depth image, and returns width and height
+    library : package that reads it; empty if we do
+    """
+
+    name: str
+    kind: Kind
+    title: str
+    suffixes: tuple[str, ...]
+    content: str
+    signature: str = ""
+    media_type: str = BYTES
+    reader: str = ""
+    size: str = ""
+    library: str = ""
+
+    def begins(self, head: bytes) -> bool:
+        """Return whether the first bytes of a file show this format."""
+        return bool(self.signature) and _pattern(self.signature).match(head) is not None
+
+
+@lru_cache(maxsize=64)
+def _pattern(signature: str) -> re.Pattern[bytes]:
+    return re.compile(signature.encode("latin-1"))
+
+
+_PCD = r"[\r\n]*(?:#[^\n]{0,200}\n[\r\n]*){0,99}(?:VERSION|FIELDS|COLUMNS)[ \t]"
+_PLY = r"ply[\n\r ]"
+_PNG = r"\x89PNG\r\n\x1a\n"
+_NUMPY = r"\x93NUMPY"
+#: With width and height, where the shape has two numbers.
+_NUMPY_IMAGE = _NUMPY + r"(?:[^}]*'shape': *\((?=\d+, *(\d+)\))(\d+))?"
+#: Beginning of NPY files of floating numbers in rows of three or four.
+_NUMPY_ROWS = (
+    _NUMPY + r"[\s\S]{4,6}(?=[^}]*'descr': *'[<>]f[248]')(?=[^}]*'shape': *\(\d+L?, *[34]L?,? *\))"
+)
+#: CDR of either byte order, and the names of three fields somewhere behind.
+_CDR = r"\x00[\x00\x01]\x00[\x00-\x03]" + "".join(
+    rf"(?=[\s\S]*?(?:\x02\x00\x00\x00|\x00\x00\x00\x02){axis}\x00)" for axis in "xyz"
+)
+_ESTIMATED = "Units and up are estimated"
+_SQLITE = r"SQLite format 3\x00"
+
+#: The rows. A format that is recognised by its first bytes precedes those that begin alike.
+FORMATS = (
+    Format(
+        "png", "depth", "PNG", (".png",),
+        "16 bits, one channel, in stored units; 0 and 65535 are missing",
+        _PNG, "image/png", "sceneprint.formats.depth_file:decode_png",
+        "sceneprint.formats.depth_file:png_size", "isal, Pillow",
+    ),
+    Format(
+        "npy", "depth", "NPY", (".npy",),
+        "two dimensions: float16, 32 or 64 in metres, or uint16 in stored units",
+        _NUMPY_IMAGE, "application/x-npy", "sceneprint.formats.depth_file:decode_npy",
+        "sceneprint.formats.depth_file:npy_size",
+    ),
+    Format(
+        "pfm", "depth", "PFM", (".pfm",), "one channel of float32 metres, either byte order",
+        r"Pf[\n\r ]+(?:(\d+) +(\d+))?", "image/x-portable-floatmap",
+        "sceneprint.formats.pfm:decode_pfm", "sceneprint.formats.pfm:pfm_size",
+    ),
+    Format(
+        "compresseddepth", "depth", "compressedDepth of ROS", (),
+        "the data of a message: PNG after 12 bytes, of 16UC1 or 32FC1",
+        r"[\s\S]{12}" + _PNG, BYTES, "sceneprint.formats.depth_file:decode_transported",
+        "sceneprint.formats.depth_file:transported_size", "isal, Pillow",
+    ),
+    Format(
+        "ply", "cloud", "PLY", (".ply",),
+        "ascii, binary of either byte order; element `vertex` with single `x`, `y`, `z` of any "
+        "type. Other properties, lists and elements are skipped",
+        _PLY, "application/ply", "sceneprint.formats.points.ply:read_ply",
+    ),
+    Format(
+        "pcd", "cloud", "PCD", (".pcd",),
+        "`ascii`, `binary`, `binary_compressed`; versions .5 to .7; `x`, `y`, `z` (or `X`, `Y`, "
+        "`Z`) of any type, organised clouds row by row; the translation of `VIEWPOINT`",
+        _PCD, BYTES, "sceneprint.formats.points.pcd:read_pcd",
+    ),
+    Format(
+        "las", "cloud", "LAS, LAZ", (".las", ".laz"),
+        "1.0 to 1.4, point formats 0 to 10; LAZ in chunks of one size or of several (COPC), with "
+        "the extra `las`. Noise points are read as points; classes, returns, time, colour and "
+        "waveforms are ignored",
+        "LASF", BYTES, "sceneprint.formats.points.las:read_las", "", "lazrs",
+    ),
+    Format(
+        "npy", "cloud", "NPY", (".npy",),
+        "(N, 3) or (N, 4) of float16, 32 or 64, either byte order, C or Fortran order; the fourth "
+        "column is ignored. With a camera, an array is a depth image",
+        _NUMPY_ROWS, "application/x-npy", "sceneprint.formats.points.cloud:read_npy",
+    ),
+    Format(
+        "kitti", "cloud", "KITTI .bin", (".bin",),
+        "x, y, z, intensity as float32, little-endian. The file does not show its format: say "
+        "`format=kitti`. Other rows are refused unless `row` names their values",
+        "", BYTES, "sceneprint.formats.points.cloud:read_kitti",
+    ),
+    Format(
+        "pointcloud2", "cloud", "PointCloud2 in CDR", (".cdr",),
+        "the message of ROS 2 as `rclpy.serialization.serialize_message` or a subscription with "
+        "`raw=True` gives it; of ROS 1 read the bag. Either byte order; `x`, `y`, `z` of any type "
+        "and offset, organised or not, padded rows; points exactly at the sensor are missing",
+        _CDR, "application/x-ros-pointcloud2", "sceneprint.formats.points.cloud:read_pointcloud2",
+    ),
+    Format("pcd", "map", "PCD", (".pcd",), f"points. {_ESTIMATED} (usually z)", _PCD),
+    Format(
+        "ply", "map", "PLY", (".ply",),
+        f"points; with an element `face`, a mesh (polygons become fans). {_ESTIMATED} (usually z)",
+        _PLY,
+    ),
+    Format(
+        "las", "map", "LAS, LAZ", (".las", ".laz"),
+        "points. Units are those of the file's coordinate system, else estimated; z is up", "LASF",
+        library="lazrs",
+    ),
+    Format(
+        "npy", "map", "NPY", (".npy",), f"points, (N, 3) or (N, 4). {_ESTIMATED} (usually z)",
+        _NUMPY_ROWS,
+    ),
+    Format(
+        "e57", "map", "E57", (".e57",),
+        "the points of all scans, in one frame, in metres; up is estimated (usually z)", "ASTM-E57",
+    ),
+    Format(
+        "stl", "map", "STL", (".stl",), f"a mesh, ascii or binary. {_ESTIMATED} (usually z)",
+        library="trimesh",
+    ),
+    Format(
+        "obj", "map", "OBJ", (".obj",),
+        "a mesh; points if it has no faces. Materials are ignored. "
+        f"{_ESTIMATED} (usually y)", library="trimesh",
+    ),
+    Format(
+        "glb", "map", "glTF", (".glb",),
+        "all triangles of the scene; points if it has none. Textures are ignored. Units are "
+        "metres, y is up", "glTF",
+        library="trimesh",
+    ),
+    Format(
+        "gltf", "map", "glTF", (".gltf",), "the same, with embedded buffers", library="trimesh",
+    ),
+    Format(
+        "zip", "archive", "zip", (".zip",), "folders of frames",
+        r"PK(?:\x03\x04|\x05\x06)", "application/zip",
+    ),
+    Format(
+        "tar", "archive", "tar", (".tar",), "folders of frames",
+        r"[\s\S]{257}ustar", "application/x-tar",
+    ),
+    Format(
+        "gzip", "archive", "tar.gz", (".gz", ".tgz"), "a tar", r"\x1f\x8b", "application/gzip",
+    ),
+    Format(
+        "bzip2", "archive", "tar.bz2", (".bz2", ".tbz2"), "a tar", "BZh", "application/x-bzip2",
+    ),
+    Format(
+        "xz", "archive", "tar.xz", (".xz", ".txz"), "a tar", r"\xfd7zXZ\x00", "application/x-xz",
+    ),
+    Format(
+        "mcap", "recording", "MCAP", (".mcap",), "messages of ROS 2 and ROS 1",
+        r"\x89MCAP0\r\n", library="rosbags",
+    ),
+    Format(
+        "rosbag2", "recording", "rosbag2", (".db3",),
+        "the file, or the folder with its `metadata.yaml`", _SQLITE, library="rosbags",
+    ),
+    Format(
+        "rosbag1", "recording", "ROS 1", (".bag",), "version 2.0", "#ROSBAG V2",
+        library="rosbags",
+    ),
+    Format(
+        "rtabmap", "capture", "RTAB-Map", (".db",), "depth, laser scans and poses of a database",
+        _SQLITE,
+    ),
+    Format(
+        "e57", "capture", "E57", (".e57",), "each scan with its pose", "ASTM-E57",
+        reader="sceneprint.formats.exports.e57_scans:e57_sequence",
+    ),
+    Format(
+        "record3d", "capture", "Record3D", (".r3d",), "depth and poses of a capture",
+        r"PK\x03\x04", reader="sceneprint.formats.exports.record3d:record3d_sequence",
+        library="lzfse",
+    ),
+)  # fmt: skip
+
+
+def formats_of(*kinds: Kind) -> tuple[Format, ...]:
+    """Return the rows of some kinds, in the order of the table."""
+    return tuple(one for one in FORMATS if one.kind in kinds)
+
+
+def suffixes_of(*kinds: Kind) -> tuple[str, ...]:
+    """Return the suffixes of file names of some kinds."""
+    return tuple(dict.fromkeys(one for row in formats_of(*kinds) for one in row.suffixes))
+
+
+def media_types_of(*kinds: Kind) -> tuple[str, ...]:
+    """Return the media types of some kinds; any file may be sent as `BYTES`, which is the last."""
+    found = dict.fromkeys(one.media_type for one in formats_of(*kinds))
+    return (*(one for one in found if one != BYTES), BYTES)
+
+
+def titles_of(*kinds: Kind, last: str = "and") -> str:
+    """Return the titles of some kinds as an enumeration, such as "PNG, NPY and PFM"."""
+    *most, final = dict.fromkeys(one.title for one in formats_of(*kinds))
+    return f"{', '.join(most)} {last} {final}"
+
+
+def format_at(head: bytes, *kinds: Kind) -> Format | None:
+    """Return the format that the first `HEAD` bytes of a file show; None if they show none."""
+    return next((one for one in formats_of(*kinds) if one.begins(head)), None)
+
+
+def format_named(file: str, *kinds: Kind) -> Format | None:
+    """Return the format that the suffix of a file's name stands for; None if it is of none.
+
+    A `.npy` is the first of the kinds that a `.npy` may be, in the order of the table.
+    """
+    suffix = PurePath(file).suffix.lower()
+    return next((one for one in formats_of(*kinds) if suffix in one.suffixes), None)
+
+
+def format_of(head: bytes) -> CloudFormat | None:
+    """Return the format of a point cloud by its first `HEAD` bytes; those of KITTI show none."""
+    found = format_at(head, "cloud")
+    return None if found is None else cast(CloudFormat, found.name)
+
+
+def is_cloud(file: str) -> bool:
+    """Return whether a file of this name always holds points; a .npy may be a depth image."""
+    found = format_named(file, "depth", "cloud")
+    return found is not None and found.kind == "cloud"
+
+
+@lru_cache(maxsize=64)
+def function_at(place: str) -> Callable[..., Any]:
+    """Import and return the function at MODULE:FUNCTION."""
+    module, _, name = place.partition(":")
+    function: Callable[..., Any] = getattr(import_module(module), name)
+    return function

@@ -1,0 +1,84 @@
+"""The table of file formats against files of each, and against what else is written of them."""
+
+import re
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from sceneprint.decoders.child_process import array_samples, text_samples
+from sceneprint.formats.depth_file import decode_samples, encode_npy, encode_png, size_of
+from sceneprint_client.formats import (
+    FORMATS,
+    CloudFormat,
+    format_at,
+    format_named,
+    format_of,
+    formats_of,
+    function_at,
+    is_cloud,
+    suffixes_of,
+    titles_of,
+)
+
+ROOT = Path(__file__).parents[1]
+PNG = encode_png(np.ones((2, 3), np.uint16))
+DEPTH = {
+    "png": PNG,
+    "npy": encode_npy(np.ones((2, 3), np.uint16)),
+    "pfm": b"Pf\n3 2\n-1.0\n" + bytes(24),
+    "compresseddepth": bytes(12) + PNG,
+}
+
+
+def test_a_name_stands_once_in_its_kind_and_functions_are_there() -> None:
+    keys = [(one.kind, one.name) for one in FORMATS]
+    assert len(set(keys)) == len(keys)
+    assert {one.name for one in formats_of("cloud")} == set(get_args(CloudFormat))
+    for one in FORMATS:
+        for place in filter(None, (one.reader, one.size)):
+            assert callable(function_at(place))
+        assert (one.kind in ("depth", "cloud")) <= bool(one.reader)
+
+
+def test_every_depth_format_is_recognised_measured_and_read() -> None:
+    assert set(DEPTH) == {one.name for one in formats_of("depth")}
+    for name, data in DEPTH.items():
+        found = format_at(data, "depth", "map", "archive", "recording", "capture")
+        assert found is not None
+        assert found.name == name
+        assert size_of(data) == (3, 2)
+        assert decode_samples(data).shape == (2, 3)
+
+
+def test_every_cloud_format_but_one_is_recognised() -> None:
+    for data, name in (*array_samples(), *text_samples()):
+        assert format_of(data) == (None if name == "kitti" else name)
+
+
+@pytest.mark.parametrize("kind", ["depth", "cloud"])
+def test_an_array_is_a_cloud_by_its_columns_and_type(kind: str) -> None:
+    array = np.ones((5, 3), "<f4" if kind == "cloud" else "<u2")
+    assert format_of(encode_npy(array)) == ("npy" if kind == "cloud" else None)
+    assert format_of(encode_npy(np.ones((5, 30), "<f4"))) is None
+    assert format_of(encode_npy(np.ones((5, 4), ">f8"))) == "npy"
+
+
+def test_names() -> None:
+    assert [is_cloud(name) for name in ("A.PLY", "a.npy", "a.pfm", "a.e57")] == [True] + [False] * 3
+    assert titles_of("depth", last="or") == "PNG, NPY, PFM or compressedDepth of ROS"
+    found = format_named("run.MCAP", "recording")
+    assert found is not None
+    assert found.name == "mcap"
+    assert suffixes_of("recording", "capture") == (".mcap", ".db3", ".bag", ".db", ".e57", ".r3d")
+
+
+def test_no_other_file_lists_suffixes() -> None:
+    """A new format is a row of the table and a reader: nothing else knows a suffix."""
+    own = set(suffixes_of("depth", "cloud", "map")) - {".png", ".npy", ".ply", ".bin"}
+    quoted = re.compile("|".join(rf"[\"']{re.escape(one)}[\"']" for one in own))
+    for folder in ("client", "sceneprint", "service", "worker"):
+        for file in (*(ROOT / folder).rglob("*.py"), *(ROOT / folder).rglob("*.js")):
+            if file.name not in ("formats.py", "formats.js"):
+                assert not quoted.findall(file.read_text(encoding="utf-8")), file

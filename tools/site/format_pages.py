@@ -1,0 +1,66 @@
+"""The table of file formats as a page of the documentation and as a module of the dashboard."""
+
+from __future__ import annotations
+
+import json
+
+from sceneprint_client.formats import Kind, formats_of
+from tools.site.markup import code, page, table
+
+_TITLES: dict[Kind, str] = {
+    "depth": "Depth images",
+    "cloud": "Point clouds",
+    "map": "Whole maps",
+    "archive": "Archives",
+    "recording": "Recordings of ROS",
+    "capture": "Files of other systems",
+}
+#: Kinds of files that the dashboard takes, in the order in which it looks at their first bytes: an
+#: array is a cloud rather than an image, and a cloud a frame rather than a whole map.
+_DASHBOARD: tuple[Kind, ...] = ("cloud", "depth", "map", "archive")
+
+
+def formats_page() -> str:
+    """Return Markdown with a table of the formats of each kind."""
+    return page(
+        "# File formats",
+        "For anyone who wonders whether a file can be read: every format, and what is read of it.",
+        *(f"## {title}\n\n{_rows(kind)}" for kind, title in _TITLES.items()),
+        "What becomes of them: [point clouds](clouds.md), [recordings](recordings.md), "
+        "[captures](exports.md).",
+    )
+
+
+def _rows(kind: Kind) -> str:
+    return table(
+        ("format", "names", "what is read", "recognised by", "media type", "library"),
+        (
+            (
+                one.title,
+                ", ".join(map(code, one.suffixes)),
+                one.content,
+                "first bytes" if one.signature else "name",
+                code(one.media_type),
+                one.library or "our own",
+            )
+            for one in formats_of(kind)
+        ),
+    )
+
+
+def formats_module() -> str:
+    """Return JavaScript with the formats that the dashboard takes."""
+    rows = "".join(
+        f"  {json.dumps(row)},\n"
+        for kind in _DASHBOARD
+        for one in formats_of(kind)
+        for row in [{"kind": kind, "name": one.name, "title": one.title,
+                     "suffixes": one.suffixes, "signature": one.signature}]
+    )  # fmt: skip
+    return (
+        "// The formats of files, written by `make goldens` from sceneprint_client/formats.py.\n"
+        '\n/** @typedef {"depth"|"cloud"|"map"|"archive"} FileKind */\n'
+        "/** @type {{kind: FileKind, name: string, title: string, suffixes: string[], "
+        "signature: string}[]} */\n"
+        f"export const FORMATS = [\n{rows}];\n"
+    )
