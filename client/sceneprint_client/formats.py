@@ -235,11 +235,6 @@ def formats_of(*kinds: Kind) -> tuple[Format, ...]:
     return tuple(one for one in FORMATS if one.kind in kinds)
 
 
-def suffixes_of(*kinds: Kind) -> tuple[str, ...]:
-    """Return the suffixes of file names of some kinds."""
-    return tuple(dict.fromkeys(one for row in formats_of(*kinds) for one in row.suffixes))
-
-
 def media_types_of(*kinds: Kind) -> tuple[str, ...]:
     """Return the media types of some kinds; any file may be sent as `BYTES`, which is the last."""
     found = dict.fromkeys(one.media_type for one in formats_of(*kinds))

@@ -124,6 +124,7 @@ async def get_patches(map_name: str, frame_id: str, request: Request, here: Here
     "/signature",
     response_class=Response,
     responses=file_responses(
+        BYTES,
         NPY,
         model=FrameSignature,
         description="By Accept: JSON with the bytes as base64, the bytes, or an NPY file.",

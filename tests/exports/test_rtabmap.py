@@ -21,7 +21,7 @@ from sceneprint.errors import DatasetError, SceneprintError, UnreadableCloud, Un
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.formats.dataset.frame_reference import session_of
 from sceneprint.formats.depth_file import encode_png
-from sceneprint.formats.exports.rtabmap_blobs import rvl_samples
+from sceneprint.formats.exports.rtabmap_blobs import depth_samples
 from sceneprint_client.frame_files import meta_of
 
 Floats = NDArray[np.float64]
@@ -403,15 +403,13 @@ def test_rvl_of_random_images_and_zeros_is_read_back() -> None:
     depth = rng.integers(0, 65_536, (23, 31)) / 1000
     depth[rng.random(depth.shape) < 0.4] = 0
     for image in (depth, np.zeros((3, 4)), np.full((2, 9), 65.535)):
-        height, width = image.shape
-        unpacked = rvl_samples(rvl(image)[16:], width, height)
-        assert (unpacked == np.rint(image * 1000)).all()
+        assert (depth_samples(rvl(image)) == np.rint(image * 1000)).all()
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff" * 400, bytes(400), b"\x77" * 400])
 def test_damaged_rvl_is_refused(content: bytes) -> None:
-    with pytest.raises(UnreadableFrame, match="RVL data do not fit"):
-        rvl_samples(content, 20, 10)
+    with pytest.raises(UnreadableFrame, match="RVL is damaged"):
+        depth_samples(b"DEPTHRVL" + struct.pack("<II", 20, 10) + content)
 
 
 def test_matrices_that_announce_too_much_are_refused(room: Any, tmp_path: Path) -> None:

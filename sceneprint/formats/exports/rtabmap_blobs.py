@@ -25,6 +25,7 @@ from sceneprint.formats.depth_file import Samples, decode_png
 from sceneprint.types import MAXIMUM_SAMPLES, Floats, Floats32
 from sceneprint_client.files import PNG_SIGNATURE
 from sceneprint_client.poses import rigid_transform
+from sceneprint_client.ros_messages import rvl_samples
 
 #: Of a database: major, minor and patch.
 Version = tuple[int, int, int]
@@ -229,9 +230,7 @@ def depth_samples(blob: bytes) -> Samples:
         )
     if kind == "millimetres":
         return decode_png(blob)
-    return (
-        _float_samples(blob) if kind == "metres" else rvl_samples(blob[_RVL_HEADER:], width, height)
-    )
+    return _float_samples(blob) if kind == "metres" else rvl_samples(blob[len(_RVL) :])
 
 
 def _float_samples(blob: bytes) -> Floats32:
@@ -245,50 +244,6 @@ def _float_samples(blob: bytes) -> Floats32:
         raise UnreadableFrame(f"The depth image is damaged ({cause}). {_AGAIN}") from cause
     # OpenCV's order is blue, green, red, alpha: the four bytes of a float32
     return np.ascontiguousarray(colours[:, :, [2, 1, 0, 3]]).view("<f4")[:, :, 0]
-
-
-def rvl_samples(data: bytes, width: int, height: int) -> NDArray[np.uint16]:
-    """Return the samples (height, width) of an image that was packed with RVL (Wilson 2017).
-
-    The bytes are 32-bit words of eight nibbles, the highest first; three bits of each nibble belong
-    to a number, lowest first, and the fourth says that more follow. The numbers are, in turn, how
-    many samples are zero, how many follow that are not, and the differences between these.
-
-    Raises
-    ------
-    UnreadableFrame : the data end early, or hold more samples than the image has.
-    """
-    count = width * height
-    damaged = UnreadableFrame(f"The depth image is damaged: its RVL data do not fit. {_AGAIN}")
-    words = np.frombuffer(data[: min(len(data), 3 * count + 20) // 4 * 4], "<u4")
-    shifts = np.arange(28, -4, -4, dtype=np.uint32)
-    nibbles = ((words[:, None] >> shifts) & 15).astype(np.uint8).reshape(-1)
-    ends = np.flatnonzero(nibbles < 8)
-    starts = np.concatenate(([0], ends[:-1] + 1)) if len(ends) else ends
-    lengths = ends - starts + 1
-    if lengths.max(initial=0) > 9:
-        raise damaged
-    numbers = np.zeros(len(ends), np.int32)
-    for k in range(int(lengths.max(initial=0))):
-        longer = np.flatnonzero(lengths > k)
-        numbers[longer] |= (nibbles[starts[longer] + k].astype(np.int32) & 7) << (3 * k)
-    samples = np.zeros(count, np.uint16)
-    place = at = previous = 0
-    while place < count:
-        if at + 2 > len(numbers):
-            raise damaged
-        place += int(numbers[at])
-        n = int(numbers[at + 1])
-        packed = numbers[at + 2 : at + 2 + n]
-        if place + n > count or len(packed) < n:
-            raise damaged
-        if n:
-            differences = ((packed >> 1) ^ -(packed & 1)).astype(np.int64)
-            run = previous + np.cumsum(differences)
-            samples[place : place + n] = run & 0xFFFF
-            previous = int(run[-1]) & 0xFFFF
-        place, at = place + n, at + 2 + n
-    return samples.reshape(height, width)
 
 
 # Laser scans.

@@ -24,7 +24,7 @@ from sceneprint_client.files import LAS_SIGNATURE
 
 # The compressed points of LAZ files, by lazrs (Rust), which is an extra.
 #
-# bytes, header  --inflated_records-->  records, a block at a time
+# bytes  --inflated_records-->  records, a block at a time
 #
 # lazrs takes memory as the file says, and a Rust program that gets none aborts: so all that it
 # allocates by is compared with the length of the file before it is called. Of the points that is
@@ -44,20 +44,13 @@ _BYTES, _LAYERED_BYTES = 0, 14
 
 
 def inflated_records(
-    data: FileBytes,
-    header: int,
-    start: int,
-    form: int,
-    length: int,
-    count: int,
-    row: np.dtype[np.void],
+    data: FileBytes, start: int, form: int, length: int, count: int, row: np.dtype[np.void]
 ) -> Iterator[NDArray[np.void]]:
     """Yield the records of a LAZ file.
 
     Parameters
     ----------
     data : the file
-    header : bytes of its header
     start : of its points
     form : point format
     length : bytes of a record
@@ -70,7 +63,7 @@ def inflated_records(
     UnreadableCloud : the compressed points are not what the header says, or damaged.
     """
     lazrs = _lazrs()
-    vlr = _laszip_vlr(data, header, start)
+    vlr = _laszip_vlr(data)
     compressor, coder, chunk, kinds = _described(vlr)
     layered = compressor == 3
     known = layered == (form >= 6) and coder == 0 and compressor in (2, 3)
@@ -129,18 +122,22 @@ def _lazrs() -> ModuleType:
     return module
 
 
-def _laszip_vlr(data: FileBytes, at: int, end: int) -> bytes:
-    """The record that tells how points are packed, of those between header and points."""
-    (count,) = struct.unpack_from("<I", data, 100)
+def las_records(data: FileBytes) -> Iterator[tuple[bytes, int, bytes]]:
+    """Yield user, number and content of the records between the header and the points."""
+    at, end, count = struct.unpack_from("<HII", data, 94)
     for _ in range(min(count, _MAXIMUM_VLRS)):
         if at + _VLR > end:
-            break
+            return
         user, number, length = struct.unpack_from("<16sHH", data, at + 2)
-        if at + _VLR + length > end:
-            break
-        if user.rstrip(b"\0") == b"laszip encoded" and number == 22204:
-            return data[at + _VLR : at + _VLR + length]
+        yield user.rstrip(b"\0"), number, data[at + _VLR : min(at + _VLR + length, end)]
         at += _VLR + length
+
+
+def _laszip_vlr(data: FileBytes) -> bytes:
+    """Return the record that says how points are packed."""
+    for user, number, content in las_records(data):
+        if (user, number) == (b"laszip encoded", 22204):
+            return content
     raise UnreadableCloud(f"The LAZ file does not tell how its points are packed. {_AGAIN}")
 
 
@@ -244,7 +241,7 @@ def read_las(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     row = np.dtype({"names": list("xyz"), "formats": ["<i4"] * 3, "offsets": [0, 4, 8],
                     "itemsize": length})  # fmt: skip
     if packed:
-        records = inflated_records(data, header, start, form, length, count, row)
+        records = inflated_records(data, start, form, length, count, row)
     else:
         if count * length > len(data) - start:
             raise UnreadableCloud(

@@ -339,7 +339,8 @@ def _read_any_profile() -> None:
             finally:
                 self.bio = opened
 
-    mcap.get_msgdef = lambda _: MessageDefinition(MessageDefinitionFormat.NONE, "")
+    none = MessageDefinition(MessageDefinitionFormat.NONE, "")
+    mcap.get_msgdef = lambda _: none  # type: ignore[assignment]
     reader.DirectoryReader.STORAGE_PLUGINS["mcap"] = ProfiledReader  # type: ignore[index]
     reader.Reader.STORAGE_PLUGINS[".mcap"] = ProfiledReader  # type: ignore[index]
 
@@ -348,7 +349,7 @@ _PROFILE = struct.pack("<I4s", 4, b"ros2")
 
 
 class _Profiled:
-    """A file of MCAP in whose header, after 9 bytes of others and its length, a profile comes first."""
+    """A file of MCAP whose header, after its length at byte 9, begins with the profile of ROS 2."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
@@ -362,9 +363,9 @@ class _Profiled:
         if place == 17:
             return _PROFILE + bytes(self._file.read(size - len(_PROFILE)))
         data: bytes = self._file.read(size)
-        return (
-            struct.pack("<Q", struct.unpack("<Q", data)[0] + len(_PROFILE)) if place == 9 else data
-        )
+        if place == 9:
+            data = struct.pack("<Q", struct.unpack("<Q", data)[0] + len(_PROFILE))
+        return data
 
 
 def _zstd() -> Any:

@@ -9,10 +9,9 @@ import re
 import struct
 
 from sceneprint.errors import UnreadableCloud
+from sceneprint.formats.points.las import las_records
 from sceneprint.formats.points.rows import FileBytes
 
-_VLR = 54  #: bytes of a record's own header
-_MOST_VLRS = 1000
 _GEO_KEYS, _WKT = 34735, 2112
 _MODEL, _LINEAR_UNIT, _GEOGRAPHIC = 1024, 3076, 2
 #: Codes of EPSG: metre, international foot, US survey foot.
@@ -27,23 +26,12 @@ def las_units_per_metre(data: FileBytes) -> float | None:
     ------
     UnreadableCloud : the coordinates are degrees.
     """
-    header, start = struct.unpack_from("<HI", data, 94)
-    (count,) = struct.unpack_from("<I", data, 100)
-    at = header
-    for _ in range(min(count, _MOST_VLRS)):
-        if at + _VLR > start:
-            break
-        user, number, length = struct.unpack_from("<16sHH", data, at + 2)
-        body = data[at + _VLR : min(at + _VLR + length, start)]
-        if user.rstrip(b"\0") == b"LASF_Projection":
-            found = None
-            if number == _GEO_KEYS:
-                found = _of_keys(body)
-            elif number == _WKT:
-                found = _of_wkt(body.decode("latin-1"))
+    for user, number, content in las_records(data):
+        if user == b"LASF_Projection" and number in (_GEO_KEYS, _WKT):
+            is_wkt = number == _WKT
+            found = _of_wkt(content.decode("latin-1")) if is_wkt else _of_keys(content)
             if found is not None:
                 return found
-        at += _VLR + length
     return None
 
 
