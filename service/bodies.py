@@ -101,16 +101,15 @@ def parameters() -> list[dict[str, Any]]:
         "base_frame": (text, "what the robot calls its base; default: base_link."),
         "up": (text, "up in the sensor's axes as x,y,z: a unit vector."),
     }
-    return [
-        {
-            "name": name,
-            "in": "query",
-            "required": False,
-            "schema": schema,
-            "description": own + what,
-        }
-        for name, (schema, what) in told.items()
-    ]
+    return [query_parameter(name, schema, own + what) for name, (schema, what) in told.items()]
+
+
+def query_parameter(name: str, schema: Mapping[str, Any], description: str) -> dict[str, Any]:
+    """A parameter of the query string that may be left out, for the OpenAPI document."""
+    return {
+        "name": name, "in": "query", "required": False, "schema": schema,
+        "description": description,
+    }  # fmt: skip
 
 
 async def received(
@@ -188,21 +187,22 @@ def query_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
 
 
 def _query_meta(given: dict[str, str], head: bytes) -> FrameMeta:
-    text = given.pop("meta", None)
+    text = take_alone(given, "meta")
+    if text is not None:
+        return read_meta(text, "The parameter `meta`")
+    return checked(FrameMeta, _fields(given, head), "The frame metadata in the query string")
+
+
+def take_alone(given: dict[str, str], name: str) -> str | None:
+    """Take a parameter that stands for all others; InvalidRequest where it has some beside it."""
+    text = given.pop(name, None)
     if text is not None and given:
         raise InvalidRequest(
-            f"The query string has `meta` and {', '.join(sorted(given))}. Put everything into "
-            "`meta`, or leave it out.",
-            tuple((name, "beside meta") for name in sorted(given)),
+            f"The query string has `{name}` and {', '.join(sorted(given))}. Put everything into "
+            f"`{name}`, or leave it out.",
+            tuple((other, f"beside {name}") for other in sorted(given)),
         )
-    try:
-        if text is not None:
-            return FrameMeta.model_validate_json(text)
-        return FrameMeta.model_validate(_fields(given, head))
-    except ValidationError as error:
-        if error.errors(include_url=False)[0]["type"] == "json_invalid":
-            raise MalformedBody("The parameter `meta` is not JSON. Send a JSON object.") from error
-        raise invalid(error, "The frame metadata in the query string") from error
+    return text
 
 
 def _fields(given: Mapping[str, str], head: bytes) -> dict[str, Any]:
@@ -521,9 +521,24 @@ async def read_record(
         return kind()
     types = ("application/json",)
     document = await read_json_object(request, what, types, ", or no body" if optional else "")
+    return checked(kind, document, what)
+
+
+def checked(kind: type[_Record], fields: object, what: str) -> _Record:
+    """A record of the API, or what is wrong with its fields."""
     try:
-        return kind.model_validate(document)
+        return kind.model_validate(fields)
     except ValidationError as error:
+        raise invalid(error, what) from error
+
+
+def read_meta(text: str, what: str) -> FrameMeta:
+    """The metadata of a frame from JSON, or what is wrong with it."""
+    try:
+        return FrameMeta.model_validate_json(text)
+    except ValidationError as error:
+        if error.errors(include_url=False)[0]["type"] == "json_invalid":
+            raise MalformedBody(f"{what} is not JSON. Send a JSON object.") from error
         raise invalid(error, what) from error
 
 
@@ -534,12 +549,7 @@ def _meta(text: str | None) -> FrameMeta:
             "camera intrinsics, for a point cloud {}.",
             (("meta", "missing"),),
         )
-    try:
-        return FrameMeta.model_validate_json(text)
-    except ValidationError as error:
-        if error.errors(include_url=False)[0]["type"] == "json_invalid":
-            raise MalformedBody("The field `meta` is not JSON. Send a JSON object.") from error
-        raise invalid(error, "The field `meta`") from error
+    return read_meta(text, "The field `meta`")
 
 
 def _text(values: list[UploadFile | str], name: str) -> str:

@@ -13,7 +13,7 @@ from pydantic_core import from_json
 
 from sceneprint.engine.ingest.archive_import import Receiver
 from sceneprint.engine.ingest.uploads import Upload
-from sceneprint.errors import InvalidRequest, MalformedBody, UnsupportedType
+from sceneprint.errors import MalformedBody, UnsupportedType
 from sceneprint.store.queue import JobFile
 from sceneprint_client.api import Added, Frame, FrameState, Job, Page
 from sceneprint_client.api.base import NOVEL, novelty_of
@@ -35,6 +35,7 @@ from service.bodies import (
     FORM,
     FRAME_BODY,
     IdempotencyKey,
+    checked,
     frames_of,
     guarded,
     mark_replayed,
@@ -44,7 +45,6 @@ from service.bodies import (
     uploaded,
 )
 from service.problems import declared
-from service.routes.queries import checked
 
 router = v1_router("/maps/{map_name}/frames", "frames")
 
@@ -109,11 +109,8 @@ Prefer = Annotated[
 
 def in_query(options: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
     """Options as the query string has them, for the OpenAPI document."""
-    return [
-        {"name": name, "in": "query", "required": False, "schema": schema,
-         "description": "Where the frame is the body: as in the form."}
-        for name, schema in options.items()
-    ]  # fmt: skip
+    text = "Where the frame is the body: as in the form."
+    return [bodies.query_parameter(name, schema, text) for name, schema in options.items()]
 
 
 def _described_upload() -> dict[str, Any]:
@@ -306,15 +303,7 @@ def _described_import() -> dict[str, Any]:
     own = schema_of["properties"]
     base = {one["name"]: one for one in bodies.parameters() if one["name"].startswith("base")}
     text = "ImportOptions as JSON, in place of what follows."
-    parameters: list[dict[str, Any]] = [
-        {
-            "name": "options",
-            "in": "query",
-            "required": False,
-            "schema": {"type": "string"},
-            "description": text,
-        }
-    ]
+    parameters = [bodies.query_parameter("options", {"type": "string"}, text)]
     for name in _PARAMETERS:
         told = own.get(name, {})
         schema = OPTIONS.get(name) or {"type": "string"}
@@ -325,9 +314,7 @@ def _described_import() -> dict[str, Any]:
             schema = {"type": "number", "exclusiveMinimum": 0}
         said = told.get("description") or base.get(name, {}).get("description", "")
         said = " ".join(filter(None, (said, _WRITTEN.get(name))))
-        parameters.append(
-            {"name": name, "in": "query", "required": False, "schema": schema, "description": said}
-        )
+        parameters.append(bodies.query_parameter(name, schema, said))
     return {
         "parameters": parameters,
         "requestBody": {"required": True, "content": bodies.content(TYPES)},
@@ -417,14 +404,8 @@ async def _written(here: Context, receiver: Receiver, data: bytes) -> None:
 
 def _options(request: Request) -> ImportOptions:
     given = bodies.query_parameters(request, ("options", *_PARAMETERS))
-    text = given.pop("options", None)
+    text = bodies.take_alone(given, "options")
     if text is not None:
-        if given:
-            raise InvalidRequest(
-                f"The query string has `options` and {', '.join(sorted(given))}. Put everything "
-                "into `options`, or leave it out.",
-                tuple((name, "beside options") for name in sorted(given)),
-            )
         try:
             return checked(ImportOptions, from_json(text), "The import options")
         except ValueError as error:

@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any, BinaryIO, Generic, TypeVar
 
 from fastapi import Depends, Request
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 from starlette.datastructures import FormData, UploadFile
 
 from sceneprint.engine.results.query_entry import SentQuery, query_row, unknown_query
@@ -41,19 +41,22 @@ from service.bodies import (
     FORM,
     FRAME_BODY,
     FormUpload,
+    checked,
     form_of,
     frames_of,
     media_type,
+    query_parameter,
     read_json,
+    read_meta,
     uploaded,
 )
-from service.problems import declared, invalid
+from service.problems import declared
 
 Asked = TypeVar("Asked", bound=Query)
-Record = TypeVar("Record", bound=BaseModel)
 
 JSON = "application/json"
 TEMPLATE = "#/components/schemas/{model}"
+_QUERY = "The query"
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +106,13 @@ async def question(
     """
     if media_type(request) == JSON:
         given = await read_object(request)
-        asker = checked(_Asker, {"robot": given.pop("robot", None)})
+        asker = checked(_Asker, {"robot": given.pop("robot", None)}, _QUERY)
         own = {} if named in kind.model_fields else {named: given.pop(named, None)}
-        yield QueryBody(checked(kind, given), None, own, asker.robot)
+        yield QueryBody(checked(kind, given, _QUERY), None, own, asker.robot)
         return
     options = [name for name in kind.model_fields if name != named]
     async with uploaded(request, *options) as upload:
-        yield QueryBody(checked(kind, upload.fields), upload, {}, upload.meta.robot)
+        yield QueryBody(checked(kind, upload.fields, _QUERY), upload, {}, upload.meta.robot)
 
 
 async def read_object(request: Request) -> dict[str, Any]:
@@ -118,14 +121,6 @@ async def read_object(request: Request) -> dict[str, Any]:
     if not isinstance(given, dict):
         raise MalformedBody("The body is not a JSON object. Send an object.")
     return given
-
-
-def checked(kind: type[Record], fields: Mapping[str, Any], what: str = "The query") -> Record:
-    """A record of the API, or what is wrong with its fields."""
-    try:
-        return kind.model_validate(fields)
-    except ValidationError as error:
-        raise invalid(error, what) from error
 
 
 def unnamed(name: str) -> InvalidRequest:
@@ -190,7 +185,7 @@ def _parameter(name: str, option: Mapping[str, Any]) -> dict[str, Any]:
     """An option as the query string has it, where the frame is the body."""
     schema = {key: one for key, one in option.items() if key not in ("description", "title")}
     told = f"Where the frame is the body: {option.get('description', 'as in JSON')}"
-    return {"name": name, "in": "query", "required": False, "schema": schema, "description": told}
+    return query_parameter(name, schema, told)
 
 
 def as_text(option: Mapping[str, Any]) -> dict[str, Any]:
@@ -294,12 +289,7 @@ def _pair_frame(
     field = f"meta_{name}"
     if field not in texts:
         raise _wrong(field, "missing")
-    try:
-        return Sent(files[name], FrameMeta.model_validate_json(texts[field]))
-    except ValidationError as error:
-        if error.errors(include_url=False)[0]["type"] == "json_invalid":
-            raise MalformedBody(f"The field `{field}` is not JSON. Send a JSON object.") from error
-        raise invalid(error, f"The field `{field}`") from error
+    return Sent(files[name], read_meta(texts[field], f"The field `{field}`"))
 
 
 def _wrong(name: str, how: str) -> InvalidRequest:
@@ -401,7 +391,7 @@ async def localize_sequence(
         here.gate.place(),
         frames_of(request, *options, most=MOST_OF_SEQUENCE) as sent,
     ):
-        query = checked(Query, sent.texts)
+        query = checked(Query, sent.texts, _QUERY)
         wrong = next((one for one in sent.metas if not isinstance(one, FrameMeta)), None)
         if wrong is not None:
             raise wrong
