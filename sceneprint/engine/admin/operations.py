@@ -451,17 +451,13 @@ def _key_record(row: stored.KeyRow) -> Key:
     return Key(
         name=row.name,
         grants=row.grants,
-        created_at=datetime.fromtimestamp(row.created_at, UTC),
-        expires_at=_time(row.expires_at),
+        created_at=when(row.created_at),
+        expires_at=when(row.expires_at),
         tenant=row.tenant,
         # when it has passed, it is of no more interest
-        previous_until=_time(row.previous_until) if (row.previous_until or 0) > now else None,
-        last_used_at=_time(row.last_used_at),
+        previous_until=when(row.previous_until) if (row.previous_until or 0) > now else None,
+        last_used_at=when(row.last_used_at),
     )
-
-
-def _time(seconds: float | None) -> datetime | None:
-    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
 
 
 def _name_of(cursor: str) -> str:
