@@ -283,7 +283,7 @@ class JobMethods(ServiceConnection):
         self, map_name: str, session: str, other: str | None = None, *,
         robots: Sequence[str] | None = None, filter: Filter | Mapping[str, Any] | None = None,  # noqa: A002
         apart: int | None = None, not_within_s: float | None = None, k: int = 3,
-        candidates: int = 10, seed: int = 0, min_overlap: float = 0.0,
+        candidates: int = 10, seed: int = 0, min_overlap: float = 0.0, join: bool = True,
         validation: ValidationOptions | Mapping[str, Any] | None = None, timeout_s: float = 3600.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> Association:  # fmt: skip
@@ -299,6 +299,7 @@ class JobMethods(ServiceConnection):
         apart, not_within_s : within one session, least number of frames or seconds between two
         k, candidates, seed : accepted edges wanted for each frame, candidates to try, random seed
         min_overlap : least overlap of an edge to keep
+        join : where the join of two sessions is strong, let their poses lead to one parent frame
         validation : when an edge is accepted
         timeout_s : seconds to wait; 0 returns at once. The job continues in any case
         progress : called with the number of finished frames and the total
@@ -320,7 +321,7 @@ class JobMethods(ServiceConnection):
         )  # fmt: skip
         wanted = checked(
             NewAssociation, "The association", sessions=sessions, k=k, candidates=candidates,
-            seed=seed, min_overlap=min_overlap, **fields,
+            seed=seed, min_overlap=min_overlap, join=join, **fields,
         )  # fmt: skip
         begun = self._begin(Association, f"{map_path(map_name)}/associations", wanted)
         return self.wait_for_association(begun, timeout_s=timeout_s, progress=progress)

@@ -250,6 +250,8 @@ def _create_frames() -> None:
         sa.Column("pose_x", sa.Float()),
         sa.Column("pose_y", sa.Float()),
         sa.Column("pose_z", sa.Float()),
+        sa.Column("sent_parent", _string(128)),
+        sa.Column("sent_pose", sa.JSON()),
         sa.Column("base_frame", _string(128)),
         sa.Column("base", sa.JSON()),
         sa.Column("novelty", sa.Float()),
@@ -315,6 +317,20 @@ def _create_frames() -> None:
         ["map_number", "deletion", "number"],
         sqlite_where=sa.text("deletion IS NOT NULL"),
         postgresql_where=sa.text("deletion IS NOT NULL"),
+    )
+
+
+def _create_parent_joins() -> None:
+    op.create_table(
+        "parent_joins",
+        sa.Column("map_number", WHOLE, nullable=False),
+        sa.Column("parent", _string(128), nullable=False),
+        sa.Column("root", _string(128), nullable=False),
+        sa.Column("transform", sa.JSON(), nullable=False),
+        sa.Column("job_id", _string(32), nullable=False),
+        sa.Column("joined_at", sa.Float(), nullable=False),
+        sa.PrimaryKeyConstraint("map_number", "parent", name="pk_parent_joins"),
+        sa.ForeignKeyConstraint(["map_number"], ["maps.number"], name="fk_parent_joins_map_number"),
     )
 
 
@@ -632,6 +648,7 @@ def upgrade() -> None:
         _create_tenants,
         _create_maps,
         _create_frames,
+        _create_parent_joins,
         _create_queries,
         _create_surface_tiles,
         _create_surfaces,

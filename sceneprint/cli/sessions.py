@@ -227,6 +227,13 @@ def add_associate(commands: Any) -> None:
         help="minimum overlap of an edge, 0 to 1",
     )
     command.add_argument(
+        "--join",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="let the poses of both sessions lead to one parent frame, where the join is strong "
+        "(default)",
+    )
+    command.add_argument(
         "--out",
         type=Path,
         metavar="FILE",
@@ -272,7 +279,7 @@ def run_associate(options: argparse.Namespace) -> int:
             options.map, *options.session, robots=options.robot, filter=wanted or None,
             apart=options.apart, not_within_s=options.not_within, k=options.k,
             candidates=options.candidates, seed=options.seed, min_overlap=options.min_overlap,
-            progress=progress,
+            join=options.join, progress=progress,
         )  # fmt: skip
         if kind is not None and told.state is JobState.SUCCEEDED:
             graph = client.graph(options.map, told.association_id, kind, odometry=options.odometry)
@@ -312,9 +319,11 @@ def _join(one: Join) -> list[str]:
         return [f"not joined, {names}: {one_line(one.reason)}"]
     sure = "surely" if one.strength == "strong" else "weakly (check it before you rely on it)"
     t, r = one.transform.translation, one.transform.rotation
+    moved = [] if one.root is None else [f"  all their poses are in {one_line(one.root)} now"]
     return [
         f"joined {sure}, {names}: {one_line(one.reason)}, spread "
         f"{100 * (one.spread_m or 0.0):.1f} cm, {one.spread_deg or 0.0:.1f} deg",
         f"  translation {t.x:.4f} {t.y:.4f} {t.z:.4f} m, rotation {r.x:.6f} {r.y:.6f} {r.z:.6f} "
         f"{r.w:.6f} (x y z w)",
+        *moved,
     ]

@@ -16,6 +16,7 @@ from sqlalchemy import Connection
 from sceneprint.store.deletion import DAY_S, count_old, without_content
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import model_names
+from sceneprint.store.parent_joins import count_poses
 from sceneprint.store.queue import job_ids_of
 from sceneprint.store.reencoding_rows import switch_progress
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
@@ -126,6 +127,7 @@ def map_record(connection: Connection, row: MapRow) -> Map:
         label = model_label(names[row.next_model_id], row.next_model_id)
         now = switch_progress(connection, row)
         coming = Reencoding(model=label, model_id=row.next_model_id, **asdict(now))
+    posed, parents = count_poses(connection, row.number)
     return Map(
         name=row.name,
         title=row.title,
@@ -135,6 +137,8 @@ def map_record(connection: Connection, row: MapRow) -> Map:
         created_at=when(row.created_at),
         revision=row.revision,
         frames=count_states(connection, row.number),
+        posed_frames=posed,
+        parent_frames=parents,
         used_frames=row.used_frames,
         used_bytes=row.used_bytes,
         quota_frames=row.quota_frames,
@@ -187,6 +191,9 @@ def _frame(row: MapRow, frame: FrameRow, job_id: str) -> Frame:
     pose = None
     if frame.pose is not None and frame.pose_parent is not None:
         pose = transform(np.array(frame.pose), frame.pose_parent, sensor_of(frame))
+    sent = None
+    if frame.sent_pose is not None and frame.sent_parent is not None:
+        sent = transform(np.array(frame.sent_pose), frame.sent_parent, sensor_of(frame))
     base = None
     if frame.base is not None and frame.base_frame is not None:
         base = transform(np.array(frame.base), frame.base_frame, sensor_of(frame))
@@ -207,6 +214,7 @@ def _frame(row: MapRow, frame: FrameRow, job_id: str) -> Frame:
         received_at=when(frame.received_at),
         indexed_at=when(frame.indexed_at),
         pose=pose,
+        sent_pose=sent,
         base_frame=frame.base_frame,
         T_base_sensor=base,
         up=_direction(frame.up),

@@ -31,8 +31,8 @@ from sceneprint_client.api import FrameState, JobState
 #: Columns of a frame that are copied; the rest is the store's own.
 COPIED = (
     "content_id", "blob", "bytes", "intrinsics", "depth_scale", "depth_along_ray", "robot",
-    "session", "captured_at", "tags", "pose_parent", "pose", "base_frame", "base", "novelty",
-    "received_at", "indexed_at", "cloud", "up", "name", "sequence",
+    "session", "captured_at", "tags", "pose_parent", "pose", "sent_parent", "sent_pose",
+    "base_frame", "base", "novelty", "received_at", "indexed_at", "cloud", "up", "name", "sequence",
 )  # fmt: skip
 #: Columns of a signature that tell one from another without its bytes.
 _TOLD = ("checksum", "geometry", "n_patches", "n_pairs")

@@ -54,6 +54,7 @@ from sceneprint.store.tables import (
     map_row,
     maps,
     now,
+    parent_joins,
     queries,
     signatures,
     surface_frames,
@@ -67,8 +68,8 @@ from sceneprint_client.api import FrameState, JobState
 #: What is known of a frame, and not of its camera; cleared when it is purged.
 _KNOWN = (
     "reason", "robot", "session", "captured_at", "pose_parent", "pose", "pose_x", "pose_y",
-    "pose_z", "base_frame", "base", "novelty", "up", "name", "sequence", "deletion",
-    "deleted_from", "deleted_content",
+    "pose_z", "sent_parent", "sent_pose", "base_frame", "base", "novelty", "up", "name",
+    "sequence", "deletion", "deleted_from", "deleted_content",
 )  # fmt: skip
 
 
@@ -203,11 +204,11 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     blobs : that it referred to
     """
     own = select(frames.c.number).where(frames.c.map_number == row.number)
-    of_map = select(jobs.c.number).where(jobs.c.map_number == row.number)
+    own_jobs = select(jobs.c.number).where(jobs.c.map_number == row.number)
     asked = (
         select(frames.c.blob).where(frames.c.map_number == row.number),
         select(signatures.c.geometry).where(signatures.c.frame_number.in_(own)),
-        select(job_files.c.blob).where(job_files.c.job_number.in_(of_map)),
+        select(job_files.c.blob).where(job_files.c.job_number.in_(own_jobs)),
         *(
             select(column).where(surface_tiles.c.map_number == row.number, column.is_not(None))
             for column in (surface_tiles.c.blob, surface_tiles.c.draft)
@@ -219,10 +220,10 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     connection.execute(delete(signatures).where(signatures.c.frame_number.in_(own)))
     tiles = select(surface_tiles.c.number).where(surface_tiles.c.map_number == row.number)
     connection.execute(delete(surface_touches).where(surface_touches.c.tile_number.in_(tiles)))
-    for of_surface in (surface_tiles, surface_frames, surfaces):
-        connection.execute(delete(of_surface).where(of_surface.c.map_number == row.number))
+    for of_map in (surface_tiles, surface_frames, surfaces, parent_joins):
+        connection.execute(delete(of_map).where(of_map.c.map_number == row.number))
     for made in (job_items, job_files):
-        connection.execute(delete(made).where(made.c.job_number.in_(of_map)))
+        connection.execute(delete(made).where(made.c.job_number.in_(own_jobs)))
     keep_turns(connection)
     connection.execute(delete(jobs).where(jobs.c.map_number == row.number))
     connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(own)))

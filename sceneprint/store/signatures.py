@@ -24,7 +24,8 @@ from sqlalchemy import (
 from sceneprint.errors import DamagedSignature
 from sceneprint.store import reencoding_rows
 from sceneprint.store.events import events_table
-from sceneprint.store.maps import next_revision
+from sceneprint.store.maps import next_revision, position
+from sceneprint.store.parent_joins import root_columns
 from sceneprint.store.queue import PENDING
 from sceneprint.store.surface_rows import mark_edited, note_edit
 from sceneprint.store.tables import (
@@ -81,10 +82,19 @@ def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) 
     _write_signature(connection, frame, made)
     mark_edited(connection, frame.number)  # it may have been indexed before
     revision = next_revision(connection, frame.map_number)
+    moved = root_columns(connection, frame)
+    if moved:
+        moved |= position(moved["pose"])
     connection.execute(
         update(frames)
         .where(frames.c.number == frame.number)
-        .values(state=FrameState.INDEXED, reason=None, indexed_at=time.time(), revision=revision)
+        .values(
+            state=FrameState.INDEXED,
+            reason=None,
+            indexed_at=time.time(),
+            revision=revision,
+            **moved,
+        )
     )
     return revision
 
@@ -105,7 +115,8 @@ def index_claimed_frame(
     Returns
     -------
     done : False, and nothing was written, on SQLite; where the job is not held any more; where
-        the map has another model, or is to have one: then what else has to be done must be found
+        the map has another model, or is to have one, or joined the frame's parent frame: then what
+        else has to be done must be found
     """
     if connection.dialect.name == "sqlite":
         return False
@@ -115,7 +126,7 @@ def index_claimed_frame(
         "frame": frame.number, "model": made.model_id, "vector": made.vector,
         "checksum": crc32(made.vector), "geometry": made.geometry,
         "n_patches": json.dumps(list(made.n_patches)), "n_pairs": json.dumps(list(made.n_pairs)),
-        "indexed_at": time.time(), **told,
+        "indexed_at": time.time(), "parent": frame.pose_parent, **told,
         "data": json.dumps(told["data"]),
     }  # fmt: skip
     statement = _index_claimed(events_table(connection).name)
@@ -134,6 +145,9 @@ def _index_claimed(events_name: str) -> TextClause:
                 AND EXISTS (
                     SELECT FROM maps WHERE number = :map_number AND model_id = :model
                         AND next_model_id IS NULL)
+                AND NOT EXISTS (
+                    SELECT FROM parent_joins WHERE map_number = :map_number
+                        AND parent = cast(:parent AS text))
             RETURNING number
         ), revised AS (
             UPDATE maps SET revision = revision + 1

@@ -111,6 +111,18 @@ def write_surface(connection: Connection, map_number: int, **values: object) -> 
 def note_edit(connection: Connection, frame_number: int, map_number: int) -> None:
     """Let the surface learn that a frame was edited, in the transaction that does so."""
     mark_edited(connection, frame_number)
+    _count_edit(connection, map_number)
+
+
+def note_moved(connection: Connection, numbers: Sequence[int], map_number: int) -> None:
+    """As `note_edit`, of many frames at once."""
+    for some in blocks(numbers):
+        own = among(connection, surface_frames.c.frame_number, some)
+        connection.execute(update(surface_frames).where(own).values(changed=True))
+    _count_edit(connection, map_number)
+
+
+def _count_edit(connection: Connection, map_number: int) -> None:
     of_map = surfaces.c.map_number == map_number
     counted = update(surfaces).where(of_map).values(pose_edits=surfaces.c.pose_edits + 1)
     connection.execute(counted)

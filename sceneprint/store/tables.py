@@ -124,6 +124,9 @@ frames = Table(
     Column("pose_x", Float),  # its translation, metres, to be searched for
     Column("pose_y", Float),
     Column("pose_z", Float),
+    # where a join moved the pose: its parent frame and its matrix as they were sent
+    Column("sent_parent", _string(128)),
+    Column("sent_pose", JSON(none_as_null=True)),
     Column("base_frame", _string(128)),
     Column("base", JSON(none_as_null=True)),  # T_base_sensor, 4 rows of 4
     Column("novelty", Float),  # kept only if the nearest frame is farther, as a share of d0
@@ -181,6 +184,18 @@ Index(
     "ix_frames_ended", frames.c.map_number, frames.c.state, frames.c.ended_at,
     sqlite_where=ENDED, postgresql_where=ENDED,
 )  # fmt: skip
+
+#: Parent frames that joins lead from: poses sent in `parent` are stored in `root`.
+parent_joins = Table(
+    "parent_joins",
+    metadata,
+    Column("map_number", WHOLE, ForeignKey("maps.number"), primary_key=True),
+    Column("parent", _string(128), primary_key=True),
+    Column("root", _string(128), nullable=False),  # never joined itself
+    Column("transform", JSON, nullable=False),  # T_root_parent, 4 rows of 4
+    Column("job_id", _string(32), nullable=False),  # association that found it
+    Column("joined_at", Float, nullable=False),
+)
 
 #: `frames.tags` once more, a row each, to be searched for.
 frame_tags = Table(
@@ -668,6 +683,8 @@ class FrameRow:
     deletion: int | None = None
     deleted_from: FrameState | None = None
     deleted_content: str | None = None
+    sent_parent: str | None = None
+    sent_pose: list[list[float]] | None = None
 
     @property
     def kind(self) -> Kind:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 from sqlalchemy import Connection, Table, insert, select, update
 
@@ -12,6 +13,7 @@ from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
 from sceneprint.store.maps import add_frame, add_map, keep_model, map_of
 from sceneprint.store.new_frames import NewFrame, receive_frames
+from sceneprint.store.parent_joins import ParentJoin, join_parent
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame, index_frame
 from sceneprint.store.tables import (
     JobRow,
@@ -120,6 +122,25 @@ def test_a_frame_is_received_as_by_its_parts(server_store: Store, pair: list[Map
     assert single["frames"][0]["pose_x"] == 2.5
     assert single["jobs"][0] | {"priority": 3, "state": "queued"} == single["jobs"][0]
     assert (single["maps"][0]["used_frames"], single["maps"][0]["used_bytes"]) == (1, 70)
+
+
+def test_a_frame_of_a_joined_parent_frame_is_indexed_in_the_root(
+    server_store: Store, pair: list[MapRow]
+) -> None:
+    row, T = pair[0], np.diag([-1.0, -1.0, 1.0, 1.0])  # half a turn about z
+    received(server_store, row, at_once=True)
+    job = claimed(server_store, row)
+    with server_store.database.write(map_number=row.number) as connection:
+        assert join_parent(connection, row.number, ParentJoin("odom", "hall", T), "0" * 32)
+        # as a frame that came in the very moment of the join
+        sent = {"pose_parent": "odom", "pose": POSE, "sent_parent": None, "sent_pose": None}
+        connection.execute(update(frames).values(**sent, pose_x=0, pose_y=0, pose_z=0))
+    assert not indexed(server_store, row, job, at_once=True)
+    assert indexed(server_store, row, job, at_once=False)
+    [stored] = rows(server_store, row)["frames"]
+    assert (stored["pose_parent"], stored["sent_parent"]) == ("hall", "odom")
+    assert [stored[f"pose_{axis}"] for axis in "xyz"] == [-2.5, 1.0, 0.5]
+    assert (stored["pose"], stored["sent_pose"]) == ((T @ np.array(POSE)).tolist(), POSE)
 
 
 @pytest.mark.parametrize(

@@ -55,6 +55,8 @@ class FrameRowRecord(ApiRecord):
     tags: list[str]
     pose_parent: str | None
     pose: _Matrix | None
+    sent_parent: str | None
+    sent_pose: _Matrix | None
     base_frame: str | None
     base: _Matrix | None
     novelty: float | None

@@ -82,6 +82,11 @@ class Frame(ApiRecord):
     received_at: datetime
     indexed_at: datetime | None
     pose: Transform | None
+    sent_pose: Transform | None = Field(
+        default=None,
+        description="The pose as it was sent, where the map joined its parent frame to that of "
+        "`pose`; else null.",
+    )
     base_frame: str | None = Field(default=None, description="Frame of the robot's base.")
     T_base_sensor: Transform | None = Field(
         default=None, description="Where the sensor sits on the robot, as it was sent."

@@ -102,6 +102,14 @@ class Map(ApiRecord):
     created_at: datetime
     revision: int = Field(description="Grows with every frame that is indexed or deleted.")
     frames: dict[str, int] = Field(description="How many frames are in each state.")
+    posed_frames: int = Field(
+        default=0, description="Indexed frames with a pose. Without any, answers have no pose."
+    )
+    parent_frames: int = Field(
+        default=0,
+        description="Parent frames of these poses. More than one: answers are in that of their "
+        "matches, until an association joins them.",
+    )
     used_frames: int = Field(
         default=0, description="Frames that count for the quota: neither deleted nor redundant."
     )

@@ -223,6 +223,11 @@ class Match(ApiRecord):
         description="Of a guided match: `transform` as the map's poses predict it from the matches "
         "before, up to 15 cm and 6 deg off.",
     )
+    parent_frame: str | None = Field(
+        default=None,
+        description="Parent frame that the pose of the frame was sent in; null without a pose. "
+        "Where the map joined it to another, `pose_in_map` is in that.",
+    )
     pose_in_map: Transform | None = Field(
         description="The query in the parent frame of the match's pose, where that is known and "
         "the match is not rejected."

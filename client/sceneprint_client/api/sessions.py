@@ -54,6 +54,11 @@ class NewAssociation(Given):
         description="How many of a frame's ranking are selected and validated until `k` are "
         "accepted, some 20 ms each.",
     )
+    join: bool = Field(
+        default=True,
+        description="Of two sessions: where the join between their parent frames is strong, let "
+        "all poses of the map in these frames lead to one of them.",
+    )
     seed: int = Field(default=0, ge=0, lt=2**32, description="Of the random choices.")
     min_overlap: float = Field(
         default=0.0, ge=0.0, le=1.0, description="Least overlap of an edge that is kept."
@@ -105,7 +110,7 @@ class Edge(ApiRecord):
     ambiguity: float = Field(description="Share that the best other transform explains.")
     similarity: float = Field(description="Of the signatures, 0 to 1.")
     from_pose: Transform | None = Field(
-        default=None, description="Of `from_frame`, in the parent frame that it was sent with."
+        default=None, description="Of `from_frame`, in the parent frame that its pose is in now."
     )
     to_pose: Transform | None = Field(default=None, description="Of `to_frame`.")
     from_name: str | None = Field(default=None, description="What the file was called.")
@@ -145,6 +150,11 @@ class Join(ApiRecord):
     )
     spread_deg: float | None
     reason: str
+    root: str | None = Field(
+        default=None,
+        description="Parent frame that the poses of both are in from then on, the one whose "
+        "frames came first; null where nothing was moved.",
+    )
 
 
 class AssociationResult(ApiRecord):
@@ -187,8 +197,8 @@ class Vertex(ApiRecord):
     name: str | None = Field(default=None, description="Of the original file or message.")
     sequence: int | None = Field(default=None, description="Place within the session.")
     pose: Transform | None = Field(
-        description="In `frame` of the graph where the sessions are joined; else in the parent "
-        "frame that it was sent with. null where it has none and no edge leads to one that has."
+        description="In `frame` of the graph where the sessions are joined; else in its own "
+        "parent frame. null where it has none and no edge leads to one that has."
     )
 
 

@@ -98,12 +98,19 @@ def find_duplicate(
     return None
 
 
+def _sent_value(frame: FrameRow, name: str) -> Any:
+    """Return a column of a frame as it was sent, before a join moved its pose."""
+    if frame.sent_parent is not None and name in ("pose", "pose_parent"):
+        return frame.sent_pose if name == "pose" else frame.sent_parent
+    return getattr(frame, name)
+
+
 def _differing(frame: FrameRow, known: dict[str, Any]) -> list[str]:
     return [
         _FIELDS.get(name, name)
         for name, value in known.items()
         if name not in _LABELS
-        and _given_value(name, getattr(frame, name)) != _given_value(name, value)
+        and _given_value(name, _sent_value(frame, name)) != _given_value(name, value)
     ]
 
 

@@ -45,6 +45,7 @@ from sceneprint.store.maps import (
     model_content,
     model_names,
 )
+from sceneprint.store.parent_joins import root_columns
 from sceneprint.store.queue import cancel_jobs
 from sceneprint.store.tables import FrameRow, MapRow, jobs, models
 from sceneprint_client.api import Frame, FrameMeta, FrameState, Map, NewMap
@@ -136,7 +137,11 @@ def edit_frame(
         if frame.state == FrameState.DELETED:
             raise errors.UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted before.")
         _check_tag(f"Frame {frame.id}", serializers.frame_tag(frame), if_match)
-        now = write_frame(connection, row, frame, edited(frame, patch))
+        values = edited(frame, patch)
+        if "pose_parent" in values:  # it is sent anew, in a parent frame that may be joined
+            values = {"sent_parent": None, "sent_pose": None, **values}
+            values |= root_columns(connection, replace(frame, **values))
+        now = write_frame(connection, row, frame, values)
         return serializers.frame_records(connection, row, [now])[0]
 
 

@@ -223,6 +223,7 @@ def _match(
             if tried is None or tried.predicted is None
             else transform(tried.predicted, sensor_of(row), candidates.query_frame)
         ),
+        parent_frame=row.sent_parent or row.pose_parent,
         pose_in_map=(
             None
             if in_map is None

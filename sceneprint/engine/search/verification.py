@@ -19,6 +19,7 @@ from sceneprint.engine.search.retrieval import Deadline, Searched, SearchedMap
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, InvalidRequest, UnreadableGeometry
+from sceneprint.geometry.registration.icp import transported
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.map_verification import (
@@ -39,6 +40,7 @@ from sceneprint.store.maps import (
     placed_frames,
     viewpoints_among,
 )
+from sceneprint.store.parent_joins import find_join
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Prior, Query, ValidationOptions
@@ -249,14 +251,17 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
         )
     row, name = places[0].row, str(prior.pose.parent_frame)
     with store.database.read() as connection:
+        joined = find_join(connection, row.number, name)
+        if joined is not None:  # the map's poses are in its root
+            name, T = joined.root, joined.T @ T
+            covariance = transported(covariance, joined.T[:3, :3], np.zeros(3))
         if not has_parent_frame(connection, row.number, name):
             raise InvalidRequest(
                 f"No frame of map {row.name!r} has a pose in the parent frame {name!r} of the "
                 "prior. Give the pose in one that the map has; `sceneprint frames` shows them.",
                 (("prior.pose.parent_frame", "not of this map"),),
             )
-    parent = f"{row.number} {name}"
-    return PosePrior(parent, T, covariance)
+    return PosePrior(f"{row.number} {name}", T, covariance)
 
 
 #: Least eigenvalue of a covariance once its deviations are 1: what is less is rounding.

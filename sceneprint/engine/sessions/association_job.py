@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept
 from sceneprint.engine.search.local_index import IndexView
 from sceneprint.engine.search.retrieval import Readers
 from sceneprint.engine.search.up_vectors import known_ups
@@ -29,6 +31,7 @@ from sceneprint.geometry.retrieval.ranking import (
     ranking_size,
     similarity,
 )
+from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.session_join import (
     CycleParameters,
     JoiningParameters,
@@ -46,6 +49,7 @@ from sceneprint.pipeline import PairMatch, associate
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import PathFrame, stops_of
 from sceneprint.store.maps import find_map, frames_of, geometry_blobs, unknown_map
+from sceneprint.store.parent_joins import ParentJoin, join_parent, posed_runs
 from sceneprint.store.queue import items_of
 from sceneprint.store.signatures import stored_signatures
 from sceneprint.store.tables import MapRow
@@ -184,12 +188,37 @@ class Associating:
         judged, counts, joins = finish_association(
             found, plan.source, plan.target, stops, asked, scale
         )
+        rooted = self._rooted(task, joins) if asked.join and len(asked.sessions) == 2 else []
         result = {
             "frames": len(plan.source), "skipped": progress["skipped"],
             "validated": progress["validated"], "edges": len(found), **counts,
             "joins": joins,
         }  # fmt: skip
-        return SliceResult(True, progress, items + judged, result=result, event="association.found")
+        return SliceResult(
+            True, progress, items + judged, result=result, event="association.found",
+            write=partial(_apply, task, rooted) if rooted else None,
+        )  # fmt: skip
+
+    def _rooted(self, task: LongJob, joins: list[dict[str, Any]]) -> list[ParentJoin]:
+        """Return what strong joins lead to: the parent frame whose frames came first is the root.
+
+        Each of these joins comes to name it.
+        """
+        with self._store.database.read() as connection:
+            parents = [run.parent for run in posed_runs(connection, task.of_map.number)]
+        place = {name: i for i, name in enumerate(dict.fromkeys(parents))}
+        found: dict[str, ParentJoin] = {}
+        for one in joins:
+            ends = one["from_parent"], one["to_parent"]
+            if one["strength"] != "strong" or ends[0] == ends[1] or not place.keys() >= {*ends}:
+                continue
+            root, parent = sorted(ends, key=place.__getitem__)
+            T = np.array(one["transform"]["matrix"])
+            if parent in found or root in found:  # by a pair of frames before: one is enough
+                continue
+            one["root"] = root
+            found[parent] = ParentJoin(parent, root, T if root == ends[1] else inverse(T))
+        return list(found.values())
 
     def _begin(self, task: LongJob, asked: NewAssociation) -> dict[str, Any]:
         runs = runs_of(self._store, task.of_map, asked)
@@ -275,6 +304,19 @@ class Associating:
                     raise unknown_map(of.name)
                 if row.model_id == model.id:
                     return row, model, self._readers.view(connection, row)
+
+
+def _apply(task: LongJob, joins: list[ParentJoin], connection: Connection) -> list[str]:
+    """Join parent frames in the commit that ends an association; no blob is of no use after it.
+
+    Raises
+    ------
+    Swept : another association joined one of them meanwhile, and the end is concluded again.
+    """
+    for one in joins:
+        if not join_parent(connection, task.of_map.number, one, task.job.id):
+            raise Swept(f"Another association has joined {one.parent} or {one.root} meanwhile.")
+    return []
 
 
 def _item(number: int, match: PairMatch) -> dict[str, Any]:

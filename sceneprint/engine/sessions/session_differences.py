@@ -111,7 +111,7 @@ def shared_parent(connection: Connection, row: MapRow, asked: NewDifference) -> 
         raise InvalidRequest(
             f"Session {asked.before!r:.80} has poses in {', '.join(before)!r:.200}, session "
             f"{asked.after!r:.80} in {', '.join(after)!r:.200}: they share no parent frame. "
-            "Associate the sessions, and give their frames poses in one parent frame.",
+            "Associate the sessions: a strong join gives their poses one parent frame.",
             (("after", "no parent frame in common"),),
         )
     return asked.parent_frame or shared[0]

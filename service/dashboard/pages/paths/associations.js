@@ -46,7 +46,7 @@ function told(one, edges) {
   const joins = one.result.joins.map((join) => h("li", {},
     h("span", { class: "badge", dataset: { kind: join.transform === null ? "warn" : join.strength === "strong" ? "good" : "neutral" } }, join.transform === null ? "not joined" : `joined, ${join.strength}`),
     h("span", {}, h("span", { class: "mono" }, `${join.from_parent} → ${join.to_parent}`),
-      h("span", { class: "muted" }, join.transform === null ? coded(` ${join.reason}`) : ` ${join.support} of ${join.votes} edges agree, within ${metres(join.spread_m)}, ${degrees(join.spread_deg)}`))));
+      h("span", { class: "muted" }, join.transform === null ? coded(` ${join.reason}`) : ` ${join.support} of ${join.votes} edges agree, within ${metres(join.spread_m)}, ${degrees(join.spread_deg)}${join.root ? `. All poses are in ${join.root} now` : ""}`))));
   return [
     h("ul", { class: "paths-kinds" }, kinds),
     edges && edges.drawn < one.result.edges && h("p", { class: "muted" },
