@@ -124,6 +124,9 @@ class Settings(BaseSettings):
     #: Who begins the fused surface of a map: workers, as frames come, or whoever asks for it.
     #: Deleted frames are always taken out of one that there is.
     surfaces: Literal["auto", "asked"] = "auto"
+    #: Who starts the associations that join the parent frames of a map: workers, as sessions come,
+    #: or whoever asks for one. Only a strong join moves poses.
+    joins: Literal["auto", "asked"] = "auto"
     #: Seconds after which no byte of a deleted frame is left in the caches of this node.
     purge_s: float = Field(default=3600.0, ge=1, le=31_536_000)
 

@@ -39,6 +39,7 @@ from sceneprint.engine.search.shared_index import open_shared
 from sceneprint.engine.serializers import frame_records, map_record
 from sceneprint.engine.sessions.association_job import Associating
 from sceneprint.engine.sessions.associations import ASSOCIATE, AssociationJobs
+from sceneprint.engine.sessions.join_upkeep import JoinUpkeep
 from sceneprint.engine.sessions.session_differences import (
     DIFFERENCE,
     DifferenceHandler,
@@ -140,6 +141,7 @@ class Engine:
         self._surface_upkeep = SurfaceUpkeep(
             self.store, self.bell, auto=settings.surfaces == "auto"
         )
+        self._join_upkeep = JoinUpkeep(self.store, self.bell, auto=settings.joins == "auto")
         self.audit = Audit(self.store, settings.audit_kept_days)
         self.key_uses = stored_keys.KeyUses()
         self.outputs = FrameFiles(self.store, self.signers)
@@ -381,8 +383,8 @@ class Engine:
 
     def publish_due(self) -> int:
         """Bring maps on to their next models, delete what is too old, publish the indexes that have
-        fallen behind, verify a little, and remove what is no longer kept; returns how many indexes
-        were published.
+        fallen behind, look for joins, verify a little, and remove what is no longer kept; returns
+        how many indexes were published.
         """
         number_events(self.store.database)  # where nobody reads them
         self._reencoding.run()
@@ -393,6 +395,7 @@ class Engine:
         self.query_log.tidy()
         self.imports.tidy()
         self._surface_upkeep.run()
+        self._join_upkeep.run()
         if self.purging.run() is not None:
             with self.store.database.read() as connection:
                 self._readers.purge(connection)

@@ -122,7 +122,7 @@ def running(data: Path, workers: int, port: int = 0) -> Iterator[Station]:
             [sys.executable, "-m", "sceneprint", "serve", "--port", str(port),
              "--data", str(data), "--workers", str(workers)],
             stdout=subprocess.PIPE, stderr=log, text=True,
-            env={**os.environ, "SCENEPRINT_SURFACES": "asked"},
+            env={**os.environ, "SCENEPRINT_SURFACES": "asked", "SCENEPRINT_JOINS": "asked"},
         )  # fmt: skip
     assert process.stdout is not None
     try:

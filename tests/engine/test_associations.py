@@ -19,12 +19,14 @@ from sceneprint.engine.jobs.lifecycle import list_jobs
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.sessions import associations
 from sceneprint.engine.sessions.association_job import Associating, finish_association
+from sceneprint.engine.sessions.join_upkeep import JoinUpkeep
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.lab.synth import SynthRoom
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
 from sceneprint.store.frame_queries import PathFrame
+from sceneprint.store.parent_joins import posed_runs
 from sceneprint.store.tables import events, frames, job_items, jobs
 from sceneprint.types import Floats
 from sceneprint_client.api import Filter, JobState, NewMap
@@ -103,6 +105,9 @@ def test_two_robots_maps_are_joined(engine: Engine, work_off: Callable[[Engine],
     assert (join.from_parent, join.to_parent) == ("ann/a", "bob/b")
     assert (join.support, join.votes) == (result.edges, result.edges)
     assert join.strength == "weak"  # ten edges of either run and more, of a few centimetres
+    assert join.root is None
+    with engine.store.database.read() as connection:
+        assert {one.parent for one in posed_runs(connection, 1)} == {"ann/a", "bob/b"}
     assert "all within 0.0" in join.reason
     assert join.transform is not None
     told_between = (join.transform.parent_frame, join.transform.child_frame)
@@ -118,6 +123,28 @@ def test_two_robots_maps_are_joined(engine: Engine, work_off: Callable[[Engine],
         kind = events.c.kind == "association.found"
         data = connection.execute(select(events.c.data).where(kind)).scalar_one()
     assert data["edges"] == result.edges
+
+
+def test_parent_frames_are_associated_unasked(
+    engine: Engine, work_off: Callable[[Engine], Any]
+) -> None:
+    def look(*, auto: bool = True) -> list[NewAssociation]:
+        """What a process asks for that looks for the first time."""
+        before = {one.association_id for one in engine.associations.list_all("hall").items}
+        JoinUpkeep(engine.store, engine.bell, auto=auto).run()
+        after = engine.associations.list_all("hall").items
+        return [one.asked for one in after if one.association_id not in before]
+
+    assert look(auto=False) == []
+    assert look() == [NewAssociation(sessions=["b", "a"], robots=["bob", "ann"])]
+    assert look() == []  # it is queued
+    work_off(engine)
+    assert look() == []  # the two sessions have not grown
+    sides = {"source": [1, 2, 3, 4], "target": [5, 6, 7, 8, 9]}
+    with engine.store.database.write() as connection:  # 9 frames, and 12 are a quarter more
+        of_kind = jobs.c.kind == associations.ASSOCIATE
+        connection.execute(update(jobs).where(of_kind).values(progress=sides))
+    assert len(look()) == 1
 
 
 def pose_of(engine: Engine, frame_id: str) -> Floats:
