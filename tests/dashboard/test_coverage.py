@@ -173,15 +173,17 @@ def test_cells_are_ranked_by_what_robots_lose(station: Any, page: Page, settle: 
     settle(page)
 
     def cell(column: int, **counts: int) -> dict[str, int]:
-        return {"column": column, "row": 0, "frames": 9, **dict.fromkeys(OUTCOMES, 0), **counts}
+        known = {"column": column, "row": 0, "frames": 9, "unchecked": 0}
+        return {**known, **dict.fromkeys(OUTCOMES, 0), **counts}
 
     cells = [
         cell(0, found=1, not_found=1), cell(1, found=3), cell(2, not_found=1), cell(3, ambiguous=2),
-        cell(4, wrong=1), cell(5),
+        cell(4, wrong=1), cell(5), cell(6, unchecked=2), cell(7, found=1, unchecked=1),
     ]  # fmt: skip
     script = """async ([url, cells]) => { const m = await import(url);
         return [m.worstCells(cells).map((one) => one.column), cells.map(m.outcomeIn)]; }"""
     url = f"{station.url}/dashboard/coverage/outcomes.js"
     worst, outcomes = page.evaluate(script, [url, cells])
     assert worst == [4, 3, 2, 0]
-    assert outcomes == ["not_found", "found", "not_found", "ambiguous", "wrong", None]
+    assert outcomes[:5] == ["not_found", "found", "not_found", "ambiguous", "wrong"]
+    assert outcomes[5:] == [None, "unchecked", "found"]

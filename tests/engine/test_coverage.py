@@ -18,6 +18,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import Work, cancel
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.maps.map_coverage import CoverageHandler, frames_to_query
+from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.lab.synth import SynthRoom
 from sceneprint.settings import Settings
@@ -161,6 +162,20 @@ def test_cells_count_the_frames_taken_in_them(engine: Engine, rooms: Rooms) -> N
         assert {place: cell.frames for place, cell in cells.items()} == expected
         outcome = "ambiguous" if plan is plans[0] else "found"
         assert {place: getattr(cell, outcome) for place, cell in cells.items()} == expected
+
+
+def test_an_answer_in_another_parent_frame_is_not_checked(
+    engine: Engine, work_off: WorkOff, rooms: Rooms
+) -> None:
+    mine = [one for one in engine.list_frames("hall").items if one.session == "c"]
+    edit_frame(engine.store, "hall", mine[0].frame_id, {"pose": {"parent_frame": "elsewhere"}})
+    told = measured(engine, work_off, session="c", not_within_s=0.0)
+    assert told.result is not None
+    assert (told.result.frames, told.result.found, told.result.unchecked) == (4, 3, 1)
+    assert told.plans is not None
+    of_parent = {one.parent_frame: one.cells for one in told.plans}
+    assert sum(one.found for one in of_parent[rooms.parents[1]]) == 3
+    assert sum(one.unchecked for one in of_parent["elsewhere"]) == 1
 
 
 def test_only_another_session_of_an_equal_room_gives_wrong_poses(

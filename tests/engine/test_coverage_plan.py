@@ -147,3 +147,4 @@ def test_two_results_are_compared_cell_by_cell() -> None:
     assert told.cells[4].after is None
     assert (gone.parent_frame, [one.trend for one in gone.cells]) == ("gone", ["gone"])
     assert localisability(before[0].cells[3]) == pytest.approx(1 / 3)
+    assert localisability(cell(0, 0, 3, found=1, wrong=0, not_found=1, unchecked=1)) == 0.5

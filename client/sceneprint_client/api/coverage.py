@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 from pydantic import Field, model_validator
 
@@ -13,8 +13,8 @@ from sceneprint_client.api.query import Cause
 #: Most frames that one coverage job queries.
 MOST_QUERIED = 5000
 #: What became of a frame that was queried.
-CoverageOutcome = Literal["found", "wrong", "ambiguous", "not_found"]
-COVERAGE_OUTCOMES: tuple[CoverageOutcome, ...] = ("found", "wrong", "ambiguous", "not_found")
+CoverageOutcome = Literal["found", "wrong", "ambiguous", "not_found", "unchecked"]
+COVERAGE_OUTCOMES: tuple[CoverageOutcome, ...] = get_args(CoverageOutcome)
 #: Whence the up axis of a plan comes.
 UpSource = Literal["map", "frames", "cameras"]
 #: How a cell compares with an earlier result.
@@ -82,10 +82,15 @@ class NewMapCoverage(Given):
 class OutcomeCounts(ApiRecord):
     """How many queried frames had each outcome."""
 
-    found: int = Field(description="Found, and right as far as that can be checked.")
+    found: int = Field(description="Found, and right.")
     wrong: int = Field(description="Found, but not at the frame's own pose.")
     ambiguous: int
     not_found: int
+    unchecked: int = Field(
+        default=0,
+        description="Found, and nothing says whether that is right, as frame and answer have no "
+        "poses in one parent frame. Of a share that is found, leave these out.",
+    )
 
 
 class CoverageResult(OutcomeCounts):
@@ -94,10 +99,6 @@ class CoverageResult(OutcomeCounts):
     frames: int = Field(description="Frames that were queried.")
     skipped: int = Field(
         description="Frames that could not be queried: deleted, damaged or edited meanwhile."
-    )
-    unchecked: int = Field(
-        description="Of `found`: those whose pose cannot be checked, as frame and answer have no "
-        "poses in one parent frame."
     )
     model: str = Field(description="Of the signatures.")
     revision: int = Field(

@@ -428,7 +428,8 @@ class MapImporter:
         counts = Counter(outcomes)
         known = ("points", "triangles", "units_per_metre", "units_from", "up_from", "notes")
         facts: dict[str, Any] = {name: progress[name] for name in known}
-        facts |= {name: counts[name] for name in COVERAGE_OUTCOMES}
+        # every view has a pose in the map's parent frame, so all are checked
+        facts |= {name: counts[name] for name in COVERAGE_OUTCOMES if name != "unchecked"}
         return MapImportResult(
             **facts,
             up=Direction(**_xyz(surface.up)),

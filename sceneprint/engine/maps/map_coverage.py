@@ -348,9 +348,6 @@ class CoverageHandler:
         result = CoverageResult(
             **{name: counts[name] for name in COVERAGE_OUTCOMES},
             frames=len(found), skipped=progress["skipped"],
-            unchecked=sum(
-                item["outcome"] == "found" and item["error_m"] is None for item in found
-            ),
             model=label, revision=progress["revision"], last_revision=row.revision,
             map_frames=states.get("indexed", 0), cell_m=cell_m,
         )  # fmt: skip
@@ -377,7 +374,7 @@ def outcome_of(answer: Answer, stop: PathFrame, asked: NewMapCoverage) -> dict[s
     off = _difference(there, own, stop.parent)
     outcome: CoverageOutcome = "not_found"
     if answer.status == "found":
-        outcome = "found" if off is None or _is_within(off, asked) else "wrong"
+        outcome = "unchecked" if off is None else "found" if _is_within(off, asked) else "wrong"
     elif answer.status == "ambiguous":
         outcome = "ambiguous"
     poses = [one.pose for one in answer.alternatives]

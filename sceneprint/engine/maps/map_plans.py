@@ -142,8 +142,8 @@ def queried_in(cell: CoverageCell) -> int:
 
 
 def localisability(cell: CoverageCell) -> float:
-    """Mean over the queried frames of a cell: 1 for found, -1 for wrong, 0 otherwise."""
-    return (cell.found - cell.wrong) / queried_in(cell)
+    """Mean over the checked frames of a cell: 1 for found, -1 for wrong, 0 otherwise."""
+    return (cell.found - cell.wrong) / max(queried_in(cell) - cell.unchecked, 1)
 
 
 def plan_changes(

@@ -9,7 +9,7 @@ import { flat, nameOf } from "../plan/axes.js";
 import { cornersOf, laySurface, surfaceOf, unseen } from "../plan/backdrop.js";
 import { Plan } from "../plan/plan.js";
 import { beginCoverage, cancelCoverage, followJob, goesOn } from "./measurement.js";
-import { OUTCOMES, outcomeMark, TRENDS } from "./outcomes.js";
+import { checkedIn, outcomeMark, outcomesIn, TRENDS } from "./outcomes.js";
 import { areaCard, cellsTable, changesCard, countsCard, worstCard } from "./panels.js";
 import { cellAt, drawCells, drawFrames, hit, keyOf } from "./sheet.js";
 
@@ -155,7 +155,7 @@ class Page {
       .map((one) => ({ ...one, at: this.#flat(one.position) }));
     this.#links(); // beneath the numbers of cells
     drawCells(this.plan, changed ? changed.cells : planned.cells, wide, this.seen.cell);
-    this.plan.label(`Plan of ${planned.parent_frame}: ${OUTCOMES.map(({ name, text }) => `${result[name]} ${text.toLowerCase()}`).join(", ")}`);
+    this.plan.label(`Plan of ${planned.parent_frame}: ${outcomesIn(result).map(({ name, text }) => `${result[name]} ${text.toLowerCase()}`).join(", ")}`);
     put(this.plan.about, `${planned.parent_frame}${right && top ? ` · ${right} → ${top} ↑` : ""}`);
     const corners = /** @type {import("../plan/plan.js").Place[]} */ (planned.cells.flatMap(({ column, row }) => [[column * wide, row * wide], [(column + 1) * wide, (row + 1) * wide]]));
     const fused = this.surface.parents.find((one) => one.parent_frame === planned.parent_frame) ?? null;
@@ -167,7 +167,7 @@ class Page {
     return h("section", { class: "card cover-plan", "aria-label": "Plan" }, several, this.plan.element,
       h("ul", { class: "plan-key", "aria-label": "Legend" }, changed
         ? TRENDS.map(({ name, text, sign }) => h("li", {}, h("span", { class: "cover-sign", dataset: { trend: name }, "aria-hidden": "true" }, sign), text))
-        : OUTCOMES.map(({ name, text }) => h("li", {}, outcomeMark(name), text))),
+        : outcomesIn(result).map(({ name, text }) => h("li", {}, outcomeMark(name), text))),
       h("p", { class: "muted cover-note" }, `Cells of ${metres(wide)}; the number is how many frames of the map were taken there. Click a cell or a frame. Drag to move.${whence}`));
   }
 
@@ -183,7 +183,7 @@ class Page {
 
   #toolbar() {
     const { coverage_id: id, created_at: when } = this.shown, same = JSON.stringify(this.shown.asked);
-    const name = (one) => `${one.created_at.slice(0, 16).replace("T", " ")} · ${percent(one.result.found / Math.max(one.result.frames, 1))} of ${count(one.result.frames)} found`;
+    const name = (one) => `${one.created_at.slice(0, 16).replace("T", " ")} · ${percent(one.result.found / Math.max(checkedIn(one.result), 1))} of ${count(one.result.frames)} found`;
     const earlier = this.results.filter((one) => one.created_at < when && JSON.stringify(one.asked) === same);
     return h("div", { class: "toolbar cover-bar" },
       h("label", { class: "cover-field" }, h("span", { class: "muted" }, "Result"),

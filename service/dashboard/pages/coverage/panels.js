@@ -3,7 +3,7 @@ import { h } from "../lib/dom.js";
 import { count, degrees, metres, percent, shortId } from "../lib/format.js";
 import { coded, sentence } from "../lib/prose.js";
 import { link } from "../lib/router.js";
-import { OUTCOMES, outcomeMark, outcomeOf, queriedIn, tally, TRENDS, worstCells } from "./outcomes.js";
+import { checkedIn, outcomeMark, outcomeOf, outcomesIn, queriedIn, tally, TRENDS, worstCells } from "./outcomes.js";
 import { keyOf } from "./sheet.js";
 
 const MOST_WORST = 8, MOST_LISTED = 40;
@@ -13,10 +13,10 @@ export function countsCard(result) {
   const before = result.last_revision !== result.revision;
   return h("section", { class: "card cover-card", "aria-labelledby": "cover-counts" },
     h("h2", { id: "cover-counts" }, `${count(result.frames)} of ${count(result.map_frames)} frames queried`),
-    h("ul", { class: "cover-counts" }, OUTCOMES.map(({ name, text }) => h("li", { dataset: { outcome: name } },
+    h("ul", { class: "cover-counts" }, outcomesIn(result).map(({ name, text }) => h("li", { dataset: { outcome: name } },
       outcomeMark(name), h("span", {}, text), h("strong", { class: "number" }, count(result[name])),
-      h("span", { class: "muted number" }, percent(result.frames ? result[name] / result.frames : 0))))),
-    result.unchecked > 0 && h("p", { class: "muted" }, `${count(result.unchecked)} of those found cannot be checked: frame and answer have no poses in one parent frame.`),
+      h("span", { class: "muted number" }, name === "unchecked" ? "" : percent(result[name] / Math.max(checkedIn(result), 1)))))),
+    result.unchecked > 0 && h("p", { class: "muted" }, coded(outcomeOf("unchecked").next ?? "")),
     result.skipped > 0 && h("p", { class: "muted" }, `${count(result.skipped)} could not be queried: deleted, damaged or edited meanwhile.`),
     before && h("p", { class: "muted" }, "Frames came or went while it ran."));
 }
@@ -63,7 +63,7 @@ export function areaCard({ map, cell, key, wide, frames, chosen, onchoose, onove
 }
 
 /** @param {Object<string, any>} frame */
-const rankOf = ({ outcome }) => ["found", "ambiguous", "not_found", "wrong"].indexOf(outcome);
+const rankOf = ({ outcome }) => ["found", "unchecked", "ambiguous", "not_found", "wrong"].indexOf(outcome);
 
 function frameItem(map, one, chosen, onchoose, onoverlay) {
   const { text } = outcomeOf(one.outcome), id = one.frame_id;
@@ -81,7 +81,7 @@ function frameItem(map, one, chosen, onchoose, onoverlay) {
 
 /** How cells changed. @param {Object<string, any>} changes of the API */
 export function changesCard({ trends, result_before: a, result_after: b }) {
-  const share = (result) => percent(result.frames ? result.found / result.frames : 0);
+  const share = (result) => percent(result.found / Math.max(checkedIn(result), 1));
   return h("section", { class: "card cover-card", "aria-labelledby": "cover-changes" },
     h("h2", { id: "cover-changes" }, "Changes"),
     h("p", {}, "Found ", h("strong", { class: "number" }, share(a)), " before, ", h("strong", { class: "number" }, share(b)), " now."),
@@ -92,11 +92,12 @@ export function changesCard({ trends, result_before: a, result_after: b }) {
 
 /** All cells as a table. @param {Object<string, any>[]} cells @param {number} wide @param {(cell: string) => void} onchoose */
 export function cellsTable(cells, wide, onchoose) {
+  const outcomes = outcomesIn(...cells);
   const rows = cells.toSorted((a, b) => b.row - a.row || a.column - b.column).slice(0, 500).map((cell) => h("tr", {},
     h("th", { scope: "row" }, h("button", { class: "button quiet", type: "button", id: `row-${keyOf(cell)}`, onClick: () => onchoose(keyOf(cell)) }, placeOfCell(cell, wide))),
-    h("td", { class: "number" }, count(cell.frames)), OUTCOMES.map(({ name }) => h("td", { class: "number" }, count(cell[name])))));
+    h("td", { class: "number" }, count(cell.frames)), outcomes.map(({ name }) => h("td", { class: "number" }, count(cell[name])))));
   return h("div", { class: "cover-scroll", tabindex: "0", role: "region", "aria-label": "Cells of the plan" }, h("table", { class: "table" },
     h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Middle"), h("th", { scope: "col", class: "number" }, "Frames"),
-      OUTCOMES.map(({ text }) => h("th", { scope: "col", class: "number" }, text)))), h("tbody", {}, rows)),
+      outcomes.map(({ text }) => h("th", { scope: "col", class: "number" }, text)))), h("tbody", {}, rows)),
   cells.length > 500 && h("p", { class: "muted" }, "The first 500 cells; the JSON file has all of them."));
 }
