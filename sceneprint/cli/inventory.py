@@ -547,13 +547,17 @@ def _delete(client: Client, name: str, *, sure: bool) -> None:
 
 
 def _line(one: Map) -> str:
-    limits = _limits(one)
-    return f"map {one.name}, {one.model}{limits and ', '}{limits}"
+    notes = _notes(one)
+    return f"map {one.name}, {one.model}{notes and ', '}{notes}"
 
 
-def _limits(one: Map) -> str:
-    """What a map has of what it may have, and for how long."""
+def _notes(one: Map) -> str:
+    """What a map has of what it may have, and for how long, and whether its poses fall apart."""
     parts = []
+    if one.frames.get("indexed") and not one.posed_frames:
+        parts.append("no poses")
+    if one.parent_frames > 1:
+        parts.append(f"{one.parent_frames} parent frames")
     if one.quota_frames is not None:
         parts.append(f"{one.used_frames} of {one.quota_frames} frames")
     if one.quota_bytes is not None:
@@ -578,8 +582,8 @@ def _print_maps(maps: list[Map], *, as_json: bool) -> None:
     for one in maps:
         n = one.frames
         waiting = n.get("received", 0) + n.get("signing", 0)
-        title, limits = one_line(one.title or ""), _limits(one)
-        told = f"{title}  ({limits})".strip() if limits else title
+        title, notes = one_line(one.title or ""), _notes(one)
+        told = f"{title}  ({notes})".strip() if notes else title
         print(
             f"{one.name:{width}}  {n.get('indexed', 0):7}  {waiting:7}  {n.get('rejected', 0):8}  "
             f"{n.get('failed', 0):6}  {one.model:20}  {told}".rstrip()

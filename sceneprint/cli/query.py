@@ -554,5 +554,5 @@ def localization_lines(name: str, there: Localization) -> list[str]:
         lines += [_pose_line(there.pose), f"  {_grounds(there)}"]
     elif there.best is not None:
         best = frame_label(there.best.frame_id, there.best.name)
-        lines.append(f"  at {metres(there.best.transform)} m from frame {best}")
+        lines.append(f"  no coordinates: frame {best} has no pose")
     return lines + _alternative_lines(there.alternatives)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 import time
 from collections import Counter
@@ -55,6 +56,7 @@ from sceneprint_client.sidecars import row_of
 if TYPE_CHECKING:
     from sceneprint_client import Client
     from sceneprint_client.api import Added, FrameMeta, Job
+    from sceneprint_client.api.listing import Session
 
 # What has become of the frames of an upload.
 
@@ -343,7 +345,45 @@ def run_upload(options: argparse.Namespace) -> int:
                     "starts some.",
                     file=sys.stderr,
                 )
+        clouds = sum(frame.cloud is not None for _, frame in found)
+        for line in map_lines(client, options.map, clouds) if tally.new or tally.there else ():
+            print(line)
     return 2 if tally.errors or stalled else 0
+
+
+def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
+    """Say what an upload leaves to do: poses, their parent frames, and the model of the map.
+
+    Parameters
+    ----------
+    client, map_name : of the map
+    clouds : point clouds among the frames that were uploaded
+    """
+    now, lines = client.map(map_name), []
+    if clouds and now.model.startswith("depth-"):
+        lines.append(
+            f"{clouds} of the frames are point clouds, and map {now.name} has the model for depth "
+            f"cameras. For scans of a LiDAR, `sceneprint reencode {now.name} --model lidar` "
+            "switches it."
+        )
+    if now.frames.get("indexed") and not now.posed_frames:
+        lines.append(f"map {now.name} has no poses: queries find frames, and no coordinates")
+    if now.parent_frames > 1:
+        first: dict[str, Session] = {}
+        for one in client.sessions(now.name):
+            if one.session is not None:
+                for parent in one.parent_frames:
+                    first.setdefault(parent, one)
+        two = list(first.values())[:2]
+        given = " ".join(f"--session {shlex.quote(str(one.session))}" for one in two)
+        if len({one.session for one in two}) < len(two) and all(one.robot for one in two):
+            given += "".join(f" --robot {shlex.quote(str(one.robot))}" for one in two)
+        lines.append(
+            f"the poses of map {now.name} are in {now.parent_frames} parent frames, and an answer "
+            "is in that of its matches. The service joins those that surely show one place; "
+            f"`sceneprint associate {now.name} {given}` does so at once, or says why not."
+        )
+    return lines
 
 
 def pose_line(

@@ -35,8 +35,11 @@ def house(service_url: str, rooms: Path) -> str:
         [sys.executable, "-m", "sceneprint", *arguments], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    first, second, third = done.stdout.splitlines()
+    first, second, third, fourth = done.stdout.splitlines()
     assert third == "poses of 6 of 6 frames"
+    assert fourth.startswith("the poses of map house are in 2 parent frames")
+    join = "`sceneprint associate house --session room-0/seq-01 --session room-1/seq-01`"
+    assert join in fourth
     assert re.fullmatch(r"created map house with model depth-[0-9a-f]{12}", first)
     assert second.startswith(
         "6 frames: 6 received, 0 already there; 6 indexed, 0 rejected, 0 failed; "

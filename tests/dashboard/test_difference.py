@@ -13,19 +13,50 @@ Settle = Callable[[Page], None]
 SIDES = ("monday", "tuesday")
 
 
-@pytest.fixture(scope="module")
-def weeks(station: Any, until: Callable[..., Any]) -> str:
-    """Path of a map whose sessions are one view of a room and the next one, an hour apart."""
-    path = str(station.make_map("weeks", title="Weeks"))
+def filled(station: Any, until: Callable[..., Any], name: str, *, apart: bool) -> str:
+    """Path of a map whose sessions are one view of a room and the next one, an hour apart.
+
+    They share a parent frame, unless they are to be `apart`.
+    """
+    path = str(station.make_map(name, title=name.capitalize()))
     for i, (sent, session) in enumerate(zip(station.frames[:2], SIDES, strict=True)):
         form = sent.form()
         meta = {**sent.meta, "session": session, "captured_at": f"2026-11-20T0{i}:00:00Z"}
+        if apart:
+            meta["pose"] = {**meta["pose"], "parent_frame": session}
         added = station.client.post(
             f"{path}/frames", files=form["files"], data={"meta": json.dumps(meta)}
         )
         assert added.status_code == 202, added.text
     until(lambda: station.client.get(path).json()["frames"].get("indexed") == 2)
     return path
+
+
+@pytest.fixture(scope="module")
+def weeks(station: Any, until: Callable[..., Any]) -> str:
+    """See `filled`."""
+    return filled(station, until, "weeks", apart=False)
+
+
+def test_sessions_that_share_no_frame_are_joined_on_the_page_where_that_is_sure(
+    station: Any, until: Callable[..., Any], page: Page, settle: Settle
+) -> None:
+    path = filled(station, until, "astray", apart=True)
+    page.allowed.append("422")  # type: ignore[attr-defined]
+    page.goto(f"{station.home}#/maps/astray/difference")
+    settle(page)
+    page.get_by_role("button", name="Compare").click()
+    expect(page.get_by_text("they share no parent frame")).to_be_visible()
+    page.get_by_role("button", name="Join them, and compare").click()
+    # one frame of each is no proof
+    expect(page.get_by_role("heading", name="These sessions are not joined")).to_be_visible()
+    (told,) = station.client.get(f"{path}/associations").json()["items"]
+    assert (told["asked"]["sessions"], told["state"]) == (["tuesday", "monday"], "succeeded")
+    assert all(join["root"] is None for join in told["result"]["joins"])
+    page.goto(f"{station.home}#/")
+    settle(page)
+    card = page.locator("[data-map=astray]")
+    expect(card.get_by_role("link", name="2 frames of reference")).to_be_visible()
 
 
 def test_two_sessions_are_compared_and_seen_side_by_side(

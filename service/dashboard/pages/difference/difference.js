@@ -98,10 +98,37 @@ class Page {
     } catch (error) {
       if (error.status !== 422) throw error;
       this.button.disabled = false;
-      put(this.body, empty({ title: "These sessions cannot be compared", text: coded(error.detail) }));
+      const apart = (error.errors ?? []).some((one) => one.reason === "no parent frame in common");
+      put(this.body, empty({ title: "These sessions cannot be compared", text: coded(error.detail),
+        actions: apart && h("button", { class: "button primary", type: "button", id: "difference-join", onClick: () => this.join() }, "Join them, and compare") }));
       return;
     }
     await this.show();
+  }
+
+  /** Associate the two sessions, and compare them where that joins them. */
+  async join() {
+    const path = at("maps", this.map, "associations"), { before, after } = this.seen, turn = this.#turn;
+    const refused = (text) => put(this.body, empty({ title: "These sessions are not joined", text: coded(text) }));
+    put(this.body);
+    try {
+      const { data } = await send("POST", path, { json: { sessions: [after, before] } });
+      put(this.said, "Joining: waiting for a worker…");
+      await followJob(`${path}/${data.association_id}`, (now) => {
+        if (turn !== this.#turn) return;
+        if (now && goesOn(now)) {
+          if (now.progress?.total) put(this.said, `Joining: ${count(now.progress.done)} of ${count(now.progress.total)} frames`);
+          return;
+        }
+        put(this.said);
+        const joins = now?.result?.joins ?? [];
+        if (joins.some((one) => one.root !== null)) this.begin();
+        else refused(now?.error ?? joins[0]?.reason ?? "No edge connects their frames.");
+      }, this.signal);
+    } catch (error) {
+      if (error.status !== 422) throw error;
+      refused(error.detail);
+    }
   }
 
   async #follow(id, turn) {

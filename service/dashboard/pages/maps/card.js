@@ -60,7 +60,7 @@ export function mapCard(map, { signal, changed }) {
   }
 
   function draw() {
-    const { name, title, frames, model, reencoding } = card.map;
+    const { name, title, frames, model, reencoding, posed_frames, parent_frames } = card.map;
     put(parts.title, title ?? name); // the link itself stays, and with it the focus
     put(parts.name, title === null || title === name ? "" : name);
     put(parts.number, count(frames.indexed ?? 0));
@@ -69,8 +69,9 @@ export function mapCard(map, { signal, changed }) {
       badge(name, "bad", frames.failed, "failed", "failed"),
       badge(name, "warn", frames.rejected, "rejected", "rejected"),
       badge(name, "neutral", frames.redundant, "redundant", "redundant"),
+      Boolean(frames.indexed) && posed_frames === 0 && h("span", { class: "badge", dataset: { kind: "warn" }, title: "Queries find frames, and no coordinates. Send `pose` with frames." }, "no poses"),
     ].filter(Boolean);
-    put(parts.badges, badges.length ? badges : healthy(frames.indexed));
+    put(parts.badges, badges.length ? badges : healthy(frames.indexed), parent_frames > 1 && parted(name, parent_frames));
     put(parts.model, model, reencoding && progress(reencoding));
   }
 
@@ -101,6 +102,11 @@ export function mapCard(map, { signal, changed }) {
 
 function badge(map, kind, n, text, state) {
   return Boolean(n) && h("a", { class: "badge", dataset: { kind }, href: link("maps", map, { state }) }, `${count(n)} ${text}`);
+}
+
+/** Poses of a map that are not in one frame of reference. */
+function parted(map, n) {
+  return h("a", { class: "badge", dataset: { kind: "neutral" }, href: link("maps", map, "place"), title: "Each answer is in the frame of reference of its matches, until an association joins them." }, `${count(n)} frames of reference`);
 }
 
 function healthy(indexed) {
