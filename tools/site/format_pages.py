@@ -50,10 +50,12 @@ def _rows(kind: Kind) -> str:
 
 def formats_module() -> str:
     """Return JavaScript with the formats that the dashboard takes."""
+    clouds = {one.name for one in formats_of("cloud")}  # any of them may be marked as a map
     rows = "".join(
         f"  {json.dumps(row)},\n"
         for kind in _DASHBOARD
         for one in formats_of(kind)
+        if kind != "map" or one.name not in clouds
         for row in [{"kind": kind, "name": one.name, "title": one.title,
                      "suffixes": one.suffixes, "signature": one.signature}]
     )  # fmt: skip

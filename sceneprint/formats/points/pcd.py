@@ -21,8 +21,8 @@ from sceneprint.formats.points.rows import (
     axis_names,
     check_count,
     check_room,
-    columns,
     parse_blocks,
+    record_blocks,
     steps,
 )
 from sceneprint.geometry.kernel import kernel
@@ -161,17 +161,8 @@ def read_pcd(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
                 f"The PCD header announces {count} points of {width} bytes, and "
                 f"{len(data) - start} of {count * width} bytes follow. {_AGAIN}"
             )
-        before = np.cumsum([0] + [field.size for field in fields]).tolist()
-        where = [names.index(k) for k in _XYZ]
-        row = np.dtype(
-            {
-                "names": _XYZ,
-                "formats": [fields[i].kind for i in where],
-                "offsets": [before[i] for i in where],
-                "itemsize": width,
-            }
-        )
-        blocks = columns(np.frombuffer(data, row, count, start), _XYZ)
+        kinds = [(field.name, field.kind, field.count) for field in fields]
+        blocks = record_blocks(data, start, count, kinds)
     elif form == "binary_compressed":
         blocks = _compressed(data, start, count, fields, most)
     else:

@@ -21,8 +21,8 @@ from sceneprint.formats.points.rows import (
     axis_names,
     check_count,
     check_room,
-    columns,
     parse_blocks,
+    record_blocks,
     skip_lines,
     steps,
 )
@@ -199,18 +199,8 @@ def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
         return FilePoints(
             vertex.count, list_blocks(view, begins, vertex.count, kinds, picked, order)
         )
-    offsets = np.cumsum([0] + [np.dtype(p.kind).itemsize for p in vertex.properties]).tolist()
-    where = [own.index(name) for name in _XYZ]
-    row = np.dtype(
-        {
-            "names": _XYZ,
-            "formats": [order + vertex.properties[i].kind for i in where],
-            "offsets": [offsets[i] for i in where],
-            "itemsize": vertex.least,
-        }
-    )
-    table = np.frombuffer(data, row, vertex.count, begins)
-    return FilePoints(vertex.count, columns(table, _XYZ))
+    packed = [(p.name, order + p.kind, 1) for p in vertex.properties]
+    return FilePoints(vertex.count, record_blocks(data, begins, vertex.count, packed))
 
 
 def element_end(data: FileBytes, start: int, element: Element, order: str) -> int:

@@ -9,7 +9,7 @@ take a minute for the largest file.
 from __future__ import annotations
 
 import mmap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,13 +73,22 @@ def axis_names(names: list[str]) -> list[str]:
     return names
 
 
-def columns(table: NDArray[np.void], names: tuple[str, str, str]) -> Iterator[Floats]:
-    """The three columns of a table of records, a block at a time."""
-    for first, n in steps(len(table)):
-        rows, block = table[first : first + n], np.empty((n, 3))
-        for k, name in enumerate(names):
-            block[:, k] = rows[name]
-        yield block
+def record_blocks(
+    data: FileBytes, start: int, count: int, fields: Iterable[tuple[str, str, int]]
+) -> Iterator[Floats]:
+    """Yield x, y and z of packed records, which the file has room for, a block at a time.
+
+    Parameters
+    ----------
+    data, start, count : the file, and place and number of its records
+    fields : name, type of numpy and number of values of each field; one each is x, y and z
+    """
+    packed = [(name if name in ("x", "y", "z") else f"{place}", kind, (n,) * (n != 1))
+              for place, (name, kind, n) in enumerate(fields)]  # fmt: skip
+    table = np.frombuffer(data, np.dtype(packed), count, start)
+    for first, n in steps(count):
+        rows = table[first : first + n]
+        yield np.stack([rows[name] for name in "xyz"], axis=1, dtype=np.float64)
 
 
 # Numbers written out, a row to a line.

@@ -160,7 +160,7 @@ function dropZone(take) {
   const [files, folder] = [pick({ accept: ACCEPT, name: "files" }), pick({ webkitdirectory: true, name: "folder" })];
   const zone = h("div", { class: "drop" }, files, folder,
     h("strong", {}, "Drop frames, folders, archives or a whole map here"),
-    h("p", { class: "muted" }, `Depth images (${titlesOf("depth")}), point clouds (${titlesOf("cloud")}), or archives (${titlesOf("archive")}). A mesh (OBJ, STL, glTF), an E57 file, or a cloud marked as a whole map, becomes the map. An intrinsics.json, clouds.json or NAME.pose.txt beside them is read.`),
+    h("p", { class: "muted" }, `Depth images (${titlesOf("depth")}), point clouds (${titlesOf("cloud")}), or archives (${titlesOf("archive")}). A file of ${titlesOf("map")}, or a cloud marked as a whole map, becomes the map. An intrinsics.json, clouds.json or NAME.pose.txt beside them is read.`),
     h("div", { class: "toolbar" },
       h("button", { class: "button", type: "button", onClick: () => files.click() }, "Choose files"),
       h("button", { class: "button", type: "button", onClick: () => folder.click() }, "Choose a folder")));
