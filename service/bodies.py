@@ -32,7 +32,7 @@ from sceneprint.errors import (
 from sceneprint.formats.depth_file import size_of
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint_client.api import FrameMeta
-from sceneprint_client.api.base import novelty_of
+from sceneprint_client.api.base import invalid_record, novelty_of, record_of
 from sceneprint_client.api.frames import MOST_OF_BATCH, MOST_PRIORITY, Batch
 from sceneprint_client.formats import (
     HEAD,
@@ -44,7 +44,6 @@ from sceneprint_client.formats import (
 )
 from service.auth import Caller
 from service.limits import IN_MEMORY
-from service.problems import invalid
 
 _Record = TypeVar("_Record", bound=BaseModel)
 
@@ -190,7 +189,7 @@ def _query_meta(given: dict[str, str], head: bytes) -> FrameMeta:
     text = take_alone(given, "meta")
     if text is not None:
         return read_meta(text, "The parameter `meta`")
-    return checked(FrameMeta, _fields(given, head), "The frame metadata in the query string")
+    return record_of(FrameMeta, _fields(given, head), "The frame metadata in the query string")
 
 
 def take_alone(given: dict[str, str], name: str) -> str | None:
@@ -521,15 +520,7 @@ async def read_record(
         return kind()
     types = ("application/json",)
     document = await read_json_object(request, what, types, ", or no body" if optional else "")
-    return checked(kind, document, what)
-
-
-def checked(kind: type[_Record], fields: object, what: str) -> _Record:
-    """A record of the API, or what is wrong with its fields."""
-    try:
-        return kind.model_validate(fields)
-    except ValidationError as error:
-        raise invalid(error, what) from error
+    return record_of(kind, document, what)
 
 
 def read_meta(text: str, what: str) -> FrameMeta:
@@ -539,7 +530,7 @@ def read_meta(text: str, what: str) -> FrameMeta:
     except ValidationError as error:
         if error.errors(include_url=False)[0]["type"] == "json_invalid":
             raise MalformedBody(f"{what} is not JSON. Send a JSON object.") from error
-        raise invalid(error, what) from error
+        raise invalid_record(error, what) from error
 
 
 def _meta(text: str | None) -> FrameMeta:
@@ -676,7 +667,7 @@ def _batch_meta(given: Any) -> FrameMeta | InvalidRequest:
     try:
         return FrameMeta.model_validate(given)
     except ValidationError as error:
-        return invalid(error, "The frame metadata")
+        return invalid_record(error, "The frame metadata")
 
 
 # The header Idempotency-Key: a request that is sent again takes effect once.

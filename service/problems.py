@@ -11,11 +11,11 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 
 from sceneprint import errors
 from sceneprint_client.api import Problem
+from sceneprint_client.api.base import invalid_request
 from service.browser_security import security_headers
 
 log = logging.getLogger(__name__)
@@ -66,8 +66,6 @@ UNUSABLE: dict[type[errors.SceneprintError], str] = {
     "stored. See its log under the request's id. Retry later.",
 }
 MEDIA_TYPE = "application/problem+json"
-#: Most fields at fault that a problem lists, and most characters of the place of one.
-MOST_FIELDS, PLACE = 20, 80
 
 
 def status_of(error: errors.SceneprintError) -> int:
@@ -97,12 +95,6 @@ def problem(
     if status == 401:
         headers["WWW-Authenticate"] = "Bearer"
     return JSONResponse(document, status, headers, MEDIA_TYPE)
-
-
-def invalid(error: ValidationError, what: str) -> errors.InvalidRequest:
-    """What pydantic found, in our words."""
-    found = error.errors(include_url=False, include_context=False, include_input=False)
-    return _invalid([dict(one) for one in found], what)
 
 
 #: Names of RFC 9110 that the standard library has from Python 3.13 on.
@@ -145,7 +137,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def _validation(request: Request, error: RequestValidationError) -> JSONResponse:
-        ours = _invalid([dict(one) for one in error.errors()], "The request")
+        ours = invalid_request(error.errors(), "The request")
         return problem(_id(request), "InvalidRequest", 422, str(ours), ours.fields)
 
     @app.exception_handler(HTTPException)
@@ -175,23 +167,6 @@ def install(app: FastAPI) -> None:
         return answer
 
 
-def _invalid(found: Sequence[dict[str, Any]], what: str) -> errors.InvalidRequest:
-    fields = tuple(
-        (
-            ".".join(str(part) for part in one["loc"] if part != "query")[:PLACE],
-            one["msg"].removeprefix("Value error, "),
-        )
-        for one in found[:MOST_FIELDS]  # a caller may invent more without end
-    )
-    first = "; ".join(f"{place or 'it'}: {reason}" for place, reason in fields[:3])
-    more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
-    if len(found) > MOST_FIELDS:
-        more = f" (and {len(found) - 3} more; {MOST_FIELDS} of {len(found)} are listed)"
-    return errors.InvalidRequest(
-        f"{what} is not valid: {first}{more}. See /docs for its fields.", fields
-    )
-
-
 def _allowed(app: FastAPI, path: str) -> list[str]:
     """Methods of a path: of `/v1/keys/me` its own, not those of `/v1/keys/{key_name}`."""
     paths = app.openapi()["paths"]
@@ -205,4 +180,4 @@ def _id(request: Request) -> str:
     return str(getattr(request.state, "request_id", ""))
 
 
-__all__ = ["Problem", "declared", "install", "invalid", "problem", "status_of"]
+__all__ = ["Problem", "declared", "install", "problem", "status_of"]

@@ -16,7 +16,7 @@ from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.errors import MalformedBody, UnsupportedType
 from sceneprint.store.queue import JobFile
 from sceneprint_client.api import Added, Frame, FrameState, Job, Page
-from sceneprint_client.api.base import NOVEL, novelty_of
+from sceneprint_client.api.base import NOVEL, novelty_of, record_of
 from sceneprint_client.api.frames import (
     MOST_OF_BATCH,
     MOST_PRIORITY,
@@ -35,7 +35,6 @@ from service.bodies import (
     FORM,
     FRAME_BODY,
     IdempotencyKey,
-    checked,
     frames_of,
     guarded,
     mark_replayed,
@@ -407,7 +406,7 @@ def _options(request: Request) -> ImportOptions:
     text = bodies.take_alone(given, "options")
     if text is not None:
         try:
-            return checked(ImportOptions, from_json(text), "The import options")
+            return record_of(ImportOptions, from_json(text), "The import options")
         except ValueError as error:
             raise MalformedBody("The parameter `options` is not JSON. Send an object.") from error
     fields: dict[str, Any] = {name: given[name] for name in _TEXTS if name in given}
@@ -426,4 +425,4 @@ def _options(request: Request) -> ImportOptions:
     if "priority" in given:
         fields["priority"] = given["priority"]
     fields["if_novel"] = novelty_of(given.get("if_novel"))
-    return checked(ImportOptions, fields, "The import options")
+    return record_of(ImportOptions, fields, "The import options")

@@ -33,7 +33,7 @@ from sceneprint_client.api import (
     SeveralQuery,
     Similarity,
 )
-from sceneprint_client.api.base import Given, Label
+from sceneprint_client.api.base import Given, Label, record_of
 from sceneprint_client.api.query import MOST_OF_SEQUENCE
 from service import bodies
 from service.auth import Asking, Caller, Context, Here, may_read, v1_router
@@ -41,7 +41,6 @@ from service.bodies import (
     FORM,
     FRAME_BODY,
     FormUpload,
-    checked,
     form_of,
     frames_of,
     media_type,
@@ -106,13 +105,13 @@ async def question(
     """
     if media_type(request) == JSON:
         given = await read_object(request)
-        asker = checked(_Asker, {"robot": given.pop("robot", None)}, _QUERY)
+        asker = record_of(_Asker, {"robot": given.pop("robot", None)}, _QUERY)
         own = {} if named in kind.model_fields else {named: given.pop(named, None)}
-        yield QueryBody(checked(kind, given, _QUERY), None, own, asker.robot)
+        yield QueryBody(record_of(kind, given, _QUERY), None, own, asker.robot)
         return
     options = [name for name in kind.model_fields if name != named]
     async with uploaded(request, *options) as upload:
-        yield QueryBody(checked(kind, upload.fields, _QUERY), upload, {}, upload.meta.robot)
+        yield QueryBody(record_of(kind, upload.fields, _QUERY), upload, {}, upload.meta.robot)
 
 
 async def read_object(request: Request) -> dict[str, Any]:
@@ -242,14 +241,14 @@ async def pair(request: Request) -> AsyncIterator[PairBody]:
     StoreFull, UnusableStore : the machine cannot keep a file until it is read.
     """
     if media_type(request) == JSON:
-        how = checked(Comparison, await read_object(request), "The comparison")
+        how = record_of(Comparison, await read_object(request), "The comparison")
         a, b = (_pair_frame(name, how, {}, {}) for name in _SIDES)
         yield PairBody(a, b, how)
         return
     async with form_of(request, most_files=2) as form:
         files, texts = _parts(form)
         own = {name: value for name, value in texts.items() if not name.startswith("meta_")}
-        how = checked(Comparison, own, "The comparison")
+        how = record_of(Comparison, own, "The comparison")
         a, b = (_pair_frame(name, how, files, texts) for name in _SIDES)
         yield PairBody(a, b, how)
 
@@ -391,7 +390,7 @@ async def localize_sequence(
         here.gate.place(),
         frames_of(request, *options, most=MOST_OF_SEQUENCE) as sent,
     ):
-        query = checked(Query, sent.texts, _QUERY)
+        query = record_of(Query, sent.texts, _QUERY)
         wrong = next((one for one in sent.metas if not isinstance(one, FrameMeta)), None)
         if wrong is not None:
             raise wrong

@@ -43,7 +43,7 @@ def test_frames_by_their_metadata(client: Client, map_name: str, ids: list[str])
     assert listed(client, map_name, session="room-0/seq-01", captured_before=START) == ids[:1]
     assert listed(client, map_name, has_pose=False) == []
     for bad in ({"robot": ""}, {"captured_after": datetime(2026, 1, 1)}, {"order": "up"}):
-        with pytest.raises(InvalidRequest, match="The list is not as it should be"):
+        with pytest.raises(InvalidRequest, match="The list is not valid"):
             listed(client, map_name, **bad)  # type: ignore[arg-type]
 
 

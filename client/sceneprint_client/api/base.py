@@ -6,6 +6,7 @@ from __future__ import annotations
 import ipaddress
 import math
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from typing import Annotated, Any, Generic, Literal, TypeVar
@@ -265,15 +266,41 @@ def checked(kind: type[Record], what: str, **fields: Any) -> Record:
     ------
     InvalidRequest : a field is missing, unknown or out of its range.
     """
+    return record_of(kind, fields, what)
+
+
+def record_of(kind: type[Record], fields: object, what: str) -> Record:
+    """As `checked`, of fields that whoever sent them may call anything."""
     try:
         return kind.model_validate(fields)
     except ValidationError as error:
-        found = tuple(
-            (".".join(map(str, one["loc"])), one["msg"].removeprefix("Value error, "))
-            for one in error.errors(include_url=False)
+        raise invalid_record(error, what) from error
+
+
+def invalid_record(error: ValidationError, what: str) -> InvalidRequest:
+    """Return what pydantic found wrong with a record, in our words."""
+    found = error.errors(include_url=False, include_context=False, include_input=False)
+    return invalid_request(found, what)
+
+
+#: Fields that are listed at most, and characters of the name of one: a caller may invent more.
+MOST_FIELDS, MOST_OF_FIELD = 20, 80
+
+
+def invalid_request(found: Sequence[Mapping[str, Any]], what: str) -> InvalidRequest:
+    """Return an error that names the first of the fields at fault."""
+    fields = tuple(
+        (
+            ".".join(str(part) for part in one["loc"] if part != "query")[:MOST_OF_FIELD],
+            one["msg"].removeprefix("Value error, "),
         )
-        told = "; ".join(f"{place or 'it'}: {reason}" for place, reason in found[:3])
-        raise InvalidRequest(f"{what} is not as it should be: {told}.", found) from error
+        for one in found[:MOST_FIELDS]
+    )
+    first = "; ".join(f"{place or 'it'}: {reason}" for place, reason in fields[:3])
+    more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
+    if len(found) > MOST_FIELDS:
+        more = f" (and {len(found) - 3} more; {MOST_FIELDS} of {len(found)} are listed)"
+    return InvalidRequest(f"{what} is not valid: {first}{more}. See /docs for its fields.", fields)
 
 
 #: Most samples a depth image may have (an 8-megapixel sensor); more is refused unread.

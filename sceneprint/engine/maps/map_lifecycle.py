@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 from sqlalchemy import Connection, select
 
 from sceneprint import errors
@@ -50,7 +49,7 @@ from sceneprint.store.queue import cancel_jobs
 from sceneprint.store.tables import FrameRow, MapRow, jobs, models
 from sceneprint_client.api import Frame, FrameMeta, FrameState, Map, NewMap
 from sceneprint_client.api.admin import ModelInfo
-from sceneprint_client.api.base import ROS_NAMES
+from sceneprint_client.api.base import ROS_NAMES, record_of
 from sceneprint_client.api.listing import FrameEdit, MapEdit
 
 #: Fields of a new map that say what it may hold, and for how long.
@@ -154,10 +153,7 @@ def edit_map(
     Who may set a quota, the caller has seen to. With `dry_run` nothing is changed, and the map told
     as it would be.
     """
-    try:
-        change = MapEdit.model_validate(dict(patch))
-    except ValidationError as error:
-        raise _invalid(error, "The edit of the map") from error
+    change = record_of(MapEdit, dict(patch), "The edit of the map")
     values = change.model_dump(include=change.model_fields_set)
     if change.up is not None:
         values["up"] = change.up.unit
@@ -209,10 +205,7 @@ def _merged(frame: FrameRow, patch: Mapping[str, Any]) -> FrameMeta:
         is_transform = field in ("pose", "T_base_sensor") and isinstance(given, Mapping)
         now[field] = _with(now[field], given) if is_transform else given
     wanted = {name: value for name, value in now.items() if value is not None}
-    try:
-        return FrameMeta.model_validate({"intrinsics": frame.intrinsics, **wanted})
-    except ValidationError as error:
-        raise _invalid(error, "The edit of the frame") from error
+    return record_of(FrameMeta, {"intrinsics": frame.intrinsics, **wanted}, "The edit of the frame")
 
 
 def _relative_transform(
@@ -254,15 +247,6 @@ def _check_tag(what: str, tag: str, if_match: Collection[str] | None) -> None:
             f'{what} was edited after you read it: its ETag is now "{tag}". Read it again, and '
             "send the edit with the new ETag in If-Match."
         )
-
-
-def _invalid(error: ValidationError, what: str) -> errors.InvalidRequest:
-    found = tuple(
-        (".".join(str(part) for part in one["loc"])[:80], one["msg"].removeprefix("Value error, "))
-        for one in error.errors(include_url=False, include_input=False)[:20]
-    )
-    told = "; ".join(f"{place or 'it'}: {reason}" for place, reason in found[:3])
-    return errors.InvalidRequest(f"{what} is not valid: {told}. See /docs.", found)
 
 
 # Re-encoding of a map: its frames are signed again with another model, then the map switches.
