@@ -11,7 +11,6 @@ from sceneprint.decoders.child_process import array_samples, text_samples
 from sceneprint.formats.depth_file import decode_samples, encode_npy, encode_png, size_of
 from sceneprint_client.formats import (
     FORMATS,
-    HEAD,
     CloudFormat,
     format_at,
     format_named,
@@ -63,12 +62,6 @@ def test_an_array_is_a_cloud_by_its_columns_and_type(kind: str) -> None:
     assert format_of(encode_npy(array)) == ("npy" if kind == "cloud" else None)
     assert format_of(encode_npy(np.ones((5, 30), "<f4"))) is None
     assert format_of(encode_npy(np.ones((5, 4), ">f8"))) == "npy"
-
-
-def test_only_the_first_bytes_show_a_format() -> None:
-    fields = b"".join(b"\2\0\0\0" + axis + b"\0" for axis in (b"x", b"y", b"z"))
-    assert format_of(bytes(HEAD - len(fields)) + fields) == "pointcloud2"
-    assert format_of(bytes(HEAD - len(fields) + 1) + fields) is None
 
 
 def test_names() -> None:

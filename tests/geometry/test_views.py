@@ -306,6 +306,22 @@ def test_scanners_stand_in_the_room_whose_cloud_has_no_sides() -> None:
     np.testing.assert_allclose(places[:, 2], 1.0, atol=0.05)
 
 
+def test_a_scanner_stands_on_both_sides_of_a_partition() -> None:
+    """A room of 12 x 8 m, and across it a wall of 5 m whose only front faces away from y = 0."""
+    points, triangles = box(np.array([12.0, 8.0, 3.0]), inwards=True)
+    wall = np.array([[3, 4, 0], [8, 4, 0], [8, 4, 3], [3, 4, 3]], np.float32)
+    faces = np.concatenate([triangles, np.array([[10, 9, 8], [11, 10, 8]], np.int32)])
+    surface = ReferenceSurface(np.concatenate([points, wall]), faces, np.zeros(3), UP)
+    p = view_parameters(read_model("lidar").parameters)
+    plan = choose_views(surface, p)
+    places = np.concatenate([plan.poses, plan.held_out])[:, :3, 3]
+    before_wall = (places[:, 0] > 3.0) & (places[:, 0] < 8.0)
+    assert (before_wall & (places[:, 1] < 3.5)).sum() >= 3
+    assert (before_wall & (places[:, 1] > 4.5)).sum() >= 3
+    assert (places > 0).all()  # and nowhere outside, behind the walls
+    assert (places < (12.0, 8.0, 3.0)).all()
+
+
 def test_places_of_a_cloud_have_floor_below_them() -> None:
     """A floor of 4 x 4 m and, 4 m beside it, a wall: nothing is known of what lies between."""
     a, b = (one.ravel() for one in np.meshgrid(np.arange(0.0, 4.0, 0.1), np.arange(0.0, 4.0, 0.1)))

@@ -36,9 +36,10 @@ _LEAST_HIT, _LEAST_AROUND, _LEAST_BESIDE = 0.45, 0.25, 0.25
 _LEAST_DEPTH = 1.0 / 11.0
 #: Places that see something in this share of all directions tell which side of a mesh is its front.
 _INDOORS = 0.6
-#: Share of what is hit that may be seen from behind: of a mesh, and of a cloud, whose sides are
-#: estimated.
-_MOST_BACK, _MOST_BACK_GUESSED = 0.1, 0.3
+#: Share of what is hit that may be seen from behind: by a camera's view of a mesh; by a scanner in
+#: it, which sees both sides of partitions, but from behind the walls next to nothing else; and in a
+#: cloud, whose sides are estimated.
+_MOST_BACK, _MOST_BACK_AROUND, _MOST_BACK_GUESSED = 0.1, 0.5, 0.3
 #: Cosine between up and the normal of a wall, at most.
 _WALL = 0.7
 #: A cloud's piece has one side where the other has at most this share of the votes.
@@ -47,10 +48,11 @@ _ONE_SIDED = 0.1
 _TURNS, _PITCHES = 8, (-25.0, 10.0)
 #: What a view adds that is the first, or the second, to see something; later ones add nothing.
 _WORTH = np.array([1.0, 0.5, 0.0])
-#: Choosing ends once the best view adds less than this share of the first one's gain.
-_LEAST_GAIN = 0.01
-#: Views that are none of the map, at most.
-_HELD_OUT = 60
+#: Choosing ends once the best view adds less than this share of the first one's gain: of a camera,
+#: and of a scanner, which sees all around and needs fewer.
+_LEAST_GAIN, _LEAST_GAIN_AROUND = 0.01, 0.03
+#: Views that are none of the map: one for so many of its views, and at least and at most so many.
+_VIEWS_A_TEST, _LEAST_TESTS, _MOST_TESTS = 4, 20, 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +115,11 @@ def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewP
     free = _in_front(free, level, lookout, p)
     views = [(k, d) for k, (_, one) in enumerate(free) for d in _worth_seeing(one, p)]
     sights = [one for _, one in free]
-    chosen, covered = _cover(sights, views, lookout.universe, p.most_views)
+    least = _LEAST_GAIN if p.camera else _LEAST_GAIN_AROUND
+    chosen, covered = _cover(sights, views, lookout.universe, p.most_views, least)
     left = sorted(set(range(len(views))) - set(chosen))
-    spread = np.linspace(0, len(left) - 1, min(_HELD_OUT, len(left))).astype(int)
+    tests = min(max(len(chosen) // _VIEWS_A_TEST, _LEAST_TESTS), _MOST_TESTS, len(left))
+    spread = np.linspace(0, len(left) - 1, tests).astype(int)
 
     def poses(indices: Sequence[int]) -> Floats:
         found = np.tile(np.eye(4), (len(indices), 1, 1))
@@ -174,7 +178,7 @@ def _in_front(
         if len(shares) and (shares > 1.0 - _MOST_BACK).sum() > (shares < _MOST_BACK).sum():
             free = [(place, replace(one, back=1.0 - one.back)) for place, one in free]
         if p.camera is None:
-            free = [(place, one) for place, one in free if one.back[0] <= _MOST_BACK]
+            free = [(place, one) for place, one in free if one.back[0] <= _MOST_BACK_AROUND]
         return free
     # level surfaces are seen from above wherever one stands; walls tell where one is
     is_wall = (lookout.normals != 0).any(axis=1) & (np.abs(lookout.normals[:, 2]) < _WALL)
@@ -227,8 +231,9 @@ def _add(
 
 
 def _cover(
-    sights: Sequence[Sight], views: Sequence[tuple[int, int]], universe: int, most: int
-) -> tuple[list[int], float]:
+    sights: Sequence[Sight], views: Sequence[tuple[int, int]], universe: int, most: int,
+    least_gain: float,
+) -> tuple[list[int], float]:  # fmt: skip
     """Choose views, greedily, until none adds much; their indices, and the share that is covered.
 
     Gains only fall as views are chosen, so that most need not be worked out anew each time.
@@ -239,6 +244,7 @@ def _cover(
     views : place and direction of each
     universe : how many elements there are
     most : views that are chosen
+    least_gain : choosing ends once a view adds less than this share of the first one's gain
     """
     counts = np.zeros(universe, np.uint8)
 
@@ -249,7 +255,7 @@ def _cover(
     heap = [(-gain(index), index) for index in range(len(views))]
     heapq.heapify(heap)
     chosen: list[int] = []
-    least = _LEAST_GAIN * -heap[0][0] if heap else 0.0
+    least = least_gain * -heap[0][0] if heap else 0.0
     while heap and len(chosen) < most:
         _, index = heapq.heappop(heap)
         fresh = gain(index)
