@@ -60,9 +60,7 @@ class Format:
 
     def begins(self, head: bytes) -> bool:
         """Return whether the first bytes of a file show this format."""
-        # no further: a search through hundreds of megabytes would hold up all threads
-        pattern = _pattern(self.signature)
-        return bool(self.signature) and pattern.match(head, 0, HEAD) is not None
+        return bool(self.signature) and _pattern(self.signature).match(head) is not None
 
 
 @lru_cache(maxsize=64)
