@@ -64,6 +64,8 @@ def test_rows_of_five_are_named_or_refused(sceneprint: Run, scans: Path, tmp_pat
     assert "/0: A row of the file holds 5 numbers" in done.stderr
     done = sceneprint("upload", "rows", tmp_path, "--row", "x,y,z,i,ring", *without)
     assert "1 frames: 1 received" in done.stdout
+    assert "1 of the frames are point clouds" in done.stdout
+    assert "`sceneprint reencode rows --model lidar`" in done.stdout
     done = sceneprint("upload", "rows", scans, "--row", "x,y,z,i", expect=2)
     assert "--row is for .bin files, and walk has others" in done.stderr
     done = sceneprint("upload", "rows", scans / "1.ply", "--as-map", "--row", "x,y,z", expect=2)

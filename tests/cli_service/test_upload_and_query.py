@@ -104,6 +104,22 @@ def test_bad_frames_stop_no_others(
     assert "\nposes of 0 of 4 frames; 4 without: --no-pose\n" in without.stdout
 
 
+def test_a_map_without_poses_says_so_and_gives_no_coordinates(
+    sceneprint: Run, service_url: str, rooms: Path
+) -> None:
+    folder = rooms / "room-0" / "seq-01"
+    done = sceneprint("upload", "bare", folder, "--no-pose")
+    *_, last = done.stdout.splitlines()
+    assert last == "map bare has no poses: queries find frames, and no coordinates"
+    [row] = [one for one in sceneprint("maps").stdout.splitlines() if one.startswith("bare ")]
+    assert row.endswith("(no poses)")
+    there = sceneprint("localize", "bare", folder / "frame-000000.depth.png").stdout
+    assert re.search(r": found \(.*\n  no coordinates: frame .* has no pose\n", there)
+    with Client(service_url) as client:
+        assert client.localize("bare", folder / "frame-000000.depth.png").pose is None
+        client.delete_map("bare")
+
+
 def test_upload_without_waiting(sceneprint: Run, service_url: str, rooms: Path) -> None:
     done = sceneprint("upload", "later", rooms, "--no-wait", "--model", "depth", "--parallel", 2)
     assert "6 received" in done.stdout
