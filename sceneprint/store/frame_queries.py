@@ -244,9 +244,7 @@ def _listing_conditions(map_number: int, wanted: FrameListing) -> list[ColumnEle
     if wanted.received_before is not None:
         found.append(c.received_at <= wanted.received_before.timestamp())
     if wanted.parent_frame is not None:
-        found.append(
-            or_(c.pose_parent == wanted.parent_frame, c.sent_parent == wanted.parent_frame)
-        )
+        found.append(c.pose_parent == wanted.parent_frame)
     if wanted.has_pose is not None:
         found.append(c.pose_x.is_not(None) if wanted.has_pose else c.pose_x.is_(None))
     if wanted.content_id is not None:

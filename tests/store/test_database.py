@@ -29,7 +29,7 @@ from sceneprint.store.tables import MapRow, metadata
 TABLES = [
     "audit", "doomed", "events", "former_maps",
     "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs", "keys", "maps",
-    "models", "pending_events", "queries", "samples", "schema_range",
+    "models", "parent_joins", "pending_events", "queries", "samples", "schema_range",
     "scrubs", "secrets", "signatures", "surface_frames",
     "surface_tiles", "surface_touches", "surfaces", "tenants",
 ]  # fmt: skip
