@@ -242,18 +242,19 @@ async def caller(
     request: Request, here: Here,
     given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Caller:  # fmt: skip
-    """Who asks, by the key that was shown.
+    """Return who asks, by the key that was shown; where no key is required, one that is shown
+    counts all the same: a wrong one would else go unnoticed until the service requires it.
 
     Raises
     ------
     KeyRequired : none was shown, or one that is unknown, revoked or expired.
     RateLimited, Busy : its tenant asks too often, or too much at once.
     """
-    if not requires_key(request, here):
+    if given is None:
+        if requires_key(request, here):
+            raise KeyRequired(_why(request, here))
         set_actor(Actor("", address_of(request) or None))
         return anybody()
-    if given is None:
-        raise KeyRequired(_why(request, here))
     key = await to_thread.run_sync(here.engine.find_key, given.credentials, limiter=here.lookups)
     if key is None or (key.expires_at is not None and key.expires_at <= time.time()):
         enforce_rate_limit(request, here.limits.failed_keys, network_of(address_of(request)))

@@ -26,6 +26,7 @@ from sceneprint.errors import (
     MalformedBody,
     StoreFull,
     TooLarge,
+    UnreadableFrame,
     UnsupportedType,
     UnusableStore,
 )
@@ -143,6 +144,8 @@ async def received(
             await file.seek(0)
             head = await file.read(HEAD)
             await file.seek(0)
+            if not head:
+                raise UnreadableFrame(_NO_BODY)
         except OSError as error:
             raise unspoolable(error) from error
         others = {name: given.pop(name) for name in fields if name in given}
@@ -331,6 +334,17 @@ class FormUpload:
     fields: dict[str, str]
 
 
+_NO_BODY = (
+    "The body is empty. Send the file itself: of curl, with --data-binary @FILE or -F frame=@FILE."
+)
+
+
+def _has_no_body(request: Request) -> bool:
+    """Return whether the headers of a request say that nothing follows them."""
+    headers = request.headers
+    return headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers
+
+
 def media_type(request: Request) -> str:
     """Type of the body, without its parameters."""
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
@@ -387,6 +401,8 @@ async def form_of(request: Request, most_files: int) -> AsyncIterator[FormData]:
     ------
     UnsupportedType, MalformedBody, StoreFull, UnusableStore : as `uploaded`.
     """
+    if _has_no_body(request):
+        raise MalformedBody(_NO_BODY)
     if media_type(request) != FORM:
         raise UnsupportedType(
             f"The body is {media_type(request) or 'of no type'!r:.80}. Send a frame as {FORM}: a "
@@ -470,6 +486,8 @@ async def read_json(request: Request) -> Any:
             raise TooLarge(
                 f"The JSON exceeds the limit of {FIELD_BYTES} bytes. Send only the fields in /docs."
             )
+    if not body:
+        raise MalformedBody("The body is empty. Send a JSON object.")
     try:
         return from_json(bytes(body))  # unlike `json`, no text that is not Unicode
     except ValueError as error:
@@ -513,10 +531,7 @@ async def read_record(
     UnsupportedType, MalformedBody, TooLarge : not JSON; see `read_json`.
     InvalidRequest : not such a record.
     """
-    headers = request.headers
-    if optional and headers.get("content-length", "0") == "0" and (
-        "transfer-encoding" not in headers
-    ):  # fmt: skip
+    if optional and _has_no_body(request):
         return kind()
     types = ("application/json",)
     document = await read_json_object(request, what, types, ", or no body" if optional else "")

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,15 @@ if TYPE_CHECKING:
 SEVEN_SCENES = re.compile(r"frame-\d+\.depth\.png", re.ASCII)
 #: Time stamps, in seconds, that are dates (2001 to 2096); others count from some start.
 _DATES_S = (1e9, 4e9)
+
+
+@runtime_checkable
+class PinholeCamera(Protocol):
+    """The camera of Open3D: PinholeCameraIntrinsic."""
+
+    width: int
+    height: int
+    intrinsic_matrix: NDArray[Any]
 
 
 class FrameSource(Protocol):
@@ -356,8 +365,9 @@ def sendable(
     InvalidIntrinsics, InvalidPose : what is given or lies beside it is none.
     TypeError : bytes without metadata, and of no point cloud; or no frame or no metadata at all.
     """
-    if isinstance(frame, np.ndarray):
-        return array_sendable(frame, meta, up=up)
+    array = library_array(frame)
+    if array is not None:
+        return array_sendable(array, meta, up=up)
     known = _meta_without_array(meta)
     if known is not None and up is not None:
         known = known.model_copy(update={"up": _direction(up)})
@@ -369,8 +379,8 @@ def sendable(
         found = frame
     elif not isinstance(frame, str | os.PathLike):
         raise TypeError(
-            f"a frame is a path, the bytes of a file, a FrameFile or a numpy array, not "
-            f"{type(frame).__name__}"
+            "a frame is a path, the bytes of a file, a FrameFile, a numpy array, or an image or "
+            f"cloud of Open3D or Pillow, not {type(frame).__name__}"
         )
     elif known is not None:
         data, name = _read(Path(frame), is_cloud=known.intrinsics is None), Path(frame).name
@@ -385,6 +395,35 @@ def sendable(
     return data, _named_as(known, found.original or found.path.name, found.sequence)
 
 
+def library_array(frame: Any) -> NDArray[Any] | None:
+    """Return the array of a frame that is one, or an image or cloud of Open3D or Pillow; None of
+    anything else. Neither library is imported.
+    """
+    if isinstance(frame, np.ndarray):
+        return frame
+    if isinstance(frame, bytes | str | os.PathLike | FrameFile) or frame is None:
+        return None
+    if hasattr(frame, "has_points"):  # open3d.geometry.PointCloud
+        array = np.asarray(frame.points, np.float64)
+    elif hasattr(frame, "as_tensor"):  # open3d.t.geometry.Image
+        array = frame.as_tensor().cpu().numpy()
+    elif hasattr(getattr(frame, "point", None), "positions"):  # open3d.t.geometry.PointCloud
+        array = frame.point.positions.cpu().numpy()
+    elif hasattr(frame, "__array_interface__") or hasattr(frame, "get_max_bound"):
+        array = np.asarray(frame)  # Pillow, and open3d.geometry.Image
+    else:
+        return None
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[:, :, 0]
+    if array.dtype == np.int32 and array.size and 0 <= array.min() <= array.max() <= _MOST_UNITS:
+        return array.astype(np.uint16)  # Pillow's mode I
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+#: Largest sample of a 16-bit image.
+_MOST_UNITS = 65_535
+
+
 def _named_as(known: FrameMeta, name: str, sequence: int | None) -> FrameMeta:
     """What is known of a frame, with name and place of its file where it says none."""
     labels = {"name": file_name(name), "sequence": sequence}
@@ -396,8 +435,8 @@ def _meta_without_array(meta: MetaInput | None) -> FrameMeta | None:
     """The metadata of a frame that is no array; TypeError for what is no metadata."""
     if meta is None or isinstance(meta, FrameMeta):
         return meta
-    if isinstance(meta, CameraIntrinsics):
-        return FrameMeta(intrinsics=meta)
+    if isinstance(meta, CameraIntrinsics | PinholeCamera):
+        return FrameMeta(intrinsics=camera_of(meta, (1, 1)))
     if not isinstance(meta, np.ndarray | list | tuple):  # a matrix is one of these
         raise TypeError(f"meta is a FrameMeta or CameraIntrinsics, not {type(meta).__name__}")
     raise TypeError(
@@ -415,7 +454,7 @@ def array_sendable(
     ----------
     array : (H, W) depth, uint16 in stored units (`depth_scale` to a metre, 1000 unless `meta` says
         otherwise) or floating in metres; without a camera (N, 3) or (N, 4) floating points
-    meta : FrameMeta, or the camera: CameraIntrinsics, (3, 3) matrix, or (fx, fy, cx, cy), pixels
+    meta : FrameMeta, or the camera, as for `camera_of`
     up : as for `sendable`
 
     Raises
@@ -461,14 +500,16 @@ def _checked_points(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def camera_of(
-    camera: CameraIntrinsics | Sequence[float] | NDArray[Any], size: tuple[int, int]
+    camera: CameraIntrinsics | PinholeCamera | Sequence[float] | NDArray[Any],
+    size: tuple[int, int],
 ) -> CameraIntrinsics:
     """The camera of an image of a size (width, height).
 
     Parameters
     ----------
-    camera : CameraIntrinsics as it is, a (3, 3) matrix without skew, or (fx, fy, cx, cy), pixels
-    size : width and height, pixels
+    camera : CameraIntrinsics as it is, Open3D's PinholeCameraIntrinsic, a (3, 3) matrix without
+        skew, or (fx, fy, cx, cy), pixels
+    size : width and height, pixels, where the camera does not say them
 
     Raises
     ------
@@ -476,6 +517,9 @@ def camera_of(
     """
     if isinstance(camera, CameraIntrinsics):
         return camera
+    if isinstance(camera, PinholeCamera):
+        size = (camera.width, camera.height)
+        camera = camera.intrinsic_matrix
     try:
         K = np.asarray(camera, np.float64)
     except (TypeError, ValueError):

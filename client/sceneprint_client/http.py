@@ -52,27 +52,27 @@ from sceneprint_client.errors import (
     UnknownQuery,
 )
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from sceneprint_client.frame_files import FrameFile
-
-
 # What is sent.
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from sceneprint_client.frame_files import FrameFile
+    from sceneprint_client.frame_files import FrameFile, PinholeCamera
+
+    class LibraryImage(Protocol):
+        """An image of Pillow, or another object that NumPy reads in the same way."""
+
+        @property
+        def __array_interface__(self) -> dict[str, Any]: ...
 
     #: A frame at hand: the content of a file, a path, a frame of `find_sequences`, or an array:
-    #: (H, W) depth, uint16 in stored units or floating in metres; (N, 3) floating points.
-    FrameInput = bytes | str | PathLike[str] | FrameFile | NDArray[np.generic]
-    #: What is known of a frame; or its camera alone, of an array also as (3, 3) matrix or as
-    #: (fx, fy, cx, cy), pixels.
-    MetaInput = FrameMeta | CameraIntrinsics | Sequence[float] | NDArray[np.generic]
+    #: (H, W) depth, uint16 in stored units or floating in metres; (N, 3) floating points. Images
+    #: and clouds of Open3D and images of Pillow count as arrays.
+    FrameInput = bytes | str | PathLike[str] | FrameFile | NDArray[np.generic] | LibraryImage
+    #: What is known of a frame; or its camera alone, also that of Open3D, of an array also as
+    #: (3, 3) matrix or as (fx, fy, cx, cy), pixels.
+    MetaInput = FrameMeta | CameraIntrinsics | PinholeCamera | Sequence[float] | NDArray[np.generic]
 
 #: Where `sceneprint serve` listens unless told otherwise.
 DEFAULT_URL = "http://127.0.0.1:8008"
@@ -207,11 +207,18 @@ class QueryOptions(TypedDict, total=False):
     record: bool
 
 
-def query_of(kind: type[Any], how: QueryOptions, **more: Any) -> Any:
-    """A query from what the caller gave; TypeError for an option that there is not."""
+def check_options(how: QueryOptions) -> None:
+    """Raise TypeError for options that a query does not have, before the frame is looked at."""
     unknown = how.keys() - Query.model_fields.keys()
     if unknown:
-        raise TypeError(f"a query has no option {', '.join(sorted(unknown))}")
+        raise TypeError(
+            f"a query has no option {', '.join(sorted(unknown))}; its options are "
+            f"{', '.join(sorted(QueryOptions.__annotations__))}, and the camera is `meta`"
+        )
+
+
+def query_of(kind: type[Any], how: QueryOptions, **more: Any) -> Any:
+    """Return a query from options that `check_options` has seen."""
     stages: Any = how.get("stages")
     if stages is not None and not isinstance(stages, str):
         how = {**how, "stages": tuple(stages)}

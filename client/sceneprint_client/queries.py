@@ -38,6 +38,7 @@ from sceneprint_client.http import (
     QueryFrame,
     QueryOptions,
     ServiceConnection,
+    check_options,
     compared_frame,
     form_text,
     frames_form,
@@ -93,6 +94,7 @@ class QueryMethods(ServiceConnection):
             the maps have different models.
         TypeError : not exactly one of `frame` and `frame_id`, no map, or an unknown option.
         """
+        check_options(how)
         if maps is None:
             name, wanted = named_or_sent(map_name, frame, meta, frame_id, up)
             request = _query_request(wanted, query_of(Query, how), robot)
@@ -116,6 +118,7 @@ class QueryMethods(ServiceConnection):
         **how: Unpack[QueryOptions],
     ) -> Localization:  # fmt: skip
         """Where in a map was this frame taken? One status and one pose; see `query`."""
+        check_options(how)
         name, wanted = named_or_sent(map_name, frame, meta, frame_id, up)
         request = _query_request(wanted, query_of(Query, how), robot)
         return self._ask(Localization, "POST", f"{map_path(name)}/localize", **request)
@@ -138,6 +141,7 @@ class QueryMethods(ServiceConnection):
         ------
         InvalidRequest : too few or too many frames, another number of metadata, or no odometry.
         """
+        check_options(how)
         if metas is not None and len(metas) != len(frames):
             raise InvalidRequest(
                 f"There are {len(frames)} frames and {len(metas)} `metas`. Give one for each.",

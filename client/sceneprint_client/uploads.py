@@ -49,9 +49,10 @@ class UploadMethods(ServiceConnection):
         map_name : of the map
         frame : a path, the content of a PNG or NPY file or of a cloud, a frame of
             `find_sequences`, or an array: (H, W) depth, uint16 in stored units or floating in
-            metres, or (N, 3) points
+            metres, or (N, 3) points; or an image or cloud of Open3D, or an image of Pillow
         meta : metadata; default: what `meta_of` finds. Or only the camera:
-            CameraIntrinsics, or for an array a (3, 3) matrix or (fx, fy, cx, cy)
+            CameraIntrinsics, Open3D's PinholeCameraIntrinsic, or for an array a (3, 3) matrix or
+            (fx, fy, cx, cy)
         wait_s : seconds to wait until it is signed; default: none
         priority : -10 to 10; frames of higher priority are signed first
         if_novel : keep it only if its place is new to the map: its nearest frame is farther than

@@ -10,14 +10,15 @@ import argparse
 import math
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from tqdm import tqdm
 
 from sceneprint.cli import positive_number
-from sceneprint.cli.options import up_of
-from sceneprint.errors import Busy, DatasetError, InvalidRequest, UnknownFrame
+from sceneprint.cli.options import up_of, waiting_reason
+from sceneprint.errors import Busy, DatasetError, InvalidRequest, SceneprintError, UnknownFrame
 from sceneprint.formats.archive import is_archive
 from sceneprint.formats.exports import is_export
 from sceneprint_client.api.base import checked
@@ -38,6 +39,50 @@ if TYPE_CHECKING:
 
 #: Seconds without a frame signed after which no worker is believed to be there.
 STALL_S = 120.0
+
+
+class Patience:
+    """How long an upload waits for its jobs: until a deadline, or as long as some end now and then.
+
+    Parameters
+    ----------
+    limit_s : seconds from now; None: as long as it moves
+    """
+
+    def __init__(self, limit_s: float | None) -> None:
+        self._until = None if limit_s is None else time.monotonic() + limit_s
+        self._moved = time.monotonic()
+
+    @property
+    def left_s(self) -> float:
+        """Return the seconds that are left, unless something moves meanwhile."""
+        until = self._moved + STALL_S if self._until is None else self._until
+        return max(until - time.monotonic(), 0.0)
+
+    def note_progress(self) -> None:
+        """Note that something moved."""
+        self._moved = time.monotonic()
+
+    def is_over(self, client: Client) -> bool:
+        """Return whether to give up; a service that still starts is waited for."""
+        if self.left_s > 0:
+            return False
+        if self._until is None and is_starting(client):
+            self.note_progress()
+            return False
+        return True
+
+
+def why_unsigned(client: Client, jobs: Iterable[str]) -> str:
+    """Return why jobs have not ended, by what the service counts now."""
+    from sceneprint_client.api import JobState
+
+    try:
+        stats = client.stats(minutes=1)
+        own = sum(job.state is JobState.QUEUED for job in client.wait(jobs, timeout_s=0.0))
+    except SceneprintError:  # a key for some maps alone may not see them
+        return waiting_reason(None)
+    return waiting_reason(stats, own)
 
 
 def is_starting(client: Client) -> bool:
@@ -85,7 +130,7 @@ def is_archive_file(path: Path) -> bool:
 def import_archives(
     client: Client, options: argparse.Namespace, archives: list[Path], tally: Tally
 ) -> bool:
-    """Send archives and count their frames; False where workers do nothing for long."""
+    """Send archives and count their frames; return whether all imports ended in time."""
     for path in archives:
         said = _options_of(options, path.name, name=path.name.partition(".")[0][:64] or "import")
         with path.open("rb") as file:
@@ -93,33 +138,41 @@ def import_archives(
         if options.no_wait:
             print(f"{path.name}: received; import {job.job_id} adds its frames")
             continue
-        job, moves = _waited(client, options.map, path.name, job)
+        job = _waited(client, options, path.name, job)
         _count(client, options.map, job, tally)
-        if not moves:
+        if not job.state.over:
+            _tell_late(client, options, path.name, job)
             return False
         if job.error is not None:
             tally.refuse(path.name, job.error)
     return True
 
 
-def _waited(client: Client, map_name: str, name: str, job: Job) -> tuple[Job, bool]:
-    """Return an import once it is over, or once it has not moved for long, and whether it moves."""
+def _tell_late(client: Client, options: argparse.Namespace, name: str, job: Job) -> None:
+    print(
+        f"{name}: import {job.job_id} did not end within {options.timeout or STALL_S:g} s, and "
+        f"goes on when a worker is free. {why_unsigned(client, [job.job_id])}",
+        file=sys.stderr,
+    )
+
+
+def _waited(client: Client, options: argparse.Namespace, name: str, job: Job) -> Job:
+    """Return an import once it is over, or as it is when nothing moved for long."""
     from sceneprint_client.api import JobState
 
-    moved, seen = time.monotonic(), job.progress
+    patience, seen = Patience(options.timeout), job.progress
     with tqdm(desc=name, unit="frame", disable=None) as bar:
         while not job.state.over:
             client.wait([job.job_id], timeout_s=_PAUSE_S)
-            job = client.import_job(map_name, job.job_id)
+            job = client.import_job(options.map, job.job_id)
             if job.progress is not None:
                 _show(bar, name, job.progress)
             if job.progress != seen or job.state == JobState.RUNNING:
-                moved, seen = time.monotonic(), job.progress
-            elif time.monotonic() - moved > STALL_S:
-                if not is_starting(client):
-                    return job, False
-                moved = time.monotonic()
-    return job, True
+                seen = job.progress
+                patience.note_progress()
+            if not job.state.over and patience.is_over(client):
+                break
+    return job
 
 
 def _show(bar: tqdm[Any], name: str, progress: Progress) -> None:
@@ -273,13 +326,9 @@ def import_maps(client: Client, options: argparse.Namespace) -> int:
         if options.no_wait:
             print(f"{path.name}: received; import {job.job_id} renders its views")
             continue
-        job, moves = _waited(client, options.map, path.name, job)
-        if not moves:
-            print(
-                f"{path.name}: import {job.job_id} has not moved for {STALL_S:.0f} s. Check that "
-                "workers are running; `sceneprint work` starts some.",
-                file=sys.stderr,
-            )
+        job = _waited(client, options, path.name, job)
+        if not job.state.over:
+            _tell_late(client, options, path.name, job)
             return 2
         if job.result is None:
             print(f"{path.name}: {job.error or job.state.sentence}", file=sys.stderr)

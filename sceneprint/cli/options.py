@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from sceneprint.scenes.scene import SceneStream
     from sceneprint_client import Client
     from sceneprint_client.api import Answer
+    from sceneprint_client.api.admin import Stats
 
 # Which frames of a map a command asks among.
 
@@ -287,6 +288,24 @@ def open_client(options: argparse.Namespace) -> Client:
     from sceneprint_client import Client
 
     return Client(options.url or DEFAULT_URL, options.key)
+
+
+def waiting_reason(stats: Stats | None, own: int = 0) -> str:
+    """Return why jobs wait, and what to do.
+
+    Parameters
+    ----------
+    stats : of the whole service; None where the key may not see them
+    own : jobs of the caller that wait for a worker; those of others are ahead of them
+    """
+    if stats is None or not stats.workers:
+        return "Check that workers are running; `sceneprint work` starts some."
+    busy = sum(worker.job_id is not None for worker in stats.workers)
+    ahead = max(stats.waiting - own, 0)
+    return (
+        f"{busy} of {len(stats.workers)} worker{'s' * (len(stats.workers) > 1)} busy, {ahead} "
+        f"job{'s' * (ahead != 1)} ahead."
+    )
 
 
 def one_line(text: str) -> str:

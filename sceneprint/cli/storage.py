@@ -23,6 +23,7 @@ from sceneprint.cli.options import (
     one_line,
     open_client,
     require_database,
+    waiting_reason,
 )
 from sceneprint.cli.serve import add_data_option, settings_of
 from sceneprint.errors import InvalidRequest
@@ -599,11 +600,9 @@ def _wait(engine: Engine, told: Map) -> int:
                 bar.close()
                 _print_reencoding(told)
                 if not now.dead:
-                    print(
-                        f"no progress for {STALL_S:.0f} s. Check that workers are running; "
-                        "`sceneprint work` starts some.",
-                        file=sys.stderr,
-                    )
+                    stats = engine.operations.statistics.tell(minutes=1)
+                    reason = waiting_reason(stats, 0 if now is None else now.left)
+                    print(f"no progress for {STALL_S:.0f} s. {reason}", file=sys.stderr)
                 return 2
             time.sleep(max(LOOK_S, 10 * took))
     _print_reencoding(told)

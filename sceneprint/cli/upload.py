@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from sceneprint.cli import positive
+from sceneprint.cli import positive, positive_number
 from sceneprint.cli.bag import add_recording_options, recording_options, tell
 from sceneprint.cli.imports import (
     STALL_S,
+    Patience,
     add_map_options,
     axis_or_up,
     check_map_options,
@@ -26,7 +27,7 @@ from sceneprint.cli.imports import (
     import_archives,
     import_maps,
     is_archive_file,
-    is_starting,
+    why_unsigned,
 )
 from sceneprint.cli.options import (
     add_service_options,
@@ -132,14 +133,17 @@ class Tally:
 # Waiting until the frames of an upload are signed.
 
 
-def wait_for_all(client: Client, map_name: str, tally: Tally, *, may_be_redundant: bool) -> bool:
-    """Wait for the jobs as long as some end now and then; whether all did.
+def wait_for_all(
+    client: Client, map_name: str, tally: Tally, patience: Patience, *, may_be_redundant: bool
+) -> None:
+    """Wait for the jobs until all have ended or patience has; `tally.waiting` has the rest.
 
     Parameters
     ----------
     client : of the service
     map_name : of the map
-    tally : of the upload, which is told of every job that is over
+    tally : of the upload, which counts every job that is over
+    patience : how long to wait
     may_be_redundant : whether frames were sent to be kept only where the map lacks the place
     """
     total = len(tally.waiting)
@@ -152,15 +156,15 @@ def wait_for_all(client: Client, map_name: str, tally: Tally, *, may_be_redundan
 
             over = [
                 job
-                for job in client.wait(tally.waiting, timeout_s=STALL_S, progress=progress)
+                for job in client.wait(tally.waiting, timeout_s=patience.left_s, progress=progress)
                 if job.state.over
             ]
             for job in over:
                 redundant = may_be_redundant and _is_redundant(client, map_name, job)
                 tally.end(job, redundant=redundant)
-            if not over and not is_starting(client):
-                return False
-    return True
+                patience.note_progress()
+            if tally.waiting and patience.is_over(client):
+                return
 
 
 def _is_redundant(client: Client, map_name: str, job: Job) -> bool:
@@ -295,6 +299,13 @@ def add_upload(commands: Any) -> None:
     )
     command.add_argument("--no-wait", action="store_true", help="do not wait for signing")
     command.add_argument(
+        "--timeout",
+        type=positive_number,
+        metavar="SECONDS",
+        help="wait so long for signing; frames that are not signed by then are signed later "
+        f"(default: until none was signed for {STALL_S:.0f} s)",
+    )
+    command.add_argument(
         "--parallel",
         type=positive,
         default=4,
@@ -320,15 +331,19 @@ def run_upload(options: argparse.Namespace) -> int:
     found = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
     if options.base is not None and options.base_frame is not None:
         options.base = options.base.model_copy(update={"base_frame": options.base_frame})
-    tally, start, stalled = Tally(), time.perf_counter(), False
+    tally, start, late = Tally(), time.perf_counter(), False
     with open_client(options) as client:
         _see_to_map(client, options)
         try:
             _send_all(client, options, found, tally)
-            stalled = not import_archives(client, options, archives, tally)
-            if not options.no_wait and not stalled:
+            late = not import_archives(client, options, archives, tally)
+            if not options.no_wait and not late:
                 novel = options.if_novel is not None
-                stalled = not wait_for_all(client, options.map, tally, may_be_redundant=novel)
+                patience = Patience(options.timeout)
+                wait_for_all(client, options.map, tally, patience, may_be_redundant=novel)
+                if tally.waiting:
+                    late = True
+                    _tell_late(client, options, tally)
         finally:  # what was received stays, however the run ended
             counted = tally.new + tally.there + tally.refused
             tally.report(max(len(found), counted), time.perf_counter() - start)
@@ -338,17 +353,19 @@ def run_upload(options: argparse.Namespace) -> int:
             for sequence in sequences:
                 tell(sequence)
             hint_at_maps(paths)
-            if stalled:
-                print(
-                    f"{len(tally.waiting)} frames are stored and waiting, but none was signed "
-                    f"for {STALL_S:.0f} s. Check that workers are running; `sceneprint work` "
-                    "starts some.",
-                    file=sys.stderr,
-                )
         clouds = sum(frame.cloud is not None for _, frame in found)
         for line in map_lines(client, options.map, clouds) if tally.new or tally.there else ():
             print(line)
-    return 2 if tally.errors or stalled else 0
+    return 2 if tally.errors or late else 0
+
+
+def _tell_late(client: Client, options: argparse.Namespace, tally: Tally) -> None:
+    how = "not" if options.timeout else "none was"
+    print(
+        f"{len(tally.waiting)} frames are stored and waiting, but {how} signed within "
+        f"{options.timeout or STALL_S:g} s. {why_unsigned(client, tally.waiting)}",
+        file=sys.stderr,
+    )
 
 
 def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:

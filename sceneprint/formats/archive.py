@@ -385,6 +385,8 @@ class Inflater:
             raise UnreadableArchive(_NO_TAR)
 
     def _open(self, head: bytes) -> None:
+        if not head:
+            raise UnreadableArchive("The archive is empty. Copy or pack it again.")
         if not is_archive(head):
             raise UnreadableArchive(
                 f"This is no archive that is read. Send {_KINDS} of a sequence; one frame is sent "

@@ -26,12 +26,13 @@ from sceneprint.cli.checks import (
     version_check,
     worker_check,
 )
-from sceneprint.cli.options import prepare_presets
+from sceneprint.cli.options import prepare_presets, waiting_reason
 from sceneprint.engine import compilation
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.geometry.signature import pair_features
 from sceneprint.settings import Settings
 from sceneprint_client import Client, Status
+from sceneprint_client.api.admin import WorkerSeen
 
 Run = Callable[..., Any]
 #: What is said of a service.
@@ -312,6 +313,16 @@ def test_workers_that_are_missing(waiting: Client) -> None:
     queue = queue_check(late)
     assert queue.verdict == "note"
     assert "the oldest for 100 s; 2 failed for good: `sceneprint jobs --state dead`" in queue.text
+
+
+def test_why_jobs_wait(waiting: Client) -> None:
+    stats = waiting.stats(minutes=1)
+    assert waiting_reason(stats, 1).startswith("Check that workers are running;")
+    busy = [WorkerSeen(name="host:1", job_id="j"), WorkerSeen(name="host:2", job_id=None)]
+    many = stats.model_copy(update={"workers": busy, "waiting": 45})
+    assert waiting_reason(many, 3) == "1 of 2 workers busy, 42 jobs ahead."
+    one = stats.model_copy(update={"workers": busy[:1]})
+    assert waiting_reason(one, 0) == "1 of 1 worker busy, 1 job ahead."
 
 
 def test_what_a_service_may_tell(waiting: Client) -> None:

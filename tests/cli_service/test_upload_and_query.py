@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.cli.upload import is_starting
+from sceneprint.cli.demo import serving
+from sceneprint.cli.imports import is_starting
 from sceneprint.errors import MissingDependency, TooLarge
 from sceneprint.formats.dataset import read_pose, write_depth_png
 from sceneprint_client import Client, http
@@ -352,6 +353,17 @@ def test_an_upload_waits_for_a_service_that_compiles(
         client._worker._engine.signers._compiled.clear()  # type: ignore[union-attr]
         assert is_starting(client)
     assert "the service compiles its kernels" in capsys.readouterr().err
+
+
+def test_an_upload_ends_at_its_timeout(sceneprint: Run, tmp_path: Path, rooms: Path) -> None:
+    with serving(tmp_path, 0) as url:
+        arguments = ("late", rooms, "--every", "2", "--timeout", "0.2", "--url", url)
+        said = sceneprint("upload", *arguments, expect=2)
+        assert "4 frames: 4 received, 0 already there; 0 indexed" in said.stdout
+        assert (
+            "4 frames are stored and waiting, but not signed within 0.2 s. Check that workers are "
+            "running; `sceneprint work` starts some." in said.stderr
+        )
 
 
 def test_a_map_that_is_one_file_is_uploaded_as_a_map(

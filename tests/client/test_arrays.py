@@ -176,3 +176,44 @@ def test_poses_as_ros_names_them() -> None:
     for twice in ({**told, "translation": told["position"]}, {"position": told["position"]}):
         with pytest.raises(InvalidRequest):
             checked(GivenPose, "The pose", **twice)
+
+
+def test_images_and_cameras_of_libraries_are_taken() -> None:
+    image, o3d = pytest.importorskip("PIL.Image"), pytest.importorskip("open3d")
+    millimetres = np.arange(12, dtype=np.uint16).reshape(3, 4)
+    lens = o3d.camera.PinholeCameraIntrinsic(4, 3, 5.0, 6.0, 1.5, 1.0)
+    for frame in (
+        image.fromarray(millimetres),
+        image.fromarray(millimetres.astype(np.int32)),
+        image.fromarray(millimetres.astype(">u2")),
+        o3d.geometry.Image(millimetres),
+        o3d.t.geometry.Image(millimetres),
+    ):
+        data, meta = sendable(frame, lens, with_pose=False)
+        np.testing.assert_array_equal(loaded(data), millimetres)
+        assert loaded(data).dtype == np.uint16
+        assert meta.intrinsics == CAMERA
+    metres = o3d.geometry.Image((millimetres / 1000).astype(np.float32))
+    data, _ = sendable(metres, lens, with_pose=False)
+    np.testing.assert_allclose(loaded(data), millimetres / 1000, rtol=1e-6)
+    assert sendable(b"\x89PNG", lens, with_pose=False)[1].intrinsics == CAMERA
+
+
+def test_clouds_of_open3d_are_points() -> None:
+    o3d = pytest.importorskip("open3d")
+    points = np.arange(12, dtype=np.float64).reshape(4, 3)
+    for cloud in (
+        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)),
+        o3d.t.geometry.PointCloud(points.astype(np.float32)),
+    ):
+        data, meta = sendable(cloud, None, with_pose=False)
+        np.testing.assert_array_equal(loaded(data), points)
+        assert meta == FrameMeta()
+
+
+def test_unknown_options_are_refused_before_the_frame_is_looked_at() -> None:
+    with (
+        Client("http://127.0.0.1:9") as client,
+        pytest.raises(TypeError, match="no option camera; its options are candidates"),
+    ):
+        client.localize("hall", np.zeros((3, 4), np.uint16), camera=CAMERA)  # type: ignore[call-arg]

@@ -90,7 +90,7 @@ FORMS = {
                          "no file part `frame`"),
     "no UTF-8": (X, FRAME + part("caf\xe9", b"").replace(b"\xc3", b"") + KNOWN + END, 422,
                  "invalid-request", "an unknown part 'caf\xa9'"),
-    "empty": (X, b"", 422, "invalid-request", "no file part `frame`"),
+    "empty": (X, b"", 400, "malformed-body", "The body is empty"),
     "no parts": (X, END, 422, "invalid-request", "no file part `frame`"),
     "no frame": (X, KNOWN + END, 422, "invalid-request", "no file part `frame`"),
     "no meta": (X, FRAME + END, 422, "invalid-request", "no field `meta`"),

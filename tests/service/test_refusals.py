@@ -116,7 +116,7 @@ def test_a_question_that_cannot_be_asked_is_refused(
 
 #: content of a query that is no form -> status, type, text
 BODIES = {
-    b"": (400, "malformed-body", "not JSON"), b"{": (400, "malformed-body", "not JSON"),
+    b"": (400, "malformed-body", "The body is empty."), b"{": (400, "malformed-body", "not JSON"),
     b"[]": (400, "malformed-body", "not a JSON object"),
     b'{"frame_id": "\xff"}': (400, "malformed-body", "not JSON"),
     b'{"frame_id": "\\ud800"}': (400, "malformed-body", "not JSON"),
@@ -196,3 +196,35 @@ def test_what_is_not_there_is_said_so(served, hall, refused, method, path, statu
     problem = refused(answer, status, kind)
     assert answer.headers.get("allow") == allow
     assert len(problem["detail"]) < 5300
+
+
+def test_an_empty_body_is_called_empty(served, hall, refused):
+    camera = "?fx=1&fy=1&cx=1&cy=1"
+    image = {"content-type": "image/png"}
+    told = "The body is empty. Send the file itself"
+    for route in ("frames", "queries"):
+        for path in (f"{hall}/{route}", f"{hall}/{route}{camera}"):
+            refused(served.client.post(path, headers=image), 422, "unreadable-frame", told)
+    refused(served.client.post(f"{hall}/frames"), 400, "malformed-body", told)
+    refused(served.client.post("/v1/maps", headers=JSON), 400, "malformed-body", "body is empty")
+
+
+@pytest.mark.parametrize(
+    ("request_of", "place", "rule"),
+    [
+        ({"url": "/v1/maps", "json": {"name": "My Hall"}}, "name", "1 to 63 lower-case letters"),
+        (
+            {"url": "/v1/keys", "json": {"name": "k", "grants": {"My Hall": "read"}}},
+            "grants.My Hall.[key]", "the name of a map, or * for all",
+        ),
+        (
+            {"url": "/v1/maps/refusals/frames?format=kitti&session=%01", "content": b"x",
+             "headers": {"content-type": "image/png"}},
+            "session", "characters of one line",
+        ),
+    ],
+)  # fmt: skip
+def test_a_name_that_breaks_its_rule_gets_the_rule(served, hall, refused, request_of, place, rule):
+    problem = refused(served.client.post(**request_of), 422, "invalid-request", f"must be {rule}")
+    assert problem["errors"][0]["field"] == place
+    assert "^" not in problem["detail"]

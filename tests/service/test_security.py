@@ -51,6 +51,21 @@ def test_every_answer_is_guarded(served):
         guarded(answer)
 
 
+def test_a_key_that_is_sent_counts_where_none_is_required(served, make_map, refused):
+    hall = make_map(served, "keyed-unasked")
+    wrong = {"Authorization": "Bearer sp_wrong"}
+    refused(served.client.get(hall, headers=wrong), 401, "key-required", "unknown, revoked")
+    made = served.client.post("/v1/keys", json={"name": "reader", "grants": {hall[9:]: "read"}})
+    try:
+        shown = {"Authorization": f"Bearer {made.json()['secret']}"}
+        assert served.client.get(hall, headers=shown).status_code == 200
+        assert served.client.delete(hall, headers=shown).status_code == 403
+    finally:
+        assert served.client.delete("/v1/keys/reader").status_code == 204
+    refused(served.client.get(hall, headers=shown), 401, "key-required")
+    assert served.client.get(hall).status_code == 200
+
+
 @pytest.mark.parametrize("path", ["/healthz", "/readyz"])
 def test_a_balancer_may_ask_for_the_head_alone(served, path):
     answer = served.client.head(path)

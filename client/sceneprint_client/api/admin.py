@@ -7,15 +7,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AwareDatetime, Field, StringConstraints
 
-from sceneprint_client.api.base import ApiRecord, Given, JobState, Label, Page
+from sceneprint_client.api.base import MAP_OR_EVERY, ApiRecord, Given, JobState, Label, Page
 
 #: What a key may do with a map; each may what those before it may.
 Scope = Literal["read", "write", "admin"]
 SCOPES: tuple[Scope, ...] = ("read", "write", "admin")
 #: In place of the name of a map: all of them, and what is of no map.
 EVERY = "*"
-#: A map's name, or EVERY.
-GRANTED = r"^(\*|[a-z0-9][a-z0-9_-]{0,62})$"
 
 
 class NewKey(Given):
@@ -25,7 +23,7 @@ class NewKey(Given):
         description="Who it is for; unique, and told in the audit log.", examples=["robot-7"]
     )
     grants: Annotated[
-        dict[Annotated[str, StringConstraints(pattern=GRANTED)], Scope],
+        dict[Annotated[str, StringConstraints(pattern=MAP_OR_EVERY)], Scope],
         Field(min_length=1, max_length=1000),
     ] = Field(
         description="What it may do, by the name of a map, which need not be there yet; `*` stands "

@@ -41,10 +41,32 @@ else:
 T = TypeVar("T")
 Record = TypeVar("Record", bound=BaseModel)
 
+#: Rules of names by their patterns, which errors put in the place of the pattern.
+NAME_RULES = {
+    (ONE_LINE := r"^[^\x00-\x1f\x7f]+$"): "characters of one line, without control characters",
+    (_FILE_NAME := r"^[^\x00-\x1f\x7f\\]+$"): "characters of one line, without backslashes",
+    (_TEXT := r"^[^\x00]*$"): "text without the character NUL",
+    (FOLDER_NAME := r"^[^/\\\x00-\x1f\x7f.][^/\\\x00-\x1f\x7f]*$"): (
+        "characters of one line, without slashes and without a dot in front"
+    ),
+    (MAP_NAME := r"^[a-z0-9][a-z0-9_-]{0,62}$"): (
+        "1 to 63 lower-case letters, digits, hyphens and underscores, the first a letter or digit"
+    ),
+    (MAP_OR_EVERY := r"^(\*|[a-z0-9][a-z0-9_-]{0,62})$"): "the name of a map, or * for all",
+    (DIGEST := r"^[0-9a-f]{64}$"): "64 digits of 0-9 and a-f",
+}
+
+
+def fault_reason(fault: Mapping[str, Any]) -> str:
+    """Return what is wrong with a field by an error of pydantic, a rule in words where it has a
+    pattern.
+    """
+    rule = NAME_RULES.get(fault.get("ctx", {}).get("pattern"))
+    return f"must be {rule}" if rule else str(fault["msg"]).removeprefix("Value error, ")
+
+
 #: Names that people give: printable, one line.
-Label = Annotated[
-    str, StringConstraints(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")
-]
+Label = Annotated[str, StringConstraints(min_length=1, max_length=128, pattern=ONE_LINE)]
 
 
 #: Characters of the name of a frame.
@@ -60,13 +82,13 @@ def _without_a_way_out(name: str) -> str:
 #: What an original file or message was called: a label, never a path that anybody opens.
 FileName = Annotated[
     str,
-    StringConstraints(min_length=1, max_length=MOST_OF_NAME, pattern=r"^[^\x00-\x1f\x7f\\]+$"),
+    StringConstraints(min_length=1, max_length=MOST_OF_NAME, pattern=_FILE_NAME),
     AfterValidator(_without_a_way_out),
 ]
 
 
 #: What people write about something: no database has a text with NUL.
-Note = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00]*$")]
+Note = Annotated[str, StringConstraints(max_length=200, pattern=_TEXT)]
 
 
 class Given(BaseModel):
@@ -279,7 +301,7 @@ def record_of(kind: type[Record], fields: object, what: str) -> Record:
 
 def invalid_record(error: ValidationError, what: str) -> InvalidRequest:
     """Return what pydantic found wrong with a record, in our words."""
-    found = error.errors(include_url=False, include_context=False, include_input=False)
+    found = error.errors(include_url=False, include_input=False)
     return invalid_request(found, what)
 
 
@@ -292,7 +314,7 @@ def invalid_request(found: Sequence[Mapping[str, Any]], what: str) -> InvalidReq
     fields = tuple(
         (
             ".".join(str(part) for part in one["loc"] if part != "query")[:MOST_OF_FIELD],
-            one["msg"].removeprefix("Value error, "),
+            fault_reason(one),
         )
         for one in found[:MOST_FIELDS]
     )

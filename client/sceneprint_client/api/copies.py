@@ -6,12 +6,12 @@ from typing import Annotated, Any
 
 from pydantic import Base64Bytes, Field
 
-from sceneprint_client.api.base import ApiRecord, Page
+from sceneprint_client.api.base import DIGEST, ApiRecord, Page
 
 #: Frames whose rows are told in one answer, and frames that are listed in one.
 MOST_ROWS, MOST_LISTED = 50, 1000
 
-Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Digest = Annotated[str, Field(pattern=DIGEST)]
 # a whole number stays one: rows are told apart by their JSON
 _Three = Annotated[list[int | float], Field(min_length=3, max_length=3)]
 _Four = Annotated[list[int | float], Field(min_length=4, max_length=4)]

@@ -10,6 +10,7 @@ from typing import Annotated, Literal, get_args
 from pydantic import Discriminator, Field, StringConstraints, Tag, model_validator
 
 from sceneprint_client.api.base import (
+    FOLDER_NAME,
     MOST_TAGS,
     ApiRecord,
     CameraIntrinsics,
@@ -113,9 +114,7 @@ _STATUSES: dict[type[SceneprintError], int] = {Conflict: 409, QuotaExceeded: 403
 #: As a folder may be called.
 FolderName = Annotated[
     str,
-    StringConstraints(
-        min_length=1, max_length=64, pattern=r"^[^/\\\x00-\x1f\x7f.][^/\\\x00-\x1f\x7f]*$"
-    ),
+    StringConstraints(min_length=1, max_length=64, pattern=FOLDER_NAME),
 ]
 
 

@@ -16,8 +16,10 @@ from pydantic import (
 from pydantic_core import from_json
 
 from sceneprint_client.api.base import (
+    DIGEST,
     MOST_OF_NAME,
     MOST_TAGS,
+    ONE_LINE,
     ApiRecord,
     FileName,
     FrameState,
@@ -42,9 +44,7 @@ _Names = Annotated[list[Label], BeforeValidator(_one_or_many), Field(max_length=
 
 
 #: The beginning of a name.
-_Prefix = Annotated[
-    str, Field(min_length=1, max_length=MOST_OF_NAME, pattern=r"^[^\x00-\x1f\x7f]+$")
-]
+_Prefix = Annotated[str, Field(min_length=1, max_length=MOST_OF_NAME, pattern=ONE_LINE)]
 
 
 class FrameListing(Given):
@@ -69,7 +69,7 @@ class FrameListing(Given):
     received_before: AwareDatetime | None = Field(default=None, description="Then, or earlier.")
     parent_frame: Label | None = Field(default=None, description="Its pose leads there.")
     has_pose: bool | None = Field(default=None, description="Whether it has a pose.")
-    content_id: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = Field(
+    content_id: Annotated[str, Field(pattern=DIGEST)] | None = Field(
         default=None, description="Of its samples and camera."
     )
     name: _Prefix | None = Field(default=None, description="Its name begins so; case matters.")

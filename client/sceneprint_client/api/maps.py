@@ -7,12 +7,12 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, StringConstraints, WithJsonSchema
 
-from sceneprint_client.api.base import ApiRecord, Direction, Given, Note, Up
+from sceneprint_client.api.base import MAP_NAME, ApiRecord, Direction, Given, Note, Up
 
 #: Names of the models that ship with the service, the default first.
 PRESETS = ("depth", "lidar", "paper")
 #: A map's name: an immutable slug.
-Slug = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,62}$")]
+Slug = Annotated[str, StringConstraints(pattern=MAP_NAME)]
 
 
 def _shipped(name: str) -> str:

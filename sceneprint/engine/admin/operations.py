@@ -42,7 +42,6 @@ from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Page
 from sceneprint_client.api.admin import (
     EVERY,
-    GRANTED,
     MISSED,
     AuditLine,
     Event,
@@ -51,6 +50,7 @@ from sceneprint_client.api.admin import (
     MadeKey,
     Scope,
 )
+from sceneprint_client.api.base import MAP_OR_EVERY
 
 # Following events: where a reader begins, and what comes next.
 #
@@ -346,7 +346,7 @@ def create_key(
     _check_name(name, "key")
     granted: dict[str, Scope] = dict(grants or {EVERY: "admin"})
     for one in granted:
-        if not re.fullmatch(GRANTED, one):
+        if not re.fullmatch(MAP_OR_EVERY, one):
             raise InvalidRequest(
                 f"{one!r:.80} is not a valid map name. Give map names, or * for all maps.",
                 (("grants", "not a map name"),),
