@@ -58,8 +58,8 @@ TYPES = media_types_of("depth", "cloud")
 
 _CAMERA = ("fx", "fy", "cx", "cy", "width", "height", "distortion")
 _PLAIN = (
-    "depth_scale", "depth_along_ray", "units_per_metre", "format", "robot", "session",
-    "captured_at", "name", "sequence",
+    "depth_scale", "depth_along_ray", "trust_depth", "units_per_metre", "format", "robot",
+    "session", "captured_at", "name", "sequence",
 )  # fmt: skip
 _OTHERS = ("viewpoint", "tags", "pose", "parent_frame", "base", "base_frame", "up")
 _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -83,6 +83,7 @@ def parameters() -> list[dict[str, Any]]:
         "distortion": (text, "k1,k2,p1,p2[,k3] of OpenCV."),
         "depth_scale": (number, "stored units per metre; default: 1000."),
         "depth_along_ray": ({"type": "boolean"}, "samples are ranges along the pixel's ray."),
+        "trust_depth": ({"type": "boolean"}, "take a depth image that does not look like one."),
         "viewpoint": (text, "of a point cloud: x,y,z in metres; `none` where there is none."),
         "units_per_metre": (number, "of a point cloud; default: 1."),
         "format": (

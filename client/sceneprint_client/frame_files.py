@@ -234,6 +234,7 @@ def meta_of(
     base: GivenBase | None = None,
     up: Sequence[float] | None = None,
     with_name: bool = True,
+    trust_depth: bool = False,
 ) -> FrameMeta:
     """What a data set knows of one of its frames, as it is sent with an upload.
 
@@ -248,6 +249,7 @@ def meta_of(
     base : where the sensor sits on the robot; default: as the frame says
     up : unit vector in the sensor's axes; default: of the sidecar, for all of its frames
     with_name : send the original name and the place in the sequence; queries have no use for them
+    trust_depth : take a depth image that does not look like one
 
     Raises
     ------
@@ -269,6 +271,7 @@ def meta_of(
         FrameMeta,
         "What is known of the frame",
         **(_of_depth(reference.camera) if reference.camera else _of_cloud(reference)),
+        trust_depth=trust_depth and reference.camera is not None,
         robot=robot,
         session=sequence if session is None else session,
         captured_at=None if stamp is None else datetime.fromtimestamp(stamp, timezone.utc),

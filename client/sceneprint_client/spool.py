@@ -15,7 +15,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 from threading import RLock
@@ -26,7 +26,13 @@ from numpy.typing import NDArray
 
 from sceneprint_client import errors
 from sceneprint_client.api.base import FrameMeta, GivenPose
-from sceneprint_client.api.frames import MOST_OF_BATCH, BatchItem
+from sceneprint_client.api.frames import (
+    MOST_OF_BATCH,
+    BatchItem,
+    SampleRange,
+    UploadSummary,
+    upload_summary,
+)
 from sceneprint_client.http import frame_bytes, meta_json
 from sceneprint_client.poses import rotation_of
 from sceneprint_client.tracker_core import difference
@@ -158,11 +164,20 @@ class SyncReport:
     received : frames that are new to the map
     there : frames that the map had already
     refused : frames that were set aside
+    poses : frames that the map has with their poses
+    ranges : of the frames that the map has
     """
 
     received: int = 0
     there: int = 0
     refused: int = 0
+    poses: int = 0
+    ranges: list[SampleRange] = field(default_factory=list)
+
+    @property
+    def summary(self) -> UploadSummary:
+        """Return what the map has of these frames."""
+        return upload_summary(self.done, {"": self.done - self.poses}, self.ranges)
 
     @property
     def done(self) -> int:
@@ -431,6 +446,9 @@ class Spool:
                 taken.append(one.id)
                 report.received += item.status != 200
                 report.there += item.status == 200
+                report.poses += item.frame.has_pose
+                if item.frame.samples is not None:
+                    report.ranges.append(item.frame.samples)
             elif item.status in _OF_A_FRAME:
                 refused[one.id] = item.problem.detail if item.problem else "no reason was given"
             else:

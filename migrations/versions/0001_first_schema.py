@@ -262,6 +262,7 @@ def _create_frames() -> None:
         sa.Column("up", sa.JSON()),
         sa.Column("name", _string(255)),
         sa.Column("sequence", WHOLE),
+        sa.Column("samples", sa.JSON()),
         sa.Column("ended_at", sa.Float()),
         sa.Column("deletion", WHOLE),
         sa.Column("deleted_from", _string(16)),

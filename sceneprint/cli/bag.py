@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,9 @@ from tqdm import tqdm
 
 from sceneprint.cli import number_within, positive_number
 from sceneprint.cli.options import one_line
+from sceneprint.errors import InvalidRequest
 from sceneprint.formats.dataset import FrameSequence, find_recordings, find_sequences
+from sceneprint.formats.dataset.frame_reference import Layout
 from sceneprint.formats.recording import BagOutline, RecordingOptions, bag_outline
 from sceneprint_client.formats import titles_of
 from sceneprint_client.frame_files import meta_of
@@ -41,7 +44,8 @@ def add_recording_options(command: argparse.ArgumentParser) -> None:
         "--depth-scale",
         type=positive_number,
         metavar="UNITS",
-        help="stored units per metre of 16-bit depth images (default: 1000, millimetres)",
+        help="stored units per metre of 16-bit depth images, also of folders (default: as "
+        "intrinsics.json says, else 1000, millimetres)",
     )
     group.add_argument(
         "--pose-frame",
@@ -103,6 +107,29 @@ def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]
         )
 
 
+def with_depth_scale(sequence: FrameSequence, scale: float | None) -> FrameSequence:
+    """Return a sequence whose depth images have this scale, if one is stated.
+
+    Raises
+    ------
+    InvalidRequest : it is of points, or of another system, which says the scale itself.
+    """
+    if scale is None or sequence.layout is Layout.RECORDING:  # whose reader knows it
+        return sequence
+    if sequence.layout.is_export or any(one.camera is None for one in sequence.frames):
+        raise InvalidRequest(
+            f"--depth-scale is for depth images, and {sequence.name} says its unit itself. Leave "
+            "it out.",
+            (("depth_scale", "not of these files"),),
+        )
+    frames = tuple(
+        replace(one, camera=replace(one.camera, depth_scale=scale))
+        for one in sequence.frames
+        if one.camera is not None
+    )
+    return replace(sequence, frames=frames)
+
+
 def sequences_at(
     path: Path, options: argparse.Namespace, camera: Camera | None = None
 ) -> tuple[FrameSequence, ...]:
@@ -113,7 +140,7 @@ def sequences_at(
         found = find_sequences(path, recording, camera)
     for sequence in found:
         tell(sequence)
-    return found
+    return tuple(with_depth_scale(one, options.depth_scale) for one in found)
 
 
 def tell(sequence: FrameSequence) -> None:
@@ -177,7 +204,7 @@ def _lines(path: Path, outline: BagOutline) -> list[str]:
     if not outline.sequences:
         return [*lines, f"nothing would be taken: {one_line(outline.problem)}"]
     lines += [line for sequence in outline.sequences for line in _taken(sequence)]
-    return lines if outline.depth is None else [*lines, str(outline.depth)]
+    return lines if outline.range is None else [*lines, str(outline.range)]
 
 
 def _span(outline: BagOutline) -> str:

@@ -26,6 +26,7 @@ from sceneprint_client.api.frames import (
     Axis,
     ImportOptions,
     MapImportResult,
+    UploadSummary,
     camera_fields,
     offset_fields,
 )
@@ -101,7 +102,7 @@ def _options_of(options: argparse.Namespace, file: str, **more: Any) -> ImportOp
         ImportOptions, f"The metadata of {file}", robot=options.robot, session=options.session,
         tags=options.tag, parent_frame=options.parent_frame, with_poses=not options.no_pose,
         every=options.every, T_base_sensor=options.base, up=options.up, priority=options.priority,
-        if_novel=options.if_novel, **more,
+        if_novel=options.if_novel, trust_depth=options.trust_depth, **more,
     )  # fmt: skip
 
 
@@ -145,6 +146,10 @@ def import_archives(
             return False
         if job.error is not None:
             tally.refuse(path.name, job.error)
+        if job.result is not None:
+            summary = UploadSummary.model_validate(job.result["summary"])
+            tally.summaries.append(f"{path.name}: {summary.text}")
+            tally.lost += summary.lost
     return True
 
 
@@ -285,7 +290,14 @@ def add_map_options(command: argparse.ArgumentParser) -> None:
 
 def check_map_options(options: argparse.Namespace) -> None:
     """See that options are of the kind of upload; InvalidRequest where they are not."""
-    if options.row is not None and (options.as_map or any(map(is_archive_file, options.paths))):
+    is_whole = options.as_map or any(map(is_archive_file, options.paths))
+    if options.depth_scale is not None and is_whole:
+        raise InvalidRequest(
+            "--depth-scale is for depth images and recordings, and not for a map or an archive. In "
+            'an archive, put it as "depth_scale" into intrinsics.json.',
+            (("depth_scale", "of a map or an archive"),),
+        )
+    if options.row is not None and is_whole:
         raise InvalidRequest(
             "--row is for .bin files, and not for a map or an archive. In an archive, put the "
             'names as "row" into clouds.json.',

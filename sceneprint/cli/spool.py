@@ -170,4 +170,6 @@ def _sync(spool: Spool, options: argparse.Namespace) -> int:
             print(f"{taken} frames uploaded{parts}; {now.refused} refused, {now.waiting} wait")
     for one in spool.refusals():
         print(f"{_name(one)}: {one_line(one.reason)}", file=sys.stderr)
+    if report.done:
+        print(report.summary.text)
     return 2 if now.refused else 0

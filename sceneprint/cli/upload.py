@@ -16,7 +16,12 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from sceneprint.cli import positive, positive_number
-from sceneprint.cli.bag import add_recording_options, recording_options, tell
+from sceneprint.cli.bag import (
+    add_recording_options,
+    recording_options,
+    tell,
+    with_depth_scale,
+)
 from sceneprint.cli.imports import (
     STALL_S,
     Patience,
@@ -57,6 +62,7 @@ from sceneprint_client.sidecars import row_of
 if TYPE_CHECKING:
     from sceneprint_client import Client
     from sceneprint_client.api import Added, FrameMeta, Job
+    from sceneprint_client.api.frames import SampleRange, UploadSummary
     from sceneprint_client.api.listing import Session
 
 # What has become of the frames of an upload.
@@ -76,6 +82,9 @@ class Tally:
     #: Names of the frames that are not signed yet, by their jobs; one content has one job.
     waiting: dict[str, list[str]] = field(default_factory=dict)
     errors: list[tuple[str, str]] = field(default_factory=list)  #: name of a frame, and why
+    ranges: list[SampleRange] = field(default_factory=list)  #: of the frames that were received
+    summaries: list[str] = field(default_factory=list)  #: of archives
+    lost: int = 0  #: what was left out before it was sent, though nobody asked for it
 
     def count(self, name: str, added: Added, new: bool) -> None:
         """A frame that was received, or is there."""
@@ -83,6 +92,8 @@ class Tally:
 
         self.new += new
         self.there += not new
+        if added.samples is not None:
+            self.ranges.append(added.samples)
         if added.state in (FrameState.RECEIVED, FrameState.SIGNING):
             self.waiting.setdefault(added.job_id, []).append(name)
         elif added.state is FrameState.INDEXED:
@@ -209,6 +220,11 @@ def add_frame_options(
     )
     command.add_argument("--no-pose", action="store_true", help="do not upload known poses")
     command.add_argument(
+        "--trust-depth",
+        action="store_true",
+        help="take depth images that do not look like depth, which are refused else",
+    )
+    command.add_argument(
         "--base",
         type=base_of,
         metavar="TX,TY,TZ,QX,QY,QZ,QW",
@@ -239,6 +255,7 @@ def meta_for(
         base=base,
         up=options.up,
         parent_frame=options.parent_frame or parent_frame_of(sequence, options.robot),
+        trust_depth=options.trust_depth,
     )
 
 
@@ -319,7 +336,7 @@ def add_upload(commands: Any) -> None:
 
 
 def run_upload(options: argparse.Namespace) -> int:
-    """Upload; returns 2 where a frame was not indexed."""
+    """Upload; return 2 where a frame was not indexed, or left out though nobody asked for it."""
     check_map_options(options)
     if options.as_map:
         with open_client(options) as client:
@@ -347,16 +364,20 @@ def run_upload(options: argparse.Namespace) -> int:
         finally:  # what was received stays, however the run ended
             counted = tally.new + tally.there + tally.refused
             tally.report(max(len(found), counted), time.perf_counter() - start)
-            # exports say it in their notes
-            if own := [one for one in found if not one[0].layout.is_export]:
-                print(pose_line(own, tally, with_pose=not options.no_pose))
             for sequence in sequences:
-                tell(sequence)
+                if sequence.layout.is_export:  # the summary has the notes of others
+                    tell(sequence)
+                tally.lost += 0 if options.no_pose else sequence.lost
             hint_at_maps(paths)
+            if found:
+                summary = summary_of(found, tally, with_pose=not options.no_pose)
+                tally.summaries.append(summary.text)
+            for line in tally.summaries:
+                print(line)
         clouds = sum(frame.cloud is not None for _, frame in found)
         for line in map_lines(client, options.map, clouds) if tally.new or tally.there else ():
             print(line)
-    return 2 if tally.errors or late else 0
+    return 2 if tally.errors or tally.lost or late else 0
 
 
 def _tell_late(client: Client, options: argparse.Namespace, tally: Tally) -> None:
@@ -403,10 +424,12 @@ def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
     return lines
 
 
-def pose_line(
+def summary_of(
     found: list[tuple[FrameSequence, FrameReference]], tally: Tally, *, with_pose: bool
-) -> str:
-    """Say of how many frames the poses were sent, and why not of the others."""
+) -> UploadSummary:
+    """Return of how many frames the poses were sent, why not of the others, and their range."""
+    from sceneprint_client.api.frames import upload_summary
+
     lost = {name for name, _ in tally.errors}
     without: Counter[str] = Counter()
     for sequence, frame in found:
@@ -416,8 +439,9 @@ def pose_line(
             without[sequence.unposed] += 1
         elif frame.name in lost:
             without["not indexed"] += 1
-    line = f"poses of {len(found) - without.total()} of {len(found)} frames"
-    return "; ".join([line, *(f"{n} without: {why}" for why, n in without.items() if why)])
+    sequences = dict.fromkeys(sequence for sequence, _ in found)
+    notes = [one_line(one.note) for one in sequences if one.note and not one.layout.is_export]
+    return upload_summary(len(found), without, tally.ranges, notes)
 
 
 def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSequence]:
@@ -437,6 +461,7 @@ def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSe
         for sequence in found:
             if options.row is not None:
                 sequence = _with_row(sequence, options.row)
+            sequence = with_depth_scale(sequence, options.depth_scale)
             place = sequence.place.resolve()
             known = places.setdefault(sequence.parent_frame, place)
             if known != place and options.parent_frame is None:

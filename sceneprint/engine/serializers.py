@@ -34,7 +34,7 @@ from sceneprint_client.api import (
     Vector,
 )
 from sceneprint_client.api.base import Direction
-from sceneprint_client.api.frames import Kind
+from sceneprint_client.api.frames import Kind, SampleRange
 from sceneprint_client.poses import quaternion_of
 
 # Entity tags: short texts that change when what they stand for does.
@@ -227,11 +227,18 @@ def _direction(up: Sequence[float] | None) -> Direction | None:
     return None if up is None else Direction(**dict(zip("xyz", up, strict=True)))
 
 
+def sample_range_of(frame: FrameRow) -> SampleRange | None:
+    """Return how far away the samples of a frame are; None once it is purged."""
+    return None if frame.samples is None else SampleRange.model_validate(frame.samples)
+
+
 def _sensor_record(frame: FrameRow) -> dict[str, Any]:
     """How the samples or the points of a frame are read."""
     if frame.cloud is None:
         return {
             "kind": "depth",
+            "trust_depth": None if frame.samples is None else frame.samples["trusted"],
+            "samples": sample_range_of(frame),
             "intrinsics": CameraIntrinsics.model_validate(frame.intrinsics),
             "depth_scale": frame.depth_scale,
             "depth_along_ray": frame.depth_along_ray,
@@ -239,6 +246,7 @@ def _sensor_record(frame: FrameRow) -> dict[str, Any]:
     at = frame.cloud["viewpoint"]
     return {
         "kind": "cloud",
+        "samples": sample_range_of(frame),
         "intrinsics": None,
         "depth_scale": None,
         "depth_along_ray": None,

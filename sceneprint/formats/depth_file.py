@@ -437,6 +437,7 @@ def decode_frame(
     name: str = "",
     pose: Floats | None = None,
     samples_of: Callable[[bytes], Samples] | None = None,
+    trust_depth: bool = False,
 ) -> DepthFrame:
     """Return the frame of the bytes of a depth image.
 
@@ -444,6 +445,7 @@ def decode_frame(
     ----------
     data : the whole file; the rest as for `make_frame`
     samples_of : decodes the file elsewhere; default: `decode_samples`
+    trust_depth : take samples for depth that do not look like it
 
     Raises
     ------
@@ -451,7 +453,8 @@ def decode_frame(
     """
     with naming(name):
         samples = (samples_of or decode_samples)(data)
-        check_depth(samples, depth_scale)
+        if not trust_depth:
+            check_depth(samples, depth_scale)
         frame = make_frame(
             samples, intrinsics, depth_scale=depth_scale, along_ray=along_ray, pose=pose
         )

@@ -33,6 +33,7 @@ COPIED = (
     "content_id", "blob", "bytes", "intrinsics", "depth_scale", "depth_along_ray", "robot",
     "session", "captured_at", "tags", "pose_parent", "pose", "sent_parent", "sent_pose",
     "base_frame", "base", "novelty", "received_at", "indexed_at", "cloud", "up", "name", "sequence",
+    "samples",
 )  # fmt: skip
 #: Columns of a signature that tell one from another without its bytes.
 _TOLD = ("checksum", "geometry", "n_patches", "n_pairs")

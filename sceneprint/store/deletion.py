@@ -69,7 +69,7 @@ from sceneprint_client.api import FrameState, JobState
 _KNOWN = (
     "reason", "robot", "session", "captured_at", "pose_parent", "pose", "pose_x", "pose_y",
     "pose_z", "sent_parent", "sent_pose", "base_frame", "base", "novelty", "up", "name",
-    "sequence", "deletion", "deleted_from", "deleted_content",
+    "sequence", "samples", "deletion", "deleted_from", "deleted_content",
 )  # fmt: skip
 
 

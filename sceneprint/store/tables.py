@@ -137,6 +137,7 @@ frames = Table(
     Column("up", JSON(none_as_null=True)),  # unit vector in the sensor's axes
     Column("name", _string(255)),  # of the original file or message; a label, never a path
     Column("sequence", WHOLE),  # place within the session
+    Column("samples", JSON(none_as_null=True)),  # how far away they are, and whether trusted
     Column("ended_at", Float),  # when it was deleted, or found redundant
     # of a tombstone, a deleted frame that can be restored: the first revision of its deletion
     Column("deletion", WHOLE),
@@ -679,6 +680,7 @@ class FrameRow:
     up: list[float] | None = None
     name: str | None = None
     sequence: int | None = None
+    samples: dict[str, Any] | None = None
     ended_at: float | None = None
     deletion: int | None = None
     deleted_from: FrameState | None = None

@@ -282,7 +282,8 @@ TYPES = media_types_of("archive")
 #: Bytes that are written at once.
 _CHUNK = 1 << 20
 _TEXTS = (
-    "as", "name", "robot", "session", "parent_frame", "every", "with_poses", "units_per_metre",
+    "as", "name", "robot", "session", "parent_frame", "every", "with_poses", "trust_depth",
+    "units_per_metre",
 )  # fmt: skip
 _PARAMETERS = (
     *_TEXTS, "tags", "base", "base_frame", "up", "heights", "offset", "camera", "priority",
@@ -306,7 +307,7 @@ def _described_import() -> dict[str, Any]:
     for name in _PARAMETERS:
         told = own.get(name, {})
         schema = OPTIONS.get(name) or {"type": "string"}
-        if name in ("as", "every", "with_poses", "name"):
+        if name in ("as", "every", "with_poses", "trust_depth", "name"):
             known = ("type", "enum", "default", "minimum")
             schema = {key: told[key] for key in known if key in told}
         if name == "units_per_metre":

@@ -57,7 +57,9 @@ def test_frames_are_spooled_and_uploaded(
     with Client(service_url) as client:
         client.create_map("spooled", model="depth")
         said = sceneprint("spool", "sync", spool, "spooled", "--priority", 1, expect=2)
-        assert said.stdout == "6 frames uploaded; 1 refused, 0 wait\n"
+        counts, summary = said.stdout.splitlines()
+        assert counts == "6 frames uploaded; 1 refused, 0 wait"
+        assert summary.startswith("poses of 6 of 7 frames; depth ")
         assert said.stderr.startswith("broken.ply: ")
         found = list(client.frames("spooled"))
     assert len(found) == 6
@@ -71,7 +73,7 @@ def test_frames_are_spooled_and_uploaded(
     assert (told["uploaded"], told["oldest"], told["bytes"]) == (6, None, 8192)
     assert told["refusals"][0]["name"] == "broken.ply"
     said = sceneprint("spool", "sync", spool, "spooled", "--retry-refused", expect=2)
-    assert said.stdout == "0 frames uploaded; 1 refused, 0 wait\n"
+    assert said.stdout.startswith("0 frames uploaded; 1 refused, 0 wait\nposes of 0 of 1 frames")
 
 
 @pytest.fixture

@@ -37,7 +37,10 @@ def house(service_url: str, rooms: Path) -> str:
     )
     assert done.returncode == 0, done.stderr
     first, second, third, fourth = done.stdout.splitlines()
-    assert third == "poses of 6 of 6 frames"
+    assert re.fullmatch(
+        r"poses of 6 of 6 frames; depth \S+ to \S+ m \(5th to 95th percentile\), \d+ % of pixels "
+        "valid", third,
+    )  # fmt: skip
     assert fourth.startswith("the poses of map house are in 2 parent frames")
     join = "`sceneprint associate house --session room-0/seq-01 --session room-1/seq-01`"
     assert join in fourth
@@ -85,9 +88,9 @@ def test_bad_frames_stop_no_others(
     (folder / "frame-000002.pose.txt").write_text("no pose")
     done = sceneprint("upload", "mixed", folder, "--tag", "a", "--tag", "b", expect=2)
     *_, counts, poses = done.stdout.splitlines()
-    assert poses == (
+    assert poses.startswith(
         "poses of 1 of 4 frames; 2 without: not indexed; 1 without: no NAME.pose.txt is beside "
-        "them, nor NAME.txt in a folder pose"
+        "them, nor NAME.txt in a folder pose; depth "
     )
     assert counts.startswith(
         "4 frames: 2 received, 0 already there, 2 refused; 1 indexed, 1 rejected, 0 failed; "
@@ -102,7 +105,44 @@ def test_bad_frames_stop_no_others(
     without = sceneprint("upload", "mixed", folder, "--no-pose", "--session", "s", expect=2)
     assert "3 refused" in without.stdout  # among them the two that are there with a pose or tags
     assert "1 indexed" in without.stdout  # the one whose pose is none
-    assert "\nposes of 0 of 4 frames; 4 without: --no-pose\n" in without.stdout
+    assert "\nposes of 0 of 4 frames; 4 without: --no-pose; depth " in without.stdout
+
+
+def test_what_is_lost_though_nobody_asked_ends_with_code_2(
+    sceneprint: Run, rooms: Path, tmp_path: Path
+) -> None:
+    """A trajectory of another day: the frames are indexed, and all of its poses are lost."""
+    folder = tmp_path / "day"
+    shutil.copytree(rooms / "room-0" / "seq-01", folder)
+    for pose in folder.glob("*.pose.txt"):
+        pose.unlink()
+    for i in range(3):
+        (folder / f"frame-00000{i}.depth.png").rename(folder / f"{i}.png")
+    (folder / "depth.txt").write_text("0.0 0.png\n1.0 1.png\n2.0 2.png\n")
+    (folder / "groundtruth.txt").write_text("99.5 0 0 0 0 0 0 1\n")
+    options = ("upload", "day", folder, "--depth-scale", "250")
+    done = sceneprint(*options, expect=2)
+    *_, counts, summary, hint = done.stdout.splitlines()
+    assert hint == "map day has no poses: queries find frames, and no coordinates"
+    assert "3 received, 0 already there; 3 indexed" in counts
+    assert summary.startswith(
+        "poses of 0 of 3 frames; 3 without: groundtruth.txt has no pose within 20 ms of them "
+        "(nearest: 97.5 s away); depth "
+    )
+    assert "m on is unusual for a depth camera" in summary  # four times as far away
+    assert "3 already there; 3 indexed" in sceneprint(*options, "--no-pose").stdout
+    (tmp_path / "both").mkdir()
+    folder.rename(tmp_path / "both" / "day")
+    (tmp_path / "both" / "ir").mkdir()
+    folder = tmp_path / "both" / "day"
+    (folder / "groundtruth.txt").write_text("1.01 0 0 0 0 0 0 1\n")
+    summary = sceneprint("upload", "day2", folder.parent).stdout.splitlines()[2]
+    assert summary.startswith("poses of 1 of 3 frames; 2 without: ")
+    assert "; left out: both/ir (" in summary
+    cloud = tmp_path / "points.ply"
+    cloud.write_bytes(b"ply\n")
+    done = sceneprint("upload", "day", cloud, "--depth-scale", "250", expect=2)
+    assert "--depth-scale is for depth images" in done.stderr
 
 
 def test_a_map_without_poses_says_so_and_gives_no_coordinates(
@@ -271,7 +311,8 @@ def test_maps_are_listed_made_and_deleted(sceneprint: Run, house: str) -> None:
     assert (
         "There is no map 'hall'" in sceneprint("maps", "--delete", "hall", "--yes", expect=2).stderr
     )
-    assert "name: String should match" in sceneprint("maps", "--create", "A b", expect=2).stderr
+    refused = sceneprint("maps", "--create", "A b", expect=2)
+    assert "name: must be 1 to 63 lower-case letters" in refused.stderr
     assert "--create NAME or --edit" in sceneprint("maps", "--title", "x", expect=2).stderr
 
 
@@ -290,6 +331,7 @@ def test_an_archive_is_uploaded_as_its_folder_is(
     made = shutil.make_archive(str(tmp_path / "rooms"), "gztar", rooms.parent, rooms.name)
     done = sceneprint("upload", house, made, "--robot", "r1")
     assert done.stdout.startswith("6 frames: 0 received, 6 already there; 6 indexed, ")
+    assert done.stdout.splitlines()[1].startswith("rooms.tar.gz: poses of 6 of 6 frames; depth ")
     base = ("--base", "0,0,0.5,0,0,0,1", "--base-frame", "base")
     done = sceneprint("upload", "shed", made, "--model", "depth", "--every", 3, *base)
     assert done.stdout.splitlines()[1].startswith(
@@ -303,6 +345,8 @@ def test_an_archive_is_uploaded_as_its_folder_is(
     }  # fmt: skip
     bad = tmp_path / "bad.zip"
     bad.write_bytes(b"PK\x03\x04" + bytes(600))
+    done = sceneprint("upload", house, made, "--depth-scale", 1000, expect=2)
+    assert 'put it as "depth_scale" into intrinsics.json' in done.stderr
     done = sceneprint("upload", house, bad, expect=2)
     assert (len(done.stdout.splitlines()), len(done.stderr.splitlines())) == (1, 1)
 

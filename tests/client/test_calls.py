@@ -209,7 +209,7 @@ def test_frames_that_cannot_be_taken(
 def test_requests_that_make_no_sense(
     client: Client, map_name: str, references: tuple[FrameReference, ...], bare_wall: Path
 ) -> None:
-    with pytest.raises(InvalidRequest, match="name: String should match") as told:
+    with pytest.raises(InvalidRequest, match="name: must be 1 to 63") as told:
         client.create_map("Big Hall")
     assert [place for place, _ in told.value.fields] == ["name"]
     with pytest.raises(InvalidRequest, match="model: Input should be 'depth', 'lidar' or"):

@@ -27,7 +27,7 @@ def test_what_is_sent_of_a_data_set(references: tuple[FrameReference, ...], tmp_
     np.testing.assert_array_equal(meta.pose.matrix, references[4].pose)
     assert meta_of(references[4], with_pose=False).pose is None
     assert meta_of(references[4]).session == "room-1/seq-01"
-    with pytest.raises(errors.InvalidRequest, match="robot: String should match"):
+    with pytest.raises(errors.InvalidRequest, match="robot: must be characters of one line"):
         meta_of(references[4], robot="a\nb")
     camera = references[4].camera
     for stamp, year in ((1305031102.25, 2011), (12.5, None), (1.3e18, None)):

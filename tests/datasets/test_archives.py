@@ -451,7 +451,7 @@ def test_names_of_a_zip_that_are_no_utf8_are_read(kitchen: Path, tmp_path: Path)
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"", "no archive that is read"),
+        (b"", "The archive is empty"),
         (b"\x89PNG\r\n\x1a\n" + bytes(600), "no archive that is read"),
         (bytes(1024), "no archive that is read"),
         (b"PK\x03\x04" + bytes(600), "The zip is damaged, or ends early"),

@@ -26,7 +26,7 @@ from sceneprint.store.blobs.folder import MARK
 from sceneprint.store.maps import MapUsage, counted_usage, find_map
 from sceneprint.store.queue import MAXIMUM_FAILURES, files_of
 from sceneprint_client.api import Job, JobState, NewMap
-from sceneprint_client.api.frames import ImportOptions
+from sceneprint_client.api.frames import ImportOptions, UploadSummary, pooled_range
 
 
 def packed(uploads: Any) -> bytes:
@@ -73,9 +73,19 @@ def test_a_slice_that_was_lost_is_done_again(
     assert [one["frame_id"] for one in again.items] == [one["frame_id"] for one in lost.items]
     assert empty.run(task) == JobState.SUCCEEDED  # there is time for all now
     told = empty.imports.get("hall", job.job_id)
+    assert told.result is not None
+    summary = UploadSummary.model_validate(told.result.pop("summary"))
     assert told.result == {
         "sequences": 1, "received": 3, "there": 2, "refused": 0, "ignored": 0,
     }  # fmt: skip
+    # of all slices, those of the frames that were there as well
+    assert (summary.frames, summary.poses, summary.lost) == (5, 0, 0)
+    assert list(summary.without_pose.values()) == [5]
+    items = empty.imports.items("hall", job.job_id).items
+    depth = pooled_range(one.samples for one in items if one.samples is not None)
+    assert depth is not None
+    assert summary.depth == depth
+    assert depth.count == sum(one.samples.count for one in items if one.samples is not None)
     page = empty.imports.items("hall", job.job_id, limit=3)
     rest = empty.imports.items("hall", job.job_id, page.next_cursor, 3)
     assert [one.name for one in (*page.items, *rest.items)] == [f"run/{i}.png" for i in range(5)]

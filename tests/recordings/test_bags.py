@@ -215,6 +215,7 @@ def test_interpolation_by_hand(tmp_path: Path, ros: SimpleNamespace, depth: Samp
         "without: no sample of odom -> base_link within 20 ms (nearest 0.03 s); left out: 3 "
         "without a pose"
     )
+    assert sequence.lost == 3
 
 
 def test_keyframes_by_hand(tmp_path: Path, ros: SimpleNamespace, depth: Samples) -> None:

@@ -165,7 +165,9 @@ def test_localize_and_sequences_of_a_bag(
 def test_each_bag_of_a_folder_is_a_session(sceneprint: Run, bags: Path, service_url: str) -> None:
     options = ("--keyframe-m", 0)
     done = sceneprint("upload", "days", bags, *options)
-    assert done.stdout.splitlines()[-1].startswith("5 frames: 5 received")
+    _, counts, summary, _ = done.stdout.splitlines()
+    assert counts.startswith("5 frames: 5 received")
+    assert summary.startswith("poses of 5 of 5 frames; depth ")
     assert f"{bags}/first.mcap: 2 of 2 frames of /camera" in done.stderr
     assert f"{bags}/day2/second: 3 of 3 frames of /camera" in done.stderr
     with Client(service_url) as client:
@@ -232,7 +234,7 @@ def test_what_a_bag_holds(sceneprint: Run, recording: Path) -> None:
         "up: of 0 of 8 frames",
         table[9],
     ]
-    assert re.fullmatch(r"depth: \S+ to \S+ m, median \S+ m", table[9])
+    assert re.fullmatch(r"depth \S+ to \S+ m \(5th to 95th percentile\), \d+ % of .*", table[9])
     assert table[5].startswith("camera: 640 x 480, fx ")
 
 

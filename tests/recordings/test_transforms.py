@@ -162,7 +162,9 @@ def test_quaternions_that_are_not_of_length_1(
         )
         expected = ros.transform(2, 0, 0) @ ros.camera
         np.testing.assert_allclose(found.frames[2].pose, expected, atol=1e-9)
+        assert found.lost == 0
     else:
+        assert found.lost == 3
         assert [one.pose for one in found.frames] == [None] * 3
         assert found.note.endswith(
             "poses of 0 of 3 frames; 3 without: no transforms lead from camera to a frame in which "

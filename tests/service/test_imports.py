@@ -51,6 +51,11 @@ def test_an_archive_from_the_door_to_its_frames(served, yard, small_shots, until
     told = http.get(path).json()
     assert (told["progress"]["done"], told["progress"]["total"]) == (6, 6)
     assert told["progress"]["phase"] is None
+    summary = told["result"].pop("summary")
+    assert summary["text"].startswith(
+        "poses of 0 of 5 frames; 4 without: no NAME.pose.txt is beside them, nor NAME.txt in a "
+        "folder pose; 1 without: refused; depth "
+    )
     assert told["result"] == {
         "sequences": 1, "received": 4, "there": 0, "refused": 2, "ignored": 0,
     }  # fmt: skip

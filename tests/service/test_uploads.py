@@ -30,6 +30,39 @@ def query(shot, **more: object) -> dict[str, Any]:
     }
 
 
+def test_depth_that_does_not_look_like_it_is_taken_when_trusted(
+    served, hall, small_shots, refused, until
+) -> None:
+    """It is signed from the store as well, where nobody says it again."""
+    http, shot = served.client, small_shots[0]
+    noise = (2000 * np.random.default_rng(3).gamma(60, 1 / 60, (120, 160))).astype(np.uint16)
+    out = io.BytesIO()
+    np.save(out, noise)
+    form = {"files": {"frame": ("frame.npy", out.getvalue())}}
+    problem = refused(http.post(f"{hall}/frames", **shot.form() | form), 422, "unreadable-frame")
+    assert "--trust-depth, or `trust_depth` in the metadata" in problem["detail"]
+    added = http.post(f"{hall}/frames", **shot.form(trust_depth=True) | form).json()
+    near, median, far = np.percentile(noise / 1000, (5, 50, 95))
+    expected = {"near": near, "median": median, "far": far, "count": noise.size, "valid": 1.0}
+    assert added["samples"] == pytest.approx(expected, abs=1e-4)
+    path = f"{hall}/frames/{added['frame_id']}"
+    until(lambda: http.get(path).json()["state"] not in ("received", "signing"))
+    frame = http.get(path).json()
+    assert (frame["trust_depth"], frame["samples"]) == (True, added["samples"])
+    assert frame["state"] != "failed"
+    assert "no depth" not in (frame["reason"] or "")
+    # the same content is the frame that is there, whoever trusts it
+    body = {"content": out.getvalue(), "headers": {"Content-Type": "application/x-npy"}}
+    camera = {**shot.camera, "trust_depth": "true"}
+    again = http.post(f"{hall}/frames", params=camera, **body)
+    assert (again.status_code, again.json()["frame_id"]) == (200, added["frame_id"])
+    plain = http.post(f"{hall}/frames", **small_shots[2].form(session="t")).json()
+    assert http.get(f"{hall}/frames/{plain['frame_id']}").json()["trust_depth"] is False
+    cloud = {"content": b"ply\n", "headers": {"Content-Type": "application/ply"}}
+    answer = http.post(f"{hall}/frames", params={"trust_depth": "true"}, **cloud)
+    refused(answer, 422, "invalid-request", "`trust_depth` would have no effect")
+
+
 def test_a_frame_has_the_id_it_was_put_under(served, hall, small_shots, refused) -> None:
     http, shot = served.client, small_shots[60]
     path = f"{hall}/frames/Robot-1_0.png"
@@ -155,7 +188,7 @@ def test_other_types_and_no_json_are_refused(served, hall, small_shots, refused)
     )  # fmt: skip
     refused(twice, 422, "invalid-request", "twice")
     no_json = http.post(
-        f"{hall}/frames", content=b"", params={"meta": "{"}, headers={"Content-Type": "image/png"}
+        f"{hall}/frames", content=b"x", params={"meta": "{"}, headers={"Content-Type": "image/png"}
     )
     refused(no_json, 400, "malformed-body", "not JSON")
 

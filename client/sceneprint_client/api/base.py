@@ -516,6 +516,11 @@ class FrameMeta(Given):
     depth_along_ray: bool = Field(
         default=False, description="Samples are ranges along the pixel's ray."
     )
+    trust_depth: bool = Field(
+        default=False,
+        description="Take a depth image that does not look like one, such as with more noise than "
+        "any known sensor has.",
+    )
     viewpoint: GivenVector | Literal["file"] | None = Field(
         default="file",
         description="Of a point cloud: where it was seen from, along its own axes, metres; null "

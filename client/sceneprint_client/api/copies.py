@@ -66,6 +66,7 @@ class FrameRowRecord(ApiRecord):
     up: _Three | None
     name: str | None
     sequence: int | None
+    samples: dict[str, Any] | None
     vector: Base64Bytes = Field(description="The signature.")
     geometry: Digest = Field(description="Of the artifact.")
     n_patches: list[int]

@@ -46,7 +46,7 @@ from sceneprint.store.tables import ARCHIVE, JobRow, MapRow, frames
 from sceneprint.types import Intrinsics
 from sceneprint_client.api import FrameState, Job, Page
 from sceneprint_client.api.base import GivenDirection
-from sceneprint_client.api.frames import ImportItem, ImportOptions
+from sceneprint_client.api.frames import ImportItem, ImportOptions, UploadSummary, upload_summary
 from sceneprint_client.formats import HEAD
 from sceneprint_client.frame_files import meta_of
 
@@ -156,9 +156,31 @@ def _upload(archive: Archive, step: Step, options: ImportOptions) -> Upload:
         parent_frame=options.parent_frame or parent_frame_of(step.sequence, options.robot),
         base=options.T_base_sensor,
         up=options.up.unit if isinstance(options.up, GivenDirection) else None,
+        trust_depth=options.trust_depth,
     )
     data = archive.data_of(step.reference)
     return Upload(data, meta, options.priority, options.if_novel)
+
+
+def _summary_of(
+    archive: Archive, steps: Sequence[Step], items: Sequence[dict[str, Any]], options: ImportOptions
+) -> UploadSummary:
+    """Return what an import took, by what came of each step."""
+    found = [ImportItem.model_validate(one) for one in items]
+    without, frames = Counter[str](), 0
+    for step, item in zip(steps, found, strict=True):
+        if step.sequence is None:
+            continue
+        frames += 1
+        if item.frame_id is None:
+            without["refused"] += 1
+        elif not item.has_pose:
+            without[step.sequence.unposed if options.with_poses else "with_poses is false"] += 1
+    notes = [one.note for one in archive.sequences if one.note]
+    return upload_summary(
+        frames, without, [one.samples for one in found if one.samples is not None], notes,
+        lost=sum(one.lost for one in archive.sequences if options.with_poses),
+    )  # fmt: skip
 
 
 def import_item(name: str, outcome: UploadOutcome) -> ImportItem:
@@ -170,6 +192,8 @@ def import_item(name: str, outcome: UploadOutcome) -> ImportItem:
         frame_id=None if item.frame is None else item.frame.frame_id,
         job_id=None if item.frame is None else item.frame.job_id,
         problem=item.problem,
+        samples=None if item.frame is None else item.frame.samples,
+        has_pose=item.frame is not None and item.frame.has_pose,
     )
 
 
@@ -498,9 +522,17 @@ class Imports:
                 progress[what] += 1
             progress["done"] += len(some)
         over = progress["done"] >= len(steps)
-        counts = {name: progress[name] for name in ("received", "there", "refused")}
-        result = {"sequences": len(archive.sequences), **counts, "ignored": archive.ignored}
+        result: dict[str, Any] | None = None
+        if over:
+            counts = {name: progress[name] for name in ("received", "there", "refused")}
+            with self._store.database.read() as connection:
+                before = queue.items_of(connection, task.job.number)
+            summary = _summary_of(archive, steps, [*before, *items], options)
+            result = {
+                "sequences": len(archive.sequences), **counts, "ignored": archive.ignored,
+                "summary": summary.model_dump(mode="json"),
+            }  # fmt: skip
         return SliceResult(
-            over, progress, items, drop=[ARCHIVE] if over else (), result=result if over else None,
+            over, progress, items, drop=[ARCHIVE] if over else (), result=result,
             event="import.done" if over else None,
         )  # fmt: skip

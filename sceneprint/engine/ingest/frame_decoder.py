@@ -90,6 +90,7 @@ def _read(data: bytes, meta: FrameMeta, decoder: Decoder) -> Read:
             along_ray=meta.depth_along_ray,
             pose=pose,
             samples_of=decoder.samples,
+            trust_depth=meta.trust_depth,
         )
     except errors.DecoderFailure as error:
         raise errors.UnreadableFrame(_failed(error)) from error
@@ -136,6 +137,7 @@ def _read_stored(data: bytes, row: FrameRow, decoder: Decoder) -> AnyFrame:
         along_ray=row.depth_along_ray,
         name=row.id,
         samples_of=decoder.samples,
+        trust_depth=True,  # it was let in
     )
 
 
@@ -230,8 +232,9 @@ def _is_cloud(data: bytes, meta: FrameMeta) -> bool:
 
 def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None, decoder: Decoder) -> Read:
     _refuse(
-        meta, "point cloud", {"intrinsics": None, "depth_scale": 1000.0, "depth_along_ray": False}
-    )
+        meta, "point cloud",
+        {"intrinsics": None, "depth_scale": 1000.0, "depth_along_ray": False, "trust_depth": False},
+    )  # fmt: skip
     given = meta.viewpoint
     said = None if given is None else UNSAID if given == "file" else (given.x, given.y, given.z)
     try:

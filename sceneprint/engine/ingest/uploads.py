@@ -23,7 +23,9 @@ from sqlalchemy import Connection, select
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upload
 from sceneprint.engine.ingest.write_groups import Grouping, NewFrames
+from sceneprint.engine.serializers import sample_range_of
 from sceneprint.engine.upkeep import garbage_collection, repair
+from sceneprint.formats.sample_range import sample_range
 from sceneprint.store import Store
 from sceneprint.store.deletion import make_room
 from sceneprint.store.events import record_event
@@ -43,6 +45,7 @@ from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Added, FrameMeta, FrameState
 from sceneprint_client.api.frames import (
     BatchItem,
+    SampleRange,
     check_frame_id,
     problem_of,
 )
@@ -55,8 +58,8 @@ _FIELDS = {
     "cloud": "units_per_metre",
 }  # fmt: skip
 #: Columns that do not tell uploads apart: the same content under another name is the frame that is
-#: there, and keeps the name that it came with.
-_LABELS = ("name", "sequence")
+#: there, and keeps the name that it came with; samples are content.
+_LABELS = ("name", "sequence", "samples")
 
 
 def find_duplicate(
@@ -167,7 +170,14 @@ def item_of(outcome: UploadResult) -> BatchItem:
 def upload_response(connection: Connection, frame: FrameRow) -> Added:
     """A frame as uploads are answered."""
     job_id = job_ids_of(connection, [frame.number])[frame.number]
-    return Added(frame_id=frame.id, job_id=job_id, state=frame.state, reason=frame.reason)
+    return _added(frame, job_id, frame.reason)
+
+
+def _added(frame: FrameRow, job_id: str, reason: str | None = None) -> Added:
+    return Added(
+        frame_id=frame.id, job_id=job_id, state=frame.state, reason=reason,
+        samples=sample_range_of(frame), has_pose=frame.pose is not None,
+    )  # fmt: skip
 
 
 def replayed(
@@ -390,7 +400,14 @@ class Uploads:
         read = read_upload(upload.data, upload.meta, self._store.decoders)
         content = content_id(read)
         blob = hashlib.sha256(upload.data).hexdigest()
-        known = {**columns(upload.meta, read.frame.pose, read.base), "cloud": read.cloud}
+        samples = {
+            **sample_range(read.frame).model_dump(), "trusted": upload.meta.trust_depth,
+        }  # fmt: skip
+        known = {
+            **columns(upload.meta, read.frame.pose, read.base),
+            "cloud": read.cloud,
+            "samples": samples,
+        }
         return _Prepared(upload, blob, content, known)
 
     def _settled(self, map_name: str, ready: _Prepared) -> UploadResult | None:
@@ -554,7 +571,11 @@ def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = N
 
 def _new_result(new: NewFrame) -> UploadResult:
     """What came of an upload whose frame was taken."""
-    added = Added(frame_id=new.frame_id, job_id=new.job_id, state=FrameState.RECEIVED, reason=None)
+    added = Added(
+        frame_id=new.frame_id, job_id=new.job_id, state=FrameState.RECEIVED, reason=None,
+        samples=SampleRange.model_validate(new.values["samples"]),
+        has_pose=new.values["pose"] is not None,
+    )  # fmt: skip
     return UploadResult(added, new=True)
 
 
@@ -594,5 +615,4 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
         frame = renew_frame(connection, frame.number, ready.of_blob)
     job = enqueue(connection, "sign", frame.number, upload.priority)
     record_event(connection, "frame.received", row.name, frame.id, job.id)
-    added = Added(frame_id=frame.id, job_id=job.id, state=frame.state, reason=None)
-    return UploadResult(added, new=True)
+    return UploadResult(_added(frame, job.id), new=True)

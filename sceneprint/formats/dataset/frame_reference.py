@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -188,6 +189,7 @@ class FrameSequence:
     frames : at least one
     note : what was left out on the way, for people; empty where nothing was
     unposed : why frames have no pose, for people; empty where all have one, and where `note` tells
+    lost : frames with depth or points that are left out, or whose poses are, though nobody said so
     """
 
     name: str
@@ -198,6 +200,7 @@ class FrameSequence:
     frames: tuple[FrameReference, ...]
     note: str = ""
     unposed: str = ""
+    lost: int = 0
 
     @property
     def place(self) -> Path:
@@ -205,6 +208,20 @@ class FrameSequence:
         if self.layout.is_export or self.parent_frame == self.name:
             return self.folder
         return self.folder.parent
+
+
+#: Reasons to leave out what holds neither depth nor points of a place: nothing is lost by it.
+NOTHING_TO_TAKE = frozenset(
+    {
+        "frames without a depth_file_path", "cameras without a depth image", "frames without depth",
+        "scans without points", "stereo images without depth", "laser scans of two dimensions",
+    }
+)  # fmt: skip
+
+
+def count_lost(left_out: Counter[str]) -> int:
+    """Return how many of the frames that were left out, by the reason, had something to take."""
+    return left_out.total() - sum(left_out[reason] for reason in NOTHING_TO_TAKE)
 
 
 # What a sequence is called, as it is sent with the uploads of its frames.

@@ -351,7 +351,13 @@ def find_sequences(
             "export of Polycam, Record3D or nerfstudio."
         )
     _check_parent_frames(found)
-    return (replace(found[0], note="; ".join(filter(None, (found[0].note, note)))), *found[1:])
+    return _with_note(found, note)
+
+
+def _with_note(found: Sequence[FrameSequence], note: str) -> tuple[FrameSequence, ...]:
+    """Return sequences of which the first has one more note; there may be none."""
+    first = [replace(one, note="; ".join(filter(None, (one.note, note)))) for one in found[:1]]
+    return (*first, *found[1:])
 
 
 def _note_of(left_out: list[Path], root: Path) -> str:
@@ -436,7 +442,8 @@ def find_each(
     """
     found: list[FrameSequence] = []
     refused = []
-    for one in _walk(root):
+    left_out: list[Path] = []
+    for one in _walk(root, left_out):
         if one[2] is Layout.RECORDING:
             continue
         name = _name(one[0], root)
@@ -444,7 +451,7 @@ def find_each(
             found += _sequences_in(*one, root)
         except SceneprintError as error:
             refused.append((name, error))
-    sequences = tuple(found)
+    sequences = _with_note(found, _note_of(left_out, root))
     _check_parent_frames(sequences)
     return sequences, tuple(refused)
 
@@ -547,7 +554,10 @@ def _sequences_in(
     if not layout.is_export:
         name = _name(path, root)
         frames, unposed = references(path, files, layout, name, camera)
-        return (_sequence_of(path, layout, name, frames, unposed),)
+        found = _sequence_of(path, layout, name, frames, unposed)
+        if _TRAJECTORY in files and all(one.pose_source is None for one in frames):
+            found = replace(found, lost=len(frames))  # no pose of the trajectory is of use
+        return (found,)
     if path.is_file():
         return exports.file_sequences(path, _name(path.with_suffix(""), root))
     return (exports.folder_sequence(path, layout, _name(path, root)),)

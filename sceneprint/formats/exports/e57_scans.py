@@ -16,7 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from sceneprint.errors import DatasetError, UnreadableCloud
-from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
+from sceneprint.formats.dataset.frame_reference import (
+    FrameReference,
+    FrameSequence,
+    Layout,
+    count_lost,
+)
 from sceneprint.formats.depth_file import encode_npy
 from sceneprint.formats.points.cloud import FEWEST_POINTS, MOST_POINTS, thinned
 from sceneprint.formats.points.e57 import E57Scan, read_e57, with_viewpoint
@@ -119,7 +124,8 @@ def e57_sequence(path: Path, name: str) -> FrameSequence:
     note = f"{len(frames)} of {len(scans)} scans taken"
     note += f"; left out: {reasons}" if reasons else ""
     note += f"; {thick} of more than {MOST_POINTS} points are thinned" if thick else ""
-    return FrameSequence(name, path, Layout.E57, name, None, tuple(frames), note)
+    lost = count_lost(left_out)
+    return FrameSequence(name, path, Layout.E57, name, None, tuple(frames), note, lost=lost)
 
 
 def _frame(path: Path, name: str, place: int, scan: E57Scan) -> FrameReference:

@@ -19,7 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from sceneprint.errors import DatasetError, InvalidPose, UnreadableFrame
-from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
+from sceneprint.formats.dataset.frame_reference import (
+    FrameReference,
+    FrameSequence,
+    Layout,
+    count_lost,
+)
 from sceneprint.formats.depth_file import size_of
 from sceneprint.types import Floats, Intrinsics
 from sceneprint_client.errors import printable
@@ -172,4 +177,5 @@ def sequence_of(
         )
     note = f"{len(frames)} frames of {layout.value} taken"
     note += f"; left out: {'; '.join(reasons)}" if reasons else ""
-    return FrameSequence(name, folder, layout, name, None, tuple(frames), note)
+    lost = count_lost(left_out)
+    return FrameSequence(name, folder, layout, name, None, tuple(frames), note, lost=lost)

@@ -14,7 +14,7 @@ import sqlite3
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -22,7 +22,12 @@ from urllib.parse import quote
 import numpy as np
 
 from sceneprint.errors import DatasetError, InvalidIntrinsics
-from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
+from sceneprint.formats.dataset.frame_reference import (
+    FrameReference,
+    FrameSequence,
+    Layout,
+    count_lost,
+)
 from sceneprint.formats.depth_file import encode_npy, encode_png
 from sceneprint.formats.exports.rtabmap_blobs import (
     DEPTH_HEAD,
@@ -186,10 +191,8 @@ def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequenc
     for world, of_world in _worlds(name, nodes, optimised is not None):
         sequences += _sequences(path, name, world, of_world)
     note = _note(sequences, optimised is not None, left_out)
-    return tuple(
-        FrameSequence(one.name, path, one.layout, one.parent_frame, None, one.frames, note)
-        for one in sequences
-    )
+    sequences[0] = replace(sequences[0], lost=count_lost(left_out))
+    return tuple(replace(one, note=note) for one in sequences)
 
 
 # The database.

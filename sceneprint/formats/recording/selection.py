@@ -27,8 +27,10 @@ from sceneprint.formats.recording.topics import (
     frame_topics,
     listed,
 )
-from sceneprint.types import DepthFrame, Floats
+from sceneprint.formats.sample_range import sample_range
+from sceneprint.types import Floats
 from sceneprint_client.api.base import GivenBase, checked
+from sceneprint_client.api.frames import SampleRange, pooled_range
 from sceneprint_client.errors import printable
 from sceneprint_client.files import naming
 from sceneprint_client.ros_messages import DEPTH_SCALE, camera_intrinsics
@@ -141,11 +143,8 @@ def recording_sequences(
     """
     bag = Bag(path)
     frames = choose_topic(bag, options.topic)
-    sequences = _sequences_of(bag, frames, options, recording_name(path) if name is None else name)
-    depth, _ = sampled_depth(sequences)
-    if depth is not None and depth.is_doubtful and frames.encoding != "32FC1":
-        sequences[0] = replace(sequences[0], note=f"{sequences[0].note}; {depth}")
-    return tuple(sequences)
+    name = recording_name(path) if name is None else name
+    return tuple(_sequences_of(bag, frames, options, name))
 
 
 def _sequences_of(
@@ -190,59 +189,28 @@ def _sequences_of(
                 FrameSequence(
                     part, bag.path, Layout.RECORDING, parent, None, tuple(references),
                     note="" if sequences else note,
+                    lost=0 if sequences else _lost(scan, motions),
                 )
             )  # fmt: skip
     return sequences
 
 
-@dataclass(frozen=True)
-class DepthRange:
-    """Depth of some frames, metres: the twentieth, the median, and all but a twentieth."""
-
-    near: float
-    median: float
-    far: float
-
-    @property
-    def is_doubtful(self) -> bool:
-        """Return whether hardly any depth camera measures such a range."""
-        return not _NEAREST_M < self.median < _FARTHEST_M or self.far > 2 * _FARTHEST_M
-
-    def __str__(self) -> str:
-        text = f"depth: {self.near:.2g} to {self.far:.2g} m, median {self.median:.2g} m"
-        if not self.is_doubtful:
-            return text
-        return (
-            f"{text}, which is unlikely of a depth camera: if its unit is not the millimetre, give "
-            "--depth-scale, stored units per metre"
-        )
+#: Frames of a recording that are read for its range.
+_SAMPLED = 9
 
 
-#: Between these lies the median of what depth cameras measure, metres.
-_NEAREST_M, _FARTHEST_M = 0.2, 5.0
-
-
-def sampled_depth(
+def sampled_range(
     sequences: Sequence[FrameSequence],
-) -> tuple[DepthRange | None, SceneprintError | None]:
-    """Return the depth of the first, the middle and the last frame, and why none could be read."""
+) -> tuple[SampleRange | None, SceneprintError | None]:
+    """Return the range of some frames from the first to the last, and why none could be read."""
     frames = [one for sequence in sequences for one in sequence.frames]
-    samples, error, count = [np.empty(0, np.float32)], None, 0
-    for place in sorted({0, len(frames) // 2, len(frames) - 1}):
+    found, error = list[SampleRange](), None
+    for place in sorted(set(np.linspace(0, len(frames) - 1, _SAMPLED).round().astype(int))):
         try:
-            frame = frames[place].read()
+            found.append(sample_range(frames[place].read()))
         except SceneprintError as cause:
             error = cause
-            continue
-        count += 1
-        if isinstance(frame, DepthFrame):
-            samples.append(frame.depth[frame.depth > 0])
-    depths = np.concatenate(samples)
-    if count:
-        error = None
-    if not len(depths):
-        return None, error
-    return DepthRange(*np.percentile(depths, (5, 50, 95)).tolist()), error
+    return pooled_range(found), None if found else error
 
 
 def recording_name(path: Path) -> str:
@@ -308,6 +276,7 @@ class _Motion:
     taken : places of the keyframes
     unknown : of the frames without a pose, why
     remarks : what else is to be said of transforms above the sensor
+    is_broken : whether one of these is passed over
     """
 
     world: str | None
@@ -319,6 +288,7 @@ class _Motion:
     taken: list[int] = field(default_factory=list)
     unknown: dict[int, UnknownTransform] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
+    is_broken: bool = False
 
     @property
     def is_disputed(self) -> bool:
@@ -368,6 +338,7 @@ def _motion(
         if child in above:
             times = "" if count == 1 else f"{count} times "
             motion.remarks.append(f"{parent} -> {child} is passed over {times}as {reason}")
+            motion.is_broken = True
     for (parent, child), length in sorted(tree.normalised.items()):
         if child in above:
             motion.remarks.append(
@@ -516,7 +487,7 @@ def _note(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
     )
     if poses < total:
         text += f"; {total - poses} without: {_reasons(frames, motions)}"
-    without = total - poses if poses or not taken else 0
+    without = _without_pose(scan, motions)
     left = [
         f"{count} {reason}"
         for count, reason in (
@@ -532,6 +503,21 @@ def _note(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
         text += f"; split into {len(motions)} parts, as stamps go back"
     remarks = dict.fromkeys(one for motion in motions for one in motion.remarks)
     return printable("; ".join([text, *list(remarks)[:5]]))
+
+
+def _lost(scan: BagScan, motions: list[_Motion]) -> int:
+    """Return how many frames or their poses are left out, and damaged messages."""
+    has_poses = any(motion.poses for motion in motions)
+    if not has_poses and any(motion.is_broken for motion in motions):
+        return len(scan.stamps_ns)
+    return _without_pose(scan, motions) + scan.damaged
+
+
+def _without_pose(scan: BagScan, motions: list[_Motion]) -> int:
+    """Return how many frames are left out as they have no pose, which others have."""
+    poses = sum(len(motion.poses) for motion in motions)
+    is_left_out = poses or not any(motion.taken for motion in motions)
+    return len(scan.stamps_ns) - poses if is_left_out else 0
 
 
 def _reasons(frames: FrameTopic, motions: list[_Motion]) -> str:
@@ -575,7 +561,7 @@ class BagOutline:
     frames : the topics that can be taken
     chosen : the one that would be taken, or None
     sequences : the frames that would be taken; none where nothing would be
-    depth : of some of these frames; None of points
+    range : of some of these frames
     problem : why nothing would be taken; empty where something would
     """
 
@@ -587,7 +573,7 @@ class BagOutline:
     chosen: FrameTopic | None
     camera: str | None
     sequences: tuple[FrameSequence, ...]
-    depth: DepthRange | None
+    range: SampleRange | None
     problem: str
 
 
@@ -610,7 +596,7 @@ def bag_outline(path: Path, options: RecordingOptions) -> BagOutline:
                 topic = camera_topic(bag, chosen, options.camera_info)
                 camera = None if topic is None else topic.name
             sequences = tuple(_sequences_of(bag, chosen, options, recording_name(path)))
-            depth, unreadable = sampled_depth(sequences)
+            depth, unreadable = sampled_range(sequences)
             if unreadable is not None:
                 sequences, problem = (), str(unreadable)
         except (DatasetError, InvalidIntrinsics) as error:

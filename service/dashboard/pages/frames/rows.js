@@ -169,6 +169,7 @@ function importOf(item) {
   const faults = item.refused ?? [];
   return [
     h("p", {}, `Frames: ${parts.join(", ")}.`),
+    item.job.result?.summary && h("p", {}, coded(item.job.result.summary.text)),
     faults.length > 0 && h("details", {}, h("summary", {}, `Rejected files${faults.length < refused ? ", the first of them" : ""}`),
       h("ul", {}, faults.slice(0, STEP).map((one) => h("li", {}, h("strong", {}, one.name), coded(` ${one.problem.detail}`))))),
   ];

@@ -1,0 +1,32 @@
+"""How far away what a frame shows is: the range that uploads say, by which a wrong unit is seen.
+
+Frame | Cloud  --sample_range-->  SampleRange
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sceneprint.types import AnyFrame, Cloud, Floats32
+from sceneprint_client.api.frames import SampleRange
+
+#: Samples that percentiles are taken of, at least where there are more: a millisecond.
+_SAMPLES = 20_000
+
+
+def sample_range(frame: AnyFrame) -> SampleRange:
+    """Return the range of a frame that has samples: percentiles of some thousand of them."""
+    if isinstance(frame, Cloud):
+        points = frame.points[:: max(1, len(frame.points) // _SAMPLES)]
+        return _range_of(np.linalg.norm(points, axis=1), len(frame.points), None)
+    depth = frame.depth
+    step = max(1, int((depth.size / _SAMPLES) ** 0.5))
+    some, count = depth[::step, ::step], int(np.count_nonzero(depth))
+    seen = some[some > 0]
+    return _range_of(seen if len(seen) else depth[depth > 0], count, count / depth.size)
+
+
+def _range_of(distances: Floats32, count: int, valid: float | None) -> SampleRange:
+    near, median, far = np.percentile(distances, (5, 50, 95)).round(4).tolist()
+    share = None if valid is None else round(valid, 4)
+    return SampleRange(near=near, median=median, far=far, count=count, valid=share)
