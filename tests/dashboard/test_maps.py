@@ -120,7 +120,7 @@ def test_counts_move_while_workers_sign(station: Any, page: Page, settle: Settle
     for frame in station.frames[:2]:
         station.client.post(f"{path}/frames", **frame.form())
     expect(one.locator(".map-number")).to_have_text("2")
-    expect(one).to_contain_text("Up to date")
+    expect(one).to_contain_text("no poses")
     expect(page.locator("#summary")).to_contain_text("frames indexed")
 
 
