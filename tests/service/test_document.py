@@ -90,8 +90,8 @@ def test_bodies_that_are_read_by_hand_are_described(document):
     assert "required" not in schemas["FrameMeta"]  # a cloud needs no more than its points
     assert schemas["FrameMeta"]["additionalProperties"] is False
     upload = operations(document)["post", "/v1/maps/{map_name}/frames"]["requestBody"]
-    raw = ["image/png", "application/x-npy", "application/ply", "application/x-ros-pointcloud2",
-           "application/octet-stream"]  # fmt: skip
+    raw = ["image/png", "application/x-npy", "image/x-portable-floatmap", "application/ply",
+           "application/x-ros-pointcloud2", "application/octet-stream"]  # fmt: skip
     assert list(upload["content"]) == ["multipart/form-data", *raw]
     form = upload["content"]["multipart/form-data"]["schema"]
     assert form["required"] == ["frame", "meta"]
