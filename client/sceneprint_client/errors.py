@@ -23,6 +23,7 @@
         - FrameConflict         the same content with other metadata
         - JobOver               a job that is over cannot be cancelled
         - CannotRetry           a job that cannot be tried again
+        - JoinStands            poses follow from the join of an association, which has to stay
         - NotIndexed            a frame or job that has not made yet what is asked of it
       x InvalidRequest          a field of a request is missing, unknown or out of its range
         - MalformedBody         its body cannot be parsed at all
@@ -179,6 +180,10 @@ class JobOver(Conflict):
 
 class CannotRetry(Conflict):
     """The job is not over, its frame has a later job, or there is nothing to retry."""
+
+
+class JoinStands(Conflict):
+    """The poses of a map follow from the join of an association, which has to stay."""
 
 
 class NotIndexed(Conflict):

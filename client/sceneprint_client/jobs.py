@@ -340,8 +340,22 @@ class JobMethods(ServiceConnection):
         """An association; UnknownMap or UnknownJob if it does not exist."""
         return self._ask(Association, "GET", association_path(map_name, association_id))
 
+    def undo_join(self, map_name: str, association_id: str) -> Association:
+        """Undo the join of an association: poses are again as they were sent, or in the parent
+        frame that other joins lead to. The map's sessions are not joined again automatically.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : it does not exist.
+        NotIndexed : it has not succeeded.
+        """
+        path = f"{association_path(map_name, association_id)}/join"
+        return self._ask(Association, "DELETE", path)
+
     def delete_association(self, map_name: str, association_id: str) -> None:
-        """Delete an association with its edges; UnknownMap or UnknownJob if it does not exist."""
+        """Delete an association with its edges; UnknownMap or UnknownJob if it does not exist, and
+        JoinStands if its join must be undone first.
+        """
         self._delete(association_path(map_name, association_id))
 
     def associations(self, map_name: str) -> Iterator[Association]:

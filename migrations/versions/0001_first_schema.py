@@ -326,11 +326,12 @@ def _create_parent_joins() -> None:
         "parent_joins",
         sa.Column("map_number", WHOLE, nullable=False),
         sa.Column("parent", _string(128), nullable=False),
-        sa.Column("root", _string(128), nullable=False),
+        sa.Column("towards", _string(128), nullable=False),
         sa.Column("transform", sa.JSON(), nullable=False),
         sa.Column("job_id", _string(32), nullable=False),
         sa.Column("joined_at", sa.Float(), nullable=False),
-        sa.PrimaryKeyConstraint("map_number", "parent", name="pk_parent_joins"),
+        sa.Column("undone_at", sa.Float()),
+        sa.PrimaryKeyConstraint("map_number", "parent", "towards", name="pk_parent_joins"),
         sa.ForeignKeyConstraint(["map_number"], ["maps.number"], name="fk_parent_joins_map_number"),
     )
 

@@ -174,12 +174,17 @@ def add_associate(commands: Any) -> None:
         "optimiser.",
     )
     command.add_argument("map", metavar="MAP")
-    command.add_argument(
+    which = command.add_mutually_exclusive_group(required=True)
+    which.add_argument(
         "--session",
         action="append",
-        required=True,
         metavar="NAME",
         help="once for loop closures; twice to join two sessions, the first onto the second",
+    )
+    which.add_argument(
+        "--undo",
+        metavar="ID",
+        help="undo the join of this association: poses are again as they were sent",
     )
     command.add_argument(
         "--robot",
@@ -249,7 +254,12 @@ def add_associate(commands: Any) -> None:
 
 
 def run_associate(options: argparse.Namespace) -> int:
-    """Associate, and wait; returns 2 where it did not succeed."""
+    """Associate, and wait, or undo a join; returns 2 where it did not succeed."""
+    if options.undo is not None:
+        with open_client(options) as client:
+            undone = client.undo_join(options.map, options.undo)
+        print(undone.model_dump_json() if options.json else "\n".join(association_lines(undone)))
+        return 0
     if len(options.session) > 2:
         raise InvalidRequest(
             "An association needs one or two sessions. Give --session once or twice."
@@ -320,6 +330,7 @@ def _join(one: Join) -> list[str]:
     sure = "surely" if one.strength == "strong" else "weakly (check it before you rely on it)"
     t, r = one.transform.translation, one.transform.rotation
     moved = [] if one.root is None else [f"  all their poses are in {one_line(one.root)} now"]
+    moved += ["  undone: it moves no pose any more"] if one.undone else []
     return [
         f"joined {sure}, {names}: {one_line(one.reason)}, spread "
         f"{100 * (one.spread_m or 0.0):.1f} cm, {one.spread_deg or 0.0:.1f} deg",

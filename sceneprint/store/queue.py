@@ -800,6 +800,12 @@ def remove_parts(
     return [one.blob for one in found]
 
 
+def replace_result(connection: Connection, job: JobRow, result: dict[str, Any]) -> JobRow:
+    """Return a job that is over with what it came to corrected."""
+    own = update(jobs).where(jobs.c.number == job.number).values(result=result)
+    return job_row(connection.execute(own.returning(jobs)).mappings().one())
+
+
 def remove_job(connection: Connection, job: JobRow) -> list[str]:
     """Forget a job with all that it found; a worker that is at it finds its lease lost.
 

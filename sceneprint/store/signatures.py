@@ -147,7 +147,7 @@ def _index_claimed(events_name: str) -> TextClause:
                         AND next_model_id IS NULL)
                 AND NOT EXISTS (
                     SELECT FROM parent_joins WHERE map_number = :map_number
-                        AND parent = cast(:parent AS text))
+                        AND parent = cast(:parent AS text) AND undone_at IS NULL)
             RETURNING number
         ), revised AS (
             UPDATE maps SET revision = revision + 1

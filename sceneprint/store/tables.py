@@ -186,16 +186,17 @@ Index(
     sqlite_where=ENDED, postgresql_where=ENDED,
 )  # fmt: skip
 
-#: Parent frames that joins lead from: poses sent in `parent` are stored in `root`.
+#: Joins of parent frames: poses sent in `parent` are stored in the root that its joins lead to.
 parent_joins = Table(
     "parent_joins",
     metadata,
     Column("map_number", WHOLE, ForeignKey("maps.number"), primary_key=True),
     Column("parent", _string(128), primary_key=True),
-    Column("root", _string(128), nullable=False),  # never joined itself
-    Column("transform", JSON, nullable=False),  # T_root_parent, 4 rows of 4
+    Column("towards", _string(128), primary_key=True),  # a root then, and joined itself by now
+    Column("transform", JSON, nullable=False),  # T_towards_parent, 4 rows of 4
     Column("job_id", _string(32), nullable=False),  # association that found it
     Column("joined_at", Float, nullable=False),
+    Column("undone_at", Float),  # null: it stands, and no other that stands leads from `parent`
 )
 
 #: `frames.tags` once more, a row each, to be searched for.

@@ -182,11 +182,24 @@ def get_association(map_name: str, job_id: str, here: Here) -> Association:
 
 
 @associations_router.delete(
-    "/{job_id}", status_code=204, responses=declared(404), dependencies=[Depends(may_write)]
+    "/{job_id}", status_code=204, responses=declared(404, 409), dependencies=[Depends(may_write)]
 )
 def delete_association(map_name: str, job_id: str, here: Here) -> None:
-    """Forget an association with its edges; one that is not over is given up."""
+    """Forget an association with its edges; one that is not over is given up. One whose join moved
+    poses has to stay until that is undone.
+    """
     here.engine.associations.remove(map_name, job_id)
+
+
+@associations_router.delete(
+    "/{job_id}/join", responses=declared(404, 409), dependencies=[Depends(may_write)]
+)
+def undo_join(map_name: str, job_id: str, here: Here) -> Association:
+    """Undo the join of an association: poses are again as they were sent, or in the parent frame
+    that other joins lead to. Without a join that stands nothing changes. The parent frames are not
+    joined again unless somebody asks for an association.
+    """
+    return here.engine.associations.undo_join(map_name, job_id)
 
 
 @associations_router.get("/{job_id}/edges", responses=declared(404, 422))

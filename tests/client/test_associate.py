@@ -153,6 +153,11 @@ def test_the_command(
     )
     assert lines[-1] == f"wrote {out}"
     assert out.read_text() == client.graph(MAP, newest.association_id, odometry=True)
+    undo = ["associate", MAP, "--url", service_url, "--undo"]
+    assert main([*undo, newest.association_id]) == 0
+    assert capsys.readouterr().out.splitlines() == lines[:-1]  # it moved no pose
+    assert main([*undo, "0" * 32]) == 2
+    assert "There is no association" in capsys.readouterr().err
     assert main([*of, "--apart", "2", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["asked"]["apart"] == 2

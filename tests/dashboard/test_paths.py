@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
+
+from sceneprint.formats.dataset import write_depth_png
 
 #: bob's odometry begins elsewhere, and turned.
 _A = np.deg2rad(40)
@@ -114,6 +117,41 @@ def test_runs_are_joined_from_here(
     page.reload()
     settle(page)
     expect(page.locator(".paths-run")).to_have_text(["1bob4 poses"])
+
+
+def test_a_join_is_undone_from_here(
+    page: Page, station: Any, settle: Any, until: Any, room_views: Any, tmp_path: Path
+) -> None:
+    path, metas, files = station.make_map("alike"), [], []
+    for i, frame in enumerate(room_views(21, 0, 160, along_path=True, step=8).frames):
+        write_depth_png(tmp_path / "frame.png", frame.depth, 1000.0)
+        who = "bob" if i % 2 else "ann"
+        pose = B_FROM_A @ frame.pose if i % 2 else frame.pose
+        sent = {"parent_frame": f"{who}/odom", "matrix": pose.tolist()}
+        camera = station.frames[0].meta["intrinsics"]
+        metas.append({"intrinsics": camera, "session": who, "pose": sent})
+        files.append(("frame", (f"{i}.png", (tmp_path / "frame.png").read_bytes(), "image/png")))
+    answer = station.client.post(
+        f"{path}/frames/batch", data={"metas": json.dumps(metas)}, files=files
+    )
+    assert answer.status_code == 200, answer.text
+    until(lambda: station.client.get(path).json()["frames"].get("indexed") == len(files))
+    begun = station.client.post(f"{path}/associations", json={"sessions": ["bob", "ann"]})
+    job = begun.headers["location"]
+    until(lambda: station.client.get(job).json()["state"] == "succeeded")
+    assert station.client.get(path).json()["parent_frames"] == 1
+    page.goto(f"{station.home}#/maps/alike/place")
+    settle(page)
+    name = station.client.get(job).json()["association_id"]
+    page.locator("#paths-association").select_option(name)
+    root = station.client.get(job).json()["result"]["joins"][0]["root"]
+    expect(page.locator(".paths-joins li")).to_contain_text(f"All poses are in {root} now")
+    page.get_by_role("button", name="Undo join").click()
+    page.get_by_role("dialog").get_by_role("button", name="Undo join").click()
+    expect(page.locator(".paths-left li")).to_have_count(1)  # bob's run, which nothing joins
+    expect(page.locator(".paths-joins .badge")).to_have_text("undone")
+    expect(page.get_by_role("button", name="Undo join")).to_have_count(0)
+    assert station.client.get(path).json()["parent_frames"] == 2
 
 
 def test_a_query_is_among_them(
@@ -303,6 +341,8 @@ def test_numbers_behind_the_picture(page: Page, station: Any, settle: Any) -> No
         {"transform": {"matrix": shift.tolist()}, "from_parent": "c", "to_parent": "b",
          "strength": "strong", "support": 5},
         {"transform": None, "from_parent": "c", "to_parent": "d", "strength": None, "support": 0},
+        {"transform": {"matrix": turn.tolist()}, "from_parent": "c", "to_parent": "d",
+         "strength": "strong", "support": 9, "undone": True},
     ]  # fmt: skip
     told = [{"association_id": "x", "result": {"joins": joins}}]
     reached = run("joined", """[...m.reach("a", m.bridges(given[0]))]

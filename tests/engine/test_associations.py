@@ -26,7 +26,7 @@ from sceneprint.lab.synth import SynthRoom
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
 from sceneprint.store.frame_queries import PathFrame
-from sceneprint.store.parent_joins import posed_runs
+from sceneprint.store.parent_joins import ParentJoin, join_parent, posed_runs
 from sceneprint.store.tables import events, frames, job_items, jobs
 from sceneprint.types import Floats
 from sceneprint_client.api import Filter, JobState, NewMap
@@ -144,7 +144,19 @@ def test_parent_frames_are_associated_unasked(
     with engine.store.database.write() as connection:  # 9 frames, and 12 are a quarter more
         of_kind = jobs.c.kind == associations.ASSOCIATE
         connection.execute(update(jobs).where(of_kind).values(progress=sides))
-    assert len(look()) == 1
+    (request,) = look()
+    assert request.sessions == ["b", "a"]
+    # but never again once it was undone, whatever the sessions have become
+    work_off(engine)
+    begun = engine.associations.list_all("hall").items[0].association_id
+    with engine.store.database.write() as connection:
+        assert join_parent(connection, 1, ParentJoin("bob/b", "ann/a", np.eye(4)), begun)
+    undone = engine.associations.undo_join("hall", begun)
+    assert undone.state is JobState.SUCCEEDED
+    engine.associations.remove("hall", begun)
+    with engine.store.database.write() as connection:
+        connection.execute(update(jobs).where(of_kind).values(progress=sides))
+    assert look() == []
 
 
 def pose_of(engine: Engine, frame_id: str) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import httpx
@@ -43,6 +43,7 @@ class Rooms:
     held_out : frames, with their poses in the room
     shoot : a frame as it is sent
     join : of the association of the two
+    association : path of it
     bob : the first frame of bob
     """
 
@@ -51,6 +52,7 @@ class Rooms:
     held_out: list[DepthFrame]
     shoot: Callable[..., Shot]
     join: dict[str, Any]
+    association: str
     bob: Shot
 
     def post(self, path: str, **body: Any) -> dict[str, Any]:
@@ -104,11 +106,10 @@ def rooms(
             assert _add(served, path, shot, robot, i).status_code == 202
     total = sum(map(len, runs.values()))
     until(lambda: served.client.get(path).json()["frames"].get("indexed") == total)
-    made = Rooms(served, path, list(room.frames[2::3]), shoot, {}, of_bob[0])
+    made = Rooms(served, path, list(room.frames[2::3]), shoot, {}, "", of_bob[0])
     found = made.post("associations", sessions=["evening", "morning"])
     (join,) = found["result"]["joins"]
-    made.join.update(join)
-    return made
+    return replace(made, join=join, association=f"{path}/associations/{found['association_id']}")
 
 
 def test_every_answer_is_in_the_parent_frame_of_the_first_session(rooms: Rooms) -> None:
@@ -181,3 +182,40 @@ def test_a_prior_in_a_joined_frame_is_one_in_the_root(rooms: Rooms) -> None:
     pose = answer["location"]["pose"]
     assert pose["parent_frame"] == "ann/morning"
     assert difference(ORIGINS["ann/morning"] @ np.array(pose["matrix"]), frame.pose)[0] < 0.1
+
+
+def test_a_join_is_undone(rooms: Rooms) -> None:
+    """The last test of the map."""
+    client, url = rooms.server.client, rooms.association
+    of_bob = {"robot": "bob", "limit": 1000}
+    moved = client.get(f"{rooms.path}/frames", params=of_bob).json()["items"]
+    refused = client.delete(url)
+    assert (refused.status_code, refused.json()["type"].rpartition("/")[2]) == (409, "join-stands")
+    for _ in range(2):  # the second time nothing is left to do
+        undone = client.delete(f"{url}/join")
+        assert undone.status_code == 200, undone.text
+        (join,) = undone.json()["result"]["joins"]
+        assert join == rooms.join | {"root": None, "undone": True}
+    assert client.get(url).json() == undone.json()
+    lines = client.get("/v1/audit", params={"action": "association.undone"}).json()["items"]
+    assert [one["target"] for one in lines] == [undone.json()["association_id"]]
+    sessions = client.get(f"{rooms.path}/sessions").json()["items"]
+    assert {one["robot"]: one["parent_frames"] for one in sessions} == {
+        "ann": ["ann/morning"], "bob": ["bob/evening"],
+    }  # fmt: skip
+    now = client.get(f"{rooms.path}/frames", params=of_bob).json()["items"]
+    assert [one["pose"] for one in now] == [one["sent_pose"] for one in moved]
+    assert {one["sent_pose"] for one in now} == {None}
+    found = set()
+    for frame in rooms.held_out:
+        answer = rooms.ask(frame)
+        assert answer["status"] == "found", answer["reason"]
+        pose = answer["location"]["pose"]
+        found.add(pose["parent_frame"])
+        assert frame.pose is not None
+        here = ORIGINS[pose["parent_frame"]] @ np.array(pose["matrix"])
+        assert difference(here, frame.pose)[0] < 0.1
+    assert found <= ORIGINS.keys()
+    graph = client.get(f"{url}/graph", params={"format": "json"}).json()
+    assert {one["pose"]["parent_frame"] for one in graph["vertices"]} == ORIGINS.keys()
+    assert client.delete(url).status_code == 204

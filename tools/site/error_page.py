@@ -29,6 +29,7 @@ REMEDIES: dict[type[SceneprintError], str] = {
     errors.FrameConflict: "Change the metadata of the stored frame with PATCH.",
     errors.JobOver: "Nothing: read the job to see how it ended.",
     errors.CannotRetry: "Wait until the job is over; upload the frame again if it has a later job.",
+    errors.JoinStands: "Undo the join of the association first, if its poses are to go back.",
     errors.NotIndexed: "Wait until the frame is `indexed` or the job has succeeded, and ask again.",
     errors.PreconditionFailed: "Read it again, and repeat the edit with the new ETag.",
     errors.InvalidRequest: "Correct the fields that `errors` lists.",

@@ -416,6 +416,7 @@ KINDS = {
     ),
     "import.done": "An archive or a map was imported, as far as it could be; `data` is its result.",
     "association.found": "A job that looked for associations is over; `data` is its result.",
+    "association.undone": "The join of an association was undone: frames have other poses.",
     "surface.updated": "A job that fused the surface of a map is over; `data` has `frames` and "
     "`tiles`.",
     "coverage.measured": "A job that measured a map's coverage is over; `data` is its result.",

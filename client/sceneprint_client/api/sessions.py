@@ -153,7 +153,12 @@ class Join(ApiRecord):
     root: str | None = Field(
         default=None,
         description="Parent frame that the poses of both are in from then on, the one whose "
-        "frames came first; null where nothing was moved.",
+        "frames came first; null where nothing was moved, or where that was undone.",
+    )
+    undone: bool = Field(
+        default=False,
+        description="Whether poses were moved and are back: no graph and no automatic association "
+        "joins these parent frames.",
     )
 
 

@@ -99,11 +99,17 @@ class MapJobs(Generic[Record]):
         Raises
         ------
         UnknownMap, UnknownJob : there is none.
+        Conflict : the map depends on it; see `check_removal`.
         """
         with self._store.database.write() as connection:
-            blobs = remove_job(connection, self.find(connection, map_name, job_id))
+            job = self.find(connection, map_name, job_id)
+            self.check_removal(connection, job)
+            blobs = remove_job(connection, job)
             record_change(connection, "job.removed", map_name, job_id, kind=self._kind)
         collect_deleted_blobs(self._store, blobs)
+
+    def check_removal(self, connection: Connection, job: JobRow) -> None:
+        """Raise where a job has to stay, which kinds decide."""
 
     def find(self, connection: Connection, map_name: str, job_id: str) -> JobRow:
         """Return the row of a job of a map.

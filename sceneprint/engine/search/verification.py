@@ -40,7 +40,7 @@ from sceneprint.store.maps import (
     placed_frames,
     viewpoints_among,
 )
-from sceneprint.store.parent_joins import find_join
+from sceneprint.store.parent_joins import find_joins
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Prior, Query, ValidationOptions
@@ -251,7 +251,7 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
         )
     row, name = places[0].row, str(prior.pose.parent_frame)
     with store.database.read() as connection:
-        joined = find_join(connection, row.number, name)
+        joined = find_joins(connection, row.number).get(name)
         if joined is not None:  # the map's poses are in its root
             name, T = joined.root, joined.T @ T
             covariance = transported(covariance, joined.T[:3, :3], np.zeros(3))

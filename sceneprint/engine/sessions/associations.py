@@ -15,12 +15,13 @@ from sqlalchemy import Connection
 from sceneprint.engine.jobs.map_jobs import BLOCK, MapJobs, page_of_items
 from sceneprint.engine.jobs.tasks import Tasks
 from sceneprint.engine.serializers import sensor_frame, transform, when
-from sceneprint.errors import InvalidRequest
+from sceneprint.errors import InvalidRequest, JoinStands
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.formats.export import PoseEdge, g2o, information_of
 from sceneprint.geometry.rigid import inverse, rotation_angle
 from sceneprint.index.generation_files import Keys
 from sceneprint.store import Store
+from sceneprint.store.events import record_event
 from sceneprint.store.frame_queries import (
     PathFrame,
     QueryOrigin,
@@ -29,7 +30,8 @@ from sceneprint.store.frame_queries import (
     stops_of,
 )
 from sceneprint.store.maps import find_map
-from sceneprint.store.queue import items_of
+from sceneprint.store.parent_joins import is_joined_by, undo_joins
+from sceneprint.store.queue import items_of, replace_result
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats
 from sceneprint_client.api import Page
@@ -149,6 +151,34 @@ class AssociationJobs(MapJobs[Association]):
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
         return self.queue(map_name, asked, len(runs_of(self._store, row, asked)[0]))
+
+    def undo_join(self, map_name: str, job_id: str) -> Association:
+        """Take back the join of an association: all frames have the poses that joins left give
+        them, those of no join as they were sent. Without a join that stands nothing changes.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob, NotIndexed : there is none, or it did not succeed.
+        """
+        with self._store.database.write() as connection:
+            job = self.find(connection, map_name, job_id)
+            result = self.require_success(job, map_name, "its join can be undone")
+            if job.map_number is not None and undo_joins(connection, job.map_number, job.id):
+                joins = [
+                    one if one["root"] is None else one | {"root": None, "undone": True}
+                    for one in result["joins"]
+                ]
+                job = replace_result(connection, job, result | {"joins": joins})
+                record_event(connection, "association.undone", map_name, None, job.id)
+            return self.record(job, map_name)
+
+    def check_removal(self, connection: Connection, job: JobRow) -> None:
+        """Raise JoinStands where poses of the map follow from an association."""
+        if job.map_number is not None and is_joined_by(connection, job.map_number, job.id):
+            raise JoinStands(
+                f"Association {job.id} joined parent frames of its map, and only with it this can "
+                "be undone. Undo its join first: DELETE the path of the association with /join."
+            )
 
     def edges(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
@@ -381,7 +411,7 @@ def _joined(here: str, joins: Sequence[Mapping[str, Any]]) -> list[tuple[str, Fl
     """Frames that are joined to one, with T_here_there."""
     found = []
     for one in joins:
-        if one["transform"] is None or one["from_parent"] == one["to_parent"]:
+        if one["transform"] is None or one["from_parent"] == one["to_parent"] or one.get("undone"):
             continue
         T = np.array(one["transform"]["matrix"])
         if one["to_parent"] == here:

@@ -2,7 +2,7 @@
 
 A map whose frames have poses in several parent frames gets an association of the largest session
 of each of them with the largest one of its root, once none of its frames waits to be signed. It is
-repeated only after the two sessions have grown.
+repeated only after the two sessions have grown, and never across a join that was undone.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sceneprint.errors import SceneprintError
 from sceneprint.store import Store
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import list_maps, map_of
-from sceneprint.store.parent_joins import ParentRun, posed_runs
+from sceneprint.store.parent_joins import ParentRun, posed_runs, undone_pairs
 from sceneprint.store.queue import enqueue, list_jobs
 from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
 from sceneprint.store.tables import JobRow, MapRow
@@ -102,8 +102,11 @@ def _due(connection: Connection, row: MapRow) -> NewAssociation | None:
     jobs = [one.job for one in list_jobs(connection, None, _JOBS, None, ASSOCIATE, [row.name])]
     if any(not job.state.over for job in jobs):
         return None
+    undone = undone_pairs(connection, row.number)
     root, *others = largest
     for one in others:
+        if {one.parent, root.parent} in undone:
+            continue
         request = _request(one, root)
         if request is not None and _is_worth(request, one.frames + root.frames, jobs):
             return request

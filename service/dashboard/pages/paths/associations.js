@@ -4,7 +4,7 @@ import { at, get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, metres, degrees } from "../lib/format.js";
 import { coded } from "../lib/prose.js";
-import { sheet, toast } from "../lib/states.js";
+import { confirm, sheet, toast } from "../lib/states.js";
 import { EDGES } from "./scene.js";
 
 const OVER = new Set(["succeeded", "failed", "dead", "cancelled"]);
@@ -22,9 +22,9 @@ export function titleOf(one) {
 
 /**
  * @param {{associations: any[], chosen: any | null, edges: {edges: any[], more: boolean, drawn: number} | null,
- *   maywrite: boolean, onchoose: (id: string | null) => void, onbegin: () => void}} what
+ *   maywrite: boolean, onchoose: (id: string | null) => void, onbegin: () => void, onundo: () => void}} what
  */
-export function associationsPanel({ associations, chosen, edges, maywrite, onchoose, onbegin }) {
+export function associationsPanel({ associations, chosen, edges, maywrite, onchoose, onbegin, onundo }) {
   const select = h("select", { id: "paths-association", onChange: () => onchoose(select.value || null) },
     h("option", { value: "" }, associations.length ? "None" : "No associations yet"),
     associations.map((one) => h("option", { value: one.association_id, selected: one === chosen }, titleOf(one))));
@@ -33,6 +33,7 @@ export function associationsPanel({ associations, chosen, edges, maywrite, oncho
     h("h2", { id: "paths-associations" }, "Associations"),
     h("label", { class: "field" }, h("span", {}, "Edges of"), select),
     chosen && told(chosen, edges),
+    maywrite && chosen?.result?.joins.some((join) => join.root) && h("button", { class: "button", type: "button", id: "paths-undo", onClick: onundo }, "Undo join"),
     maywrite ? h("button", { class: "button", type: "button", id: "paths-begin", onClick: onbegin }, "New association…")
       : h("p", { class: "muted" }, "To start a new one, you need a key with write access."));
 }
@@ -44,7 +45,7 @@ function told(one, edges) {
     h("span", { class: "paths-line", dataset: { kind } }), h("span", {}, kind),
     h("span", { class: "number" }, count(one.result[kind]))));
   const joins = one.result.joins.map((join) => h("li", {},
-    h("span", { class: "badge", dataset: { kind: join.transform === null ? "warn" : join.strength === "strong" ? "good" : "neutral" } }, join.transform === null ? "not joined" : `joined, ${join.strength}`),
+    h("span", { class: "badge", dataset: { kind: join.transform === null || join.undone ? "warn" : join.strength === "strong" ? "good" : "neutral" } }, join.transform === null ? "not joined" : join.undone ? "undone" : `joined, ${join.strength}`),
     h("span", {}, h("span", { class: "mono" }, `${join.from_parent} → ${join.to_parent}`),
       h("span", { class: "muted" }, join.transform === null ? coded(` ${join.reason}`) : ` ${join.support} of ${join.votes} edges agree, within ${metres(join.spread_m)}, ${degrees(join.spread_deg)}${join.root ? `. All poses are in ${join.root} now` : ""}`))));
   return [
@@ -99,6 +100,19 @@ export function begin(map, runs, onbegun) {
       button.disabled = false;
     }
   });
+}
+
+/**
+ * Ask, and undo the join of an association.
+ * @param {string} map
+ * @param {string} id
+ * @returns {Promise<boolean>} whether it was undone
+ */
+export async function undo(map, id) {
+  const text = "Poses are again as they were sent, each in its own parent frame. The service does not join these frames again by itself.";
+  if (!(await confirm({ title: "Undo this join?", text, action: "Undo join" }))) return false;
+  await send("DELETE", at("maps", map, "associations", id, "join"));
+  return true;
 }
 
 /**

@@ -16,7 +16,7 @@ export function bridges(associations) {
   const found = [];
   for (const one of associations) {
     for (const join of one.result?.joins ?? []) {
-      if (join.transform === null || join.from_parent === join.to_parent) continue;
+      if (join.transform === null || join.undone || join.from_parent === join.to_parent) continue;
       found.push({
         from: join.from_parent, to: join.to_parent, matrix: ofRows(join.transform.matrix),
         strength: join.strength, support: join.support, association: one.association_id,

@@ -4,10 +4,11 @@
 import { h, put } from "../lib/dom.js";
 import { count } from "../lib/format.js";
 import { plain } from "../lib/prose.js";
+import { go } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { multiply, ofRows } from "../viewer/matrix.js";
 import { askedPanel } from "./asked.js";
-import { associationsPanel, begin, follow, goesOn, kindOf } from "./associations.js";
+import { associationsPanel, begin, follow, goesOn, kindOf, undo } from "./associations.js";
 import { chooser } from "./card.js";
 import { edgesOf, MOST_DRAWN, MOST_RUNS, pathOf } from "./data.js";
 import { bridges, reach } from "./joined.js";
@@ -227,6 +228,8 @@ export class Runs {
         document.getElementById("paths-association")?.focus();
       },
       onbegin: () => begin(this.map, this.runs.filter((one, i, all) => all.findIndex((other) => other.session === one.session && other.robot === one.robot) === i), (begun) => this.#begun(begun)),
+      // runs are other ones then: all is fetched again
+      onundo: async () => { if (await undo(this.map, this.association.association_id)) go(location.hash, { replace: true }); },
     }));
     put(this.words, h("summary", {}, "Tables"), h("h3", {}, "Runs"), runsTable(this.#drawn, this.parent),
       told && [h("h3", {}, "Edges"), edgesTable(this.map, told.edges, told.more)]);

@@ -1,0 +1,152 @@
+"""Parent frames joined and parted again: poses by hand, and exactly as they were sent at last."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import Connection, insert, select, update
+
+from sceneprint.store import Store
+from sceneprint.store.maps import add_frame, add_map, keep_model, position
+from sceneprint.store.parent_joins import (
+    ParentJoin,
+    join_parent,
+    root_columns,
+    undo_joins,
+    undone_pairs,
+)
+from sceneprint.store.tables import frame_row, frames, surface_frames
+from sceneprint.types import Floats
+from sceneprint_client.api import FrameState
+
+MODEL = "ab" * 32
+CB, BA = "c" * 32, "b" * 32  # associations
+#: Numbers that no product of poses leaves as they are.
+SENT = [
+    [0.6, -0.8, 0.0, 0.1],
+    [0.8, 0.6, 0.0, 1 / 3],
+    [0.0, 0.0, 1.0, math.pi],
+    [0.0, 0.0, 0.0, 1.0],
+]
+#: C lies 10 m along the x of B; B is turned by a right angle about the z of A, 100 m up.
+B_C, A_B = np.eye(4), np.eye(4)
+B_C[0, 3] = 10.0
+A_B[:3] = [[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 100.0]]
+
+
+@pytest.fixture
+def at(store: Store) -> Any:
+    """A writing connection, and the number of a map of four frames: in A, B, C and without pose."""
+    with store.database.write() as connection:
+        keep_model(connection, MODEL, "toy", b"")
+        row = add_map(connection, "hall", None, MODEL)
+        for name in ("A", "B", "C", None):
+            values = {
+                "content_id": f"{name}" * 8, "blob": "e" * 64, "bytes": 1, "novelty": None,
+                "intrinsics": None, "depth_scale": 1.0, "depth_along_ray": False, "robot": None,
+                "session": name, "captured_at": None, "tags": [], "base_frame": None, "base": None,
+                "up": None, "sequence": None, "cloud": None, "pose_parent": name,
+                "pose": None if name is None else SENT,
+            }  # fmt: skip
+            add_frame(connection, row.number, values)
+        yield connection, row.number
+
+
+def stored(connection: Connection) -> dict[str | None, tuple[Any, ...]]:
+    """What the frame of each session has: parent frame, pose, and what was sent."""
+    c = frames.c
+    columns = (c.session, c.pose_parent, c.pose, c.pose_x, c.sent_parent, c.sent_pose)
+    return {name: (parent, pose, x, *sent)
+            for name, parent, pose, x, *sent in connection.execute(select(*columns))}  # fmt: skip
+
+
+def moved(T: Floats, root: str, parent: str) -> tuple[Any, ...]:
+    pose = (T @ np.array(SENT)).tolist()
+    return root, pose, pose[0][3], parent, SENT
+
+
+AS_SENT = {
+    **{name: (name, SENT, 0.1, None, None) for name in "ABC"}, None: (None, None, None, None, None)
+}  # fmt: skip
+
+
+def join_chain(connection: Connection, number: int) -> None:
+    assert join_parent(connection, number, ParentJoin("C", "B", B_C), CB)
+    assert stored(connection) == AS_SENT | {"C": moved(B_C, "B", "C")}
+    assert join_parent(connection, number, ParentJoin("B", "A", A_B), BA)
+
+
+def test_a_chain_of_joins_leads_to_its_root(at: Any) -> None:
+    connection, number = at
+    join_chain(connection, number)
+    chained = {"B": moved(A_B, "A", "B"), "C": moved(A_B @ B_C, "A", "C")}
+    assert stored(connection) == AS_SENT | chained
+    # by hand: x of A is minus y of B, y of A is x of B, 10 m of which is C's origin
+    assert [one[3] for one in stored(connection)["C"][1][:3]] == [-1 / 3, 10.1, math.pi + 100]
+    for one in (ParentJoin("B", "A", A_B), ParentJoin("A", "C", A_B)):
+        assert not join_parent(connection, number, one, "d" * 32)
+    assert stored(connection) == AS_SENT | chained
+
+
+@pytest.mark.parametrize("first", [CB, BA])
+def test_joins_are_undone_in_either_order(at: Any, first: str) -> None:
+    connection, number = at
+    join_chain(connection, number)
+    deleted = update(frames).where(frames.c.session == "C")  # it may be restored
+    connection.execute(deleted.values(state=FrameState.DELETED))
+    assert undo_joins(connection, number, first)
+    left = {BA: {"C": moved(B_C, "B", "C")}, CB: {"B": moved(A_B, "A", "B")}}[first]
+    assert stored(connection) == AS_SENT | left
+    assert undone_pairs(connection, number) == [{BA: {"A", "B"}, CB: {"A", "C"}}[first]]
+    assert not undo_joins(connection, number, first)
+    assert undo_joins(connection, number, {CB: BA, BA: CB}[first])
+    assert stored(connection) == AS_SENT  # to the last bit
+    assert undone_pairs(connection, number) in ([{"A", "B"}, {"B", "C"}], [{"B", "C"}, {"A", "B"}])
+    join_chain(connection, number)  # by somebody who knows better
+    assert undone_pairs(connection, number) == []
+
+
+def test_what_was_moved_is_noted_for_surfaces(at: Any) -> None:
+    connection, number = at
+    join_chain(connection, number)
+    numbers = list(connection.execute(select(frames.c.number).order_by(frames.c.number)).scalars())
+    rows = [
+        {"map_number": number, "frame_number": one, "parent": "A", "changed": False}
+        for one in numbers
+    ]
+    connection.execute(insert(surface_frames), rows)
+    undo_joins(connection, number, BA)
+    changed = select(surface_frames.c.frame_number).where(surface_frames.c.changed)
+    assert set(connection.execute(changed).scalars()) == {*numbers[1:3]}  # of B and C
+
+
+def test_a_frame_in_flight_is_moved_once(at: Any) -> None:
+    connection, number = at
+    which = select(frames).where(frames.c.session == "C")
+    before = frame_row(connection.execute(which).mappings().one())
+    assert root_columns(connection, before) == {}
+    join_chain(connection, number)
+    names = ("pose_parent", "pose", "sent_parent", "sent_pose")
+    root, pose, _, *sent = moved(A_B @ B_C, "A", "C")
+    assert root_columns(connection, before) == dict(zip(names, (root, pose, *sent), strict=True))
+    now = frame_row(connection.execute(which).mappings().one())
+    undo_joins(connection, number, BA)
+    undo_joins(connection, number, CB)
+    assert root_columns(connection, now) == root_columns(connection, before) == {}
+
+
+def test_a_copied_frame_follows_the_joins_of_its_own_map(at: Any) -> None:
+    """Its map has not the join that moved it elsewhere."""
+    connection, number = at
+    copied = moved(B_C, "B", "C")
+    names = ("pose_parent", "pose", "pose_x", "sent_parent", "sent_pose")
+    of_c = update(frames).where(frames.c.session == "C")
+    connection.execute(of_c.values(**dict(zip(names, copied, strict=True))))
+    assert join_parent(connection, number, ParentJoin("B", "A", A_B), BA)
+    pose = (A_B @ np.array(copied[1])).tolist()
+    assert stored(connection)["C"] == ("A", pose, position(pose)["pose_x"], "B", copied[1])
+    assert undo_joins(connection, number, BA)
+    assert stored(connection)["C"] == ("B", copied[1], 10.1, None, None)
