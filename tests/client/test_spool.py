@@ -277,7 +277,7 @@ with Spool(path) as spool:
     with Client(sys.argv[2]) as client:
         report = spool.sync(client, sys.argv[4])
     print(report.received, report.refused, spool.status().waiting)
-    print(len({one.name for one in spool.refusals() if "neither" in one.reason}))
+    print(len({one.name for one in spool.refusals() if "none of" in one.reason}))
 """
 
 

@@ -50,7 +50,7 @@ def test_a_map_is_made(
     assert axe(page) == []
     presets = [m for m in station.client.get("/v1/models").json()["items"] if m["preset"]]
     expect(dialog.get_by_role("radio")).to_have_count(len(presets))
-    for wrong, why in (("Upper Case", "Use only lower-case letters"), ("building", "building")):
+    for wrong, why in (("Upper Case", "1 to 63 lower-case letters"), ("building", "building")):
         name.fill(wrong)
         page.keyboard.press("Enter")
         place = dialog.locator("#new-name-error")

@@ -37,7 +37,10 @@ class Asked:
         self.read, self.status, self.body = 0, 0, b""
         self._pieces, self.more = pieces, asyncio.Event()
         self.more.set()
-        headers = [(b"host", b"localhost"), (b"content-type", kind.encode())]
+        headers = [
+            (b"host", b"localhost"), (b"content-type", kind.encode()),
+            (b"transfer-encoding", b"chunked"),
+        ]  # fmt: skip
         scope = {
             "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST",
             "scheme": "http", "path": path, "raw_path": path.encode(), "query_string": b"",

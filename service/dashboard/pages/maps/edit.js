@@ -13,9 +13,6 @@ const FOR = {
   paper: ["Paper", "For research: the long signatures of the paper, with exact search."],
 };
 
-// what the API's regular expression means
-const PATTERN = "Use only lower-case letters, digits, - and _, and start with a letter or digit.";
-
 /** Ask for a name, a title and a model, and make a map of them. @param {(hash: string) => void} go
  * @param {AbortSignal} signal */
 export async function createMap(go, signal) {
@@ -113,7 +110,7 @@ function tell(dialog, { field: name, reason }) {
   const input = dialog.querySelector(`[name="${CSS.escape(name)}"]`);
   const place = dialog.querySelector(`#new-${CSS.escape(name)}-error`);
   if (!place) return false;
-  put(place, reason.includes("match pattern") ? PATTERN : coded(reason));
+  put(place, coded(reason));
   if (input.type !== "radio") input.setAttribute("aria-invalid", "true");
   return true;
 }
