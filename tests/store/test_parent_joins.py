@@ -133,6 +133,9 @@ def test_a_frame_in_flight_is_moved_once(at: Any) -> None:
     root, pose, _, *sent = moved(A_B @ B_C, "A", "C")
     assert root_columns(connection, before) == dict(zip(names, (root, pose, *sent), strict=True))
     now = frame_row(connection.execute(which).mappings().one())
+    assert join_parent(connection, number, ParentJoin("A", "Z", A_B), "d" * 32)
+    assert root_columns(connection, now) == {}  # the join has moved it
+    assert undo_joins(connection, number, "d" * 32)
     undo_joins(connection, number, BA)
     undo_joins(connection, number, CB)
     assert root_columns(connection, now) == root_columns(connection, before) == {}
