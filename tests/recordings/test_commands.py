@@ -276,7 +276,7 @@ def test_without_rosbags_the_extra_is_named(
 
 
 def test_a_client_is_told_that_a_bag_is_no_frame(service_url: str, recording: Path) -> None:
-    with Client(service_url) as client, pytest.raises(DatasetError, match="may hold several frames"):
+    with Client(service_url) as client, pytest.raises(DatasetError, match="may hold several"):
         client.localize("bag", recording)
 
 
