@@ -105,6 +105,7 @@ OF_A_MAP = {
     "GET /v1/maps/{map_name}/associations": Case(),
     "GET /v1/maps/{map_name}/associations/{job_id}": Case(),
     "DELETE /v1/maps/{map_name}/associations/{job_id}": Case("write"),
+    "DELETE /v1/maps/{map_name}/associations/{job_id}/join": Case("write"),
     "GET /v1/maps/{map_name}/associations/{job_id}/edges": Case(),
     "GET /v1/maps/{map_name}/associations/{job_id}/graph": Case(),
     "POST /v1/maps/{map_name}/coverage": Case("write", body={"session": "{session}"}),
