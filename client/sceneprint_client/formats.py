@@ -37,7 +37,7 @@ class Format:
     kind : what such a file holds
     title : what people call it
     suffixes : of file names, in lower case
-    content : what is read of it, in Markdown
+    content : data that the reader takes from such a file, in Markdown
     signature : regular expression for the first bytes, as Latin-1, which Python and JavaScript
         read alike; empty if they do not show the format. Groups are width and height
     media_type : of a file over HTTP

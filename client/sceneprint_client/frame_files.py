@@ -343,12 +343,12 @@ def _of_cloud(reference: FrameFile) -> dict[str, Any]:
         file_format = None  # it is sent as NPY, whose content says so
     elif file_format is None and is_kitti(reference.path):
         file_format = "kitti"
-    known: dict[str, Any] = {"format": file_format, "units_per_metre": source.units_per_metre}
+    fields: dict[str, Any] = {"format": file_format, "units_per_metre": source.units_per_metre}
     if source.viewpoint is None:
-        known["viewpoint"] = None
+        fields["viewpoint"] = None
     elif not isinstance(source.viewpoint, Unsaid):
-        known["viewpoint"] = dict(zip("xyz", source.viewpoint, strict=True))
-    return known
+        fields["viewpoint"] = dict(zip("xyz", source.viewpoint, strict=True))
+    return fields
 
 
 def sendable(
@@ -435,7 +435,7 @@ def _named_as(known: FrameMeta, name: str, sequence: int | None) -> FrameMeta:
 
 
 def _meta_without_array(meta: MetaInput | None) -> FrameMeta | None:
-    """The metadata of a frame that is no array; TypeError for what is no metadata."""
+    """Return the metadata of a frame that is not an array; TypeError if it is no metadata."""
     if meta is None or isinstance(meta, FrameMeta):
         return meta
     if isinstance(meta, CameraIntrinsics | PinholeCamera):

@@ -95,7 +95,7 @@ class TransformTree:
     def add(
         self, parent: str, child: str, stamp_ns: int, sample: Sequence[float], *, fixed: bool
     ) -> bool:
-        """Add a sample of a transform; what is no rigid transform is passed over, and noted.
+        """Add a sample of a transform; one that is not rigid is ignored, and noted.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class TransformTree:
 
         Returns
         -------
-        taken : False where the sample was passed over
+        added : False where the sample was ignored
 
         Raises
         ------

@@ -43,7 +43,7 @@ STALL_S = 120.0
 
 
 class Patience:
-    """How long an upload waits for its jobs: until a deadline, or as long as some end now and then.
+    """A time limit for the jobs of an upload: a deadline, or STALL_S without progress.
 
     Parameters
     ----------

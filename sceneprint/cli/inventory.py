@@ -552,7 +552,7 @@ def _line(one: Map) -> str:
 
 
 def _notes(one: Map) -> str:
-    """What a map has of what it may have, and for how long, and whether its poses fall apart."""
+    """Return notes on the quotas, the retention and the parent frames of a map."""
     parts = []
     if one.frames.get("indexed") and not one.posed_frames:
         parts.append("no poses")
@@ -583,8 +583,8 @@ def _print_maps(maps: list[Map], *, as_json: bool) -> None:
         n = one.frames
         waiting = n.get("received", 0) + n.get("signing", 0)
         title, notes = one_line(one.title or ""), _notes(one)
-        told = f"{title}  ({notes})".strip() if notes else title
+        label = f"{title}  ({notes})".strip() if notes else title
         print(
             f"{one.name:{width}}  {n.get('indexed', 0):7}  {waiting:7}  {n.get('rejected', 0):8}  "
-            f"{n.get('failed', 0):6}  {one.model:20}  {told}".rstrip()
+            f"{n.get('failed', 0):6}  {one.model:20}  {label}".rstrip()
         )

@@ -84,7 +84,7 @@ class Tally:
     errors: list[tuple[str, str]] = field(default_factory=list)  #: name of a frame, and why
     ranges: list[SampleRange] = field(default_factory=list)  #: of the frames that were received
     summaries: list[str] = field(default_factory=list)  #: of archives
-    lost: int = 0  #: what was left out before it was sent, though nobody asked for it
+    lost: int = 0  #: frames and poses that could not be sent, though no option leaves them out
 
     def count(self, name: str, added: Added, new: bool) -> None:
         """A frame that was received, or is there."""
@@ -413,13 +413,13 @@ def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
                 for parent in one.parent_frames:
                     first.setdefault(parent, one)
         two = list(first.values())[:2]
-        given = " ".join(f"--session {shlex.quote(str(one.session))}" for one in two)
+        options = " ".join(f"--session {shlex.quote(str(one.session))}" for one in two)
         if len({one.session for one in two}) < len(two) and all(one.robot for one in two):
-            given += "".join(f" --robot {shlex.quote(str(one.robot))}" for one in two)
+            options += "".join(f" --robot {shlex.quote(str(one.robot))}" for one in two)
         lines.append(
             f"the poses of map {now.name} are in {now.parent_frames} parent frames, and an answer "
             "is in that of its matches. The service joins those that surely show one place; "
-            f"`sceneprint associate {now.name} {given}` does so at once, or says why not."
+            f"`sceneprint associate {now.name} {options}` does so at once, or says why not."
         )
     return lines
 

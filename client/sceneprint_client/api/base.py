@@ -58,9 +58,7 @@ NAME_RULES = {
 
 
 def fault_reason(fault: Mapping[str, Any]) -> str:
-    """Return what is wrong with a field by an error of pydantic, a rule in words where it has a
-    pattern.
-    """
+    """Return the reason of a pydantic error; a pattern of NAME_RULES is replaced by its rule."""
     rule = NAME_RULES.get(fault.get("ctx", {}).get("pattern"))
     return f"must be {rule}" if rule else str(fault["msg"]).removeprefix("Value error, ")
 
@@ -292,7 +290,7 @@ def checked(kind: type[Record], what: str, **fields: Any) -> Record:
 
 
 def record_of(kind: type[Record], fields: object, what: str) -> Record:
-    """As `checked`, of fields that whoever sent them may call anything."""
+    """Return the record of an untrusted mapping, which may have any keys; raises as `checked`."""
     try:
         return kind.model_validate(fields)
     except ValidationError as error:
@@ -300,7 +298,7 @@ def record_of(kind: type[Record], fields: object, what: str) -> Record:
 
 
 def invalid_record(error: ValidationError, what: str) -> InvalidRequest:
-    """Return what pydantic found wrong with a record, in our words."""
+    """Return the error of a record that pydantic refused."""
     found = error.errors(include_url=False, include_input=False)
     return invalid_request(found, what)
 

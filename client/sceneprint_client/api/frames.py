@@ -56,7 +56,7 @@ _MEDIAN_M, _NEAR_M, _FAR_M = (0.2, 5.0), (0.3, 2.3), 10.0
 
 
 class SampleRange(ApiRecord):
-    """How far away the samples of a frame are: depth, or the distance of points from the sensor."""
+    """Distances of the samples of a frame: depths, or ranges of points from the sensor, metres."""
 
     near: float = Field(description="Metres, as all of these; 5 % of the samples are nearer.")
     median: float
@@ -112,7 +112,7 @@ def pooled_range(ranges: Iterable[SampleRange]) -> SampleRange | None:
 
 
 class UploadSummary(ApiRecord):
-    """What an upload of several frames took of them."""
+    """Summary of an upload of several frames: poses, frames that were left out, and ranges."""
 
     frames: int = Field(description="Frames that were sent, or found in an archive.")
     poses: int = Field(description="Of these, those that the map has with their poses.")
@@ -141,7 +141,7 @@ def upload_summary(
     frames: int, without_pose: Mapping[str, int], ranges: Iterable[SampleRange],
     left_out: Sequence[str] = (), lost: int = 0,
 ) -> UploadSummary:  # fmt: skip
-    """Return what an upload took.
+    """Return the summary of an upload.
 
     Parameters
     ----------
@@ -149,15 +149,15 @@ def upload_summary(
     without_pose : number of frames by the reason why they have none
     ranges : of the frames that the map has
     """
-    known = list(ranges)
+    of_frames = list(ranges)
     return UploadSummary(
         frames=frames,
         poses=frames - sum(without_pose.values()),
         without_pose=dict(without_pose),
         left_out=list(left_out),
         lost=lost,
-        depth=pooled_range(one for one in known if one.valid is not None),
-        points=pooled_range(one for one in known if one.valid is None),
+        depth=pooled_range(one for one in of_frames if one.valid is not None),
+        points=pooled_range(one for one in of_frames if one.valid is None),
     )
 
 
