@@ -413,21 +413,25 @@ def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
                 for parent in one.parent_frames:
                     first.setdefault(parent, one)
         two = list(first.values())[:2]
-        options = " ".join(f"--session {shlex.quote(str(one.session))}" for one in two)
-        if len({one.session for one in two}) < len(two) and all(one.robot for one in two):
-            options += "".join(f" --robot {shlex.quote(str(one.robot))}" for one in two)
-        lines.append(
+        line = (
             f"the poses of map {now.name} are in {now.parent_frames} parent frames, and an answer "
-            "is in that of its matches. The service joins those that surely show one place; "
-            f"`sceneprint associate {now.name} {options}` does so at once, or says why not."
+            "is in that of its matches. The service joins those that surely show one place"
         )
+        if len(two) == 2:
+            options = " ".join(f"--session {shlex.quote(str(one.session))}" for one in two)
+            if two[0].session == two[1].session and all(one.robot for one in two):
+                options += "".join(f" --robot {shlex.quote(str(one.robot))}" for one in two)
+            line += (
+                f"; `sceneprint associate {now.name} {options}` does so at once, or says why not"
+            )
+        lines.append(f"{line}.")
     return lines
 
 
 def summary_of(
     found: list[tuple[FrameSequence, FrameReference]], tally: Tally, *, with_pose: bool
 ) -> UploadSummary:
-    """Return of how many frames the poses were sent, why not of the others, and their range."""
+    """Return the summary of the frames that were found and sent."""
     from sceneprint_client.api.frames import upload_summary
 
     lost = {name for name, _ in tally.errors}
