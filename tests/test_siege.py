@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.siege import decoders
 from benchmarks.siege.__main__ import (
     besieged,
     known_of,
@@ -18,7 +17,6 @@ from benchmarks.siege.mutations import besiege, mutated
 from benchmarks.siege.overload import overload
 from benchmarks.siege.sound_files import FILES
 from benchmarks.soak.load import Shot, shots
-from sceneprint.errors import UnreadableModel
 
 
 @pytest.fixture(scope="module")
@@ -100,38 +98,3 @@ def test_what_schemathesis_counted(
 ) -> None:
     found = read_report(f"  Tested: 104\n\nTest cases:\n  {line}\n", code)
     assert (found.requests, found.passed, found.sound) == (*figures, sound)
-
-
-@pytest.mark.parametrize("name", decoders.TARGETS)
-def test_what_a_fuzzer_begins_with_is_sound(name: str, tmp_path: Path) -> None:
-    """So that mutations go deep; of a model and a sidecar the first is not whole on purpose."""
-    decoders.write_seeds(name, tmp_path)
-    inputs = [one.read_bytes() for one in (tmp_path / "corpus").iterdir()]
-    assert 2 <= len(inputs) == len(decoders.TARGETS[name].seeds())
-    assert max(map(len, inputs)) <= decoders.TARGETS[name].most or name in ("archive", "bag")
-    read = decoders.TARGETS[name].reader()
-    for data in inputs:
-        if name == "model" and data[:1] == b"\0":
-            with pytest.raises(UnreadableModel):
-                read(data)
-        else:
-            read(data)
-
-
-def test_a_fuzzers_findings_are_noted_once_a_place(tmp_path: Path) -> None:
-    (tmp_path / "findings").mkdir()
-
-    def read(data: bytes) -> object:
-        if data == b"stated":
-            raise UnreadableModel("it is none")
-        return data[9] / 0 if data else 1 / 0
-
-    assert decoders._unstated(read, b"stated") is None
-    for data in (b"short", b"other", b""):
-        why = decoders._unstated(read, data)
-        assert why is not None
-        decoders._note(tmp_path, "unstated", data, why)
-    files = list((tmp_path / "findings").iterdir())
-    told = sorted(one.read_text().partition(":")[0] for one in files if one.suffix == ".txt")
-    assert told == ["IndexError in test_siege.py", "ZeroDivisionError in test_siege.py"]
-    assert sorted(one.read_bytes() for one in files if not one.suffix) == [b"", b"short"]
