@@ -92,7 +92,7 @@ STOPSIGNAL SIGTERM
 HEALTHCHECK --interval=15s --timeout=5s --start-period=120s --retries=3 \
     CMD ["python", "-c", "import http.client as h, os, ssl, sys; e = os.environ; a = ('127.0.0.1', int(e['SCENEPRINT_PORT'])); c = h.HTTPSConnection(*a, timeout=3, context=ssl._create_unverified_context()) if e.get('SCENEPRINT_TLS_CERT') else h.HTTPConnection(*a, timeout=3); c.request('GET', '/healthz'); sys.exit(c.getresponse().status != 200)"]
 
-# The command, not `python -m service`: the same image makes keys, signs and evaluates, and a
+# The command, not `python -m service`: the same image makes keys and signs, and a
 # container of its own is complete, as `serve` starts workers beside the service.
 ENTRYPOINT ["sceneprint"]
 CMD ["serve"]

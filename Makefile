@@ -6,6 +6,8 @@ BIN := $(VENV)/bin
 # What running needs is installed; development's packages are as well.
 RUNTIME := $(VENV)/.runtime
 STAMP := $(VENV)/.development
+# Our other distributions, each in a folder.
+PARTS := client lab viewers
 # Tools of the supply chain, apart: what they need must not move what we run.
 TOOLS := $(VENV)/tools
 # Our kernels want one thread each; more processes, not more threads, use more processors.
@@ -37,12 +39,13 @@ help:
 	@echo "make models  train the presets that ship with the package (minutes)"
 	@echo "make lock    write requirements*.lock anew from pyproject.toml [UPGRADE=1 for the newest]"
 	@echo "make sbom    the packages of the service and its image, as CycloneDX, into out/"
-	@echo "make dist    wheels and source distributions of both packages, tried in an empty environment"
+	@echo "make dist    wheels and source distributions of all packages, tried in an empty environment"
 	@echo "make advisories  known vulnerabilities of all locked packages; needs a network"
 
 # What running needs comes first: `make demo` asks for no more. Development adds its packages.
-$(RUNTIME): requirements.lock requirements-uv.lock pyproject.toml client/pyproject.toml tools/install
-	@tools/install $(PYTHON) $(VENV) requirements.lock client .
+$(RUNTIME): requirements.lock requirements-lab.lock requirements-uv.lock pyproject.toml \
+		$(addsuffix /pyproject.toml,$(PARTS)) tools/install
+	@tools/install $(PYTHON) $(VENV) requirements-lab.lock client . lab viewers
 	@touch $@
 
 $(STAMP): $(RUNTIME) requirements-dev.lock
@@ -141,7 +144,8 @@ $(TOOLS)/.installed: requirements-tools.lock requirements-uv.lock tools/install
 
 # Every version with the hashes of all its files, for every platform and Python from 3.11 on. Pins
 # that are there stay, unless UPGRADE is set. Without open3d, what running needs and the image has
-# (docs/dependencies.md); with it, development.
+# (docs/dependencies.md); with what the lab and the viewers
+# need, `make demo`; with open3d too, development.
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes \
 	--no-header --no-annotate --no-emit-index-url --no-emit-package sceneprint-client \
 	$(if $(UPGRADE),--upgrade)
@@ -149,8 +153,11 @@ COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --gene
 lock: $(RUNTIME)
 	echo open3d | $(COMPILE) --extra build --extra ros --excludes /dev/stdin \
 		--output-file requirements.lock pyproject.toml
-	$(COMPILE) --extra dev --constraint requirements.lock \
-		--output-file requirements-dev.lock pyproject.toml
+	$(COMPILE) --no-deps --constraint requirements.lock --no-emit-package sceneprint \
+		--output-file requirements-lab.lock lab/pyproject.toml viewers/pyproject.toml
+	sed -i '1i -r requirements.lock' requirements-lab.lock
+	$(COMPILE) --extra dev --constraint requirements.lock --no-emit-package sceneprint \
+		--output-file requirements-dev.lock pyproject.toml lab/pyproject.toml viewers/pyproject.toml
 	$(COMPILE) --group tools --output-file requirements-tools.lock
 	$(COMPILE) --group uv --output-file requirements-uv.lock
 
@@ -170,14 +177,15 @@ advisories: $(TOOLS)/.installed
 # The wheels are built from the source distributions: a file that these lack shows at once.
 dist: $(STAMP)
 	rm -rf dist
-	for of in client .; do (cd $$of && $(CURDIR)/$(BIN)/python -c \
+	for of in . $(PARTS); do (cd $$of && $(CURDIR)/$(BIN)/python -c \
 		'import sys; from setuptools.build_meta import build_sdist; build_sdist(sys.argv[1])' \
 		$(CURDIR)/dist > /dev/null) || exit 1; done
 	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist dist/*.tar.gz
-	@tools/install $(PYTHON) dist/try requirements.lock
+	@tools/install $(PYTHON) dist/try requirements-lab.lock
 	dist/try/bin/python -m pip install --quiet --no-deps dist/*.whl
 	cd dist && try/bin/sceneprint demo --out demo
 	@rm -rf dist/try dist/demo && ls -l dist
 
 clean:
-	rm -rf $(VENV) build client/build dist out demo *.egg-info client/*.egg-info tools/javascript/node_modules
+	rm -rf $(VENV) build dist out demo *.egg-info $(addsuffix /build,$(PARTS)) \
+		$(addsuffix /*.egg-info,$(PARTS)) tools/javascript/node_modules

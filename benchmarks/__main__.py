@@ -24,10 +24,10 @@ from benchmarks.machine import (
 )
 from benchmarks.pairs import real_pairs, synthetic_pairs
 from sceneprint.formats.dataset import Camera, find_sequences, write_depth_png, write_intrinsics
-from sceneprint.lab.synth import synthesise_room
 from sceneprint.models import PRESETS
 from sceneprint.pipeline import open_signer
 from sceneprint.types import DepthFrame
+from sceneprint_lab.synth import synthesise_room
 
 ROOT = Path(__file__).resolve().parent.parent
 #: Frames of the maps that are searched, and whether by sketches.

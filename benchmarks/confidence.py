@@ -22,13 +22,13 @@ from typing import Any
 from tqdm import tqdm
 
 from sceneprint.geometry.validation.confidence import PlaceEvidence, confidences_of
-from sceneprint.lab.confidence import JudgedQuery, fit, judged_queries
-from sceneprint.lab.evaluation.measures import calibration
-from sceneprint.lab.evaluation.protocol import map_over
-from sceneprint.lab.evaluation.sites import MapFlaws, SiteAnswer, ask_site
 from sceneprint.models import PRESETS, read_model
 from sceneprint.models.model_file import save_model
 from sceneprint.pipeline import Signer, open_signer
+from sceneprint_lab.confidence import JudgedQuery, fit, judged_queries
+from sceneprint_lab.evaluation.measures import calibration
+from sceneprint_lab.evaluation.protocol import map_over
+from sceneprint_lab.evaluation.sites import MapFlaws, SiteAnswer, ask_site
 
 #: Of a hundred queries, how many are taken at places of each kind: a confidence is a probability
 #: among queries that are mixed so. Most robots are in ordinary rooms, or drive about.

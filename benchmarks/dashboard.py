@@ -20,7 +20,7 @@ import httpx
 
 from benchmarks.chromium import chromium, installed, settled, until, watched
 from benchmarks.rooms import Shot, fuse, multiply, send, shots, wait
-from sceneprint.cli.demo import serving
+from sceneprint_lab.cli.demo import serving
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

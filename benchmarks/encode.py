@@ -14,10 +14,10 @@ from sceneprint.geometry.signature.fisher_vector import quantise, statistics_of_
 from sceneprint.geometry.signature.pair_features import count_pairs
 from sceneprint.geometry.signature.segmentation import hierarchy, patch_weights, segment
 from sceneprint.geometry.surface.depth_image import inverse_depth, surface
-from sceneprint.lab.evaluation.pair_run import FEATURES, NORMALS, VOXEL, Clock, points_of
 from sceneprint.pipeline import Signer, geometry_of, sign
 from sceneprint.signing import float_signature, see
 from sceneprint.types import DepthFrame, Floats
+from sceneprint_lab.evaluation.pair_run import FEATURES, NORMALS, VOXEL, Clock, points_of
 
 __all__ = ["Clock", "measure", "open3d", "points_of", "signing_stages"]
 

@@ -21,13 +21,13 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from sceneprint.lab.evaluation.measures import answers
-from sceneprint.lab.evaluation.protocol import map_over
-from sceneprint.lab.evaluation.sites import SiteAnswer, ask_site, kinds_of
-from sceneprint.lab.synth.lookalike_surveys import SURVEYED_KINDS
-from sceneprint.lab.synth.lookalikes import KINDS, ORDINARY
 from sceneprint.models import PRESETS, read_model
 from sceneprint.pipeline import Signer, open_signer
+from sceneprint_lab.evaluation.measures import answers
+from sceneprint_lab.evaluation.protocol import map_over
+from sceneprint_lab.evaluation.sites import SiteAnswer, ask_site, kinds_of
+from sceneprint_lab.synth.lookalike_surveys import SURVEYED_KINDS
+from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY
 
 #: Queries of one site when absent scenes are asked by the thousand.
 ABSENT_BLOCK = 100

@@ -13,9 +13,9 @@ import numpy as np
 
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.geometry.rigid import inverse
-from sceneprint.lab.evaluation.protocol import overlap, view_of
-from sceneprint.lab.synth import synthesise_room
 from sceneprint.types import DepthFrame, Floats
+from sceneprint_lab.evaluation.protocol import overlap, view_of
+from sceneprint_lab.synth import synthesise_room
 
 #: A pair counts where the smaller share of either frame seen by the other is at least this.
 LEAST_OVERLAP = 0.3

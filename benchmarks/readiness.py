@@ -20,7 +20,6 @@ from sqlalchemy import insert, update
 
 from benchmarks.machine import memory_of
 from benchmarks.search import signatures as signatures_of
-from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.settings import Settings
@@ -30,6 +29,7 @@ from sceneprint.store.tables import maps, signatures
 from sceneprint_client import Client
 from sceneprint_client.api import NewMap
 from sceneprint_client.api.maps import Preset
+from sceneprint_lab.cli.demo import serving
 
 MAP = "bench"
 #: Frames that are written in one commit.

@@ -19,11 +19,11 @@ from benchmarks.pairs import FramePair
 from sceneprint.errors import MissingDependency
 from sceneprint.fusion import open3d
 from sceneprint.geometry.rigid import difference
-from sceneprint.lab.evaluation.pair_run import METHODS, register
 from sceneprint.models import Model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats
+from sceneprint_lab.evaluation.pair_run import METHODS, register
 
 #: The one of Open3D's methods that is timed here; `sceneprint evaluate-pairs` has the others.
 METHOD = METHODS[0]

@@ -20,13 +20,13 @@ from sqlalchemy import insert, select
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.formats.export import write_ply
-from sceneprint.lab.synth import KINECT, symmetric_box, synthesise_room, synthesise_survey, take
-from sceneprint.lab.synth.trajectories import pose
 from sceneprint.settings import Settings
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames as frame_table
 from sceneprint.store.tables import jobs, signatures
 from sceneprint_client.api import NewMap
+from sceneprint_lab.synth import KINECT, symmetric_box, synthesise_room, synthesise_survey, take
+from sceneprint_lab.synth.trajectories import pose
 
 SEED = 21
 #: Frames that are written in one commit.

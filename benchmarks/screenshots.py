@@ -1,6 +1,6 @@
 """`make screenshots`: every page of the dashboard, light and dark, over a real service.
 
-All that is to be seen is synthetic: rooms and a hall of `sceneprint.lab.synth`, signed by two
+All that is to be seen is synthetic: rooms and a hall of `sceneprint_lab.synth`, signed by two
 workers.
 """
 
@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from benchmarks.chromium import PATIENCE_S, chromium, installed, settled, watched
 from benchmarks.rooms import Shot, box, circled, fuse, scans, send, shots, wait
-from sceneprint.cli.demo import serving
+from sceneprint_lab.cli.demo import serving
 
 if TYPE_CHECKING:
     from playwright.sync_api import FilePayload

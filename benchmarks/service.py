@@ -29,9 +29,9 @@ from tqdm import tqdm
 from benchmarks.library import Library, accepted, are_same
 from benchmarks.machine import processor_seconds
 from benchmarks.readiness import MAP, fill_map
-from sceneprint.cli.demo import serving, write_building
 from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint_client import Client
+from sceneprint_lab.cli.demo import serving, write_building
 
 #: Processes that query at once, for their throughput beside that of one.
 CROWD = 8

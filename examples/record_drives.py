@@ -20,10 +20,10 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
-from sceneprint.lab.synth import take, trajectory
-from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.types import Floats, Intrinsics
 from sceneprint_client.poses import quaternion_of
+from sceneprint_lab.synth import take, trajectory
+from sceneprint_lab.synth.dataset import room_and_rng
 
 CAMERA = Intrinsics(320, 240, 292.5, 292.5, 159.5, 119.5)
 #: The camera sits above the base, and looks ahead and 10 degrees down: x right, y down, z forward.

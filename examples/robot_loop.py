@@ -19,10 +19,10 @@ from collections.abc import Iterable
 import numpy as np
 
 from sceneprint.errors import MapExists, UselessFrame
-from sceneprint.lab.synth import synthesise_lookalike, synthesise_room
 from sceneprint.types import DepthFrame, Floats
 from sceneprint_client import Client
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, Localization, Prior
+from sceneprint_lab.synth import synthesise_lookalike, synthesise_room
 
 MAP, CABINET, ROBOT = "robot-loop", "robot-loop-cabinet", "r2"
 

@@ -13,10 +13,10 @@ import tempfile
 
 import numpy as np
 
-from sceneprint.lab.synth import synthesise_room
 from sceneprint.types import DepthFrame, Floats
 from sceneprint_client import Client, Tracker
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose
+from sceneprint_lab.synth import synthesise_room
 
 MAP = "tracked-drive"
 

@@ -10,11 +10,13 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache
 from importlib import util
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -29,7 +31,6 @@ from benchmarks.fleet.postgres import NoServer, Server
 from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.waiting import until as wait_until
 from sceneprint.cli import main
-from sceneprint.cli.demo import write_building
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.formats.export import write_ply
 from sceneprint.geometry.registration.patch_descriptors import (
@@ -40,8 +41,6 @@ from sceneprint.geometry.signature.fisher_vector import Whitening
 from sceneprint.geometry.signature.mixture import Mixture
 from sceneprint.geometry.signature.pair_features import Projection, TableLayout
 from sceneprint.geometry.signature.segmentation import HierarchyParameters, SegmentationParameters
-from sceneprint.lab.synth import KINECT, SynthRoom, synthesise_room
-from sceneprint.lab.synth.rooms import make_room
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer
 from sceneprint.settings import Settings
@@ -49,6 +48,9 @@ from sceneprint.store import open_database
 from sceneprint.store.tables import metadata
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import CameraIntrinsics
+from sceneprint_lab.cli.demo import write_building
+from sceneprint_lab.synth import KINECT, SynthRoom, synthesise_room
+from sceneprint_lab.synth.rooms import make_room
 
 #: Folders whose files share what is dear to begin, such as a service with its workers: all of one
 #: run in one process, one after another. The longest are first, and are begun first.
@@ -103,6 +105,10 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ.setdefault("SCENEPRINT_DECODERS", "0")
     config.addinivalue_line("markers", "sqlite_only(reason): of nothing that PostgreSQL does")
     config.addinivalue_line("markers", "thorough: takes long, and runs with `make test-thorough`")
+    if not entry_points(group="sceneprint.commands"):
+        metadata_folder = Path(tempfile.mkdtemp(prefix="sceneprint-"))
+        config.add_cleanup(lambda: shutil.rmtree(metadata_folder))
+        add_distributions(metadata_folder)
     if ON_POSTGRES and "PYTEST_XDIST_WORKER" not in os.environ:
         folder = Path(tempfile.mkdtemp(prefix="sceneprint-"))
         server = Server(folder)
@@ -113,6 +119,25 @@ def pytest_configure(config: pytest.Config) -> None:
         server.execute("CREATE TABLE folders (name text, place text)")
         # for this process, those of xdist and all that tests begin
         os.environ["SCENEPRINT_TEST_SERVER"] = server.url("")
+
+
+def add_distributions(folder: Path) -> None:
+    """Let this process and its children find the entry points of the lab and the viewers, as in an
+    environment that has them; `folder` gets their metadata.
+    """
+    for name in ("lab", "viewers"):
+        project = tomllib.loads((ROOT / name / "pyproject.toml").read_text())["project"]
+        info = folder / f"{project['name'].replace('-', '_')}.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Name: {project['name']}\nVersion: {project['version']}\n")
+        lines = []
+        for group, points in project["entry-points"].items():
+            lines += [f"[{group}]", *(f"{key} = {value}" for key, value in points.items())]
+        (info / "entry_points.txt").write_text("\n".join(lines))
+    sys.path.append(str(folder))
+    known = os.environ.get("PYTHONPATH")
+    paths = (folder, ROOT / "lab", ROOT / "viewers", *([known] if known else []))
+    os.environ["PYTHONPATH"] = os.pathsep.join(map(str, paths))
 
 
 def unit_of(nodeid: str) -> str:

@@ -20,10 +20,10 @@ from PIL import Image
 from sceneprint import cli
 from sceneprint.cli import main
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.lab.synth import synthesise_survey
 from sceneprint.models import Model, save_model
 from sceneprint.pipeline import Signer, sign
 from sceneprint.types import Cloud
+from sceneprint_lab.synth import synthesise_survey
 
 CAMERA = {"width": 160, "height": 120, "fx": 146, "fy": 146, "cx": 80, "cy": 60}
 
@@ -272,10 +272,12 @@ def test_every_command_is_known() -> None:
         if name.startswith("add_") and not name.endswith(("_option", "_options"))
     }
     assert found == set(cli.COMMANDS.items())
+    of_lab = ["demo", "evaluate", "evaluate-pairs", "synth", "train"]
+    assert list(cli.all_commands()) == [*cli.COMMANDS, *of_lab]
 
 
 def test_a_command_waits_for_no_other() -> None:
-    """Its own module is loaded, and not what only evaluation or a service needs."""
+    """Its own module is loaded, and not what only other commands or a service need."""
     code = (
         "import sys; from sceneprint.cli import main\n"
         "try: main([*sys.argv[1:], '--help'])\n"
@@ -291,10 +293,13 @@ def test_a_command_waits_for_no_other() -> None:
     of_serve = loaded("serve")
     assert "sceneprint.cli.serve" in of_serve
     assert {
-        "sceneprint.cli.evaluate",
+        "sceneprint.cli.sign",
         "sceneprint_client.client",
         "sceneprint.engine",
     } & of_serve == set()
+    of_synth = loaded("synth")
+    assert "sceneprint_lab.cli.synth" in of_synth
+    assert {"sceneprint_lab.cli.train", "sceneprint.cli.sign"} & of_synth == set()
     assert {"numpy", "sceneprint.cli.serve"} & loaded("--version") == set()
 
 

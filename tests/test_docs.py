@@ -297,7 +297,7 @@ def run_example(code: str, folder: Path) -> str:
 
 
 PLACES = re.findall(
-    r"`((?:client|sceneprint|service|worker|migrations|benchmarks|tests|ros2)/[\w/.]*)(?::([\w.]+))?`",
+    r"`((?:client|sceneprint|lab|viewers|service|worker|migrations|benchmarks|tests|ros2)/[\w/.]*)(?::([\w.]+))?`",
     ARCHITECTURE,
 )
 
@@ -306,7 +306,8 @@ def test_architecture_has_a_line_for_every_package() -> None:
     folders = {
         f"{one.parent.relative_to(ROOT).as_posix()}/"
         for top in (
-            "client", "sceneprint", "service", "worker", "migrations", "benchmarks", "ros2", "tools"
+            "client", "sceneprint", "lab", "viewers", "service", "worker", "migrations",
+            "benchmarks", "ros2", "tools",
         )
         for one in (ROOT / top).rglob("__init__.py")
         # what builds leave behind

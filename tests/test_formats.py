@@ -77,7 +77,7 @@ def test_no_other_file_lists_suffixes() -> None:
     rows = formats_of("depth", "cloud", "map")
     own = {one for row in rows for one in row.suffixes} - {".png", ".npy", ".ply", ".bin"}
     quoted = re.compile("|".join(rf"[\"']{re.escape(one)}[\"']" for one in own))
-    for folder in ("client", "sceneprint", "service", "worker"):
+    for folder in ("client", "sceneprint", "lab", "viewers", "service", "worker"):
         for file in (*(ROOT / folder).rglob("*.py"), *(ROOT / folder).rglob("*.js")):
             if file.name not in ("formats.py", "formats.js"):
                 assert not quoted.findall(file.read_text(encoding="utf-8")), file

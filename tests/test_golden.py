@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from sceneprint import pipeline
-from sceneprint.cli import COMMANDS, parser
+from sceneprint.cli import all_commands, parser
 from sceneprint.formats.dataset import make_frame
 from sceneprint.settings import Settings
 from sceneprint.types import DepthFrame, Floats, Intrinsics
@@ -238,7 +238,7 @@ def test_the_help_of_every_command(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(variable, raising=False)
     top = parser()
     (commands,) = (a for a in top._actions if isinstance(a, argparse._SubParsersAction))
-    assert list(commands.choices) == list(COMMANDS)
+    assert list(commands.choices) == list(all_commands())
     assert_golden("commands.txt", [*help_lines(top)])
 
 

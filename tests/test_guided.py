@@ -11,11 +11,11 @@ import pytest
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.geometry.validation.validation import ValidationParameters, validate_guided
-from sceneprint.lab.synth import SynthRoom
 from sceneprint.localization import localize
 from sceneprint.pipeline import PairMatch, associate, open_signer, prepare, searched
 from sceneprint.places import QueryFrame
 from sceneprint.types import Floats, Geometry
+from sceneprint_lab.synth import SynthRoom
 
 Room = tuple[list[Geometry], list[Floats]]
 

@@ -30,7 +30,6 @@ from sceneprint.geometry.validation.map_verification import (
     starts_about,
 )
 from sceneprint.geometry.validation.validation import PairValidation
-from sceneprint.lab.synth import KINECT, SynthRoom, render, symmetric_box
 from sceneprint.localization import (
     PosedFrame,
     PoseEstimate,
@@ -42,6 +41,7 @@ from sceneprint.localization import (
 from sceneprint.pipeline import PairMatch, Signer, associate, open_signer, prepare, retrieve
 from sceneprint.places import LocalizationParameters, PosePrior, QueryFrame, ViewsOf
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics, Patches, Surface
+from sceneprint_lab.synth import KINECT, SynthRoom, render, symmetric_box
 
 
 def outcome(

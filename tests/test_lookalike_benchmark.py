@@ -7,13 +7,13 @@ import math
 import pytest
 
 from benchmarks.lookalikes import ask_site
-from sceneprint.lab.evaluation import sites
-from sceneprint.lab.evaluation.protocol import Error, JudgedAnswer
-from sceneprint.lab.evaluation.sites import kinds_of
-from sceneprint.lab.synth.lookalike_surveys import SURVEYED_KINDS
-from sceneprint.lab.synth.lookalikes import KINDS, ORDINARY
 from sceneprint.models import read_model
 from sceneprint.pipeline import Signer, open_signer
+from sceneprint_lab.evaluation import sites
+from sceneprint_lab.evaluation.protocol import Error, JudgedAnswer
+from sceneprint_lab.evaluation.sites import kinds_of
+from sceneprint_lab.synth.lookalike_surveys import SURVEYED_KINDS
+from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY
 
 #: A scan may be off by so much and still be right.
 SCAN = (0.5, 10.0)

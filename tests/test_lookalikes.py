@@ -15,12 +15,12 @@ from tqdm import tqdm
 from benchmarks.pairs import pairs_among
 from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.geometry.rigid import difference, inverse
-from sceneprint.lab.synth import KINECT, Room, corridor, symmetric_box, synthesise_survey, take
-from sceneprint.lab.synth.sensors import Spinning, scan
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
 from sceneprint.types import AnyFrame, Cloud, DepthFrame, Floats, Geometry
+from sceneprint_lab.synth import KINECT, Room, corridor, symmetric_box, synthesise_survey, take
+from sceneprint_lab.synth.sensors import Spinning, scan
 
 #: A transform this near the truth is right: then the pair was told apart after all.
 RIGHT_M = 0.2

@@ -14,9 +14,6 @@ from numpy.typing import NDArray
 from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.geometry.retrieval.ranking import cross_distances
 from sceneprint.geometry.signature.fisher_vector import quantise
-from sceneprint.lab.evaluation.protocol import overlaps, view_of
-from sceneprint.lab.synth import KINECT, Room, render, synthesise_room
-from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.pipeline import distance, sign
 from sceneprint.signing import (
     Signer,
@@ -27,6 +24,9 @@ from sceneprint.signing import (
     table_statistics,
 )
 from sceneprint.types import DepthFrame, Floats, Floats32, Intrinsics
+from sceneprint_lab.evaluation.protocol import overlaps, view_of
+from sceneprint_lab.synth import KINECT, Room, render, synthesise_room
+from sceneprint_lab.synth.dataset import room_and_rng
 
 SPLITS = {
     "forward": (range(0, 600, 2), range(650, 1000, 2)),

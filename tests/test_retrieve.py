@@ -14,9 +14,6 @@ from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.retrieval.ranking import diversify as select
 from sceneprint.geometry.signature.segmentation import patches_of, segment
 from sceneprint.geometry.validation.validation import PairValidation, expected_error, preferred
-from sceneprint.lab.evaluation.judgement import voters
-from sceneprint.lab.synth import KINECT, take, trajectory
-from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import (
     PairMatch,
@@ -32,6 +29,9 @@ from sceneprint.pipeline import (
 )
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics
+from sceneprint_lab.evaluation.judgement import voters
+from sceneprint_lab.synth import KINECT, take, trajectory
+from sceneprint_lab.synth.dataset import room_and_rng
 
 
 def signature(*values: int, model_id: str = "a" * 64) -> Signature:

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 
-from sceneprint.cli.demo import DemoQuery, choose_frames, fill, place_of, run_queries, serving
 from sceneprint.formats.dataset import FrameReference, find_sequences
-from sceneprint.lab.evaluation.report import answer_rows, judge_answers
 from sceneprint_client import Client, meta_of
 from sceneprint_client.api import Answer
+from sceneprint_lab.cli.demo import DemoQuery, choose_frames, fill, place_of, run_queries, serving
+from sceneprint_lab.evaluation.report import answer_rows, judge_answers
 
 
 def evaluate(folder: Path, *arguments: str) -> dict[str, Any]:

@@ -20,12 +20,12 @@ from sceneprint.geometry.signature.segmentation import (
     patches_of,
     segment,
 )
-from sceneprint.lab.synth import SynthRoom, synthesise_room
-from sceneprint.lab.training import TrainingParameters, preset_parameters, preset_whitening, train
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import distance, open_signer, sign
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame
+from sceneprint_lab.synth import SynthRoom, synthesise_room
+from sceneprint_lab.training import TrainingParameters, preset_parameters, preset_whitening, train
 
 MODEL = ModelParameters(
     segmentation=SegmentationParameters(n_patches=200),

@@ -9,10 +9,10 @@ import pytest
 
 from sceneprint.geometry.signature.mixture import MixtureParameters
 from sceneprint.geometry.signature.pair_features import TableLayout
-from sceneprint.lab.synth import Spinning, synthesise_survey
-from sceneprint.lab.training import TrainingParameters, preset_parameters, preset_scenes, train
 from sceneprint.models import Model, ModelParameters, read_model
 from sceneprint.pipeline import distance, open_signer, sign
+from sceneprint_lab.synth import Spinning, synthesise_survey
+from sceneprint_lab.training import TrainingParameters, preset_parameters, preset_scenes, train
 
 TRAINING = TrainingParameters(
     rooms=2, views=2, seed=3, pairs=3000, histograms=1500, descriptors=32, scenes="sites"

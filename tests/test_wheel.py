@@ -194,7 +194,12 @@ def test_another_processor_gets_code_of_its_own(installed: Path, tmp_path: Path)
 
 @pytest.mark.parametrize(
     ("folder", "packages"),
-    [(".", ("sceneprint", "service", "worker", "migrations")), ("client", ("sceneprint_client",))],
+    [
+        (".", ("sceneprint", "service", "worker", "migrations")),
+        ("client", ("sceneprint_client",)),
+        ("lab", ("sceneprint_lab",)),
+        ("viewers", ("sceneprint_viewers",)),
+    ],
 )
 def test_a_source_distribution_builds_the_whole_wheel(
     folder: str, packages: tuple[str, ...], tmp_path: Path

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sceneprint.lab.synth.sensors import Caster, RayHits
     from sceneprint.types import Floats32
+    from sceneprint_lab.synth.sensors import Caster, RayHits
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = (
@@ -87,7 +87,7 @@ def pytest_configure() -> None:
     """Move what each ray meets by up to a unit in the last place of its distance."""
     import numpy as np
 
-    from sceneprint.lab.synth import sensors
+    from sceneprint_lab.synth import sensors
 
     cast = sensors.Caster.cast
 

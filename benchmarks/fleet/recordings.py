@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprint.cli.demo import write_building
 from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import FrameReference, find_sequences, write_depth_png
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import CameraIntrinsics, FrameMeta
 from sceneprint_client.frame_files import meta_of
+from sceneprint_lab.cli.demo import write_building
 
 #: Every so many samples of a frame, so that signing costs little; there are as many walks in a
 #: recording as such grids, and no two of their frames have the same content.

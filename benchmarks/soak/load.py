@@ -20,9 +20,9 @@ import numpy as np
 from tqdm import tqdm
 
 from sceneprint.formats.dataset import write_depth_png
-from sceneprint.lab.synth import synthesise_room
 from sceneprint.types import Intrinsics
 from sceneprint_client.api import CameraIntrinsics, FrameMeta
+from sceneprint_lab.synth import synthesise_room
 
 #: Every so many samples of a frame, so that signing costs little; there are as many such frames
 #: in one as samples that are left out.

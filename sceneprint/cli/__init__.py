@@ -7,10 +7,11 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from datetime import timedelta
-from importlib import import_module
+from importlib.metadata import entry_points
+from pkgutil import resolve_name
 
 from sceneprint import __version__
 from sceneprint.errors import SceneprintError
@@ -22,7 +23,6 @@ USAGE = 2
 
 #: The module of this package that has each command, in the order in which the help lists them.
 COMMANDS = {
-    "demo": "demo",
     "serve": "serve",
     "work": "serve",
     "keys": "admin",
@@ -48,20 +48,29 @@ COMMANDS = {
     "snapshot": "storage",
     "restore": "storage",
     "pull": "storage",
-    "sign": "offline",
-    "evaluate": "evaluate",
-    "evaluate-pairs": "evaluate",
-    "synth": "offline",
-    "train": "offline",
+    "sign": "sign",
 }
 
 
-def parser(names: Iterable[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
-    """Commands with their options.
+def all_commands() -> dict[str, str]:
+    """Return the function that describes each command, as `MODULE:FUNCTION`, by its name.
+
+    Other distributions, such as sceneprint-lab, add theirs as entry points.
+    """
+    added = entry_points(group="sceneprint.commands")
+    return {name: _own(name) for name in COMMANDS} | {one.name: one.value for one in added}
+
+
+def _own(name: str) -> str:
+    return f"sceneprint.cli.{COMMANDS[name]}:add_{name.replace('-', '_')}"
+
+
+def parser(known: Mapping[str, str] | None = None) -> argparse.ArgumentParser:
+    """Return the parser of commands with their options.
 
     Parameters
     ----------
-    names : of the commands it knows; only their modules are loaded
+    known : what `all_commands` returns, or a part of it; only its modules are loaded
     """
     top = argparse.ArgumentParser(
         prog="sceneprint",
@@ -69,21 +78,23 @@ def parser(names: Iterable[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"sceneprint {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name in names:
-        module = import_module(f"sceneprint.cli.{COMMANDS[name]}")
-        getattr(module, f"add_{name.replace('-', '_')}")(commands)
+    for function in (all_commands() if known is None else known).values():
+        resolve_name(function)(commands)
     return top
 
 
-def _needed(arguments: Sequence[str]) -> Iterable[str]:
-    """Names of the commands that have to be known to read these arguments.
+def _needed(arguments: Sequence[str]) -> Mapping[str, str]:
+    """Return the commands that have to be known to read these arguments.
 
     To load them all takes a second, which is most of what a small command needs.
     """
     first = arguments[0] if arguments else ""
     if first == "--version":
-        return ()
-    return (first,) if first in COMMANDS else COMMANDS
+        return {}
+    if first in COMMANDS:
+        return {first: _own(first)}
+    found = all_commands()
+    return {first: found[first]} if first in found else found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -10,21 +10,18 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-import numpy as np
 from pydantic_core import from_json
 
 from sceneprint.atomic_files import write_whole
 from sceneprint.cli import positive
 from sceneprint.cli.options import (
-    add_scene_options,
     add_service_options,
-    check_scene,
     one_line,
     open_client,
-    open_scene,
     percent,
     up_of,
 )
+from sceneprint.cli.scenes import Scene, add_scene_options, check_scene, open_scene
 from sceneprint.errors import InvalidRequest
 from sceneprint.models import PRESETS
 from sceneprint_client.api.base import FrameState, JobState
@@ -34,7 +31,6 @@ from sceneprint_client.api.results import CLOUD_FRAMES, RECORD_STATUSES, VIEWS, 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from sceneprint.scenes.scene import SceneStream
     from sceneprint_client import Client
     from sceneprint_client.api import Frame, Job, Map
     from sceneprint_client.api.results import QueryRecord
@@ -131,13 +127,11 @@ def run_frames(options: argparse.Namespace) -> int:
     if options.trajectory is not None and options.mcap is not None:
         raise InvalidRequest("--trajectory writes no scene. Run the command once for each.")
     check_scene(options)
-    with open_client(options) as client, open_scene(options) as stream:
+    with open_client(options) as client, open_scene(options, client) as scene:
         if options.frame_id is not None:
             frame = _one(client, options)
-            if stream is not None:
-                from sceneprint.scenes.map_scene import frame_scene
-
-                stream.write(frame_scene(client, frame))
+            if scene is not None:
+                scene.add_frame(frame)
         elif options.trajectory is not None:
             _trajectory(client, options)
         else:
@@ -149,12 +143,12 @@ def run_frames(options: argparse.Namespace) -> int:
                 order=_order(options),
             )  # fmt: skip
             found = itertools.islice(found, options.limit)
-            if stream is None:
+            if scene is None:
                 _print_frames(found, as_json=options.json)
             else:
                 frames = list(found)
                 _print_frames(frames, as_json=options.json)
-                _show_frames(client, stream, frames, options)
+                _show_frames(scene, frames)
     return 0
 
 
@@ -164,17 +158,13 @@ def _order(options: argparse.Namespace) -> Literal["asc", "desc", "taken"]:
     return "taken" if len(options.session or ()) == 1 else "asc"
 
 
-def _show_frames(
-    client: Client, stream: SceneStream, frames: list[Frame], options: argparse.Namespace
-) -> None:
+def _show_frames(scene: Scene, frames: list[Frame]) -> None:
     """Write the scene of frames that are listed.
 
     Raises
     ------
     InvalidRequest : none has a pose.
     """
-    from sceneprint.scenes.map_scene import frames_scene
-
     posed = [one for one in frames if one.pose is not None]
     if not posed:
         raise InvalidRequest(
@@ -182,9 +172,7 @@ def _show_frames(
         )
     if len(posed) < len(frames):
         print(f"{len(frames) - len(posed)} frames without a pose are not shown", file=sys.stderr)
-    up = client.map(options.map).up
-    direction = None if up is None else np.array([up.x, up.y, up.z])
-    stream.write(frames_scene(client, posed, direction, options.map_frames))
+    scene.add_frames(posed)
 
 
 def _one(client: Client, options: argparse.Namespace) -> Frame:

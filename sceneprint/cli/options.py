@@ -1,9 +1,8 @@
-"""Options that many commands share: how they ask a map, and scenes of what they found."""
+"""Options that many commands share: how they ask a map, and with which model they sign."""
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import math
 import os
@@ -19,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from sceneprint.atomic_files import check_writable
 from sceneprint.cli import positive, whole_number
 from sceneprint.engine.compilation import ALL, DEPTH, compile_kernels
 from sceneprint.errors import FrameError, InvalidRequest, UnusableStore
@@ -30,11 +28,9 @@ from sceneprint.types import DepthFrame, Intrinsics
 from sceneprint_client.api.base import GivenBase, checked, novelty_of
 from sceneprint_client.api.frames import MOST_PRIORITY
 from sceneprint_client.api.query import Prior
-from sceneprint_client.frame_files import FrameFile
 from sceneprint_client.http import DEFAULT_URL
 
 if TYPE_CHECKING:
-    from sceneprint.scenes.scene import SceneStream
     from sceneprint_client import Client
     from sceneprint_client.api import Answer
     from sceneprint_client.api.admin import Stats
@@ -118,26 +114,6 @@ def _box(text: str) -> tuple[dict[str, float], dict[str, float]]:
         raise argparse.ArgumentTypeError(f"{text!r} is not six comma-separated numbers")
     x, y, z = zip(numbers[:3], numbers[3:], strict=True)
     return {"x": x[0], "y": y[0], "z": z[0]}, {"x": x[1], "y": y[1], "z": z[1]}
-
-
-# Options of the commands that judge transforms: how they are found, and when they are believed.
-
-
-def add_judging_options(command: argparse.ArgumentParser) -> None:
-    """`--mode` and `--matching`."""
-    command.add_argument(
-        "--mode",
-        choices=("full", "paper"),
-        default="full",
-        help="accept on all evidence, or on the residual alone as in the paper (default: full)",
-    )
-    command.add_argument(
-        "--matching",
-        choices=("histograms", "sequence"),
-        default="histograms",
-        help="find correspondences by histograms, or by aligned sequences of neighbours as in "
-        "the paper, which is slower (default: histograms)",
-    )
 
 
 # What options of `sceneprint upload` say, read from text.
@@ -546,79 +522,3 @@ def _wall() -> DepthFrame:
     """A flat wall 2 m ahead."""
     camera = Intrinsics(256, 192, 300, 300, 127.5, 95.5)  # halved once, as most are
     return DepthFrame(np.full((192, 256), 2.0, np.float32), camera)
-
-
-# Scenes for viewers: Foxglove, and Rerun, which reads the same files.
-
-
-def add_scene_options(command: argparse.ArgumentParser) -> None:
-    """Add `--mcap` and `--map-frames`."""
-    group = command.add_argument_group(
-        "scene", "what was found, in 3-D, for a viewer; see docs/viewers.md"
-    )
-    group.add_argument(
-        "--mcap", type=Path, metavar="FILE",
-        help="write an MCAP file for Foxglove or Rerun (sceneprint[foxglove])",
-    )  # fmt: skip
-    group.add_argument(
-        "--map-frames",
-        type=whole_number,
-        default=120,
-        metavar="N",
-        help="frames of the map whose points are shown, evenly taken (default: 120)",
-    )
-
-
-def check_scene(options: argparse.Namespace) -> None:
-    """Check before any work that the scene can be written.
-
-    Raises
-    ------
-    MissingDependency : a package that it needs is not installed.
-    OSError : the file cannot be written.
-    """
-    if options.mcap is not None:
-        from sceneprint.scenes.mcap_writer import require_foxglove
-
-        require_foxglove()
-        check_writable(options.mcap)
-
-
-def check_kept(options: argparse.Namespace) -> None:
-    """Check that the service stores the answers, from which a scene is drawn.
-
-    Raises
-    ------
-    InvalidRequest : it does not.
-    """
-    if options.mcap is not None and options.no_keep:
-        raise InvalidRequest("A scene is made of stored answers. Leave --no-keep out.")
-
-
-@contextmanager
-def open_scene(options: argparse.Namespace) -> Iterator[SceneStream | None]:
-    """Open the scene that `--mcap` names; None without that option.
-
-    The file is there only when the block ends without an error.
-    """
-    if options.mcap is None:
-        yield None
-        return
-    from sceneprint.scenes.mcap_writer import mcap_file
-    from sceneprint.scenes.scene import SceneStream
-
-    with ended_by_signals(), mcap_file(options.mcap) as writer:
-        stream = SceneStream(writer)
-        yield stream
-    if not stream.is_empty:
-        print(f"wrote {one_line(str(options.mcap))}", file=sys.stderr)
-
-
-def stamps_of(references: Sequence[FrameFile]) -> list[int | None]:
-    """Nanoseconds since 1970 of frames; all None unless each is later than the one before."""
-    stamps = [one.timestamp for one in references]
-    known = [t for t in stamps if t is not None and 0 <= t < 2**63 * 1e-9]
-    rising = all(a < b for a, b in itertools.pairwise(known))
-    if len(known) < len(stamps) or not rising:
-        return [None] * len(stamps)
-    return [round(t * 1e9) for t in known]

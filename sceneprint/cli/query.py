@@ -16,18 +16,21 @@ from sceneprint.cli.bag import add_recording_options, sequences_at
 from sceneprint.cli.options import (
     add_asking_options,
     add_prior_option,
-    add_scene_options,
     add_service_options,
     add_up_option,
-    check_kept,
-    check_scene,
     explained_lines,
     frame_label,
     one_line,
     open_client,
-    open_scene,
     options_of,
     percent,
+)
+from sceneprint.cli.scenes import (
+    Scene,
+    add_scene_options,
+    check_kept,
+    check_scene,
+    open_scene,
     stamps_of,
 )
 from sceneprint.errors import (
@@ -45,7 +48,6 @@ from sceneprint_client.api.results import COLOURS, TRANSFORMS
 from sceneprint_client.tracker_core import spaced_views
 
 if TYPE_CHECKING:
-    from sceneprint.scenes.scene import SceneStream
     from sceneprint.types import Floats
     from sceneprint_client import Client
     from sceneprint_client.api import (
@@ -175,8 +177,8 @@ def run_query(options: argparse.Namespace) -> int:
         how["maps"] = "*" if options.map == "*" else [options.map, *options.also]
     check_overlay(options, len(references))
     failed = 0
-    with open_client(options) as client, open_scene(options) as stream:
-        scene = _answer_scene(client, stream, references, options)
+    with open_client(options) as client, open_scene(options, client) as scene:
+        add_to_scene = _answer_scene(scene, references)
         for reference in references:
             try:
                 answer = client.query(
@@ -192,28 +194,22 @@ def run_query(options: argparse.Namespace) -> int:
                 print(json.dumps(told), flush=True)
             else:
                 print(text, flush=True)
-            if scene is not None:
-                scene(reference, answer, text)
+            add_to_scene(reference, answer, text)
             if options.overlay is not None:
                 print(save_overlay(client, answer, options), file=sys.stderr)
     return 2 if failed else 0
 
 
 def _answer_scene(
-    client: Client, stream: SceneStream | None, references: Sequence[FrameReference],
-    options: argparse.Namespace,
-) -> Callable[[FrameReference, Answer, str], None] | None:  # fmt: skip
-    """What adds a frame's answer, and its text, to the scene; None where there is no scene."""
-    if stream is None:
-        return None
-    from sceneprint.scenes.answer_scene import MANY, ONE, AnswerScene
-
-    limits = ONE if len(references) == 1 else MANY
-    scene = AnswerScene(stream, client, limits, options.map_frames)
+    scene: Scene | None, references: Sequence[FrameReference]
+) -> Callable[[FrameReference, Answer, str], None]:
+    """Return what adds the answer of a frame, and its text, to the scene, if there is one."""
     places = {one.path: place for place, one in enumerate(references)}
     stamps = stamps_of(references)
 
     def add(reference: FrameReference, answer: Answer, text: str) -> None:
+        if scene is None:
+            return
         place = places[reference.path]
         camera = None
         if reference.camera is not None:
@@ -221,7 +217,8 @@ def _answer_scene(
             camera = CameraIntrinsics(
                 width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy
             )
-        scene.add(answer, one_line(reference.name), text, camera, place, stamps[place])
+        of = place, len(references)
+        scene.add_answer(answer, one_line(reference.name), text, camera, of, stamps[place])
 
     return add
 
@@ -442,8 +439,8 @@ def run_localize(options: argparse.Namespace) -> int:
     chosen = _frames_to_localize(options, every)
     how = {**options_of(options), "prior": options.prior}
     lost = failed = 0
-    with open_client(options) as client, open_scene(options) as stream:
-        scene = _answer_scene(client, stream, chosen, options)
+    with open_client(options) as client, open_scene(options, client) as scene:
+        add_to_scene = _answer_scene(scene, chosen)
         for reference in chosen:
             try:
                 there = _localize(client, options, every, reference, how)
@@ -461,7 +458,7 @@ def run_localize(options: argparse.Namespace) -> int:
             else:
                 print(text, flush=True)
             if scene is not None:
-                scene(reference, client.answer(there.query_id), text)
+                add_to_scene(reference, client.answer(there.query_id), text)
     return 2 if failed else min(lost, 1)
 
 

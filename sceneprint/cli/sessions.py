@@ -12,14 +12,12 @@ from tqdm import tqdm
 from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli import positive
 from sceneprint.cli.options import (
-    add_scene_options,
     add_seed_option,
     add_service_options,
-    check_scene,
     one_line,
     open_client,
-    open_scene,
 )
+from sceneprint.cli.scenes import add_scene_options, check_scene, open_scene
 from sceneprint.errors import InvalidRequest
 from sceneprint_client.api import JobState
 
@@ -277,7 +275,7 @@ def run_associate(options: argparse.Namespace) -> int:
     wanted = {name: value for name, value in times.items() if value is not None}
     with (
         open_client(options) as client,
-        open_scene(options) as stream,
+        open_scene(options, client) as scene,
         tqdm(desc="associate", unit="frame", disable=None) as bar,
     ):
 
@@ -294,11 +292,8 @@ def run_associate(options: argparse.Namespace) -> int:
         if kind is not None and told.state is JobState.SUCCEEDED:
             graph = client.graph(options.map, told.association_id, kind, odometry=options.odometry)
             write_whole(options.out, graph.encode())
-        if stream is not None and told.state is JobState.SUCCEEDED:
-            from sceneprint.scenes.answer_scene import association_scene
-
-            text = "\n".join(association_lines(told))
-            stream.write(association_scene(client, told, text, options.map_frames))
+        if scene is not None and told.state is JobState.SUCCEEDED:
+            scene.add_association(told, "\n".join(association_lines(told)))
     print(told.model_dump_json() if options.json else "\n".join(association_lines(told)))
     if told.state is JobState.SUCCEEDED and options.out is not None and not options.json:
         print(f"wrote {options.out}")

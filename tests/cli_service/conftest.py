@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from sceneprint.cli.demo import serving
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
 from sceneprint.types import DepthFrame
+from sceneprint_lab.cli.demo import serving
 
 Run = Callable[..., Any]
 

@@ -18,13 +18,13 @@ import pytest
 from PIL import Image
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.cli import demo as served
-from sceneprint.cli.demo import choose_frames, fill, serving
 from sceneprint.cli.options import ended_by_signals
 from sceneprint.errors import ServiceError, Unreachable
 from sceneprint.formats.dataset import read_pose, write_pose
 from sceneprint_client import Client
 from sceneprint_client.api import JobState
+from sceneprint_lab.cli import demo as served
+from sceneprint_lab.cli.demo import choose_frames, fill, serving
 
 
 @pytest.fixture

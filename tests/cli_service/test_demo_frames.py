@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.cli.demo import choose_frames
 from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import write_depth_png
+from sceneprint_lab.cli.demo import choose_frames
 
 
 def sequence(folder: Path, frames: int) -> None:

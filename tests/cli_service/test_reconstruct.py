@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics
-from sceneprint.lab.synth import synthesise_room
 from sceneprint_client import Client
+from sceneprint_lab.synth import synthesise_room
 
 Run = Callable[..., Any]
 

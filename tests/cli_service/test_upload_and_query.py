@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.cli.demo import serving
 from sceneprint.cli.imports import is_starting
 from sceneprint.errors import MissingDependency, TooLarge
 from sceneprint.formats.dataset import read_pose, write_depth_png
 from sceneprint_client import Client, http
 from sceneprint_client.api import Answer, FrameState, Map
+from sceneprint_lab.cli.demo import serving
 
 Run = Callable[..., Any]
 

@@ -27,10 +27,10 @@ from sceneprint.formats.dataset import (
     write_intrinsics,
     write_pose,
 )
-from sceneprint.lab.synth import SynthRoom
 from sceneprint.types import DepthFrame
 from sceneprint_client import Client, http
 from sceneprint_client.api import FrameMeta
+from sceneprint_lab.synth import SynthRoom
 
 #: Largest body the service of these tests takes, bytes.
 UPLOAD_BYTES = 2 << 20

@@ -74,17 +74,21 @@ def test_the_records_say_what_the_service_does() -> None:
     assert math.radians(ValidationOptions().residual_deg) == acceptance.residual_rad
 
 
-def test_both_distributions_have_one_version() -> None:
-    main, client = (
+def test_the_distributions_have_one_version() -> None:
+    main, client, lab, viewers = (
         tomllib.loads((folder / "pyproject.toml").read_text())["project"]
-        for folder in (ROOT, ROOT / "client")
+        for folder in (ROOT, ROOT / "client", ROOT / "lab", ROOT / "viewers")
     )
-    assert main["version"] == client["version"] == sceneprint_client.__version__
+    versions = {one["version"] for one in (main, client, lab, viewers)}
+    assert versions == {sceneprint_client.__version__}
     version = client["version"]
     # a bound of 1.0 would exclude 1.0.0rc1, which comes before it
     least = version if "rc" in version else version.rpartition(".")[0]
     major, minor = version.split(".")[:2]
-    assert f"sceneprint-client>={least},<{major}.{int(minor) + 1}" in main["dependencies"]
+    bounds = f">={least},<{major}.{int(minor) + 1}"
+    assert f"sceneprint-client{bounds}" in main["dependencies"]
+    for one in (lab, viewers):
+        assert f"sceneprint{bounds}" in one["dependencies"]
     assert {one.partition(">")[0] for one in client["dependencies"]} == {
         "httpx", "numpy", "pydantic",
     }  # fmt: skip

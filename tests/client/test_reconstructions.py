@@ -17,9 +17,9 @@ from sceneprint.formats.dataset import (
     write_intrinsics,
     write_pose,
 )
-from sceneprint.lab.synth import synthesise_room
 from sceneprint_client import Client
 from sceneprint_client.api import Answer, JobState
+from sceneprint_lab.synth import synthesise_room
 
 NAME = "rebuilt"
 

@@ -17,8 +17,6 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.lab.synth import KINECT, SynthRoom, corridor, render, synthesise_lookalike
-from sceneprint.lab.synth.trajectories import pose as camera_pose
 from sceneprint.types import DepthFrame, Floats, Intrinsics
 from sceneprint_client import AsyncTracker, Client, Tracker, errors
 from sceneprint_client.api import Alternative, FrameMeta, GivenPose, Localization
@@ -31,6 +29,8 @@ from sceneprint_client.tracker_core import (
     observation_of,
     rotation_matrix,
 )
+from sceneprint_lab.synth import KINECT, SynthRoom, corridor, render, synthesise_lookalike
+from sceneprint_lab.synth.trajectories import pose as camera_pose
 
 DEPTH = np.ones((3, 4), np.float32)
 K = (5.0, 5.0, 1.5, 1.0)

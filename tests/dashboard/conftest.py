@@ -37,7 +37,7 @@ from playwright.sync_api import (
 from benchmarks.rooms import circled, send
 from benchmarks.waiting import PATIENCE_S, until
 from sceneprint.formats.dataset import write_depth_png
-from sceneprint.lab.synth import SynthRoom
+from sceneprint_lab.synth import SynthRoom
 
 FLAGS = [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",

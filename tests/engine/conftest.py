@@ -15,7 +15,6 @@ from sceneprint.engine import Engine
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.formats.dataset import decode_frame, write_depth_png
 from sceneprint.geometry.signature.fisher_vector import Whitening
-from sceneprint.lab.synth import SynthRoom
 from sceneprint.models import Model
 from sceneprint.pipeline import Signature, Signer, open_signer, prepare
 from sceneprint.settings import Settings
@@ -23,6 +22,7 @@ from sceneprint.store.events import number_events
 from sceneprint.store.tables import events, jobs
 from sceneprint.types import DepthFrame, Floats, Geometry
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, JobState, NewMap
+from sceneprint_lab.synth import SynthRoom
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,6 @@ from sceneprint.engine.sessions.association_job import Associating, finish_assoc
 from sceneprint.engine.sessions.join_upkeep import JoinUpkeep
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.geometry.rigid import difference, inverse
-from sceneprint.lab.synth import SynthRoom
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
 from sceneprint.store.frame_queries import PathFrame
@@ -31,6 +30,7 @@ from sceneprint.store.tables import events, frames, job_items, jobs
 from sceneprint.types import Floats
 from sceneprint_client.api import Filter, JobState, NewMap
 from sceneprint_client.api.sessions import Association, NewAssociation
+from sceneprint_lab.synth import SynthRoom
 
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 

@@ -20,7 +20,6 @@ from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.maps.map_coverage import CoverageHandler, frames_to_query
 from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
-from sceneprint.lab.synth import SynthRoom
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
 from sceneprint.store.frame_queries import stops_of
@@ -29,6 +28,7 @@ from sceneprint.store.tables import events, job_items, jobs
 from sceneprint.types import Floats
 from sceneprint_client.api import JobState, NewMap
 from sceneprint_client.api.coverage import CoverageFrame, MapCoverage, NewMapCoverage
+from sceneprint_lab.synth import SynthRoom
 
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 WorkOff = Callable[[Engine], list[JobState | None]]

@@ -16,10 +16,10 @@ from sceneprint.engine.maps.map_frames import list_frames, trajectory, trajector
 from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.errors import InvalidRequest, PreconditionFailed
 from sceneprint.formats.dataset import read_trajectory
-from sceneprint.lab.synth import SynthRoom
 from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
 from sceneprint_client.api.listing import FrameListing, Run
 from sceneprint_client.api.sessions import NewAssociation
+from sceneprint_lab.synth import SynthRoom
 
 #: Orders in which the eight frames of a run are uploaded.
 IN_ORDER, SHUFFLED = range(8), (5, 0, 7, 2, 6, 1, 4, 3)

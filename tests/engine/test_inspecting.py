@@ -15,11 +15,11 @@ from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownQ
 from sceneprint.formats.export import points_of
 from sceneprint.geometry.registration.icp import adjoint
 from sceneprint.geometry.rigid import difference
-from sceneprint.lab.synth import SynthRoom
 from sceneprint.pipeline import Signature, distance, validate
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.types import Geometry
 from sceneprint_client.api import Answer, Query, ValidationOptions
+from sceneprint_lab.synth import SynthRoom
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]

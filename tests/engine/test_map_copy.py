@@ -18,11 +18,11 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.maps import map_copy
 from sceneprint.engine.maps.map_copy import PulledMap, pull_map
 from sceneprint.errors import Conflict, DamagedBlob, InvalidRequest, UnknownMap
-from sceneprint.lab.synth import SynthRoom
 from sceneprint.store import open_store
 from sceneprint.types import DepthFrame
 from sceneprint_client import Client
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose
+from sceneprint_lab.synth import SynthRoom
 
 pytestmark = pytest.mark.sqlite_only("a robot's copy is a folder")
 

@@ -20,13 +20,13 @@ from sceneprint.engine.jobs.tasks import LongJob, SliceResult
 from sceneprint.engine.maps.map_lifecycle import edit_map
 from sceneprint.engine.search.query import localization_of
 from sceneprint.errors import InvalidRequest, LostLease, QuotaExceeded, UnreadableCloud
-from sceneprint.lab.synth.rooms import make_room
 from sceneprint.settings import Settings
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import files_of
 from sceneprint.types import ReferenceSurface
 from sceneprint_client.api import FrameState, Job, JobState, NewMap, Query
 from sceneprint_client.api.frames import ImportOptions, MapImportResult
+from sceneprint_lab.synth.rooms import make_room
 
 #: A camera of few pixels, so that views are rendered and signed quickly.
 CAMERA = {"fx": 146.0, "fy": 146.0, "cx": 79.5, "cy": 59.5, "width": 160, "height": 120}

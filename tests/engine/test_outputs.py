@@ -25,7 +25,6 @@ from sceneprint.engine.maps.map_frames import (
 from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownMap
 from sceneprint.formats.dataset import read_trajectory
-from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.pictures import depth_view, normals_view, picture
 from sceneprint.pipeline import Signature, Signer
 from sceneprint.signing import describe
@@ -35,6 +34,7 @@ from sceneprint_client.api import FrameMeta, NewMap
 from sceneprint_client.api.listing import Run
 from sceneprint_client.api.results import View
 from sceneprint_client.poses import rotation_of
+from sceneprint_lab.synth.dataset import room_and_rng
 
 Ids = Callable[[Engine], list[str]]
 Prepared = list[tuple[Signature, Geometry]]

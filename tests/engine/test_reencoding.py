@@ -17,11 +17,11 @@ from sceneprint.engine import Engine
 from sceneprint.engine.maps import map_lifecycle
 from sceneprint.errors import Conflict, InvalidRequest, UnknownMap, UnreadableModel
 from sceneprint.geometry.retrieval.ranking import Metric
-from sceneprint.lab.synth import SynthRoom
 from sceneprint.models import Model, save_model
 from sceneprint.settings import Settings
 from sceneprint.store.tables import frames, jobs, signatures
 from sceneprint_client.api import Answer, FrameState, JobState, NewMap, Query
+from sceneprint_lab.synth import SynthRoom
 
 Make = Callable[..., Engine]
 WorkOff = Callable[[Engine], list[JobState | None]]

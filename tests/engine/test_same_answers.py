@@ -12,13 +12,13 @@ import pytest
 from sceneprint.engine import Engine
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.rigid import difference
-from sceneprint.lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
-from sceneprint.lab.evaluation.protocol import JudgedAnswer
-from sceneprint.lab.evaluation.sites import signed
-from sceneprint.lab.synth import SynthRoom, synthesise_lookalike
 from sceneprint.pipeline import Signer
 from sceneprint.types import Floats
 from sceneprint_client.api import Answer, Query
+from sceneprint_lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
+from sceneprint_lab.evaluation.protocol import JudgedAnswer
+from sceneprint_lab.evaluation.sites import signed
+from sceneprint_lab.synth import SynthRoom, synthesise_lookalike
 
 Asked = tuple[Answer, JudgedAnswer]
 

@@ -12,7 +12,7 @@ import pytest
 
 from sceneprint.cli import main
 from sceneprint.geometry.validation.validation import PairValidation
-from sceneprint.lab.evaluation.protocol import Error, QueryOutcome, ValidatedPair
+from sceneprint_lab.evaluation.protocol import Error, QueryOutcome, ValidatedPair
 
 
 @pytest.fixture(scope="session")

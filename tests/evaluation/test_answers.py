@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.lab.evaluation.report import FramePlace, answer_rows, judge_answers
 from sceneprint_client.api import Answer, Quaternion, Transform, Vector
+from sceneprint_lab.evaluation.report import FramePlace, answer_rows, judge_answers
 
 
 def at(x: float, y: float = 0.0) -> np.ndarray:

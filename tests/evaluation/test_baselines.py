@@ -12,7 +12,9 @@ import pytest
 
 from sceneprint.cli import main
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.lab.evaluation.baselines import (
+from sceneprint.models import Model, save_model
+from sceneprint.types import Cloud, DepthFrame, Floats, Floats32
+from sceneprint_lab.evaluation.baselines import (
     BASELINES,
     FpfhVlad,
     Rings,
@@ -24,9 +26,7 @@ from sceneprint.lab.evaluation.baselines import (
     thumbnail,
     vlad,
 )
-from sceneprint.lab.evaluation.measures import points_of
-from sceneprint.models import Model, save_model
-from sceneprint.types import Cloud, DepthFrame, Floats, Floats32
+from sceneprint_lab.evaluation.measures import points_of
 
 
 def turned(points: Floats, sectors: int) -> Floats:

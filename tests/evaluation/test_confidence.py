@@ -17,8 +17,8 @@ from sceneprint.geometry.validation.confidence import (
     confidences_of,
     penalties_of,
 )
-from sceneprint.lab.confidence import JudgedQuery, fit, steps_of
-from sceneprint.lab.evaluation.measures import calibration
+from sceneprint_lab.confidence import JudgedQuery, fit, steps_of
+from sceneprint_lab.evaluation.measures import calibration
 
 #: Only these kinds cost anything.
 TRUTH = ConfidenceParameters(

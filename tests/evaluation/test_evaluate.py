@@ -15,8 +15,8 @@ from PIL import Image
 import sceneprint as sp
 from sceneprint.cli import main
 from sceneprint.geometry.rigid import difference
-from sceneprint.lab.evaluation.report import seven_scenes_table
 from sceneprint.models import Model, save_model
+from sceneprint_lab.evaluation.report import seven_scenes_table
 
 ROW = {"within_5cm_5deg", "within_10cm_10deg", "median_translation_m", "median_rotation_deg"}
 RETRIEVAL = {"top1_overlap_50", "top5_overlap_50", "top1_overlap_30", "mean_overlap"}
@@ -354,7 +354,7 @@ def test_what_cannot_be_written_is_said_before_the_work(
     def work(*_: object) -> None:
         raise AssertionError("hours of it")
 
-    monkeypatch.setattr("sceneprint.lab.evaluation.run.evaluate", work)
+    monkeypatch.setattr("sceneprint_lab.evaluation.run.evaluate", work)
     (tmp_path / "file").touch()
     asked = [str(building / "room-000"), "--db", "0:4", "--queries", "5:6"]
     asked += ["--model", str(model_file), "--jobs", "1"]

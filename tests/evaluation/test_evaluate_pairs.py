@@ -14,10 +14,10 @@ from sceneprint.cli import main
 from sceneprint.formats.export import write_ply
 from sceneprint.fusion import open3d
 from sceneprint.geometry.rigid import difference
-from sceneprint.lab.evaluation.pair_run import BINS, METHODS, points_of, register
-from sceneprint.lab.evaluation.protocol import every_frame
 from sceneprint.models import Model, save_model
 from sceneprint.types import Floats
+from sceneprint_lab.evaluation.pair_run import BINS, METHODS, points_of, register
+from sceneprint_lab.evaluation.protocol import every_frame
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.lab.evaluation.judgement import views_to_average
-from sceneprint.lab.evaluation.measures import (
+from sceneprint.types import DepthFrame, Floats, Intrinsics
+from sceneprint_lab.evaluation.judgement import views_to_average
+from sceneprint_lab.evaluation.measures import (
     PLACES,
     absent,
     accuracy,
@@ -27,14 +28,14 @@ from sceneprint.lab.evaluation.measures import (
     validation,
     voxels,
 )
-from sceneprint.lab.evaluation.protocol import (
+from sceneprint_lab.evaluation.protocol import (
     Error,
     JudgedAnswer,
     QueryOutcome,
     ValidatedPair,
     pose_error,
 )
-from sceneprint.lab.evaluation.report import (
+from sceneprint_lab.evaluation.report import (
     average,
     measured,
     per_query,
@@ -42,7 +43,6 @@ from sceneprint.lab.evaluation.report import (
     to_json,
     without_infinities,
 )
-from sceneprint.types import DepthFrame, Floats, Intrinsics
 
 MakePair = Callable[..., ValidatedPair]
 MakeOutcome = Callable[..., QueryOutcome]

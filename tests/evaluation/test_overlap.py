@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.lab.evaluation.protocol import (
+from sceneprint.types import DepthFrame, Floats, Intrinsics
+from sceneprint_lab.evaluation.protocol import (
     GRID,
     PAIR_TOLERANCE,
     RELATIVE_TOLERANCE,
@@ -14,7 +15,6 @@ from sceneprint.lab.evaluation.protocol import (
     overlaps,
     view_of,
 )
-from sceneprint.types import DepthFrame, Floats, Intrinsics
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
 
@@ -80,7 +80,7 @@ def plain_shares(a: DepthFrame, b: DepthFrame) -> tuple[float, float]:
 
 
 def test_against_the_plain_loop(room_frames: tuple[DepthFrame, ...]) -> None:
-    from sceneprint.lab.synth import synthesise_room
+    from sceneprint_lab.synth import synthesise_room
 
     frames = [*room_frames[:3], *synthesise_room(3, 0, 25, along_path=True, step=12).frames]
     views = [view_of(frame) for frame in frames]

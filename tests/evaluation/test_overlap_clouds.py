@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.lab.evaluation.protocol import POINTS, SAMPLES, overlap, view_of
 from sceneprint.types import Cloud, DepthFrame, Floats, Intrinsics
+from sceneprint_lab.evaluation.protocol import POINTS, SAMPLES, overlap, view_of
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
 

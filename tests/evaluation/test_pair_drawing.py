@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.lab.evaluation.pair_run import BINS, Drawing, Drawn, FrameOrigin, draw, inside
-from sceneprint.lab.evaluation.protocol import Overlaps
 from sceneprint.types import Floats
+from sceneprint_lab.evaluation.pair_run import BINS, Drawing, Drawn, FrameOrigin, draw, inside
+from sceneprint_lab.evaluation.protocol import Overlaps
 
 ALL = Drawing(pairs=1000, negatives=0, apart=1)
 NO_PLANES = np.zeros(100, bool)

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
-from sceneprint.lab.evaluation.pair_report import (
+from sceneprint.types import Floats
+from sceneprint_lab.evaluation.pair_report import (
     curves,
     evidence,
     pair_figures,
@@ -21,10 +22,9 @@ from sceneprint.lab.evaluation.pair_report import (
     second_pairs,
     support,
 )
-from sceneprint.lab.evaluation.pair_run import BINS, Drawn, Other, PairEvaluation, Tried
-from sceneprint.lab.evaluation.protocol import RIGHT, Error, SignedFrame, ValidatedPair
-from sceneprint.lab.evaluation.report import to_json
-from sceneprint.types import Floats
+from sceneprint_lab.evaluation.pair_run import BINS, Drawn, Other, PairEvaluation, Tried
+from sceneprint_lab.evaluation.protocol import RIGHT, Error, SignedFrame, ValidatedPair
+from sceneprint_lab.evaluation.report import to_json
 
 ACCEPTANCE = AcceptanceParameters()
 CM3, CM7, CM15, AWAY = Error(0.03, 0.0), Error(0.07, 0.0), Error(0.15, 0.0), Error(2.0, 1.0)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.lab.evaluation.run import OFF_PLANE, plane_share
 from sceneprint.types import Floats
+from sceneprint_lab.evaluation.run import OFF_PLANE, plane_share
 
 
 def sheet(n: int, seed: int, noise: float = 0.0) -> Floats:

@@ -9,7 +9,8 @@ import pytest
 
 from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
-from sceneprint.lab.evaluation.protocol import (
+from sceneprint.types import Intrinsics
+from sceneprint_lab.evaluation.protocol import (
     EvaluationProtocol,
     PathRanges,
     Range,
@@ -17,7 +18,6 @@ from sceneprint.lab.evaluation.protocol import (
     parse_part,
     parse_ranges,
 )
-from sceneprint.types import Intrinsics
 
 
 def scene(folder: Path, sequences: dict[int, int]) -> Path:

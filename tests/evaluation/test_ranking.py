@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.lab.evaluation import judgement
-from sceneprint.lab.evaluation.judgement import rank
+from sceneprint_lab.evaluation import judgement
+from sceneprint_lab.evaluation.judgement import rank
 
 
 def test_by_hand() -> None:

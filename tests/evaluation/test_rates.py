@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import beta, binom
 
-from sceneprint.lab.evaluation.measures import roc, upper_bound
+from sceneprint_lab.evaluation.measures import roc, upper_bound
 
 
 @pytest.mark.parametrize(("seen", "of"), [(0, 1), (0, 2000), (1, 10), (3, 40), (9, 10), (37, 700)])

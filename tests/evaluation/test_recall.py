@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sceneprint.lab.evaluation.measures import metres_apart, recall
-from sceneprint.lab.evaluation.protocol import SignedFrame, travelled
+from sceneprint_lab.evaluation.measures import metres_apart, recall
+from sceneprint_lab.evaluation.protocol import SignedFrame, travelled
 
 
 def member(name: str, x: float, y: float = 0.0, scene: str = "hall") -> SignedFrame:

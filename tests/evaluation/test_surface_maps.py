@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.views import view_parameters
-from sceneprint.lab.evaluation.surface_maps import join_frames, render_views
-from sceneprint.lab.synth import synthesise_room
-from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.models import read_model
 from sceneprint.types import Cloud, DepthFrame
+from sceneprint_lab.evaluation.surface_maps import join_frames, render_views
+from sceneprint_lab.synth import synthesise_room
+from sceneprint_lab.synth.dataset import room_and_rng
 
 UP = np.array([0.0, 0.0, 1.0])
 

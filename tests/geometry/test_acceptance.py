@@ -17,8 +17,8 @@ from sceneprint.geometry.validation.acceptance import (
     objection,
     sparse_evidence_suffices,
 )
-from sceneprint.lab.training import preset_parameters
 from sceneprint.types import Floats32, Geometry, Intrinsics, Patches, Surface
+from sceneprint_lab.training import preset_parameters
 
 NO_PATCHES = Patches(
     np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int32), np.zeros(0)

@@ -22,13 +22,13 @@ from sceneprint.geometry.validation.acceptance import (
     far_from,
     symmetries,
 )
-from sceneprint.lab.synth import KINECT, take
-from sceneprint.lab.synth.dataset import room_and_rng
-from sceneprint.lab.synth.trajectories import trajectory
 from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics, Patches, Surface
+from sceneprint_lab.synth import KINECT, take
+from sceneprint_lab.synth.dataset import room_and_rng
+from sceneprint_lab.synth.trajectories import trajectory
 
 P = AmbiguityParameters()
 

@@ -26,12 +26,12 @@ from sceneprint.geometry.registration.icp import (
 )
 from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.geometry.rigid import average_poses, inverse
-from sceneprint.lab.synth import KINECT, KINECT_V1, take, trajectory
-from sceneprint.lab.synth.dataset import own_sensor, room_and_rng
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats, Surface
+from sceneprint_lab.synth import KINECT, KINECT_V1, take, trajectory
+from sceneprint_lab.synth.dataset import own_sensor, room_and_rng
 
 #: Views of a room along a path, frames of the path from one to the next, and which are compared.
 VIEWS, STEP, APART = 8, 14, (1, 2, 3, 5)

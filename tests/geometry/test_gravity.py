@@ -31,13 +31,13 @@ from sceneprint.geometry.rigid import (
 )
 from sceneprint.geometry.validation.acceptance import AmbiguityParameters, best_alternative
 from sceneprint.geometry.validation.validation import validate, validate_without_up
-from sceneprint.lab.synth import KINECT, symmetric_box, take, trajectory
-from sceneprint.lab.synth.dataset import room_and_rng
-from sceneprint.lab.synth.mesh import box
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats, Geometry
+from sceneprint_lab.synth import KINECT, symmetric_box, take, trajectory
+from sceneprint_lab.synth.dataset import room_and_rng
+from sceneprint_lab.synth.mesh import box
 
 Z = np.array([0.0, 0.0, 1.0])  #: up in the world of synthetic rooms
 P = GravityParameters()

@@ -19,11 +19,11 @@ from sceneprint.geometry.registration.plan_search import (
 )
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import difference, distinct, inverse, moved
-from sceneprint.lab.synth import synthesise_survey
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import associate, geometry_of, validate
 from sceneprint.signing import see
 from sceneprint.types import Cloud, Floats, Sphere, Surface
+from sceneprint_lab.synth import synthesise_survey
 
 P = PlanParameters(cell=0.5, voxel=0.2, height_step=0.25, height_range=15.0)
 

@@ -13,11 +13,11 @@ from sceneprint.geometry.registration import icp as module
 from sceneprint.geometry.registration.icp import COARSE, FINE, RefinementParameters, refine
 from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.geometry.rigid import difference
-from sceneprint.lab.synth import KINECT, render, trajectory
-from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.models import Model
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats, Floats32, Surface
+from sceneprint_lab.synth import KINECT, render, trajectory
+from sceneprint_lab.synth.dataset import room_and_rng
 
 NEAR = replace(COARSE, stride=2)
 

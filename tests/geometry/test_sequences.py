@@ -19,12 +19,12 @@ from sceneprint.geometry.registration.sequence_alignment import (
 )
 from sceneprint.geometry.rigid import difference, inverse, moved
 from sceneprint.geometry.validation.validation import ValidationParameters, validate
-from sceneprint.lab.synth import KINECT, take, trajectory
-from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats, Patches
+from sceneprint_lab.synth import KINECT, take, trajectory
+from sceneprint_lab.synth.dataset import room_and_rng
 
 P = SequenceParameters()
 

@@ -17,8 +17,8 @@ from sceneprint.geometry.surface.upright import (
     estimate_up,
     pieces_of,
 )
-from sceneprint.lab.synth.dataset import room_and_rng, synthesise_survey
 from sceneprint.types import Floats, Floats32, Ints32
+from sceneprint_lab.synth.dataset import room_and_rng, synthesise_survey
 
 Z = np.array([0.0, 0.0, 1.0])
 #: Rotations that take z to each end of each axis.

@@ -27,14 +27,14 @@ from sceneprint.geometry.validation.validation import (
     refined_at,
     validate,
 )
-from sceneprint.lab.synth import KINECT, symmetric_box, take, trajectory
-from sceneprint.lab.synth.dataset import room_and_rng
-from sceneprint.lab.synth.mesh import Ceiling, box, join, shell, walls_of
-from sceneprint.lab.synth.rooms import Room
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats, Floats32, Geometry, Patches, Surface
+from sceneprint_lab.synth import KINECT, symmetric_box, take, trajectory
+from sceneprint_lab.synth.dataset import room_and_rng
+from sceneprint_lab.synth.mesh import Ceiling, box, join, shell, walls_of
+from sceneprint_lab.synth.rooms import Room
 
 #: Views of a room, each with its pose, two or three decimetres and some twenty degrees apart.
 Views = list[tuple[Floats, Geometry]]

@@ -27,15 +27,15 @@ from sceneprint.geometry.validation.acceptance import (
     objection,
 )
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters, validate
-from sceneprint.lab.synth import KINECT, take
-from sceneprint.lab.synth.dataset import room_and_rng
-from sceneprint.lab.synth.rooms import Room
-from sceneprint.lab.synth.trajectories import pose as looking
 from sceneprint.models import Model, read_model
 from sceneprint.models.model import scaled
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
 from sceneprint.types import Cloud, DepthFrame, Floats, Floats32, Geometry, Sphere
+from sceneprint_lab.synth import KINECT, take
+from sceneprint_lab.synth.dataset import room_and_rng
+from sceneprint_lab.synth.rooms import Room
+from sceneprint_lab.synth.trajectories import pose as looking
 
 Make = Callable[[Cloud | DepthFrame], Geometry]
 

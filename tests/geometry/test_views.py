@@ -16,9 +16,9 @@ from sceneprint.geometry.views.plan import level_axes
 from sceneprint.geometry.views.raster import draw_triangles, pinhole
 from sceneprint.geometry.views.render import cube_faces, rays_of
 from sceneprint.geometry.views.samples import blocks_of, on_surface, surfels, thinned
-from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.models import read_model
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, ReferenceSurface
+from sceneprint_lab.synth.dataset import room_and_rng
 
 CAMERA = Intrinsics(80, 60, 73.0, 73.0, 39.5, 29.5)
 ROOM = np.array([6.0, 5.0, 2.5])

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from sceneprint.cli import main
-from sceneprint.cli.demo import serving
 from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import decode_png, find_sequences
 from sceneprint.formats.recording import bag
 from sceneprint_client import Client
 from sceneprint_client.api import Frame
+from sceneprint_lab.cli.demo import serving
 
 Run = Callable[..., Any]
 FRAMES = 8

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.cli.demo import serving
 from sceneprint.formats.dataset import decode_png, find_sequences
 from sceneprint_client import Client
 from sceneprint_client.frame_files import meta_of
+from sceneprint_lab.cli.demo import serving
 
 PACKAGE = Path(__file__).resolve().parents[2] / "ros2" / "sceneprint_ros"
 #: Frames of the room, of which every second is in the map; and seconds from one to the next.

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.cli.demo import serving
 from sceneprint.formats.dataset import (
     Camera,
     FrameReference,
@@ -21,9 +20,10 @@ from sceneprint.formats.dataset import (
     write_intrinsics,
     write_pose,
 )
-from sceneprint.scenes.scene import Moment, SceneEntity
 from sceneprint.types import DepthFrame
 from sceneprint_client import Client, meta_of
+from sceneprint_lab.cli.demo import serving
+from sceneprint_viewers.scene import Moment, SceneEntity
 
 MAP, WALK = "rooms", 8
 #: What Rerun, which does not draw them, calls lines and labels.

@@ -9,9 +9,11 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import FrameReference
-from sceneprint.scenes.answer_scene import MANY, ONE, AnswerScene, short_name, space_name
-from sceneprint.scenes.map_scene import evenly_taken, listed_runs, map_runs
-from sceneprint.scenes.scene import (
+from sceneprint_client import Client, meta_of
+from sceneprint_client.api import Alternative, Answer
+from sceneprint_viewers.answer_scene import MANY, ONE, AnswerScene, short_name, space_name
+from sceneprint_viewers.map_scene import evenly_taken, listed_runs, map_runs
+from sceneprint_viewers.scene import (
     QUERY,
     STRONG,
     UNSURE,
@@ -21,8 +23,6 @@ from sceneprint.scenes.scene import (
     SceneStream,
     TextPage,
 )
-from sceneprint_client import Client, meta_of
-from sceneprint_client.api import Alternative, Answer
 
 from .conftest import MAP, ListWriter, moved
 

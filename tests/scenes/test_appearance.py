@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.scenes.scene import (
+from sceneprint_client.api.base import CameraIntrinsics
+from sceneprint_viewers.scene import (
     AXES_M,
     FRUSTUM_M,
     SMALL_M,
@@ -17,7 +18,6 @@ from sceneprint.scenes.scene import (
     small_outline,
     up_of_sensors,
 )
-from sceneprint_client.api.base import CameraIntrinsics
 
 #: 4 x 2 pixels, 90 degrees wide, its axis in the middle.
 CAMERA = CameraIntrinsics(width=4, height=2, fx=2, fy=2, cx=1.5, cy=0.5)

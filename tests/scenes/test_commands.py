@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.cli import main
-from sceneprint.cli.options import stamps_of
+from sceneprint.cli.scenes import stamps_of
 from sceneprint.formats.dataset import Camera, FrameReference
 from sceneprint.types import Intrinsics
 from sceneprint_client import Client
@@ -164,22 +162,6 @@ def test_joined_sessions_are_shown_in_one_space(
             np.testing.assert_allclose(f(points, axis=0), f(expected, axis=0), atol=1e-3)
     edges = drawn_at(rows, f"/{space}/edges").values()
     assert sum(len(one["lines"]) for one in edges) == told["result"]["edges"]
-
-
-@pytest.mark.parametrize("command", ["query", "localize", "frames", "associate"])
-def test_a_missing_extra_is_told_before_any_work(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    monkeypatch.setitem(sys.modules, "foxglove", None)
-    what = {"frames": (), "associate": ("--session", "a")}.get(command, ("nowhere.png",))
-    url = ("--url", "http://127.0.0.1:9")  # nobody there, and nobody asks
-    assert main([command, "map", *what, *url, "--mcap", str(tmp_path / "x")]) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.count("\n") == 1
-    assert "Run: pip install 'sceneprint[foxglove]'" in said.err
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_cannot_be_is_refused_first(

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.scenes.mcap_writer import mcap_file, upright
-from sceneprint.scenes.scene import (
+from sceneprint_client.poses import rotation_of
+from sceneprint_viewers.mcap_writer import mcap_file, upright
+from sceneprint_viewers.scene import (
     LineSet,
     Moment,
     Placement,
@@ -23,7 +24,6 @@ from sceneprint.scenes.scene import (
     TextPage,
     UpAxis,
 )
-from sceneprint_client.poses import rotation_of
 
 from .conftest import UPDATE, Logged, drawn_at, mcap_rows, moves_of
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.rigid import difference, inverse
-from sceneprint.lab.synth import SynthRoom
 from sceneprint.types import DepthFrame, Floats
+from sceneprint_lab.synth import SynthRoom
 from tests.service.conftest import Server, Shot, until
 
 pytestmark = pytest.mark.timeout(600)

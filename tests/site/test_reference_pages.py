@@ -12,7 +12,7 @@ import pytest
 
 import sceneprint_client
 from sceneprint import errors
-from sceneprint.cli import COMMANDS
+from sceneprint.cli import all_commands
 from sceneprint.settings import Settings
 from sceneprint_client import Client
 from service.problems import type_of as problem_type
@@ -143,7 +143,7 @@ def test_every_metric_is_listed_with_its_labels(pages: dict[str, GeneratedPage])
 
 def test_every_command_is_described_with_all_its_options(pages: dict[str, GeneratedPage]) -> None:
     found = sections(pages["reference/commands.md"].text)
-    assert list(found) == list(commands()) == list(COMMANDS)
+    assert list(found) == list(commands()) == list(all_commands())
     for name, command in commands().items():
         cells = [row[0] for row in rows(found[name])]
         for option in command._actions:

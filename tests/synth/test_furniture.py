@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from sceneprint.lab.synth import furniture
-from sceneprint.lab.synth.furniture import Shelf, curtain, radiator, scatter
-from sceneprint.lab.synth.mesh import SyntheticMesh, area, face_normals, volume
+from sceneprint_lab.synth import furniture
+from sceneprint_lab.synth.furniture import Shelf, curtain, radiator, scatter
+from sceneprint_lab.synth.mesh import SyntheticMesh, area, face_normals, volume
 
 PIECES = [
     furniture.table, furniture.round_table, furniture.desk, furniture.chair,

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.lab.evaluation.protocol import overlaps, view_of
-from sceneprint.lab.synth import KINECT, Room, render, synthesise_lookalike
-from sceneprint.lab.synth.lookalikes import (
+from sceneprint.types import Floats, Intrinsics
+from sceneprint_lab.evaluation.protocol import overlaps, view_of
+from sceneprint_lab.synth import KINECT, Room, render, synthesise_lookalike
+from sceneprint_lab.synth.lookalikes import (
     APART,
     ELSEWHERE,
     KINDS,
@@ -26,9 +27,8 @@ from sceneprint.lab.synth.lookalikes import (
     equal_bays,
     equal_offices,
 )
-from sceneprint.lab.synth.mesh import rotation_z
-from sceneprint.lab.synth.trajectories import orbit, scattered_poses
-from sceneprint.types import Floats, Intrinsics
+from sceneprint_lab.synth.mesh import rotation_z
+from sceneprint_lab.synth.trajectories import orbit, scattered_poses
 
 SEED = 5
 #: a Kinect's field of view in few samples

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from sceneprint.cli.offline import LOOKALIKES
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.lab.synth import synthesise_lookalike_survey
-from sceneprint.lab.synth.large_scenes import symmetric_hall
-from sceneprint.lab.synth.lookalike_surveys import (
+from sceneprint.types import Floats
+from sceneprint_lab.cli.synth import LOOKALIKES
+from sceneprint_lab.synth import synthesise_lookalike_survey
+from sceneprint_lab.synth.large_scenes import symmetric_hall
+from sceneprint_lab.synth.lookalike_surveys import (
     MAP_SCANS,
     SURVEYED_KINDS,
     Stop,
@@ -25,10 +26,9 @@ from sceneprint.lab.synth.lookalike_surveys import (
     row_of,
     told_apart,
 )
-from sceneprint.lab.synth.lookalikes import KINDS, Likeness
-from sceneprint.lab.synth.sensors import Rosette, Spinning, scan
-from sceneprint.lab.synth.trajectories import scanner_pose, scattered
-from sceneprint.types import Floats
+from sceneprint_lab.synth.lookalikes import KINDS, Likeness
+from sceneprint_lab.synth.sensors import Rosette, Spinning, scan
+from sceneprint_lab.synth.trajectories import scanner_pose, scattered
 
 SEED = 5
 #: copies that do not differ at all

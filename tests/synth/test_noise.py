@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.lab.synth import KINECT, KINECT_V1, kinect_noise
+from sceneprint_lab.synth import KINECT, KINECT_V1, kinect_noise
 
 SHAPE = (480, 640)
 FACING = np.ones(SHAPE, np.float32)

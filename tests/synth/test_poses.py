@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from sceneprint.lab.synth import make_room, scattered_poses, trajectory
-from sceneprint.lab.synth.mesh import Ceiling, SyntheticMesh, box
-from sceneprint.lab.synth.rooms import Room, inside
-from sceneprint.lab.synth.trajectories import CLEARANCE, HEIGHTS, clear, pose
 from sceneprint.types import Floats
+from sceneprint_lab.synth import make_room, scattered_poses, trajectory
+from sceneprint_lab.synth.mesh import Ceiling, SyntheticMesh, box
+from sceneprint_lab.synth.rooms import Room, inside
+from sceneprint_lab.synth.trajectories import CLEARANCE, HEIGHTS, clear, pose
 
 SEEDS = (0, 1, 2)
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import MissingDependency
-from sceneprint.lab.synth import Caster, cast_depth, corridor, make_room, render, symmetric_box
-from sceneprint.lab.synth.mesh import SyntheticMesh, ellipsoid, face_normals, mesh_of
-from sceneprint.lab.synth.sensors import cast_faces, pixel_rays
-from sceneprint.lab.synth.trajectories import pose
 from sceneprint.types import Floats, Intrinsics
+from sceneprint_lab.synth import Caster, cast_depth, corridor, make_room, render, symmetric_box
+from sceneprint_lab.synth.mesh import SyntheticMesh, ellipsoid, face_normals, mesh_of
+from sceneprint_lab.synth.sensors import cast_faces, pixel_rays
+from sceneprint_lab.synth.trajectories import pose
 
 SMALL = Intrinsics(24, 18, 20.0, 21.0, 11.3, 8.9)
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from sceneprint.lab.synth import corridor, make_room, symmetric_box
-from sceneprint.lab.synth.mesh import (
+from sceneprint_lab.synth import corridor, make_room, symmetric_box
+from sceneprint_lab.synth.mesh import (
     Ceiling,
     Opening,
     Wall,
@@ -14,7 +14,7 @@ from sceneprint.lab.synth.mesh import (
     volume,
     walls_of,
 )
-from sceneprint.lab.synth.rooms import CELL, Floor, PiecePose, inside
+from sceneprint_lab.synth.rooms import CELL, Floor, PiecePose, inside
 
 L_PLAN = np.array([(0, 0), (4, 0), (4, 2), (2, 2), (2, 3), (0, 3)], float)
 

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from sceneprint.lab.synth.mesh import (
+from sceneprint_lab.synth.mesh import (
     SyntheticMesh,
     area,
     blob,

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.lab.synth.mesh import SyntheticMesh, box
-from sceneprint.lab.synth.sensors import Caster, Spinning, scan
 from sceneprint.types import Floats, Floats32
+from sceneprint_lab.synth.mesh import SyntheticMesh, box
+from sceneprint_lab.synth.sensors import Caster, Spinning, scan
 
 HALF = np.array([6.0, 4.0, 2.0])  #: of the box scanned from within, metres
 SENSOR = Spinning(

@@ -5,9 +5,9 @@ import hashlib
 import numpy as np
 import pytest
 
-from sceneprint.lab.synth.dataset import Survey, premises_and_rng, synthesise_survey
-from sceneprint.lab.synth.sensors import Spinning
-from sceneprint.lab.synth.trajectories import STEP
+from sceneprint_lab.synth.dataset import Survey, premises_and_rng, synthesise_survey
+from sceneprint_lab.synth.sensors import Spinning
+from sceneprint_lab.synth.trajectories import STEP
 
 #: few points, so that a scan takes a millisecond
 SMALL = Spinning(rings=8, azimuth_step=0.03)

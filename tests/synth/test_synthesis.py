@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.lab.synth import KINECT, SynthRoom, render, synthesise_room
-from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.types import Intrinsics
+from sceneprint_lab.synth import KINECT, SynthRoom, render, synthesise_room
+from sceneprint_lab.synth.dataset import room_and_rng
 
 SMALL = Intrinsics(160, 120, 146.25, 146.25, 80.0, 60.0)
 

@@ -6,7 +6,7 @@
 One of the candidates is right, or none. The logarithm of the odds of each, against none, is what a
 pose with the best evidence has, less one penalty for each kind of evidence. A penalty is a
 piecewise linear function of its evidence that never rises with better evidence, so more support
-never lowers a confidence, and a better rival never raises one. `sceneprint.lab.confidence` learns
+never lowers a confidence, and a better rival never raises one. `sceneprint_lab.confidence` learns
 the penalties on synthetic places; docs/trust.md shows how well the confidences are calibrated on
 recordings.
 """

@@ -16,8 +16,8 @@ from PIL import Image
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
-from sceneprint.cli.demo import serving
 from sceneprint_client import Client
+from sceneprint_lab.cli.demo import serving
 
 
 @pytest.fixture

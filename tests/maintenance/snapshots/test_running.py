@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
 from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 from sceneprint_client import Client
+from sceneprint_lab.cli.demo import serving
 
 
 @dataclass(eq=False)

@@ -1,0 +1,492 @@
+"""`sceneprint demo`: the main job, start to end, through a service of its own."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from selectors import EVENT_READ, DefaultSelector
+from tempfile import TemporaryDirectory
+from typing import IO, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from sceneprint.atomic_files import write_whole
+from sceneprint.cli import positive
+from sceneprint.cli.options import ended_by_signals
+from sceneprint.engine.search.verification import CANDIDATES
+from sceneprint.errors import DatasetError, FrameConflict, FrameError, ServiceError, Unreachable
+from sceneprint.formats.dataset import (
+    Camera,
+    FrameReference,
+    find_sequences,
+    write_depth_png,
+    write_intrinsics,
+    write_pose,
+)
+from sceneprint.models import PRESETS, read_model
+from sceneprint.pictures import overlay_picture
+from sceneprint.settings import Settings
+from sceneprint.signing import see
+from sceneprint_client import Client, meta_of
+from sceneprint_client.api import Added, Answer, JobState
+from sceneprint_lab.evaluation.report import FramePlace, answer_rows, judge_answers
+
+# The demo's building: rooms walked through once, some frames for the map and some to look up.
+
+SEED = 11
+#: Frames of a walk, 3 to 8 cm apart. Of every ten, those of the map and those that are looked up,
+#: which are 10 to 30 cm away from any of the map.
+WALK, TEN, MAP, QUERIES = 100, 10, (0, 2, 4), (7,)
+DEPTH_SCALE = 1000.0
+
+
+def write_building(folder: Path, rooms: int) -> Generator[None]:
+    """Write rooms in 7-Scenes layout with split files, and yield after each.
+
+    Parameters
+    ----------
+    folder : new
+    rooms : how many
+    """
+    write = partial(_write_room, folder)
+    jobs = min(os.cpu_count() or 1, rooms)
+    if jobs == 1:  # a process of its own would import all anew
+        yield from map(write, range(rooms))
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(write, range(rooms))
+
+
+def _write_room(folder: Path, number: int) -> None:
+    from sceneprint_lab.synth import KINECT, take, trajectory
+    from sceneprint_lab.synth.dataset import room_and_rng
+
+    room, rng = room_and_rng(SEED, number)
+    scene = folder / f"room-{number}"
+    for name in ("seq-01", "seq-02"):
+        (scene / name).mkdir(parents=True)
+    write_intrinsics(scene, Camera(KINECT, DEPTH_SCALE, along_ray=False))
+    (scene / "TrainSplit.txt").write_text("sequence1\n")
+    (scene / "TestSplit.txt").write_text("sequence2\n")
+    for i, pose in enumerate(trajectory(room, WALK, rng)):
+        if i % TEN in MAP + QUERIES:
+            run = scene / ("seq-01" if i % TEN in MAP else "seq-02")
+            depth = take(room, pose, KINECT, rng)
+            write_depth_png(run / f"frame-{i:06d}.depth.png", depth, DEPTH_SCALE)
+            write_pose(run / f"frame-{i:06d}.pose.txt", pose)
+
+
+# Which frames of a data set the demo keeps as its map, and which it looks up.
+#
+# path  --choose_frames-->  Choice
+
+#: Without split files: shares of each sequence that are the map, and that separate it.
+DATABASE_SHARE, GAP_SHARE = 0.60, 0.05
+#: Most frames of either, evenly spread, so that the demo takes minutes.
+MOST_DATABASE, MOST_QUERIES = 300, 180
+
+
+@dataclass(frozen=True, eq=False)
+class DemoFrame:
+    """A frame that takes part, the frame its pose leads to, and the run it is of."""
+
+    parent: str
+    session: str
+    reference: FrameReference
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The frames of the demo."""
+
+    database: list[DemoFrame]
+    queries: list[DemoFrame]
+
+
+def choose_frames(path: Path) -> Choice:
+    """Database and queries, by split files where the scene has them.
+
+    Parameters
+    ----------
+    path : of one or several sequences
+
+    Raises
+    ------
+    DatasetError : no sequence there, or too few frames for both.
+    """
+    database: list[DemoFrame] = []
+    queries: list[DemoFrame] = []
+    found = find_sequences(path)
+    split = any(sequence.split for sequence in found)
+    for sequence in found:
+        frames = [
+            DemoFrame(sequence.parent_frame, sequence.name, reference)
+            for reference in sequence.frames
+        ]
+        if split:
+            database += frames if sequence.split == "train" else []
+            queries += frames if sequence.split == "test" else []
+        else:
+            n = len(frames)
+            database += frames[: round(DATABASE_SHARE * n)]
+            queries += frames[round((DATABASE_SHARE + GAP_SHARE) * n) :]
+    if not database or not queries:
+        raise DatasetError(
+            f"{path}: has {len(database)} frames for the map and {len(queries)} to query, and "
+            "the demo needs both. Use a longer sequence."
+        )
+    return Choice(_thinned(database, MOST_DATABASE), _thinned(queries, MOST_QUERIES))
+
+
+def _thinned(frames: Sequence[DemoFrame], most: int) -> list[DemoFrame]:
+    return list(frames[:: max(-(-len(frames) // most), 1)])
+
+
+def add_demo(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "demo",
+        help="run a service, upload a map, query it over HTTP and print the accuracy",
+        description="Start a service with an empty folder, upload the frames of a small "
+        "synthetic building (or of --dataset) to a map, query it with other frames, print the "
+        "rows of the paper with true pose errors, and draw a match. The service and its data are "
+        "removed at the end.",
+    )
+    command.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR")
+    command.add_argument(
+        "--dataset",
+        type=Path,
+        metavar="PATH",
+        help="your own frames, in any layout that `sign` reads",
+    )
+    command.add_argument(
+        "--model", choices=PRESETS, default=PRESETS[0], help=f"default: {PRESETS[0]}"
+    )
+    command.add_argument(
+        "--workers",
+        type=positive,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="number of worker processes",
+    )
+    command.add_argument("--rooms", type=positive, default=3, help=argparse.SUPPRESS)
+    command.set_defaults(run=run_demo)
+
+
+def run_demo(options: argparse.Namespace) -> int:
+    """Show the whole way of a frame, over HTTP."""
+    from sceneprint.cli.options import prepare_presets
+    from sceneprint_client import Client
+
+    options.out.mkdir(parents=True, exist_ok=True)
+    begun = time.perf_counter()
+    with ended_by_signals(), TemporaryDirectory(prefix="sceneprint-demo-") as temporary:
+        folder = Path(temporary)
+        choice = choose_frames(options.dataset or _building(folder / "building", options.rooms))
+        prepare_presets(Settings())
+        (folder / "data").mkdir()
+        with serving(folder / "data", options.workers) as url, Client(url) as client:
+            print(f"service: {url}, empty data folder, {options.workers} worker processes")
+            known = fill(client, options.model, choice)
+            asked = run_queries(client, choice)
+        report(known, asked)
+        draw(known, asked, options.model, options.out)
+    print(f"whole demo: {time.perf_counter() - begun:.1f} s")
+    print(
+        "next: `sceneprint serve`; then, in another terminal, `sceneprint upload MAP PATH` and "
+        "`sceneprint query MAP PATH` with your own frames; the dashboard is at "
+        "http://127.0.0.1:8008/dashboard"
+    )
+    return 0
+
+
+def _building(folder: Path, rooms: int) -> Path:
+
+    start = time.perf_counter()
+    # closed before the folder is removed, however this ends: its processes write there
+    with closing(write_building(folder, rooms)) as made:
+        for _ in tqdm(made, total=rooms, desc="synthetic building", unit="room", disable=None):
+            pass
+    print(f"synthetic building: {rooms} rooms in {time.perf_counter() - start:.1f} s")
+    return folder
+
+
+# The demo's map, filled and asked over HTTP.
+
+DEMO_MAP = "demo"
+#: Uploads in flight.
+PARALLEL = 4
+#: What is wrong with one frame, and says nothing of the next.
+_OF_FRAME = (FrameError, FrameConflict)
+
+
+@dataclass(frozen=True, eq=False)
+class DemoQuery:
+    """A query and its answers: of VR and of VDR, and what the latter took, seconds."""
+
+    chosen: DemoFrame
+    ranked: Answer
+    diverse: Answer
+    seconds: float
+
+
+def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
+    """Upload the database and wait until it is signed.
+
+    Returns
+    -------
+    known : the frames that are indexed, by their ids
+
+    Raises
+    ------
+    DatasetError : none could be.
+    ServiceError : some were not signed in time.
+    """
+    client.create_map(DEMO_MAP, model=model)
+    known: dict[str, DemoFrame] = {}
+    jobs = []
+    start = time.perf_counter()
+    pool = ThreadPoolExecutor(PARALLEL)
+    try:
+        uploads = [(one, pool.submit(_upload, client, one)) for one in choice.database]
+        for one, upload in tqdm(uploads, desc="upload", unit="frame", disable=None):
+            try:
+                added = upload.result()
+            except _OF_FRAME as error:
+                tqdm.write(f"skipped: {one.reference.name}: {error}")
+                continue
+            known[added.frame_id] = one
+            jobs.append(added.job_id)
+    finally:  # where something ends it, what is not in flight is not begun
+        pool.shutdown(cancel_futures=True)
+    with tqdm(total=len(jobs), desc="sign", unit="frame", disable=None) as bar:
+
+        def progress(over: int, _total: int) -> None:
+            bar.update(over - bar.n)
+
+        done = client.wait(jobs, progress=progress)
+    late = sum(not job.state.over for job in done)
+    if late:  # they would be found later, and be of no frame that is known
+        raise ServiceError(
+            f"{late} of {len(done)} map frames were not signed in time. Run the demo with more "
+            "--workers or a shorter --dataset."
+        )
+    for job in done:
+        if job.state != JobState.SUCCEEDED and job.frame_id in known:
+            print(f"skipped: {known.pop(job.frame_id).reference.name}: {job.error}")
+    if not known:
+        raise DatasetError("No map frame could be signed. The lines above give the reasons.")
+    seconds = time.perf_counter() - start
+    print(
+        f"map: {len(known)} of {len(choice.database)} frames uploaded, signed and indexed in "
+        f"{seconds:.1f} s, {len(known) / seconds:.1f} a second"
+    )
+    return known
+
+
+def run_queries(client: Client, choice: Choice) -> list[DemoQuery]:
+    """Look every query up, without and with diversification."""
+    asked, begun = [], time.perf_counter()
+    for one in tqdm(choice.queries, desc="query", unit="frame", disable=None):
+        meta = meta_of(one.reference, with_pose=False)  # a lost robot knows none
+        path = one.reference.path
+        try:
+            # all that are validated, as `sceneprint evaluate` does
+            ranked = client.query(
+                DEMO_MAP, path, meta, k=CANDIDATES, stages=("retrieve", "validate")
+            )
+            start = time.perf_counter()
+            diverse = client.query(DEMO_MAP, path, meta, k=CANDIDATES)
+        except FrameError as error:
+            tqdm.write(f"skipped: {one.reference.name}: {error}")
+            continue
+        asked.append(DemoQuery(one, ranked, diverse, time.perf_counter() - start))
+    print(f"asked: {2 * len(asked)} queries over HTTP in {time.perf_counter() - begun:.1f} s")
+    return asked
+
+
+def _upload(client: Client, one: DemoFrame) -> Added:
+    meta = meta_of(one.reference, session=one.session, parent_frame=one.parent)
+    return client.upload(DEMO_MAP, one.reference.path, meta)
+
+
+# What the demo found: the paper's rows with true pose errors, and a picture.
+
+_NAMES = {
+    "R": "R    nearest frame",
+    "VR": "VR   validated of R",
+    "DR": "DR   diverse frames",
+    "VDR": "VDR  validated of DR",
+    "pose_average": "pose of the answer",
+}
+
+
+def report(known: Mapping[str, DemoFrame], asked: Sequence[DemoQuery]) -> None:
+    """Print the table, where true poses are known, and what a query took."""
+    counts = Counter(one.diverse.status for one in asked)
+    states = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
+    print(f"queries: {len(asked)}: {states or 'none could be sent'}")
+    truths = [(one, place_of(one.chosen)) for one in asked]
+    places = {key: place_of(one) for key, one in known.items()}
+    posed = {key: place for key, place in places.items() if place is not None}
+    if len(posed) == len(places) and asked and all(truth for _, truth in truths):
+        rows = answer_rows(
+            [judge_answers(t, one.ranked, one.diverse, posed) for one, t in truths if t is not None]
+        )
+        print(*table(rows), sep="\n")
+    else:
+        print("no table: it needs the true pose of every frame")
+    if asked:
+        stages = asked[0].diverse.milliseconds
+        medians = [
+            f"{stage} {statistics.median(one.diverse.milliseconds[stage] for one in asked):.0f}"
+            for stage in stages
+            if stage != "total"
+        ]
+        whole = 1e3 * statistics.median(one.seconds for one in asked)
+        print(f"a query over HTTP: {whole:.0f} ms (median; {', '.join(medians)})")
+
+
+def table(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The rows as lines to read; figures as `answer_rows` gives them."""
+    lines = [
+        f"{'first answer within':26}{'5cm/5deg':>10}{'10cm/10deg':>12}{'median cm':>11}{'deg':>7}"
+        f"{'first five: m from the query':>32}"
+    ]
+    for row, name in _NAMES.items():
+        figures = rows[row]
+        metres, degrees = figures["median_translation_m"], figures["median_rotation_deg"]
+        line = f"{name:26}{_share(figures['within_5cm_5deg']):>10}"
+        line += f"{_share(figures['within_10cm_10deg']):>12}"
+        line += f"{'-' if metres is None else f'{100 * metres:.1f}':>11}"
+        line += f"{'-' if degrees is None else f'{degrees:.2f}':>7}"
+        if figures["spread_mean_m"] is not None:
+            spread = f"{figures['spread_mean_m']:.2f} +- {figures['spread_std_m']:.2f}"
+            line += f"{spread:>32}"
+        lines.append(line)
+    return lines
+
+
+def draw(
+    known: Mapping[str, DemoFrame], asked: Sequence[DemoQuery], preset: str, out: Path
+) -> None:
+    """Draw the accepted match that turns the query most, as there alignment shows best."""
+    found = [
+        (one, match, np.array(match.transform.matrix))
+        for one in asked
+        for match in one.diverse.matches[:1]
+        if match.validation.status == "accepted" and match.transform is not None
+    ]
+    if not found:
+        print("no picture: no match was accepted")
+        return
+    one, match, transform = min(found, key=lambda each: each[2][:3, :3].trace())
+    parameters = read_model(preset).parameters
+    query, database = one.chosen.reference, known[match.frame_id].reference
+    title = f"{query.name} in {database.name}: {match.validation.overlap:.0%} of the surfaces agree"
+    picture = overlay_picture(
+        see(query.read(), parameters), see(database.read(), parameters), transform,
+        title.encode("ascii", "replace").decode(),
+    )  # fmt: skip
+    write_whole(out / "overlay.png", picture)
+    print(f"picture: {out / 'overlay.png'}")
+
+
+def place_of(one: DemoFrame) -> FramePlace | None:
+    """Where a frame was taken, where that is known."""
+    pose = one.reference.pose
+    return None if pose is None else FramePlace(one.parent, pose)
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+# A service of one's own for as long as it is needed, in processes of its own.
+
+#: Seconds that the service may take to start, on a machine that compiles first, and to stop.
+START_S, STOP_S = 120.0, 30.0
+_READY = "sceneprint: serving "
+
+
+@contextmanager
+def serving(data: Path, workers: int) -> Iterator[str]:
+    """Run `sceneprint serve` on a free loopback port; it is gone when this ends.
+
+    Parameters
+    ----------
+    data : folder for database and blobs; its log goes there too
+    workers : processes that sign
+
+    Yields
+    ------
+    url : of the service, which answers
+
+    Raises
+    ------
+    Unreachable : it did not start; says what it said.
+    """
+    log = data / "service.log"
+    arguments = ["--port", "0", "--data", str(data), "--workers", str(workers)]
+    with log.open("wb") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "sceneprint", "serve", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            bufsize=0,
+        )
+    try:
+        line = "" if process.stdout is None else _first_line(process.stdout)
+        if not line.startswith(_READY):
+            last = log.read_text(errors="replace").strip().splitlines()[-1:]
+            raise Unreachable(
+                f"The service did not start: {' '.join(last) or 'it printed nothing'}. Run "
+                "`sceneprint doctor` to see what is missing."
+            )
+        yield line.removeprefix(_READY).strip()
+    finally:
+        process.terminate()
+        try:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(STOP_S)
+        finally:  # also where Ctrl-C ends the wait
+            process.kill()
+            process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+
+
+def _first_line(pipe: IO[bytes]) -> str:
+    """The first line; what there is of it where the other end is closed.
+
+    Raises
+    ------
+    Unreachable : none came in time.
+    """
+    got, until = b"", time.monotonic() + START_S
+    with DefaultSelector() as selector:
+        selector.register(pipe, EVENT_READ)
+        while b"\n" not in got:
+            if not selector.select(max(until - time.monotonic(), 0.0)):
+                raise Unreachable(
+                    f"The service did not start within {START_S:g} s. "
+                    "Run `sceneprint doctor` to see what is missing, or try again."
+                )
+            more = os.read(pipe.fileno(), 4096)  # what is there: never waits for a whole line
+            if not more:
+                break
+            got += more
+    return got.partition(b"\n")[0].decode(errors="replace")

@@ -1,0 +1,519 @@
+"""`sceneprint evaluate`: how well frames are found again, by their true poses."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from tqdm import tqdm
+
+from sceneprint.atomic_files import check_writable, write_whole
+from sceneprint.cli import number_within, positive, positive_number, whole_number
+from sceneprint.cli.bag import add_recording_options, sequences_at
+from sceneprint.cli.options import add_model_options, open_for
+from sceneprint.errors import DatasetError
+from sceneprint.settings import Settings
+from sceneprint_client.sidecars import Camera
+
+if TYPE_CHECKING:
+    from sceneprint.models import Model
+    from sceneprint_lab.evaluation.protocol import EvaluationProtocol
+
+T = TypeVar("T")
+
+_EXAMPLES = """\
+frames are counted from 0 over all sequences of a PATH, in order; STOP is not included:
+  sceneprint evaluate redkitchen --db 0:600:2 --queries 650:1000:2
+each PATH may have its own ranges, joined by +; all PATHs form one database:
+  sceneprint evaluate redkitchen@db=0:600:2,queries=650:1000:2 \\
+      fr1_rpy@db=0:217,queries=235: studyroom2@db=0:25+50:75,queries=30:50
+without ranges, TrainSplit.txt and TestSplit.txt of each scene define the split: one row for
+each scene, and with several also Average and Combine (all scenes in one database):
+  sceneprint evaluate 7scenes --db-step 10 --query-step 10
+the benchmark of the paper, on the official download with its archives unpacked:
+  sceneprint evaluate --7scenes 7scenes --db-step 5 --query-step 10
+a scanner that returns to a place after more than 30 m of travel:
+  sceneprint evaluate hall --model lidar --gap-m 30 --within 5 --baselines
+"""
+
+
+def add_evaluate(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "evaluate",
+        help="measure retrieval, validation and pose accuracy on frames with known poses",
+        description="Query a database of frames with each query frame, and compare the answers "
+        "with the true\nposes: the rows R, VR, DR, VDR of the paper, and the averaged pose.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command.add_argument(
+        "paths", nargs="*", metavar="PATH", help="PATH or PATH@db=RANGES,queries=RANGES"
+    )
+    command.add_argument(
+        "--7scenes",
+        type=Path,
+        dest="seven_scenes",
+        metavar="DIR",
+        help="evaluate the scenes of 7-Scenes in this folder by their official splits, and print "
+        "the paper's table beside its figures; without intrinsics.json the Kinect's camera is "
+        "taken (585 pixels, centre 320, 240)",
+    )
+    add_model_options(command)
+    _add_frames(command)
+    _add_method(command)
+    add_recording_options(command)
+    command.add_argument("--json", type=Path, metavar="FILE", help="write all figures as JSON")
+    command.set_defaults(run=run_evaluate)
+
+
+def _add_frames(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--db", metavar="RANGES", help="database frames, such as 0:600 or 0:600:2")
+    command.add_argument("--queries", metavar="RANGES", help="query frames, such as 650:1000")
+    for option, what in (("--db-step", "database"), ("--query-step", "query")):
+        command.add_argument(
+            option,
+            type=positive,
+            default=1,
+            metavar="N",
+            help=f"use every N-th {what} frame where a range has no step (default: 1)",
+        )
+    command.add_argument(
+        "--max-overlap",
+        type=_share,
+        metavar="X",
+        help="hide from a query the frames that overlap it by more than this, 0 to 1",
+    )
+    command.add_argument(
+        "--distractors",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="PATH",
+        help="use all frames of these in the database",
+    )
+    command.add_argument(
+        "--gap-m",
+        type=positive_number,
+        metavar="METRES",
+        help="use each frame as query and as database frame (--db and --queries may overlap, "
+        "and default to all frames); a query finds only frames taken more than this distance of "
+        "travel before it",
+    )
+    command.add_argument(
+        "--within",
+        type=positive_number,
+        metavar="METRES",
+        help="recall: count a frame as the query's place if its pose is this near (default: if "
+        "the two overlap by half)",
+    )
+    command.add_argument(
+        "--absent",
+        action="store_true",
+        help="let a query find only frames of other scenes, so that every accepted match is wrong",
+    )
+
+
+def _add_method(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--signature",
+        choices=("stored", "psi"),
+        default="stored",
+        help="rank by the signature that a service stores, or by psi as in the paper, from the "
+        "given model or else the preset paper (default: stored)",
+    )
+    command.add_argument(
+        "--metric", choices=("l1", "l2"), help="default: l2; for psi l1, as in the paper"
+    )
+    command.add_argument(
+        "--levels", type=positive, metavar="H", help="levels of psi to use (default: all)"
+    )
+    _add_judging(command)
+    command.add_argument(
+        "--baselines",
+        nargs="*",
+        metavar="NAME",
+        help="also rank by these baselines: thumbnail_l1, thumbnail_zncc, fpfh_vlad, rings "
+        "(give it after the PATHs; without names: all, with a notice for those that do not "
+        "support the frames)",
+    )
+    command.add_argument(
+        "--candidates",
+        type=positive,
+        default=10,
+        metavar="N",
+        help="size of C, and number of frames of R to validate (default: 10)",
+    )
+    command.add_argument("--seed", type=whole_number, default=0, metavar="S", help="default: 0")
+    command.add_argument(
+        "--jobs",
+        type=positive,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="number of processes; results do not depend on it",
+    )
+
+
+def _add_judging(command: argparse.ArgumentParser) -> None:
+    """Add `--mode` and `--matching`."""
+    command.add_argument(
+        "--mode",
+        choices=("full", "paper"),
+        default="full",
+        help="accept on all evidence, or on the residual alone as in the paper (default: full)",
+    )
+    command.add_argument(
+        "--matching",
+        choices=("histograms", "sequence"),
+        default="histograms",
+        help="find correspondences by histograms, or by aligned sequences of neighbours as in "
+        "the paper, which is slower (default: histograms)",
+    )
+
+
+def _share(text: str) -> float:
+    """A number above 0, up to 1."""
+    return number_within(text, lambda number: 0 < number <= 1, "a share above 0, up to 1")
+
+
+def run_evaluate(options: argparse.Namespace) -> int:
+    """Evaluate, print, and write what was asked for."""
+    from sceneprint_lab.evaluation.protocol import FrameStore
+    from sceneprint_lab.evaluation.report import figures, seven_scenes_table, table, to_json
+    from sceneprint_lab.evaluation.run import EvaluationSettings, evaluate
+
+    protocol = _protocol(options)
+    baselines = _baselines(options.baselines)
+    own = Settings()
+    signer = open_for(options, own, psi=options.signature == "psi")
+    if options.levels is not None and signer.model.whitening is not None:
+        raise DatasetError(
+            f"--levels {options.levels}: the signatures of model {signer.model.label} cannot be "
+            "split by level. Add --signature psi, or leave --levels out."
+        )
+    if (options.levels or 1) > (most := len(signer.model.levels)):
+        raise DatasetError(
+            f"--levels {options.levels}: model {signer.model.label} has {most} levels. "
+            f"Choose from 1 to {most}."
+        )
+    _make_room(options.json)
+    settings = EvaluationSettings(
+        metric=options.metric,
+        levels=options.levels,
+        mode=options.mode,
+        matching=options.matching,
+        candidates=options.candidates,
+        max_overlap=options.max_overlap,
+        absent=options.absent,
+        gap_m=options.gap_m,
+        within_m=options.within,
+        baselines=baselines,
+        seed=options.seed,
+        jobs=options.jobs,
+        cache_dir=own.cache_dir,
+    )
+    with TemporaryDirectory(prefix="sceneprint-") as folder:
+        store = FrameStore(Path(folder))
+        evaluation = evaluate(protocol, signer, store, settings, _watch)
+        database = evaluation.prepared.database
+        found = figures(
+            evaluation,
+            lambda match: store.frame(database[match]),
+            _settings_of(options, signer.model),
+        )
+        if options.json is not None:
+            write_whole(options.json, to_json(found))
+        print(f"model {signer.model.label}: {_counts(found)}")
+        print("\n".join(table(found)))
+        if options.seven_scenes is not None:
+            print("\n".join(["", *seven_scenes_table(found, evaluation.outcomes[0].scene)]))
+    return 0
+
+
+def _make_room(file: Path | None) -> None:
+    """Make the folder of a file that is to be written, if any, and check that it can be.
+
+    A file that cannot be written must not cost the work of an hour.
+    """
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(file)
+
+
+def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
+    from sceneprint_lab.evaluation.protocol import PathRanges, choose, parse_part, parse_ranges
+
+    if options.seven_scenes is not None:
+        from sceneprint_lab.synth import KINECT  # the camera of 7-Scenes, by its page
+
+        return choose(
+            [PathRanges(scene) for scene in _seven_scenes(options)],
+            database_step=options.db_step,
+            query_step=options.query_step,
+            find=partial(sequences_at, options=options, camera=Camera(KINECT)),
+        )
+    if not options.paths:
+        raise DatasetError("There is nothing to evaluate. Name a PATH, or --7scenes DIR.")
+    parts = [parse_part(text) for text in options.paths]
+    both = options.db is not None, options.queries is not None
+    ranged = [part for part in parts if part.database is None and part.queries is None]
+    elsewhere = options.distractors or any(part.database for part in parts)
+    if any(both) and not all(both) and not (both[1] and elsewhere):
+        given, missing = ("--db", "--queries") if both[0] else ("--queries", "--db")
+        raise DatasetError(f"{given} needs {missing}. Give both or neither.")
+    if any(both) and not ranged:
+        raise DatasetError(
+            "--db and --queries apply only to a PATH without its own ranges, and every PATH has "
+            "some. Leave them out."
+        )
+    return choose(
+        parts,
+        options.distractors,
+        database=parse_ranges(options.db) if both[0] else None,
+        queries=parse_ranges(options.queries) if both[1] else None,
+        database_step=options.db_step,
+        query_step=options.query_step,
+        shared=options.gap_m is not None,
+        find=partial(sequences_at, options=options),
+    )
+
+
+def _seven_scenes(options: argparse.Namespace) -> list[Path]:
+    """Folders of the scenes that are there; those that are missing are told on standard error."""
+    from sceneprint_lab.evaluation.report import PAPER
+
+    for given, name in (
+        (options.paths, "PATH"), (options.db, "--db"), (options.queries, "--queries"),
+        (options.distractors, "--distractors"), (options.gap_m, "--gap-m"),
+    ):  # fmt: skip
+        if given:
+            raise DatasetError(
+                f"--7scenes takes database and queries from the splits of its scenes. Leave {name} "
+                "out, or name the scenes as PATHs."
+            )
+    folder: Path = options.seven_scenes
+    names = list(PAPER)
+    found = [folder / name for name in names if (folder / name).is_dir()]
+    missing = [name for name in names if folder / name not in found]
+    if not found:
+        raise DatasetError(
+            f"{folder}: There is no folder {', '.join(names[:-1])} or {names[-1]} here. Download "
+            "7-Scenes, unpack the archive of each scene and those of its sequences, and name the "
+            "folder that holds them."
+        )
+    if missing:
+        print(f"not in {folder}: {', '.join(missing)}", file=sys.stderr)
+    return found
+
+
+def _baselines(names: list[str] | None) -> tuple[str, ...]:
+    """The baselines to ask, in the order of BASELINES."""
+    from sceneprint_lab.evaluation.baselines import BASELINES
+
+    if names is None:
+        return ()
+    unknown = [name for name in names if name not in BASELINES]
+    if unknown:
+        raise DatasetError(
+            f"--baselines {unknown[0]}: no such baseline. Choose from {', '.join(BASELINES)}; "
+            "put the PATHs first."
+        )
+    return tuple(name for name in BASELINES if name in names or not names)
+
+
+def _settings_of(options: argparse.Namespace, model: Model) -> dict[str, Any]:
+    """Everything that is needed to repeat the evaluation."""
+    from sceneprint import __version__
+
+    keys = (
+        "paths",
+        "db",
+        "queries",
+        "db_step",
+        "query_step",
+        "max_overlap",
+        "absent",
+        "gap_m",
+        "within",
+        "baselines",
+        "signature",
+        "metric",
+        "levels",
+        "mode",
+        "matching",
+        "candidates",
+        "seed",
+    )
+    asked = {key: getattr(options, key) for key in keys}
+    asked["metric"] = options.metric or model.metric
+    return {
+        "version": __version__,
+        "model_id": model.id,
+        **asked,
+        "seven_scenes": None if options.seven_scenes is None else str(options.seven_scenes),
+        "distractors": [str(path) for path in options.distractors],
+    }
+
+
+def _counts(found: dict[str, Any]) -> str:
+    counts = found["counts"]
+    left_out = f", {counts['left_out']} frames skipped" if counts["left_out"] else ""
+    return f"{counts['queries']} queries, {counts['database']} database frames{left_out}"
+
+
+def _watch(items: Iterable[T], stage: str, total: int) -> Iterable[T]:
+    return tqdm(items, desc=stage, total=total, disable=None)
+
+
+# `sceneprint evaluate-pairs`: how well two frames are registered, and rightly believed.
+
+#: Frames of a scene at the most: overlap is of all with all.
+_MOST = 2000
+_PAIR_EXAMPLES = """\
+pairs of one PATH, or of several of one scene, may overlap; pairs of two scenes are
+negatives, a quarter of them drawn from pairs with a frame that shows little but
+one plane:
+  sceneprint evaluate-pairs redkitchen studyroom2 fr1_rpy --negatives 3000 --json pairs.json
+compare with Open3D (FPFH with RANSAC or FGR, then ICP):
+  sceneprint evaluate-pairs redkitchen --baselines
+"""
+
+
+def add_evaluate_pairs(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "evaluate-pairs",
+        help="measure registration and acceptance on pairs of frames with known poses",
+        description="Sample pairs of frames by their true overlap, validate each, and compare "
+        "the result with the\ntrue poses: success by overlap, precision, recall, false accepts.",
+        epilog=_PAIR_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="of sequences")
+    add_model_options(command)
+    _add_drawing(command)
+    _add_judging(command)
+    command.add_argument(
+        "--right",
+        nargs=2,
+        type=_limit,
+        default=[0.1, 10.0],
+        metavar=("METRES", "DEGREES"),
+        help="errors up to which a transform counts as correct (default: 0.1 10)",
+    )
+    command.add_argument(
+        "--baselines",
+        action="store_true",
+        help="also register overlapping pairs with Open3D, at about a second each",
+    )
+    command.add_argument(
+        "--jobs",
+        type=positive,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="number of processes; only the times depend on it",
+    )
+    command.add_argument("--json", type=Path, metavar="FILE", help="write all figures as JSON")
+    command.set_defaults(run=run_evaluate_pairs)
+
+
+def _add_drawing(command: argparse.ArgumentParser) -> None:
+    for option, default, kind, what in (
+        ("--pairs", 120, positive, "pairs for each overlap bin of each scene"),
+        ("--negatives", 400, whole_number, "pairs of two scenes, in total"),
+        (
+            "--apart",
+            30,
+            whole_number,
+            "minimum distance in the recording between two frames, in frames",
+        ),
+        ("--frames", 300, _frames, "maximum number of frames of each scene, evenly spread"),
+        ("--seed", 0, whole_number, "random seed of sampling and validation"),
+    ):
+        command.add_argument(
+            option, type=kind, default=default, metavar="N", help=f"{what} (default: {default})"
+        )
+
+
+def _frames(text: str) -> int:
+    """A whole number from 2 to _MOST."""
+    number = positive(text)
+    if not 2 <= number <= _MOST:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 2 to {_MOST}")
+    return number
+
+
+def _limit(text: str) -> float:
+    """A number above 0, up to 180."""
+    return number_within(text, lambda number: 0 < number <= 180, "a number above 0, up to 180")
+
+
+def run_evaluate_pairs(options: argparse.Namespace) -> int:
+    """Evaluate, print, and write what was asked for."""
+    from sceneprint_lab.evaluation.pair_report import pair_figures, pair_table
+    from sceneprint_lab.evaluation.pair_run import Drawing, PairSettings, evaluate_pairs
+    from sceneprint_lab.evaluation.protocol import FrameStore
+    from sceneprint_lab.evaluation.report import to_json
+
+    own = Settings()
+    _make_room(options.json)
+    signer = open_for(options, own)
+    settings = PairSettings(
+        drawing=Drawing(options.pairs, options.negatives, options.apart, options.seed),
+        frames=options.frames,
+        mode=options.mode,
+        matching=options.matching,
+        seed=options.seed,
+        limits=(options.right[0], options.right[1]),
+        baselines=options.baselines,
+        jobs=options.jobs,
+        cache_dir=own.cache_dir,
+    )
+    with TemporaryDirectory(prefix="sceneprint-") as folder:
+        store = FrameStore(Path(folder))
+        evaluation = evaluate_pairs(options.paths, signer, store, settings, _watch)
+        found = pair_figures(evaluation, _pair_settings(options, signer.model.id))
+        if options.json is not None:
+            write_whole(options.json, to_json(found))
+        print(f"model {signer.model.label}: {_pair_counts(found)}")
+        print("\n".join(pair_table(found)))
+    return 0
+
+
+def _pair_settings(options: argparse.Namespace, model_id: str) -> dict[str, Any]:
+    """Everything that is needed to repeat the evaluation."""
+    from sceneprint import __version__
+
+    keys = (
+        "pairs",
+        "negatives",
+        "apart",
+        "frames",
+        "seed",
+        "mode",
+        "matching",
+        "right",
+        "baselines",
+    )
+    return {
+        "version": __version__,
+        "model_id": model_id,
+        "paths": [str(path) for path in options.paths],
+        **{key: getattr(options, key) for key in keys},
+    }
+
+
+def _pair_counts(found: dict[str, Any]) -> str:
+    counts = found["counts"]
+    frames = ", ".join(
+        f"{n} frames of {scene} ({counts['planar'][scene]} planar)"
+        for scene, n in counts["frames"].items()
+    )
+    left_out = f", {counts['left_out']} frames skipped" if counts["left_out"] else ""
+    return f"{counts['pairs']} pairs of {frames}{left_out}"

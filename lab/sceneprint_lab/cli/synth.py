@@ -1,0 +1,208 @@
+"""`sceneprint synth`: synthetic rooms, or sites scanned by a laser, as a data set."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+from sceneprint.cli import positive, whole_number
+from sceneprint.errors import DatasetError
+from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
+from sceneprint.formats.export import write_ply
+from sceneprint.types import AnyFrame, Cloud, DepthFrame
+
+if TYPE_CHECKING:
+    from sceneprint_lab.synth import LookalikeSite
+
+#: Stored units per metre.
+DEPTH_SCALE = 1000.0
+#: Kinds of look-alike sites of a sensor, as `lookalikes` and `lookalike_surveys` have them.
+LOOKALIKES = {
+    "kinect": ("object", "offices", "unmapped", "kitchens", "opposite", "absent"),
+    "lidar": ("bays", "streets", "halls", "unmapped", "absent", "sites"),
+}
+
+
+def add_synth(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "synth",
+        help="generate synthetic rooms with known poses",
+        description="Render furnished rooms as a Kinect would see them, in 7-Scenes layout: "
+        "OUT/room-000/seq-01/frame-000000.depth.png and .pose.txt. With --sensor lidar: halls, "
+        "storeys and blocks as a spinning laser would see them, OUT/site-000/scan-000000.ply "
+        "and .pose.txt. With --lookalikes: sites that look like themselves or like another, as "
+        "scenes whose TrainSplit.txt and TestSplit.txt say what is the map and what the "
+        "queries, so that `sceneprint evaluate OUT` measures wrong answers.",
+    )
+    command.add_argument("out", type=Path, metavar="OUT", help="output folder, new or empty")
+    command.add_argument(
+        "--sensor", choices=("kinect", "lidar"), default="kinect", help="default: kinect"
+    )
+    command.add_argument(
+        "--lookalikes",
+        choices=sorted({kind for kinds in LOOKALIKES.values() for kind in kinds}),
+        metavar="KIND",
+        help="object: a symmetric object circled on a bare floor; offices: a row of equal rooms, "
+        "or a hall of equal bays; unmapped: such a row, the queries from a room that the map "
+        "lacks; kitchens: the queries from another kitchen with the same furniture; opposite: "
+        "furniture in a room, the queries from its other side; absent: the queries from other "
+        "rooms. With --sensor lidar: bays: a hall of equal bays; streets: a street of equal "
+        "blocks; halls: a hall that is the same after half a turn; unmapped: equal halls or "
+        "streets, the queries from one that the map lacks; absent: the queries from other halls "
+        "and streets; sites: ordinary halls, storeys and blocks, which do not repeat",
+    )
+    command.add_argument(
+        "--rooms",
+        type=positive,
+        default=4,
+        metavar="N",
+        help="number of rooms or sites (default: 4)",
+    )
+    command.add_argument(
+        "--views",
+        type=positive,
+        default=25,
+        metavar="M",
+        help="number of views per room; with --lookalikes, of queries per site (default: 25)",
+    )
+    command.add_argument("--seed", type=whole_number, default=0, metavar="S", help="default: 0")
+    command.add_argument(
+        "--path",
+        action="store_true",
+        help="place views along a hand-held path, a few centimetres apart, instead of at "
+        "random; with --sensor lidar along a walk, 1.5 m apart",
+    )
+    command.add_argument("--perfect", action="store_true", help="without sensor noise")
+    command.add_argument(
+        "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help="processes"
+    )
+    command.set_defaults(run=run_synth)
+
+
+def run_synth(options: argparse.Namespace) -> int:
+    """Make the rooms."""
+    if options.lookalikes and options.path:
+        raise DatasetError(
+            "--lookalikes and --path: look-alike sites have paths of their own. Leave --path out."
+        )
+    kinds = LOOKALIKES[options.sensor]
+    if options.lookalikes and options.lookalikes not in kinds:
+        raise DatasetError(
+            f"--lookalikes {options.lookalikes}: there is no such kind for --sensor "
+            f"{options.sensor}. Choose from {', '.join(kinds)}."
+        )
+    if options.out.exists() and any(options.out.iterdir()):
+        raise DatasetError(
+            f"{options.out}: is not empty, and frames of two runs must not be mixed. Use a new "
+            "folder, or empty this one."
+        )
+    options.out.mkdir(parents=True, exist_ok=True)
+    with tqdm(total=options.rooms, desc="synth", unit="room", disable=None) as bar:
+        for _ in _rooms(options):
+            bar.update()
+    made = "sites" if options.lookalikes or options.sensor == "lidar" else "rooms"
+    views = "queries" if options.lookalikes else "views"
+    print(f"{options.rooms} {made} of {options.views} {views} in {options.out}")
+    return 0
+
+
+def _rooms(options: argparse.Namespace) -> Iterator[None]:
+    where = options.out, options.seed, options.views
+    make: Callable[[int], None]
+    if options.lookalikes:
+        look = _write_lookalike_survey if options.sensor == "lidar" else _write_lookalike
+        make = partial(look, *where, kind=options.lookalikes, perfect=options.perfect)
+    else:
+        write = _write_site if options.sensor == "lidar" else _write_room
+        make = partial(write, *where, along_path=options.path, perfect=options.perfect)
+    jobs = min(options.jobs, options.rooms)
+    if jobs == 1:  # a process of its own would import all anew
+        yield from map(make, range(options.rooms))
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(make, range(options.rooms))
+
+
+def _write_room(
+    out: Path, seed: int, views: int, index: int, *, along_path: bool, perfect: bool
+) -> None:
+    from sceneprint_lab.synth import KinectNoise, synthesise_room
+
+    noise = None if perfect else KinectNoise()
+    room = synthesise_room(seed, index, views, along_path=along_path, noise=noise)
+    folder = out / room.name
+    _write_sequence(folder / "seq-01", room.frames)
+    write_intrinsics(folder, Camera(room.frames[0].intrinsics, DEPTH_SCALE, along_ray=False))
+
+
+def _write_sequence(sequence: Path, frames: Sequence[DepthFrame]) -> None:
+    sequence.mkdir(parents=True)
+    for number, frame in enumerate(frames):
+        write_depth_png(sequence / f"frame-{number:06d}.depth.png", frame.depth, DEPTH_SCALE)
+        if frame.pose is not None:
+            write_pose(sequence / f"frame-{number:06d}.pose.txt", frame.pose)
+
+
+def _write_lookalike(
+    out: Path, seed: int, queries: int, index: int, *, kind: str, perfect: bool
+) -> None:
+    """A scene of two sequences, or two scenes where the queries' place is not in the map."""
+    from sceneprint_lab.synth import KinectNoise, synthesise_lookalike
+
+    noise = None if perfect else KinectNoise()
+    site = synthesise_lookalike(kind, seed, index, queries=queries, noise=noise)
+    of_map, of_queries = _split_scenes(out, site)
+    _write_sequence(of_map / "seq-01", site.map)
+    _write_sequence(of_queries / "seq-02", site.queries)
+    for folder in {of_map, of_queries}:
+        write_intrinsics(folder, Camera(site.map[0].intrinsics, DEPTH_SCALE, along_ray=False))
+
+
+def _write_lookalike_survey(
+    out: Path, seed: int, queries: int, index: int, *, kind: str, perfect: bool
+) -> None:
+    """As `_write_lookalike`, of scans."""
+    from sceneprint_lab.synth import synthesise_lookalike_survey
+
+    site = synthesise_lookalike_survey(kind, seed, index, queries=queries, perfect=perfect)
+    of_map, of_queries = _split_scenes(out, site)
+    _write_scans(of_map / "seq-01", site.map)
+    _write_scans(of_queries / "seq-02", site.queries)
+
+
+def _split_scenes(out: Path, site: LookalikeSite[AnyFrame]) -> tuple[Path, Path]:
+    """Folders of the scenes of a site's map and of its queries, with the files of their splits."""
+    of_map = of_queries = out / site.name
+    if not site.same_frame:
+        of_queries = out / f"{site.name}-elsewhere"
+    for folder in (of_map, of_queries):
+        folder.mkdir(parents=True, exist_ok=True)
+    (of_map / "TrainSplit.txt").write_text("sequence1\n")
+    (of_queries / "TestSplit.txt").write_text("sequence2\n")
+    return of_map, of_queries
+
+
+def _write_site(
+    out: Path, seed: int, views: int, index: int, *, along_path: bool, perfect: bool
+) -> None:
+    from sceneprint_lab.synth import synthesise_survey
+
+    survey = synthesise_survey(seed, index, views, along_path=along_path, perfect=perfect)
+    _write_scans(out / survey.name, survey.clouds)
+
+
+def _write_scans(folder: Path, clouds: Sequence[Cloud]) -> None:
+    folder.mkdir(parents=True)
+    for number, cloud in enumerate(clouds):
+        (folder / f"scan-{number:06d}.ply").write_bytes(write_ply(cloud.points))
+        if cloud.pose is not None:
+            write_pose(folder / f"scan-{number:06d}.pose.txt", cloud.pose)

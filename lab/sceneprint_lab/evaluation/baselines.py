@@ -1,0 +1,609 @@
+"""Other ways to find a place again, measured in the same run: what the signature is held against.
+
+Prepared, allowed  --compare-->  Compared: each baseline's ranking of every query, and its time
+
+Thumbnails: the depth image made small, what anyone would try first.
+
+    depth (H, W)  --thumbnail-->  (30, 40) inverse depth      two of them  -->  L1 or ZNCC
+
+FPFH: local features of Open3D, aggregated by VLAD over a vocabulary of the database.
+
+    frame  --features-->  (n, 33)  --vlad-->  (64 * 33,)      two of them  -->  L2 distance
+
+Rusu et al., Fast point feature histograms, ICRA 2009; Jegou et al., Aggregating local descriptors,
+CVPR 2010. The vocabulary is learnt on the database that is searched, which favours the baseline:
+the model it is held against has never seen a frame of it.
+
+Rings: how high the world is about a scanner, as Scan Context.
+
+    points (N, 3)  --ring_descriptor-->  (rings, sectors)      two  --ring_distance-->  distance
+
+Kim and Kim, Scan Context: egocentric spatial descriptor for place recognition within 3D point
+cloud map, IROS 2018. The ground about the sensor is divided into rings and sectors; each cell has
+the height of its highest point. Turning the sensor about the upright axis by a sector moves the
+columns on by one, so that two scans are compared at every shift, and the best counts.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import FrameError, UselessFrame
+from sceneprint.fusion import open3d
+from sceneprint.geometry.kernel import kernel
+from sceneprint.pipeline import Signer, sign
+from sceneprint.types import AnyFrame, Cloud, DepthFrame, Floats, Floats32
+from sceneprint_lab.evaluation.judgement import Candidate, Judge, QueryTask, validated
+from sceneprint_lab.evaluation.measures import FIRST
+from sceneprint_lab.evaluation.protocol import (
+    FrameStore,
+    Prepared,
+    SignedFrame,
+    ValidatedPair,
+    Watch,
+    unwatched,
+)
+
+# Thumbnails.
+
+ROWS, COLUMNS = 30, 40
+
+Comparison = Literal["l1", "zncc"]
+
+
+def thumbnail(depth: Floats32, rows: int = ROWS, columns: int = COLUMNS) -> Floats32:
+    """Mean inverse depth of the samples in each cell of a grid over the image.
+
+    Parameters
+    ----------
+    depth : (H, W) metres; 0 where missing
+    rows, columns : of the grid
+
+    Returns
+    -------
+    (rows, columns) float32, 1/metres; 0 where a cell has no sample
+    """
+    height, width = depth.shape
+    y, x = np.nonzero(depth > 0)
+    cell = (y * rows // height) * columns + x * columns // width
+    inverse = 1.0 / depth[y, x].astype(np.float64)
+    total = np.bincount(cell, inverse, rows * columns)
+    count = np.bincount(cell, minlength=rows * columns)
+    mean: Floats32 = (total / np.maximum(count, 1)).astype(np.float32)
+    return mean.reshape(rows, columns)
+
+
+class Thumbnails:
+    """Small inverse depth images, by mean absolute difference or by correlation.
+
+    Parameters
+    ----------
+    comparison : "l1": mean absolute difference over cells that both have filled, or "zncc":
+        1 - zero-mean normalised cross-correlation, empty cells at the mean
+    """
+
+    def __init__(self, comparison: Comparison) -> None:
+        self.comparison = comparison
+        self.name = f"thumbnail_{comparison}"
+
+    def takes(self, frame: AnyFrame) -> bool:
+        """Whether the baseline is made for such a frame."""
+        return isinstance(frame, DepthFrame)
+
+    def read(self, frame: AnyFrame) -> Floats32:
+        """The thumbnail of a depth image."""
+        if not isinstance(frame, DepthFrame):
+            raise UselessFrame(f"{frame.name}: A thumbnail is of a depth image. Send one.")
+        return thumbnail(frame.depth)
+
+    def check(self) -> None:
+        """Nothing is needed."""
+
+    def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
+        """Nothing is learnt."""
+
+    def finish(self, kept: Floats32) -> Floats32:
+        """The thumbnail; for correlation at mean 0 and length 1."""
+        if self.comparison == "l1":
+            return kept
+        filled = kept > 0
+        mean = float(kept[filled].mean()) if filled.any() else 0.0
+        centred = np.where(filled, kept - mean, 0.0)
+        length = float(np.linalg.norm(centred))
+        return (centred / length if length > 0 else centred).astype(np.float32)
+
+    def distances(self, query: Floats32, database: Floats32) -> Floats:
+        """Distance of one finished thumbnail to each of (N, rows, columns): (N,)."""
+        own = query.reshape(-1).astype(np.float64)
+        others = database.reshape(len(database), -1).astype(np.float64)
+        if self.comparison == "zncc":
+            correlation: Floats = 1.0 - others @ own
+            return correlation
+        both = (own > 0) & (others > 0)
+        total = np.where(both, np.abs(others - own), 0.0).sum(axis=1)
+        count = both.sum(axis=1)
+        # nothing in common is as far as can be
+        return np.where(count > 0, total / np.maximum(count, 1), np.inf)
+
+
+# FPFH and VLAD.
+
+#: Voxel of the points, reach of normals and of features, metres, for a sensor of RANGE metres;
+#: for others in proportion.
+VOXEL, NORMALS, FEATURES, RANGE = 0.05, 0.10, 0.25, 9.0
+_WHAT = "The baseline fpfh_vlad"  #: needs Open3D
+#: Words of the vocabulary, and features that it is learnt from.
+WORDS, LEARNT_FROM = 64, 20_000
+
+
+def features(points: Floats, scale: float = 1.0) -> Floats32:
+    """FPFH of a cloud's voxels.
+
+    Parameters
+    ----------
+    points : (N, 3) metres, the sensor at the origin
+    scale : of VOXEL, NORMALS and FEATURES
+
+    Returns
+    -------
+    (n, 33) float32, of each of the three histograms the root of its shares, so that L2 between
+    two is Hellinger's distance
+    """
+    o3d = open3d(_WHAT)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, np.float64)))
+    cloud = cloud.voxel_down_sample(VOXEL * scale)
+    search = o3d.geometry.KDTreeSearchParamHybrid
+    cloud.estimate_normals(search(radius=NORMALS * scale, max_nn=30))
+    cloud.orient_normals_towards_camera_location(np.zeros(3))
+    fpfh = o3d.pipelines.registration.compute_fpfh_feature(
+        cloud, search(radius=FEATURES * scale, max_nn=100)
+    )
+    found = np.maximum(np.asarray(fpfh.data).T, 0.0).reshape(-1, 3, 11)
+    total = found.sum(axis=2, keepdims=True)  # 0 without neighbours
+    shares = np.divide(found, total, out=np.zeros_like(found), where=total > 0)
+    rooted: Floats32 = np.sqrt(shares).reshape(-1, 33).astype(np.float32)
+    return rooted
+
+
+def vlad(local: Floats32, words: Floats) -> Floats32:
+    """Sums of what is left of features less their nearest word: VLAD, intra-normalised.
+
+    Parameters
+    ----------
+    local : (n, d)
+    words : (k, d)
+
+    Returns
+    -------
+    (k * d,) float32 of length 1, or 0 where every feature is a word
+    """
+    own = local.astype(np.float64)
+    squares = (words**2).sum(axis=1) - 2 * own @ words.T  # and |own|^2, the same for every word
+    nearest = squares.argmin(axis=1)
+    sums = np.zeros_like(words)
+    np.add.at(sums, nearest, own - words[nearest])
+    length = np.linalg.norm(sums, axis=1, keepdims=True)
+    sums = np.divide(sums, length, out=np.zeros_like(sums), where=length > 0)
+    whole = float(np.linalg.norm(sums))
+    result: Floats32 = (sums.reshape(-1) / (whole if whole > 0 else 1.0)).astype(np.float32)
+    return result
+
+
+class FpfhVlad:
+    """FPFH-VLAD as a baseline, for depth images and clouds.
+
+    Parameters
+    ----------
+    maximum : the sensor's range, metres; farther points are left out
+    """
+
+    name = "fpfh_vlad"
+
+    def __init__(self, maximum: float = RANGE) -> None:
+        self.maximum = maximum
+        self._words: Floats | None = None
+
+    def check(self) -> None:
+        """See `open3d`."""
+        open3d(_WHAT)
+
+    def takes(self, frame: AnyFrame) -> bool:  # noqa: ARG002
+        """Whether the baseline is made for such a frame: always."""
+        return True
+
+    def read(self, frame: AnyFrame) -> Floats32:
+        """The local features of a frame.
+
+        Raises
+        ------
+        MissingDependency : see `open3d`.
+        UselessFrame : no point is in range.
+        """
+        points = _points(frame)
+        points = points[np.linalg.norm(points, axis=1) <= self.maximum]
+        if not len(points):
+            raise UselessFrame(f"{frame.name}: No point lies within {self.maximum:g} m.")
+        return features(points, self.maximum / RANGE)
+
+    def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
+        """The vocabulary: k-means of as many features of every frame of the database."""
+        from sklearn.cluster import KMeans
+
+        rng, share = np.random.default_rng(seed), -(-LEARNT_FROM // max(count, 1))
+        drawn = [
+            one[np.sort(rng.choice(len(one), min(share, len(one)), replace=False))]
+            for one in database
+        ]
+        sample = np.concatenate(drawn).astype(np.float64)
+        distinct = len(np.unique(sample, axis=0))  # k-means warns where words would be alike
+        means = KMeans(min(WORDS, distinct), n_init=1, random_state=seed).fit(sample)
+        self._words = np.asarray(means.cluster_centers_, np.float64)
+
+    def finish(self, kept: Floats32) -> Floats32:
+        """The VLAD of a frame's features; after `learn`."""
+        if self._words is None:
+            raise ValueError("the vocabulary has not been learnt")
+        return vlad(kept, self._words)
+
+    def distances(self, query: Floats32, database: Floats32) -> Floats:
+        """Euclidean distance of one to each of (N, k * d): (N,)."""
+        found: Floats = np.linalg.norm(database.astype(np.float64) - query, axis=1)
+        return found
+
+
+def _points(frame: AnyFrame) -> Floats:
+    if isinstance(frame, Cloud):
+        return np.asarray(frame.points, np.float64)
+    k, depth = frame.intrinsics, frame.depth
+    y, x = np.nonzero(depth > 0)
+    z = depth[y, x].astype(np.float64)
+    return np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=1)
+
+
+# Rings.
+
+#: The paper's numbers: rings, sectors, metres that the rings reach, and what is added to heights
+#: so that what lies about the wheels is not nought, metres.
+RINGS, SECTORS, RADIUS, LIFT = 20, 60, 80.0, 2.0
+
+
+def ring_descriptor(
+    points: Floats32 | Floats,
+    *,
+    rings: int = RINGS,
+    sectors: int = SECTORS,
+    radius: float = RADIUS,
+    lift: float = LIFT,
+    pole: int = 2,
+) -> Floats32:
+    """The greatest height in each ring and sector about the sensor.
+
+    Parameters
+    ----------
+    points : (N, 3) metres, the sensor at the origin
+    rings, sectors : how many; a sector is 2 pi / sectors of azimuth
+    radius : metres in the ground plane; points beyond are left out
+    lift : added to every height, metres
+    pole : axis that points up, 0, 1 or 2; azimuth counts from the next axis towards the one after
+
+    Returns
+    -------
+    (rings, sectors) float32, the height and `lift`; 0 where a cell holds no point
+    """
+    p = np.asarray(points, np.float64)
+    a, b, c = (p[:, (pole + k) % 3] for k in (1, 2, 0))
+    flat = np.hypot(a, b)
+    inside = flat < radius
+    ring = (flat[inside] / radius * rings).astype(np.intp)
+    azimuth = np.mod(np.arctan2(b[inside], a[inside]), 2 * np.pi)
+    # an azimuth a rounding below 2 pi is of the last sector, not of one more
+    sector = np.minimum((azimuth / (2 * np.pi) * sectors).astype(np.intp), sectors - 1)
+    highest = np.full((rings, sectors), -np.inf)
+    np.maximum.at(highest, (ring, sector), c[inside] + lift)
+    return np.where(np.isfinite(highest), highest, 0.0).astype(np.float32)
+
+
+@kernel
+def _unit_columns(descriptor: Floats, unit: Floats, filled: NDArray[np.bool_]) -> None:
+    rings, sectors = descriptor.shape
+    for s in range(sectors):
+        square = 0.0
+        for r in range(rings):
+            square += descriptor[r, s] ** 2
+        filled[s] = square > 0.0
+        for r in range(rings):
+            unit[s, r] = descriptor[r, s] / np.sqrt(square) if square > 0.0 else 0.0
+
+
+@kernel
+def _best_shift(
+    a: Floats, a_filled: NDArray[np.bool_], b: Floats, b_filled: NDArray[np.bool_]
+) -> tuple[float, int]:
+    """Least distance over shifts, and the shift: column s of `a` against s + shift of `b`."""
+    sectors, rings = a.shape
+    best, at = 2.0, 0
+    for shift in range(sectors):
+        total, count = 0.0, 0
+        for s in range(sectors):
+            t = (s + shift) % sectors
+            if a_filled[s] and b_filled[t]:
+                cosine = 0.0
+                for r in range(rings):
+                    cosine += a[s, r] * b[t, r]
+                total += 1.0 - cosine
+                count += 1
+        if count and total / count < best:
+            best, at = total / count, shift
+    return best, at
+
+
+def _columns(descriptor: Floats32) -> tuple[Floats, NDArray[np.bool_]]:
+    unit = np.empty(descriptor.shape[::-1])
+    filled = np.empty(descriptor.shape[1], np.bool_)
+    _unit_columns(np.ascontiguousarray(descriptor, np.float64), unit, filled)
+    return unit, filled
+
+
+def ring_distance(a: Floats32, b: Floats32) -> tuple[float, int]:
+    """How unlike two scans are, whichever way they are turned about the upright axis.
+
+    Parameters
+    ----------
+    a, b : (rings, sectors) each
+
+    Returns
+    -------
+    distance : mean of 1 - cosine over columns that both have filled, at the best shift; 0 to 2
+    shift : sectors by which the columns of `a` lie further on in `b`
+    """
+    distance, shift = _best_shift(*_columns(a), *_columns(b))
+    return float(distance), int(shift)
+
+
+def ring_distances(query: Floats32, database: Floats32) -> Floats:
+    """Distance of one descriptor (rings, sectors) to each of (N, rings, sectors): (N,)."""
+    own = _columns(query)
+    return np.array([_best_shift(*own, *_columns(other))[0] for other in database], float)
+
+
+class Rings:
+    """The ring descriptor as a baseline: for clouds with a viewpoint."""
+
+    name = "rings"
+
+    def __init__(self, radius: float = RADIUS) -> None:
+        self.radius = radius
+
+    def takes(self, frame: AnyFrame) -> bool:
+        """Whether the baseline is made for such a frame."""
+        return isinstance(frame, Cloud) and frame.has_viewpoint
+
+    def read(self, frame: AnyFrame) -> Floats32:
+        """The descriptor of a cloud, its z axis taken as upright."""
+        if not isinstance(frame, Cloud):
+            raise UselessFrame(f"{frame.name}: A ring descriptor is of a point cloud. Send one.")
+        return ring_descriptor(frame.points, radius=self.radius)
+
+    def check(self) -> None:
+        """Nothing is needed."""
+
+    def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
+        """Nothing is learnt."""
+
+    def finish(self, kept: Floats32) -> Floats32:
+        """The descriptor itself."""
+        return kept
+
+    def distances(self, query: Floats32, database: Floats32) -> Floats:
+        """See `ring_distances`."""
+        return ring_distances(query, database)
+
+
+# What every baseline does, so that one loop can ask them all.
+
+
+class Baseline(Protocol):
+    """A way to compare frames that knows nothing of signatures."""
+
+    name: str
+
+    def check(self) -> None:
+        """Raise MissingDependency where what it needs is not there."""
+        ...
+
+    def takes(self, frame: AnyFrame) -> bool:
+        """Whether it is made for such a frame."""
+        ...
+
+    def read(self, frame: AnyFrame) -> Floats32:
+        """What it keeps of a frame; UselessFrame where that is nothing."""
+        ...
+
+    def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
+        """Learn from what was kept of the `count` frames of the database."""
+        ...
+
+    def finish(self, kept: Floats32) -> Floats32:
+        """The descriptor of what was kept of a frame; of one shape for all."""
+        ...
+
+    def distances(self, query: Floats32, database: Floats32) -> Floats:
+        """(N,) from one descriptor to each of a stack of N; infinite is farthest."""
+        ...
+
+
+#: Each baseline, made for a sensor of so many metres of range.
+BASELINES: dict[str, Callable[[float], Baseline]] = {
+    "thumbnail_l1": lambda _: Thumbnails("l1"),
+    "thumbnail_zncc": lambda _: Thumbnails("zncc"),
+    "fpfh_vlad": FpfhVlad,
+    "rings": lambda _: Rings(),
+}
+
+
+def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
+    """Baselines by their names, ready to be asked.
+
+    Parameters
+    ----------
+    names : keys of BASELINES
+    maximum : range of the sensor, metres
+
+    Raises
+    ------
+    MissingDependency : a library one needs is absent.
+    """
+    opened = [BASELINES[name](maximum) for name in names]
+    for one in opened:
+        one.check()
+    return opened
+
+
+# The baselines asked what the signatures were asked.
+
+#: Queries that are described and signed once more, to time a baseline beside the signature.
+TIMED = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """What a baseline made of the queries.
+
+    Parameters
+    ----------
+    name : of the baseline
+    reason : why it could not be asked; empty where it was
+    rankings : of each query the nearest database indices, nearest first; none where refused
+    first : of each query the pair with the nearest, validated as ours; None without a ranking
+    milliseconds : processor time, medians of a query: to `describe` it, to `sign` it for the
+        signature, and to `rank` the database
+    """
+
+    name: str
+    reason: str
+    rankings: list[list[int]]
+    first: list[ValidatedPair | None]
+    milliseconds: dict[str, float]
+
+
+def compare(
+    baseline: Baseline,
+    prepared: Prepared,
+    store: FrameStore,
+    allowed: NDArray[np.bool_],
+    signer: Signer,
+    seed: int,
+    watch: Watch = unwatched,
+) -> Compared:
+    """Rank the database for every query by a baseline.
+
+    One process and one thread, in which the signature is timed as well.
+
+    Parameters
+    ----------
+    baseline : see there
+    prepared, store : frames
+    allowed : (Q, N), which frames a query may find
+    signer : of the signatures, to be timed
+    seed : of what is learnt
+    watch : told of every frame
+    """
+    from threadpoolctl import threadpool_limits
+
+    def refused(reason: str) -> Compared:
+        return Compared(baseline.name, reason, [[] for _ in prepared.queries], [], {})
+
+    for member in (*prepared.queries, *prepared.database):
+        if not baseline.takes(store.frame(member)):
+            return refused(f"it is not made for frames such as {member.name}")
+    with threadpool_limits(1):
+        try:
+            found = _compared(baseline, prepared, store, allowed, seed, watch)
+            spent = timed(baseline, prepared, store, signer)
+            return replace(found, milliseconds=found.milliseconds | spent)
+        except FrameError as error:
+            return refused(str(error))
+
+
+def _compared(
+    baseline: Baseline,
+    prepared: Prepared,
+    store: FrameStore,
+    allowed: NDArray[np.bool_],
+    seed: int,
+    watch: Watch,
+) -> Compared:
+    def kept(member: SignedFrame) -> Path:
+        return store.folder / f"{member.number}.{baseline.name}.npy"
+
+    members = {m.number: m for m in (*prepared.queries, *prepared.database)}
+    for member in watch(members.values(), baseline.name, len(members)):
+        np.save(kept(member), baseline.read(store.frame(member)))
+
+    def database() -> Iterator[Floats32]:
+        return (np.load(kept(m)) for m in prepared.database)
+
+    baseline.learn(database(), len(prepared.database), seed)
+    stack = np.stack([baseline.finish(one) for one in database()])
+    rankings, ranking_ms = [], []
+    for i, member in enumerate(prepared.queries):
+        descriptor = baseline.finish(np.load(kept(member)))
+        index = np.flatnonzero(allowed[i])
+        start = time.process_time()
+        order = np.argsort(baseline.distances(descriptor, stack[index]), kind="stable")
+        ranking_ms.append(1e3 * (time.process_time() - start))
+        rankings.append(index[order[: FIRST[-1]]].tolist())
+    return Compared(baseline.name, "", rankings, [], {"rank": float(np.median(ranking_ms))})
+
+
+def registered(
+    judge: Judge,
+    rankings: Sequence[Sequence[int]],
+    prepared: Prepared,
+    overlap_mean: NDArray[np.float64],
+    overlap_least: NDArray[np.float64],
+) -> list[ValidatedPair | None]:
+    """The nearest frame of each query validated as ours is: what R would be by this ranking."""
+    found: list[ValidatedPair | None] = []
+    for i, (query, ranking) in enumerate(zip(prepared.queries, rankings, strict=True)):
+        if not ranking:
+            found.append(None)
+            continue
+        j = ranking[0]
+        match = prepared.database[j]
+        candidate = Candidate(
+            j, match.number, match.scene, match.pose,
+            float(overlap_mean[i, j]), float(overlap_least[i, j]),
+        )  # fmt: skip
+        task = QueryTask(query.number, query.scene, query.pose, [j], [], (candidate,))
+        found.append(validated(judge, task, candidate))
+    return found
+
+
+def timed(
+    baseline: Baseline, prepared: Prepared, store: FrameStore, signer: Signer
+) -> dict[str, float]:
+    """Processor time to describe a query by a baseline, and to sign it: medians, milliseconds.
+
+    Some evenly chosen queries, each described and signed in turn, so that both meet the same
+    machine; after `compare`.
+    """
+    n = len(prepared.queries)
+    chosen = sorted({round(i) for i in np.linspace(0, n - 1, min(TIMED, n))})
+    spent: dict[str, list[float]] = {"describe": [], "sign": []}
+    frames = [store.frame(prepared.queries[i]) for i in chosen]
+    for frame in (frames[0], *frames):  # the first once more: libraries loaded, loops compiled
+        start = time.process_time()
+        baseline.finish(baseline.read(frame))
+        between = time.process_time()
+        sign(frame, signer)
+        spent["describe"].append(1e3 * (between - start))
+        spent["sign"].append(1e3 * (time.process_time() - between))
+    return {name: float(np.median(of[1:])) for name, of in spent.items()}

@@ -1,0 +1,503 @@
+"""The figures of pairs of frames, ready for JSON.
+
+PairEvaluation  --pair_figures-->  dict
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Evidence
+from sceneprint.geometry.validation.map_verification import at_place, different_views
+from sceneprint.geometry.validation.validation import PairValidation
+from sceneprint.types import Floats
+from sceneprint_lab.evaluation.measures import (
+    CONFIDENCE,
+    Figures,
+    accuracy,
+    roc,
+    upper_bound,
+    validation_of,
+)
+from sceneprint_lab.evaluation.pair_run import BINS, METHODS, PairEvaluation, Tried
+from sceneprint_lab.evaluation.protocol import Error, ValidatedPair
+from sceneprint_lab.evaluation.report import without_infinities
+from sceneprint_lab.evaluation.run import PLANAR
+
+_COLUMNS = ("within_5cm_5deg", "right")
+_LIMITS = "within 5 cm / right"
+_HEAD = f"{'':24}" + "".join(f"{name + ' %':>16}" for name in BINS)
+
+
+def pair_table(found: dict[str, Any]) -> list[str]:
+    """Bins, negatives, statistics and baselines; figures as `pair_report.pair_figures` has them."""
+    lines: list[str] = []
+    for scene, own in found.get("scenes", {}).items():
+        lines += [f"{scene}, alone", *_bins(own), ""]
+    if lines:
+        lines.append("all scenes")
+    lines += [*_bins(found), ""]
+    if "baselines" in found:
+        lines += [*_baselines(found), ""]
+    lines += [*_negatives(found["negatives"]), "", *_statistics(found["roc"]), ""]
+    v = found["validation"]
+    lines.append(
+        f"acceptance    precision {_number(v['precision'])}, recall {_number(v['recall'])}, where "
+        f"overlap is 30 % {_number(v['recall_overlap_30'])}; {v['accepted']} of {v['pairs']} pairs "
+        f"accepted, {v['accepted_strong']} strong"
+    )
+    s = found["support"]
+    lines.append(
+        f"second pair   {s['supported']} accepted pairs have one that agrees: precision "
+        f"{_number(s['precision'])}; {s['contradicted']} have only others that disagree: "
+        f"{_number(s['precision_contradicted'])}; {s['alone']} have no other: "
+        f"{_number(s['precision_alone'])}"
+    )
+    kinds = [one["what"] for one in found["failures"]]
+    counts = [f"{kinds.count(kind)} {kind.replace('_', ' ')}" for kind in dict.fromkeys(kinds)]
+    lines.append(f"failures      {', '.join(counts) or 'none'}")
+    times = found["milliseconds"]
+    lines.append(
+        f"milliseconds  prepare {_number(times['prepare'], 1)}, validate "
+        f"{_number(times['validate'], 1)} (medians)"
+    )
+    return lines
+
+
+def _bins(found: dict[str, Any]) -> list[str]:
+    of = found["bins"]
+    rows: list[tuple[str, Callable[[dict[str, Any]], str]]] = [
+        ("pairs", lambda one: str(one["pairs"])),
+        (_LIMITS, lambda one: _two(one["success"])),
+        ("  from the true pose", lambda one: _two(one["bound"])),
+        ("accepted", lambda one: str(one["validation"]["accepted"])),
+        ("  precision", lambda one: _number(one["validation"]["precision"])),
+        ("  recall", lambda one: _number(one["validation"]["recall"])),
+        ("with a second pair", lambda one: str(one["support"]["supported"])),
+        ("  precision", lambda one: _number(one["support"]["precision"])),
+    ]
+    lines = [_HEAD]
+    for name, cell in rows:
+        lines.append(f"{name:24}" + "".join(f"{cell(of[b]):>16}" for b in BINS))
+    v = found["validation"]
+    if "same_scene" in found:
+        same = found["same_scene"]
+        lines.append(
+            f"with {same['pairs']} pairs of it that see nothing of each other: precision "
+            f"{_number(v['precision'])}, recall {_number(v['recall'])}, where overlap is 30 % "
+            f"{_number(v['recall_overlap_30'])}"
+        )
+    return lines
+
+
+def _baselines(found: dict[str, Any]) -> list[str]:
+    of = found["baselines"]
+    lines = [f"beside Open3D, {of['pairs']} pairs, {_LIMITS}", _HEAD]
+    lines.append(f"{'ours':24}" + "".join(f"{_two(found['bins'][b]['success']):>16}" for b in BINS))
+    for method, own in of["methods"].items():
+        for step, name in (("start", ""), ("icp", " + ICP"), ("ours", " + ours")):
+            cells = [_two(own["bins"][b][step]) for b in BINS]
+            lines.append(f"{method + name:24}" + "".join(f"{cell:>16}" for cell in cells))
+    times = [
+        f"{method} + ICP {_number(own['milliseconds'], 0)} (ours / it {_number(own['time_ratio'])})"
+        for method, own in of["methods"].items()
+    ]
+    lines.append(
+        f"milliseconds  ours {_number(of['milliseconds'], 0)}, {', '.join(times)}; medians, one "
+        "thread, features of both frames counted"
+    )
+    return lines
+
+
+def _negatives(found: dict[str, Any]) -> list[str]:
+    names = {
+        "same scene, no overlap": found["same_scene"],
+        "two scenes": found["cross_scene"],
+        "  a frame planar": found["cross_scene_planar"],
+        **{f"  {name}": own for name, own in found["by_scenes"].items()},
+    }
+    lines = [f"{'negatives':36}{'pairs':>8}{'accepted':>10}{'strong':>8}{'at most':>10}"]
+    for name, own in names.items():
+        if own["pairs"]:
+            lines.append(
+                f"{name:36}{own['pairs']:>8}{own['accepted']:>10}{own['accepted_strong']:>8}"
+                f"{_number(own['upper'], 5):>10}"
+            )
+    lines.append(
+        f"(at most: the rate, with {found['confidence']:.0%} confidence, were pairs independent)"
+    )
+    return lines
+
+
+def _statistics(found: dict[str, Any]) -> list[str]:
+    lines = [f"{'decides alone':16}{'area':>8}{'right at no wrong':>20}{'at 1 %':>8}{'at 5 %':>8}"]
+    for name, own in found.items():
+        at = own["right_at"]
+        lines.append(
+            f"{name:16}{_number(own['area']):>8}{_number(at['0']):>20}{_number(at['0.01']):>8}"
+            f"{_number(at['0.05']):>8}"
+        )
+    return lines
+
+
+def _two(shares: dict[str, float | None]) -> str:
+    return " / ".join(_number(shares[name]) for name in _COLUMNS)
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+# What is told of a transform, and how well each number would decide alone.
+#
+# Pair, ...  --curves-->  figures
+
+#: Shares of wrong pairs at which a curve is read off.
+FALSE_RATES = (0.0, 0.01, 0.05)
+
+
+def evidence(v: PairValidation, p: AcceptanceParameters) -> float:
+    """For less against, as acceptance weighs it; without its stiffness, which is not told."""
+    told = Evidence(
+        v.residual_m, v.residual_rad, v.overlap, v.plane_overlap, v.violations, math.inf
+    )
+    return told.total(p)
+
+
+def residual(v: PairValidation, p: AcceptanceParameters) -> float:
+    """Of the two directions: the greater of metres and radians, each over its own limit."""
+    return max(v.residual_m / p.residual_m, v.residual_rad / p.residual_rad)
+
+
+#: What is told of a transform, each so that more speaks for it; None where it is not known.
+STATISTICS: dict[str, Callable[[PairValidation, AcceptanceParameters], float | None]] = {
+    "residual": lambda v, p: -residual(v, p),
+    "overlap": lambda v, _: v.overlap,
+    "plane_overlap": lambda v, _: v.plane_overlap,
+    "violations": lambda v, _: None if v.violations is None else -v.violations,
+    "evidence": evidence,
+    "ambiguity": lambda v, _: -v.ambiguity,
+    "inliers": lambda v, _: v.inliers,
+}
+
+
+def curves(pairs: Sequence[ValidatedPair], p: AcceptanceParameters) -> dict[str, Any]:
+    """The receiver operating characteristic of each statistic, were it to decide alone.
+
+    A pair is right where its transform is, whatever was decided. One without a transform, or of
+    which a statistic is not known, has nothing to say for it. Of `ambiguity` only pairs are
+    counted for which rivals were looked for. `curve` has (share of wrong ones, share of right
+    ones, threshold); thresholds of statistics that should be small are negative.
+    """
+    found = {}
+    for name, told in STATISTICS.items():
+        own = [pair for pair in pairs if name != "ambiguity" or _ambiguity_was_tested(pair)]
+        values = [
+            told(one.validation, p) if one.validation.T_match_query is not None else None
+            for one in own
+        ]
+        right = np.array([pair.right for pair in own], bool)
+        curve = roc(np.array([-math.inf if v is None else v for v in values], float), right)
+        found[name] = {
+            "right": int(right.sum()),
+            "wrong": int((~right).sum()),
+            "area": None if curve is None else curve.area,
+            "right_at": {
+                f"{share:g}": None if curve is None else curve.true_at(share)
+                for share in FALSE_RATES
+            },
+            "curve": [] if curve is None else curve.thinned(),
+        }
+    return found
+
+
+def _ambiguity_was_tested(pair: ValidatedPair) -> bool:
+    return pair.accepted or pair.validation.ambiguity > 0
+
+
+#: Of JSON: raised when a key changes its meaning.
+SCHEMA_VERSION = 1
+
+
+def pair_figures(evaluation: PairEvaluation, settings: dict[str, Any]) -> dict[str, Any]:
+    """Every figure of an evaluation of pairs.
+
+    Parameters
+    ----------
+    evaluation : see PairEvaluation
+    settings : all that is needed to repeat it
+    """
+    members, tried = evaluation.members, evaluation.tried
+    scenes = list(dict.fromkeys(member.scene for member in members))
+    scene_of = [member.scene for member in members]
+    found: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "settings": settings}
+    found["counts"] = {
+        "frames": {scene: scene_of.count(scene) for scene in scenes},
+        "planar": {
+            scene: sum(
+                own == scene and bool(share >= PLANAR)
+                for own, share in zip(scene_of, evaluation.planes, strict=True)
+            )
+            for scene in scenes
+        },
+        "left_out": len(evaluation.left_out),
+        "pairs": len(tried),
+    }
+    found["left_out"] = [{"name": n, "reason": why} for n, why in evaluation.left_out]
+    limits = evaluation.limits
+    seconds = second_pairs(evaluation)
+    found["bins"] = bins(tried, seconds, limits)
+    found["negatives"] = negatives(evaluation)
+    found["validation"] = validation_of([one.pair for one in tried])
+    found["support"] = support(tried, seconds)
+
+    def within(scene: str) -> list[int]:
+        return [i for i, one in enumerate(tried) if _within(one, scene, scene_of)]
+
+    if len(scenes) > 1:
+        found["scenes"] = {
+            scene: _of_scene(within(scene), tried, seconds, limits) for scene in scenes
+        }
+    found["roc"] = curves([one.pair for one in tried], evaluation.acceptance)
+    found["milliseconds"] = {
+        "prepare": evaluation.prepare_ms,
+        "validate": _median([one.pair.milliseconds for one in tried]),
+    }
+    if any(one.others is not None for one in tried):
+        found["baselines"] = baselines(tried, limits)
+    found["failures"] = failures(evaluation)
+    cleaned: dict[str, Any] = without_infinities(found)
+    return cleaned
+
+
+def _within(one: Tried, scene: str, scene_of: Sequence[str]) -> bool:
+    return scene_of[one.drawn.query] == scene_of[one.drawn.match] == scene
+
+
+def _of_scene(
+    own: Sequence[int], tried: Sequence[Tried], seconds: Sequence[Second | None],
+    limits: tuple[float, float],
+) -> dict[str, Any]:  # fmt: skip
+    """Figures of the pairs of one scene, its negatives among them."""
+    pairs, theirs = [tried[i] for i in own], [seconds[i] for i in own]
+    return {
+        "bins": bins(pairs, theirs, limits),
+        "same_scene": rate([one for one in pairs if one.drawn.kind == "same_scene"]),
+        "validation": validation_of([one.pair for one in pairs]),
+        "support": support(pairs, theirs),
+    }
+
+
+#: What other accepted pairs of the same query say of an accepted pair.
+Second = Literal["supported", "contradicted", "alone"]
+
+
+def second_pairs(evaluation: PairEvaluation) -> list[Second | None]:
+    """Return whether a second pair agrees with each accepted one, None for others.
+
+    Each accepted pair places its query by the true pose of its match, as the pose of a frame of
+    a map would. A pair is supported if another accepted pair of the same query, whose match was
+    taken from a different viewpoint, places it there too, to what a map takes for one place;
+    contradicted if all others place it elsewhere.
+    """
+    members, p = evaluation.members, evaluation.map
+    of_query: dict[int, list[int]] = {}
+    poses: dict[int, Floats] = {}
+    for i, one in enumerate(evaluation.tried):
+        T = one.pair.validation.T_match_query
+        if one.pair.accepted and T is not None:
+            of_query.setdefault(one.drawn.query, []).append(i)
+            poses[i] = members[one.drawn.match].pose @ T
+    said: list[Second | None] = [None] * len(evaluation.tried)
+    for own in of_query.values():
+        for i in own:
+            match = members[evaluation.tried[i].drawn.match]
+            agree = []
+            for j in own:
+                other = members[evaluation.tried[j].drawn.match]
+                views = np.stack([match.pose, other.pose])
+                if match.scene != other.scene:
+                    agree.append(False)
+                elif len(different_views(views, p)) > 1:
+                    agree.append(bool(at_place(poses[j][None], poses[i], p)[0]))
+            said[i] = "supported" if any(agree) else "contradicted" if agree else "alone"
+    return said
+
+
+def support(tried: Sequence[Tried], seconds: Sequence[Second | None]) -> dict[str, Any]:
+    """How many accepted pairs a second one supports, and how many of each kind are right."""
+    found: dict[str, Any] = {}
+    kinds: tuple[Second, ...] = get_args(Second)
+    for kind in kinds:
+        right = [t.pair.right for t, said in zip(tried, seconds, strict=True) if said == kind]
+        found[kind] = len(right)
+        name = "precision" if kind == "supported" else f"precision_{kind}"
+        found[name] = sum(right) / len(right) if right else None
+    return found
+
+
+def bins(
+    tried: Sequence[Tried], seconds: Sequence[Second | None], limits: tuple[float, float]
+) -> dict[str, dict[str, Any]]:
+    """By true overlap: how often the transform is right, accepted or not, and whether believed.
+
+    `success`: of the transform that validation found; `right`: to the limits of the evaluation.
+    `bound`: of refinement started at the true pose. Without a transform a pair is a failure.
+    `validation`: see `measures.validation`. `support`: see `support`.
+    """
+    found = {}
+    for name in BINS:
+        chosen = [i for i, one in enumerate(tried) if one.drawn.bin == name]
+        own = [tried[i].pair for i in chosen]
+        found[name] = {
+            "pairs": len(own),
+            "success": _shares([pair.error for pair in own], limits),
+            "bound": _shares([pair.bound or Error() for pair in own], limits),
+            "validation": validation_of(own),
+            "support": support([tried[i] for i in chosen], [seconds[i] for i in chosen]),
+        }
+    return found
+
+
+def _shares(errors: Sequence[Error], limits: tuple[float, float]) -> Figures:
+    figures = accuracy(errors)
+    right = sum(e.within(*limits) for e in errors) / len(errors) if errors else None
+    return {
+        "within_5cm_5deg": figures["within_5cm_5deg"],
+        "within_10cm_10deg": figures["within_10cm_10deg"],
+        "right": right,
+    }
+
+
+def negatives(evaluation: PairEvaluation) -> dict[str, Any]:
+    """How many pairs that see nothing of each other were accepted, and how many may be.
+
+    `planar`: the pairs of two scenes of which a frame is planar. `by_scenes`: of every two.
+    """
+    tried, members = evaluation.tried, evaluation.members
+    same = [one for one in tried if one.drawn.kind == "same_scene"]
+    cross = [one for one in tried if one.drawn.kind == "cross_scene"]
+    couples: dict[str, list[Tried]] = {}
+    for one in cross:
+        a, b = members[one.drawn.query].scene, members[one.drawn.match].scene
+        couples.setdefault(f"{a} | {b}", []).append(one)
+    return {
+        "same_scene": rate(same),
+        "cross_scene": rate(cross),
+        "cross_scene_planar": rate([one for one in cross if one.drawn.planar]),
+        "by_scenes": {name: rate(own) for name, own in couples.items()},
+        "confidence": CONFIDENCE,
+    }
+
+
+def rate(tried: Sequence[Tried]) -> dict[str, float | int | None]:
+    """Of pairs that ought not to be accepted: how many are; `upper`: see `upper_bound`."""
+    accepted = [one.pair for one in tried if one.pair.accepted]
+    return {
+        "pairs": len(tried),
+        "planar": sum(one.drawn.planar for one in tried),
+        "accepted": len(accepted),
+        "accepted_strong": sum(pair.validation.strength == "strong" for pair in accepted),
+        "upper": upper_bound(len(accepted), len(tried)),
+    }
+
+
+def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, Any]:
+    """Success of others by bin on the same pairs, and what ours costs beside them.
+
+    `start`: before refinement; `icp`: after their own; `ours`: after our refinement in its place.
+    `time_ratio`: median over pairs of our time over theirs, features of both frames counted.
+    """
+    beside = [one for one in tried if one.others is not None]
+    found: dict[str, Any] = {"pairs": len(beside), "methods": {}}
+    found["milliseconds"] = _median([one.milliseconds for one in beside if one.milliseconds])
+    for method in METHODS:
+        by_bin = {}
+        for name in BINS:
+            own = [(one.others or {}).get(method) for one in beside if one.drawn.bin == name]
+            by_bin[name] = {
+                "start": _shares([one.start if one else Error() for one in own], limits),
+                "icp": _shares([one.icp if one else Error() for one in own], limits),
+                "ours": _shares([one.ours if one else Error() for one in own], limits),
+            }
+        both = [
+            (one.milliseconds, one.others[method].milliseconds)
+            for one in beside
+            if one.milliseconds and one.others and method in one.others
+        ]
+        found["methods"][method] = {
+            "bins": by_bin,
+            "milliseconds": _median([theirs for _, theirs in both]),
+            "time_ratio": _median([ours / theirs for ours, theirs in both]),
+        }
+    return found
+
+
+def why(one: Tried) -> str | None:
+    """What went wrong with a pair, None where nothing did.
+
+    `wrongly_accepted`; `not_believed`: a right transform that was not accepted; `near`: off by
+    up to twice the limits, and not accepted; `not_found`: farther off or without a transform,
+    though the two overlap.
+    """
+    pair = one.pair
+    if pair.accepted:
+        return None if pair.right else "wrongly_accepted"
+    if pair.right:
+        return "not_believed"
+    if one.drawn.kind != "overlapping":
+        return None
+    metres, degrees = pair.limits
+    return "near" if pair.error.within(2 * metres, 2 * degrees) else "not_found"
+
+
+def failures(evaluation: PairEvaluation) -> list[dict[str, Any]]:
+    """Every pair that went wrong, the worst kind first, and all that was told of it."""
+    order = ("wrongly_accepted", "not_believed", "near", "not_found")
+    listed = [(why(one), number, one) for number, one in enumerate(evaluation.tried)]
+    wrong = [(kind, number, one) for kind, number, one in listed if kind is not None]
+    wrong.sort(key=lambda entry: (order.index(entry[0]), entry[1]))
+    return [
+        {
+            "number": number,
+            "what": kind,
+            "query": evaluation.members[one.drawn.query].name,
+            "match": evaluation.members[one.drawn.match].name,
+            "kind": one.drawn.kind,
+            "planar": one.drawn.planar,
+            "true_overlap": one.drawn.overlap_least,
+            **_pair_record(one.pair, evaluation.acceptance),
+            "bound": None if one.pair.bound is None else _off(one.pair.bound),
+        }
+        for kind, number, one in wrong
+    ]
+
+
+def _pair_record(pair: ValidatedPair, p: AcceptanceParameters) -> dict[str, Any]:
+    v = pair.validation
+    return {
+        **_off(pair.error),
+        "status": v.status,
+        "strength": v.strength,
+        "reason": v.reason,
+        "residual_m": v.residual_m,
+        "residual_deg": math.degrees(v.residual_rad),
+        "overlap": v.overlap,
+        "plane_overlap": v.plane_overlap,
+        "violations": v.violations,
+        "evidence": evidence(v, p),
+        "ambiguity": v.ambiguity,
+        "inliers": v.inliers,
+    }
+
+
+def _off(error: Error) -> dict[str, float]:
+    return {"translation_m": error.metres, "rotation_deg": math.degrees(error.radians)}
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if len(values) else None

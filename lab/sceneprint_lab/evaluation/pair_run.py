@@ -1,0 +1,691 @@
+"""From recordings to pairs of frames that were registered, and how far off each is.
+
+PATH...  --evaluate_pairs-->  PairEvaluation
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import combinations, pairwise
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import DatasetError
+from sceneprint.fusion import open3d
+from sceneprint.geometry.registration.alignment import AlignmentParameters
+from sceneprint.geometry.registration.icp import refined_all
+from sceneprint.geometry.registration.sequence_alignment import Matching
+from sceneprint.geometry.signature.pair_features import PropertyParameters
+from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
+from sceneprint.geometry.validation.map_verification import MapParameters
+from sceneprint.geometry.validation.validation import refined_at
+from sceneprint.models import Model, ModelParameters
+from sceneprint.pipeline import Signer, geometry_of
+from sceneprint.signing import see
+from sceneprint.types import AnyFrame, Cloud, DepthFrame, Floats, Geometry
+from sceneprint_lab.evaluation.judgement import (
+    Candidate,
+    Judge,
+    QueryTask,
+    open_judge,
+    refined_from_truth,
+    true_transform,
+    validated,
+)
+from sceneprint_lab.evaluation.protocol import (
+    RIGHT,
+    Error,
+    FrameStore,
+    Overlaps,
+    Prepared,
+    ProtocolFrame,
+    SignedFrame,
+    ValidatedPair,
+    Watch,
+    every_frame,
+    map_over,
+    pose_error,
+    prepare_all,
+    unwatched,
+    view_of,
+)
+from sceneprint_lab.evaluation.run import OFF_PLANE, PLANAR, overlaps_of, plane_share
+
+#: Edges of the bins of true overlap: the smaller direction, agreement within 10 cm.
+EDGES = (0.1, 0.3, 0.5, 0.7, 1.0)
+BINS = tuple(f"{round(100 * low)}-{round(100 * high)}" for low, high in pairwise(EDGES))
+#: Two frames of a scene see nothing of each other below this, mean of both directions.
+NOTHING = 0.01
+#: Share of cross-scene pairs that are drawn among those with a planar frame.
+PLANAR_SHARE = 0.25
+
+Kind = Literal["overlapping", "same_scene", "cross_scene"]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """How many pairs are drawn, and how.
+
+    Parameters
+    ----------
+    pairs : of each bin of each scene, and as many of each scene that see nothing of each other
+    negatives : of two scenes, over all of these
+    apart : places in the recording between two frames of one sequence, at least
+    seed : of the draw
+    """
+
+    pairs: int = 120
+    negatives: int = 400
+    apart: int = 30
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class FrameOrigin:
+    """Where a frame comes from.
+
+    Parameters
+    ----------
+    scene : its parent frame
+    run : its sequence
+    number : its place in the sequence
+    """
+
+    scene: str
+    run: str
+    number: int
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A pair of frames that is tried.
+
+    Parameters
+    ----------
+    query, match : indices of members
+    kind : overlapping, or a negative of one scene or of two
+    bin : of BINS where they overlap, else None
+    overlap_mean, overlap_least : as in Overlaps; 0 for two scenes
+    planar : whether a frame of the two is planar
+    """
+
+    query: int
+    match: int
+    kind: Kind
+    bin: str | None
+    overlap_mean: float
+    overlap_least: float
+    planar: bool
+
+
+def draw(
+    places: Sequence[FrameOrigin], truth: Overlaps, planar: NDArray[np.bool_], p: Drawing
+) -> list[Drawn]:
+    """Pairs of every bin and of both kinds of negatives, each pair once; fewer where fewer exist.
+
+    The later frame is the query. Of pairs of two scenes, every two scenes have as many, and a
+    quarter is drawn among those with a planar frame, so long as there are any.
+
+    Parameters
+    ----------
+    places : (N,) of the frames
+    truth : (N, N) overlap, 0 between scenes
+    planar : (N,) whether a frame shows little but one plane
+    p : see Drawing
+    """
+    scenes = list(dict.fromkeys(place.scene for place in places))
+    of = {s: np.flatnonzero([place.scene == s for place in places]) for s in scenes}
+    drawn: list[Drawn] = []
+    for number, scene in enumerate(scenes):
+        drawn += _of_one_scene(of[scene], places, truth, planar, p, number)
+    couples = list(combinations(scenes, 2))
+    for number, (a, b) in enumerate(couples):
+        share = p.negatives // len(couples) + (number < p.negatives % len(couples))
+        rng = np.random.default_rng((p.seed, 1, number))
+        drawn += _of_two_scenes(of[a], of[b], planar, share, rng)
+    return drawn
+
+
+def _of_one_scene(
+    own: NDArray[np.intp],
+    places: Sequence[FrameOrigin],
+    truth: Overlaps,
+    planar: NDArray[np.bool_],
+    p: Drawing,
+    scene: int,
+) -> list[Drawn]:
+    later, earlier = np.tril_indices(len(own), -1)
+    later, earlier = own[later], own[earlier]
+    _, runs = np.unique([place.run for place in places], return_inverse=True)
+    numbers = np.array([place.number for place in places], int)
+    near = (runs[later] == runs[earlier]) & (np.abs(numbers[later] - numbers[earlier]) < p.apart)
+    later, earlier = later[~near], earlier[~near]
+    least, mean = truth.least[later, earlier], truth.mean[later, earlier]
+    found = []
+    choices: list[tuple[Kind, str | None, NDArray[np.bool_]]] = [
+        ("overlapping", name, inside(least, name)) for name in BINS
+    ]
+    choices.append(("same_scene", None, (mean < NOTHING) & (least < NOTHING)))
+    for number, (kind, name, good) in enumerate(choices):
+        rng = np.random.default_rng((p.seed, 0, scene, number))
+        for k in _some(np.flatnonzero(good), p.pairs, rng):
+            i, j = int(later[k]), int(earlier[k])
+            flat = bool(planar[i] or planar[j])
+            found.append(Drawn(i, j, kind, name, float(mean[k]), float(least[k]), flat))
+    return found
+
+
+def inside(least: Floats, name: str) -> NDArray[np.bool_]:
+    """Whether overlaps lie in a bin; the last one has its upper edge."""
+    low, high = list(pairwise(EDGES))[BINS.index(name)]
+    return (least >= low) & ((least < high) | (high == EDGES[-1]))
+
+
+def _of_two_scenes(
+    a: NDArray[np.intp],
+    b: NDArray[np.intp],
+    planar: NDArray[np.bool_],
+    n: int,
+    rng: np.random.Generator,
+) -> list[Drawn]:
+    flat = (planar[a][:, None] | planar[b]).ravel()
+    first = _some(np.flatnonzero(flat), round(PLANAR_SHARE * n), rng)
+    rest = np.setdiff1d(np.arange(len(flat)), first)
+    chosen = np.concatenate([first, _some(rest, n - len(first), rng)])
+    return [
+        Drawn(int(a[k // len(b)]), int(b[k % len(b)]), "cross_scene", None, 0.0, 0.0, bool(flat[k]))
+        for k in np.sort(chosen)
+    ]
+
+
+def _some(of: NDArray[np.intp], n: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """At most n of some numbers, each once, rising."""
+    return np.sort(rng.choice(of, min(n, len(of)), replace=False))
+
+
+# Registration as others do it, beside ours: FPFH with RANSAC or FGR, then ICP, by Open3D.
+#
+# points, points  --register-->  Attempt of each method
+#
+# One standard configuration each, not tuned, in one direction; they always answer, and do not say
+# whether to believe it. Features are counted on both frames.
+
+T = TypeVar("T")
+
+#: FPFH as its users run it: voxel, then normals (radius, neighbours), features (the same).
+VOXEL, NORMALS, FEATURES = 0.05, (0.10, 30), (0.25, 100)
+#: RANSAC: farthest correspondence (metres), points a hypothesis, least ratio of edge lengths, ...
+CORRESPONDENCE, POINTS, BASELINE_EDGES = 0.075, 3, 0.9
+#: ... hypotheses at the most, and confidence at which it stops.
+HYPOTHESES, CONFIDENCE = 100_000, 0.999
+#: FGR: farthest correspondence, metres: half a voxel, as its authors' example has it.
+FGR_CORRESPONDENCE = 0.025
+#: ICP, point to plane: voxel of both clouds, and farthest correspondence, metres.
+ICP_VOXEL, ICP_CORRESPONDENCE = 0.02, 0.05
+#: What is measured, in the order of the tables.
+METHODS = ("FPFH + RANSAC", "FPFH + FGR")
+#: Fewer points than this in the thinned cloud are not registered.
+_FEWEST = 10
+
+
+class Clock:
+    """Milliseconds by stage."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, float] = {}
+
+    def run(self, stage: str, call: Callable[[], T]) -> T:
+        """Time one call and add it to its stage."""
+        start = time.perf_counter()
+        result = call()
+        self.stages[stage] = self.stages.get(stage, 0.0) + 1e3 * (time.perf_counter() - start)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """What one method makes of a pair.
+
+    Parameters
+    ----------
+    start : (4, 4) T_match_query before ICP
+    refined : (4, 4) after ICP
+    stages : milliseconds; those of features on both frames
+    """
+
+    start: Floats
+    refined: Floats
+    stages: dict[str, float]
+
+    @property
+    def milliseconds(self) -> float:
+        """Of all stages."""
+        return sum(self.stages.values())
+
+
+def points_of(frame: DepthFrame, minimum: float, maximum: float) -> Floats:
+    """All samples of a depth image within a range, (N, 3) metres."""
+    k = frame.intrinsics
+    y, x = np.nonzero((frame.depth >= minimum) & (frame.depth <= maximum))
+    z = frame.depth[y, x].astype(np.float64)
+    return np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=1)
+
+
+def register(
+    query: Floats,
+    match: Floats,
+    o3d: Any,
+    methods: Sequence[str] = METHODS,
+    *,
+    seed: int = 0,
+    scale: float = 1.0,
+) -> dict[str, Attempt]:
+    """Each method on a pair of clouds; nothing where one of these is next to empty.
+
+    Features are computed once, and counted for each method.
+
+    Parameters
+    ----------
+    query, match : (N, 3) metres
+    o3d : of `open3d`
+    methods : of METHODS
+    seed : of the random choices
+    scale : that all lengths are multiplied by: 1 for rooms
+    """
+    register, search = o3d.pipelines.registration, _searching(o3d, scale)
+    shared, clouds = Clock(), [cloud_of(points, o3d) for points in (query, match)]
+    thin = shared.run("voxel grid", lambda: [c.voxel_down_sample(scale * VOXEL) for c in clouds])
+    if min(len(c.points) for c in thin) < _FEWEST:
+        return {}
+    shared.run("normals", lambda: [c.estimate_normals(search(*NORMALS)) for c in thin])
+    features = shared.run(
+        "features", lambda: [register.compute_fpfh_feature(c, search(*FEATURES)) for c in thin]
+    )
+    found = {}
+    for name in methods:
+        clock, estimate = Clock(), _ransac if name == METHODS[0] else _fgr
+        clock.stages |= shared.stages
+        o3d.utility.random.seed(seed)
+        start = clock.run(name.split()[-1], lambda: estimate(thin, features, o3d, scale))  # noqa: B023
+        refined = clock.run("ICP", lambda: _icp(clouds, start, o3d, scale))  # noqa: B023
+        found[name] = Attempt(start, refined, clock.stages)
+    return found
+
+
+def cloud_of(points: Floats, o3d: Any) -> Any:
+    """Open3D's cloud of (N, 3) points."""
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+
+
+def _searching(o3d: Any, scale: float) -> Callable[[float, int], Any]:
+    return lambda radius, most: o3d.geometry.KDTreeSearchParamHybrid(scale * radius, most)
+
+
+def _ransac(thin: list[Any], features: list[Any], o3d: Any, scale: float) -> Floats:
+    register = o3d.pipelines.registration
+    found = register.registration_ransac_based_on_feature_matching(
+        *thin,
+        *features,
+        True,
+        scale * CORRESPONDENCE,
+        register.TransformationEstimationPointToPoint(False),
+        POINTS,
+        [
+            register.CorrespondenceCheckerBasedOnEdgeLength(BASELINE_EDGES),
+            register.CorrespondenceCheckerBasedOnDistance(scale * CORRESPONDENCE),
+        ],
+        register.RANSACConvergenceCriteria(HYPOTHESES, CONFIDENCE),
+    )
+    return np.array(found.transformation, np.float64)
+
+
+def _fgr(thin: list[Any], features: list[Any], o3d: Any, scale: float) -> Floats:
+    register = o3d.pipelines.registration
+    option = register.FastGlobalRegistrationOption(
+        maximum_correspondence_distance=scale * FGR_CORRESPONDENCE
+    )
+    found = register.registration_fgr_based_on_feature_matching(*thin, *features, option)
+    return np.array(found.transformation, np.float64)
+
+
+def _icp(clouds: list[Any], start: Floats, o3d: Any, scale: float) -> Floats:
+    """Point to plane; the finer clouds and the normals it asks for are its own."""
+    register = o3d.pipelines.registration
+    fine = [c.voxel_down_sample(scale * ICP_VOXEL) for c in clouds]
+    fine[1].estimate_normals(_searching(o3d, scale)(*NORMALS))
+    found = register.registration_icp(
+        *fine,
+        scale * ICP_CORRESPONDENCE,
+        start,
+        register.TransformationEstimationPointToPlane(),
+    )
+    return np.array(found.transformation, np.float64)
+
+
+# A pair of frames registered by us and by others, and judged by the true poses.
+#
+# Drawn, Member, Member  --attempt-->  Tried
+
+
+@dataclass(frozen=True, eq=False)
+class Other:
+    """What a baseline made of a pair.
+
+    Parameters
+    ----------
+    start, icp, ours : errors: as found; after its own ICP; after our refinement in its place
+    milliseconds : features of both frames, search and its own ICP
+    """
+
+    start: Error
+    icp: Error
+    ours: Error
+    milliseconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A pair that was validated.
+
+    Parameters
+    ----------
+    drawn : see Drawn
+    pair : see Pair; with `bound` where the two overlap
+    others : by method; None where baselines were not asked for, or the two do not overlap, and
+        empty where there were too few points for any
+    milliseconds : beside others: of ours, features of both frames counted; else None
+    """
+
+    drawn: Drawn
+    pair: ValidatedPair
+    others: dict[str, Other] | None
+    milliseconds: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What a process needs to try pairs.
+
+    Parameters
+    ----------
+    judging : see Judge
+    store : of the frames
+    model : for baselines: with the parameters of ours
+    limits : metres and degrees to which a transform is to be right
+    o3d : Open3D, or None where no baselines were asked for
+    """
+
+    judging: Judge
+    store: FrameStore
+    model: Model
+    limits: tuple[float, float]
+    o3d: Any | None
+
+
+def open_bench(
+    store: FrameStore,
+    model: Model,
+    mode: Mode,
+    seed: int,
+    limits: tuple[float, float],
+    *,
+    baselines: bool,
+    matching: Matching = "histograms",
+) -> Bench:
+    """Make ready to try pairs of the frames of a store."""
+    o3d = open3d("A baseline of registration") if baselines else None
+    judging = open_judge(store, mode, seed, model.parameters.validation, matching)
+    return Bench(judging, store, model, limits, o3d)
+
+
+def attempt(bench: Bench, task: tuple[Drawn, SignedFrame, SignedFrame]) -> Tried:
+    """Validate a pair; where the two overlap, see what registration could reach and others do."""
+    drawn, query, match = task
+    candidate = Candidate(
+        drawn.match, match.number, match.scene, match.pose, drawn.overlap_mean, drawn.overlap_least
+    )
+    asked = QueryTask(query.number, query.scene, query.pose, [], [], (candidate,))
+    pair = replace(validated(bench.judging, asked, candidate), limits=bench.limits)
+    if drawn.kind != "overlapping":
+        return Tried(drawn, pair, None, None)
+    T = refined_from_truth(bench.judging, asked, candidate)
+    true = true_transform(asked, candidate)
+    pair = replace(pair, bound=_error(T, true))
+    if bench.o3d is None:
+        return Tried(drawn, pair, None, None)
+    others, spent = _others(bench, bench.store.frame(query), bench.store.frame(match), true)
+    return Tried(drawn, pair, others, spent + pair.milliseconds)
+
+
+def _others(
+    bench: Bench, query: AnyFrame, match: AnyFrame, true: Floats
+) -> tuple[dict[str, Other], float]:
+    """What the baselines make of two frames, and the milliseconds of our geometry of both."""
+    p = bench.model.parameters
+    start = time.perf_counter()
+    ours, its = (geometry_of(see(frame, p), bench.model) for frame in (query, match))
+    spent = 1e3 * (time.perf_counter() - start)
+    found = register(
+        peer_points(query, bench.model),
+        peer_points(match, bench.model),
+        bench.o3d,
+        seed=bench.judging.seed,
+        scale=scale_of(p),
+    )
+    others = {}
+    for name, one in found.items():
+        refined = refined_by_us(ours, its, one.start, bench.judging.p.alignment)
+        others[name] = Other(
+            _error(one.start, true),
+            _error(one.refined, true),
+            _error(refined, true),
+            one.milliseconds,
+        )
+    return others, spent
+
+
+def scale_of(p: ModelParameters) -> float:
+    """How much longer the lengths of a model are than those for rooms, by its radius."""
+    return p.properties.radius / PropertyParameters().radius
+
+
+def peer_points(frame: AnyFrame, model: Model) -> Floats:
+    """What baselines are given: all points, of a depth image those within the model's range."""
+    if isinstance(frame, Cloud):
+        return frame.points.astype(np.float64)
+    p = model.parameters.depth
+    return points_of(frame, p.minimum_depth, p.maximum_depth)
+
+
+def refined_by_us(
+    query: Geometry, match: Geometry, T: Floats, p: AlignmentParameters
+) -> Floats | None:
+    """Our refinement of another's transform: with wide gates first, as our own hypotheses get."""
+    coarse = refined_all(query.surface, match.surface, T[None], p.coarse)
+    return refined_at(query, match, coarse[0] if len(coarse) else T, p.fine)
+
+
+def _error(T: Floats | None, true: Floats) -> Error:
+    return Error() if T is None else pose_error(T, true)
+
+
+@dataclass(frozen=True)
+class PairSettings:
+    """How to evaluate pairs.
+
+    Parameters
+    ----------
+    drawing : see Drawing
+    frames : of each scene, evenly spread over its recordings, at most
+    mode, matching : of validation
+    seed : of every pair that is validated
+    limits : metres and degrees to which a transform is to be right
+    baselines : whether overlapping pairs are registered by Open3D as well
+    jobs : processes; no figure but times depends on it
+    cache_dir : of derived files of the model; None for the user's
+    """
+
+    drawing: Drawing = field(default_factory=Drawing)
+    frames: int = 300
+    mode: Mode = "full"
+    matching: Matching = "histograms"
+    seed: int = 0
+    limits: tuple[float, float] = RIGHT
+    baselines: bool = False
+    jobs: int = 1
+    cache_dir: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PairEvaluation:
+    """What came of every pair.
+
+    Parameters
+    ----------
+    members : N frames that can be used, without their signatures
+    limits : metres and degrees to which a transform was to be right
+    acceptance, map : the numbers of the model's
+    planes : (N,) share of each one's samples in its largest plane
+    tried : in the order drawn
+    left_out : (name, reason) of other frames
+    prepare_ms : median time to sign a frame and work out its geometry
+    """
+
+    members: list[SignedFrame]
+    limits: tuple[float, float]
+    acceptance: AcceptanceParameters
+    planes: Floats
+    tried: list[Tried]
+    left_out: list[tuple[str, str]]
+    prepare_ms: float | None
+    map: MapParameters = field(default_factory=MapParameters)
+
+
+def evaluate_pairs(
+    paths: Sequence[Path],
+    signer: Signer,
+    store: FrameStore,
+    settings: PairSettings,
+    watch: Watch = unwatched,
+) -> PairEvaluation:
+    """Draw pairs by true overlap, validate each, and judge it by the true poses.
+
+    Parameters
+    ----------
+    paths : of sequences with poses; frames of two scenes are negatives of each other
+    signer : see `open_signer`
+    store : an empty one; its frames serve the pictures afterwards
+    settings : see Settings
+    watch : told of every step of every stage
+
+    Raises
+    ------
+    DatasetError : no two frames could be used, or no pair is to be had of them.
+    MissingDependency : baselines were asked for, and Open3D cannot be imported.
+    """
+    if settings.baselines:
+        # before all the reading: where it is missing, that is what is to be told
+        open3d("A baseline of registration")
+    placed = spread(every_frame(paths), settings.frames)
+    chosen = tuple(one for one, _ in placed)
+    prepared = prepare_all(
+        chosen,
+        signer,
+        store,
+        jobs=settings.jobs,
+        cache_dir=settings.cache_dir,
+        watch=watch,
+    )
+    members = [replace(m, signature=np.empty(0, np.uint8)) for m in prepared.queries]
+    if len(members) < 2:
+        raise DatasetError(_too_few(prepared))
+    parameters = signer.model.parameters
+    opening_views = partial(_views, store, OFF_PLANE * scale_of(parameters))
+    shares = map_over(members, _plane_share, opening_views, settings.jobs)
+    planes = np.array(list(watch(shares, "planes", len(members))))
+    places = [placed[member.number][1] for member in members]
+    truth = _overlaps(members, store, watch)
+    drawn = draw(places, truth, planes >= PLANAR, settings.drawing)
+    if not drawn:
+        raise DatasetError(
+            f"Of {len(members)} frames no two overlap by a tenth or see nothing of each other, "
+            f"{settings.drawing.apart} places apart. Give more recordings, or a smaller --apart."
+        )
+    tasks = [(one, members[one.query], members[one.match]) for one in drawn]
+    opening = partial(
+        open_bench,
+        store,
+        signer.model,
+        settings.mode,
+        settings.seed,
+        settings.limits,
+        baselines=settings.baselines,
+        matching=settings.matching,
+    )
+    tried = map_over(tasks, attempt, opening, settings.jobs)
+    return PairEvaluation(
+        members,
+        settings.limits,
+        parameters.validation.acceptance,
+        planes,
+        list(watch(tried, "validate", len(tasks))),
+        prepared.left_out,
+        prepared.milliseconds,
+        signer.model.answer.map,
+    )
+
+
+def spread(chosen: Sequence[ProtocolFrame], most: int) -> list[tuple[ProtocolFrame, FrameOrigin]]:
+    """At most so many frames of each scene, evenly over its recordings, and where each is."""
+    counts: Counter[tuple[str, str]] = Counter()
+    of: dict[str, list[tuple[ProtocolFrame, FrameOrigin]]] = {}
+    for one in chosen:
+        run = str(one.reference.path.parent)
+        place = FrameOrigin(one.scene, run, counts[one.scene, run])
+        counts[one.scene, run] += 1
+        of.setdefault(one.scene, []).append((one, place))
+    return [
+        own[i]
+        for own in of.values()
+        for i in np.linspace(0, len(own) - 1, min(most, len(own))).round().astype(int).tolist()
+    ]
+
+
+def _too_few(prepared: Prepared) -> str:
+    usable = len(prepared.queries)
+    if not prepared.left_out:
+        return f"There is {usable} frame, and a pair has two. Give more recordings."
+    name, reason = prepared.left_out[0]
+    return (
+        f"{usable or 'No'} frame can be used, and a pair has two. The first that was left out is "
+        f"{name}: {reason.rstrip('.')}. Choose other recordings."
+    )
+
+
+def _views(store: FrameStore, off: float) -> tuple[FrameStore, float]:
+    return store, off
+
+
+def _plane_share(opened: tuple[FrameStore, float], member: SignedFrame) -> float:
+    store, off = opened
+    return plane_share(view_of(store.frame(member)).samples, off)
+
+
+def _overlaps(members: Sequence[SignedFrame], store: FrameStore, watch: Watch) -> Overlaps:
+    """Overlap of all with all; 0 between scenes."""
+    shape = len(members), len(members)
+    mean, least = np.zeros(shape), np.zeros(shape)
+    for scene in dict.fromkeys(member.scene for member in members):
+        own = [i for i, member in enumerate(members) if member.scene == scene]
+        of_scene = [members[i] for i in own]
+        found = overlaps_of(Prepared(of_scene, of_scene, [], None), store, watch)
+        at = np.ix_(own, own)
+        mean[at], least[at] = found.mean, found.least
+    return Overlaps(mean, least)

@@ -1,0 +1,626 @@
+"""The figures of an evaluation as lines to read in a terminal.
+
+figures  --table-->  lines
+Evaluation  --recalls, baseline_rows-->  rows of the baselines, as the table has them for R
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.geometry.rigid import inverse
+from sceneprint.types import AnyFrame, Floats
+from sceneprint_client.api import Answer, Match
+from sceneprint_lab.evaluation.baselines import Compared
+from sceneprint_lab.evaluation.measures import (
+    FIRST,
+    Figures,
+    absent,
+    accuracy,
+    answers,
+    bound,
+    diversity,
+    lost,
+    oracle_and_random,
+    place_of,
+    recall,
+    rows,
+    validation,
+)
+from sceneprint_lab.evaluation.protocol import VIEWS, Error, QueryOutcome, ValidatedPair, pose_error
+from sceneprint_lab.evaluation.run import Evaluation
+
+
+def recalls(evaluation: Evaluation) -> dict[str, Any]:
+    """Recall of R, of C, and of a random frame; see `recall`.
+
+    `within_m`: a frame is the query's place where it was taken within so many metres; null: where
+    the two overlap by half.
+    """
+    relevant, allowed = evaluation.relevant, evaluation.allowed
+    outcomes = evaluation.outcomes
+    return {
+        "within_m": evaluation.within_m,
+        "R": recall(relevant, allowed, [o.ranking for o in outcomes]),
+        "DR": recall(relevant, allowed, [o.selection for o in outcomes]),
+        "random": _by_chance(relevant, allowed),
+    }
+
+
+def _by_chance(
+    relevant: NDArray[np.bool_], allowed: NDArray[np.bool_]
+) -> dict[str, float | int | None]:
+    """Expected share of queries that a random frame would answer rightly."""
+    good, n = (relevant & allowed).sum(axis=1), allowed.sum(axis=1)
+    able = good > 0
+    shares = good[able] / n[able]
+    return {"queries": int(able.sum()), "at_1": float(shares.mean()) if able.any() else None}
+
+
+def baseline_rows(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
+    """Each baseline's figures by its name: those of R, by its ranking.
+
+    `milliseconds`: see Compared. `ratio`: to describe a query and to rank the database for it,
+    over the same by the signature.
+    `reason`: why the baseline could not be asked; then it has no figures.
+    """
+    ours = float(np.median([o.milliseconds["rank"] for o in evaluation.outcomes]))
+    return {
+        one.name: {"reason": one.reason} if one.reason else _row(one, evaluation, ours)
+        for one in evaluation.compared
+    }
+
+
+def _row(one: Compared, evaluation: Evaluation, ranking_ms: float) -> dict[str, Any]:
+    outcomes = evaluation.outcomes
+    here = [i for i, o in enumerate(outcomes) if o.present]
+    firsts = [one.first[i] for i in here]
+    ms = one.milliseconds
+    return {
+        **accuracy([Error() if pair is None else pair.error for pair in firsts]),
+        **_overlaps([outcomes[i] for i in here], [one.rankings[i] for i in here]),
+        "recall": recall(evaluation.relevant, evaluation.allowed, one.rankings),
+        "milliseconds": ms,
+        "ratio": (ms["describe"] + ms["rank"]) / (ms["sign"] + ranking_ms),
+    }
+
+
+def _overlaps(
+    outcomes: Sequence[QueryOutcome], rankings: Sequence[Sequence[int]]
+) -> dict[str, float | None]:
+    """As `measures.retrieval`, of any ranking."""
+    if not outcomes:
+        names = ("top1_overlap_50", "top5_overlap_50", "top1_overlap_30", "mean_overlap")
+        return dict.fromkeys(names)
+    first = [
+        [o.overlap_of(match) for match in ranking[: FIRST[1]]]
+        for o, ranking in zip(outcomes, rankings, strict=True)
+    ]
+    nearest = np.array([five[0] for five in first])
+    return {
+        "top1_overlap_50": float((nearest >= 0.5).mean()),
+        "top5_overlap_50": float(np.mean([max(five) >= 0.5 for five in first])),
+        "top1_overlap_30": float((nearest >= 0.3).mean()),
+        "mean_overlap": float(nearest.mean()),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class FramePlace:
+    """Where a frame was taken: T_parent_sensor (4, 4), in a parent frame."""
+
+    parent: str
+    pose: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """How far off the answers to one query are.
+
+    Parameters
+    ----------
+    first : of each row, error of its first answer; infinite where it has none
+    spread : of each row, mean and standard deviation of the distance between the query and the
+        first five frames, metres; None with fewer than two of its parent frame
+    """
+
+    first: Mapping[str, Error]
+    spread: Mapping[str, tuple[float, float] | None]
+
+
+def judge_answers(
+    truth: FramePlace, ranked: Answer, diverse: Answer, known: Mapping[str, FramePlace]
+) -> Judgement:
+    """Judge two answers to one query.
+
+    Parameters
+    ----------
+    truth : of the query
+    ranked : asked without diversification, for as many matches as are validated
+    diverse : asked with all stages, likewise
+    known : places of the database frames by their id
+    """
+    first = {
+        "R": _first(_by_rank(ranked), truth, known),
+        "VR": _first(_accepted(ranked), truth, known),
+        "DR": _first(_by_rank(diverse), truth, known),
+        "VDR": _first(_accepted(diverse), truth, known),
+        "pose_average": _located(diverse, truth),
+    }
+    spread = {
+        "R": _spread(_by_rank(ranked), truth, known),
+        "VR": _spread(_accepted(ranked), truth, known),
+        "DR": _spread(_by_rank(diverse), truth, known),
+        "VDR": _spread(_accepted(diverse), truth, known),
+    }
+    return Judgement(first, spread)
+
+
+def answer_rows(judged: Sequence[Judgement]) -> dict[str, Figures]:
+    """The figures of each row over queries, as `measures.rows` defines them.
+
+    `spread_mean_m` and `spread_std_m`: as in Judgement, averaged over the queries that have them.
+    """
+    rows: dict[str, Figures] = {}
+    for row in ("R", "VR", "DR", "VDR", "pose_average"):
+        spreads = [found for one in judged if (found := one.spread.get(row)) is not None]
+        mean = np.mean(spreads, axis=0).tolist() if spreads else (None, None)
+        rows[row] = accuracy([one.first[row] for one in judged]) | {
+            "spread_mean_m": mean[0],
+            "spread_std_m": mean[1],
+        }
+    return rows
+
+
+def _by_rank(answer: Answer) -> list[Match]:
+    return sorted(answer.matches, key=lambda match: match.rank)
+
+
+def _accepted(answer: Answer) -> list[Match]:
+    return [match for match in answer.matches if match.validation.status == "accepted"]
+
+
+def _first(matches: Sequence[Match], truth: FramePlace, known: Mapping[str, FramePlace]) -> Error:
+    if not matches:
+        return Error()
+    match = matches[0]
+    place = known[match.frame_id]
+    if match.transform is None or place.parent != truth.parent:
+        return Error()
+    return pose_error(np.array(match.transform.matrix), inverse(place.pose) @ truth.pose)
+
+
+def _located(answer: Answer, truth: FramePlace) -> Error:
+    if answer.location is None or answer.location.pose.parent_frame != truth.parent:
+        return Error()
+    return pose_error(np.array(answer.location.pose.matrix), truth.pose)
+
+
+def _spread(
+    matches: Sequence[Match], truth: FramePlace, known: Mapping[str, FramePlace]
+) -> tuple[float, float] | None:
+    places = [known[match.frame_id] for match in matches[:VIEWS]]
+    metres = [
+        float(np.linalg.norm(place.pose[:3, 3] - truth.pose[:3, 3]))
+        for place in places
+        if place.parent == truth.parent
+    ]
+    return (float(np.mean(metres)), float(np.std(metres))) if len(metres) >= 2 else None
+
+
+# The figures of an evaluation, as JSON and as a table to read.
+#
+# Evaluation  --figures-->  dict  --to_json-->  bytes        dict  --table-->  lines
+
+#: Of JSON: raised when a key changes its meaning.
+SCHEMA_VERSION = 1
+
+ROWS = ("R", "VR", "DR", "VDR", "pose_average", "pose_average_vr")
+
+
+def figures(
+    evaluation: Evaluation,
+    database: Callable[[int], AnyFrame],
+    settings: dict[str, Any],
+) -> dict[str, Any]:
+    """Every figure of an evaluation, ready for JSON.
+
+    At the top, all queries against the whole database (of several scenes, the paper's
+    `Combine`). `by_scene` has the same for the queries of each scene, where there are several;
+    `scenes` has each scene with a database of its own and `average` the mean of their rows,
+    for a 7-Scenes table. `recall` and `baselines`: see there.
+
+    Parameters
+    ----------
+    evaluation : see Evaluation
+    database : gives the frame of a database index, with its pose
+    settings : all that is needed to repeat it
+    """
+    prepared = evaluation.prepared
+    poses = [member.pose for member in prepared.database]
+    found: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "settings": settings}
+    found["counts"] = {
+        "queries": len(prepared.queries),
+        "database": len(prepared.database),
+        "left_out": len(prepared.left_out),
+    }
+    found["left_out"] = [{"name": n, "reason": why} for n, why in prepared.left_out]
+    found |= measured(evaluation.outcomes, poses, database)
+    found["recall"] = recalls(evaluation)
+    if evaluation.compared:
+        found["baselines"] = baseline_rows(evaluation)
+    scenes = list(dict.fromkeys(o.scene for o in evaluation.outcomes))
+    if len(scenes) > 1:
+        found["by_scene"] = {
+            scene: measured([o for o in evaluation.outcomes if o.scene == scene], poses, database)
+            for scene in scenes
+        }
+    if evaluation.alone:
+        found["scenes"] = {
+            scene: measured(outcomes, poses, database)
+            for scene, outcomes in evaluation.alone.items()
+        }
+        found["average"] = average([found["scenes"][scene] for scene in found["scenes"]])
+    found["milliseconds"] = {
+        "prepare": prepared.milliseconds,
+        **milliseconds(evaluation.outcomes),
+    }
+    names = [member.name for member in prepared.database]
+    found["per_query"] = [per_query(outcome, names) for outcome in evaluation.outcomes]
+    found["mistakes"] = mistakes(evaluation.outcomes, names)
+    cleaned: dict[str, Any] = without_infinities(found)
+    return cleaned
+
+
+def measured(
+    outcomes: Sequence[QueryOutcome], poses: Sequence[Floats], database: Callable[[int], AnyFrame]
+) -> dict[str, Any]:
+    """All figures of some queries."""
+    return {
+        **rows(outcomes),
+        "bound": bound(outcomes),
+        **oracle_and_random(outcomes),
+        "validation": validation(outcomes),
+        "diversity": diversity(outcomes, poses, database),
+        "lost": lost(outcomes),
+        "absent": absent(outcomes),
+        "answers": answers([outcome.answer for outcome in outcomes]),
+    }
+
+
+def average(scenes: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The mean of each figure of each row over scenes; null where a scene has none."""
+    result: dict[str, Any] = {}
+    for row in ROWS:
+        columns = {key: [scene[row][key] for scene in scenes] for key in scenes[0][row]}
+        result[row] = {
+            key: None if None in values else float(np.mean(values))
+            for key, values in columns.items()
+        }
+    return result
+
+
+def milliseconds(outcomes: Sequence[QueryOutcome]) -> dict[str, float | None]:
+    """Median time of each stage: of a query, or under `validate` of one pair."""
+    stages: dict[str, list[float]] = {
+        stage: [o.milliseconds[stage] for o in outcomes if stage in o.milliseconds]
+        for stage in ("rank", "compare_ranking", "diversify", "average", "answer")
+    }
+    stages["validate"] = [pair.milliseconds for o in outcomes for pair in o.pairs.values()]
+    return {stage: float(np.median(ms)) if ms else None for stage, ms in stages.items()}
+
+
+def per_query(outcome: QueryOutcome, names: Sequence[str]) -> dict[str, Any]:
+    """What one query came to: to look into what was lost, and to hold other answers to it.
+
+    `ranking` has the first of R, `selection` all of C, `matches` all pairs of C in the order in
+    which `associate` gives them.
+    """
+    answers = outcome.views("VDR")
+    best = int(np.argmax(outcome.overlap_mean)) if len(outcome.overlap_mean) else None
+    return {
+        "name": outcome.name,
+        "lost": place_of(outcome),
+        "best_overlap": None if best is None else float(outcome.overlap_mean[best]),
+        "R": _answer(outcome, outcome.ranking[:1], names),
+        "VDR": _answer(outcome, [pair.match for pair in answers[:1]], names),
+        "accepted": len(answers),
+        "pose_average": _error(outcome.average),
+        "answer": {
+            "status": outcome.answer.status,
+            "strength": outcome.answer.strength,
+            **_error(outcome.answer.error),
+        },
+        "ranking": [names[match] for match in outcome.ranking[: outcome.candidates]],
+        "selection": [names[match] for match in outcome.selection],
+        "matches": _matches(outcome, names),
+    }
+
+
+def _matches(outcome: QueryOutcome, names: Sequence[str]) -> list[dict[str, Any]]:
+    distance = dict(zip(outcome.ranking, outcome.distances.tolist(), strict=True))
+    return [
+        {
+            "match": names[pair.match],
+            "distance": distance[pair.match],
+            "status": pair.validation.status,
+            "strength": pair.validation.strength,
+            "T_match_query": None if (T := pair.validation.T_match_query) is None else T.tolist(),
+        }
+        for pair in outcome.tried()
+    ]
+
+
+def mistakes(outcomes: Sequence[QueryOutcome], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Pairs that were accepted with a wrong transform, or not accepted with a right one."""
+    return [
+        {
+            "query": outcome.name,
+            "same_scene": pair.same_scene,
+            "overlap_least": pair.overlap_least,
+            "residual_m": pair.validation.residual_m,
+            "residual_rad": pair.validation.residual_rad,
+            "agreement": pair.validation.overlap,
+            "plane_agreement": pair.validation.plane_overlap,
+            "violations": pair.validation.violations,
+            **_described(pair, names),
+        }
+        for outcome in outcomes
+        for pair in outcome.pairs.values()
+        if pair.accepted != pair.right
+    ]
+
+
+def _answer(outcome: QueryOutcome, first: list[int], names: Sequence[str]) -> dict[str, Any] | None:
+    if not first:
+        return None
+    return _described(outcome.pairs[first[0]], names)
+
+
+def _described(pair: ValidatedPair, names: Sequence[str]) -> dict[str, Any]:
+    v = pair.validation
+    return {
+        "match": names[pair.match],
+        "overlap": pair.overlap_mean,
+        "status": v.status,
+        "strength": v.strength,
+        "reason": v.reason,
+        "ambiguity": v.ambiguity,
+        **_error(pair.error),
+    }
+
+
+def _error(error: Error) -> dict[str, float]:
+    return {"translation_m": error.metres, "rotation_deg": math.degrees(error.radians)}
+
+
+def without_infinities(value: Any) -> Any:
+    """The same with null for what JSON has no number for."""
+    if isinstance(value, dict):
+        return {key: without_infinities(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_infinities(one) for one in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def to_json(found: dict[str, Any]) -> bytes:
+    """Bytes of a JSON file."""
+    return (json.dumps(found, indent=1, allow_nan=False) + "\n").encode()
+
+
+_NAMES = {"pose_average": "pose average", "pose_average_vr": "  of VR's views"}
+_HEAD = f"{'':18}{'5cm/5deg':>10}{'10cm/10deg':>12}{'median cm':>11}{'deg':>7}"
+_OVERLAP_HEAD = f"{'overlap':>10}{'top1 @.5':>10}{'top5 @.5':>10}{'top1 @.3':>10}{'scene':>8}"
+
+
+def table(found: dict[str, Any]) -> list[str]:
+    """The rows and a line for each of the rest; figures as `report.figures` gives them."""
+    lines = []
+    for scene, figures in found.get("scenes", {}).items():
+        lines += [f"{scene}, alone", *_rows(figures), ""]
+    if "average" in found:
+        lines += ["Average", *_rows(found["average"]), "", "Combine"]
+    lines += _rows(found)
+    lines += [_chance(found[name], name) for name in ("oracle", "random")]
+    baselines = found.get("baselines", {})
+    lines += [_accuracy(n, row) + _overlap(row) for n, row in baselines.items() if "recall" in row]
+    lines += ["", *_recalls(found), "", *_answers(found), "", *_sentences(found), ""]
+    for scene, figures in found.get("by_scene", {}).items():
+        lines += [
+            f"queries of {scene}, among all",
+            *_rows(figures),
+            *_answers(figures),
+            _lost(figures),
+            "",
+        ]
+    if found["left_out"]:
+        lines.append(_left_out(found))
+    return [*lines, _times(found)]
+
+
+#: Share of queries within 5 cm and 5 degrees, %: R and VDR in the table of the paper.
+PAPER = {
+    "chess": (97.3, 99.5), "fire": (92.3, 97.8), "heads": (93.5, 98.9), "office": (89.7, 98.4),
+    "pumpkin": (78.3, 82.8), "redkitchen": (87.9, 93.7), "stairs": (54.8, 61.0),
+}  # fmt: skip
+PAPER_OVERALL = {"average": (84.8, 90.3), "combine": (84.8, 90.4)}
+
+
+def seven_scenes_table(found: dict[str, Any], scene: str) -> list[str]:
+    """Queries within 5 cm and 5 degrees by scene, in percent, beside the figures of the paper.
+
+    Average and Combine are of the scenes that are there. The paper prints no DR, as its first match
+    is that of R.
+
+    Parameters
+    ----------
+    found : as `figures` gives them
+    scene : name of the first scene, for figures of one alone
+    """
+    rows = ("R", "DR", "VDR", "pose_average")
+    lines = [
+        "7-Scenes, queries within 5 cm and 5 deg, %",
+        f"{'':12}{'R':>7}{'DR':>7}{'VDR':>7}{'average':>9}{'R, paper':>10}{'VDR, paper':>12}",
+    ]
+    alone = found.get("scenes", {scene: found})
+    several = {"average": found["average"], "combine": found} if "average" in found else {}
+    for name, figures in {**alone, **several}.items():
+        own = [_percent(figures[row]["within_5cm_5deg"]) for row in rows]
+        r, vdr = (PAPER | PAPER_OVERALL)[name]
+        lines.append(f"{name:12}{own[0]:>7}{own[1]:>7}{own[2]:>7}{own[3]:>9}{r:>10}{vdr:>12}")
+    return lines
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f}"
+
+
+def _rows(figures: dict[str, Any]) -> list[str]:
+    lines = [_HEAD + _OVERLAP_HEAD]
+    lines += [_accuracy(_NAMES.get(r, r), figures[r]) + _overlap(figures[r]) for r in ROWS]
+    bounds = figures.get("bound", {})
+    names = {"VDR": "bound of VDR", "pose_average": "bound of average"}
+    return lines + [_accuracy(names[row], bounds[row]) for row in bounds]
+
+
+def _accuracy(name: str, row: dict[str, Any]) -> str:
+    metres = row["median_translation_m"]
+    return (
+        f"{name:18}{_share(row['within_5cm_5deg']):>10}{_share(row['within_10cm_10deg']):>12}"
+        f"{'-' if metres is None else f'{100 * metres:.1f}':>11}"
+        f"{_share(row['median_rotation_deg'], 1):>7}"
+    )
+
+
+def _overlap(row: dict[str, Any]) -> str:
+    if "mean_overlap" not in row:
+        return ""
+    keys = ("mean_overlap", "top1_overlap_50", "top5_overlap_50", "top1_overlap_30")
+    return "".join(f"{_share(row[key]):>10}" for key in keys) + (
+        f"{_share(row['right_scene']):>8}" if "right_scene" in row else ""
+    )
+
+
+def _recalls(found: dict[str, Any]) -> list[str]:
+    """Recall by every way to rank, and what a query costs beside the signature."""
+    if "recall" not in found:  # of figures that were kept before there was one
+        return []
+    within = found["recall"]["within_m"]
+    place = "overlap by half" if within is None else f"taken within {within:g} m"
+    able = found["recall"]["R"]["queries"]
+    lines = [
+        f"{f'{able} queries with a frame that is their place ({place}), recall':58}"
+        f"{'@1':>10}{'@5':>10}{'@10':>10}{'ms':>10}{'x ours':>8}"
+    ]
+    lines += [_recall(name, found["recall"][name]) for name in ("R", "DR", "random")]
+    for name, row in found.get("baselines", {}).items():
+        if "recall" not in row:
+            lines.append(f"{name:18}not asked: {row['reason']}")
+            continue
+        spent = row["milliseconds"]["describe"] + row["milliseconds"]["rank"]
+        ratio = f"{spent:>10.1f}{_share(row['ratio'], 2):>8}"
+        lines.append(_recall(name, row["recall"]) + ratio)
+    return lines
+
+
+def _recall(name: str, row: dict[str, Any]) -> str:
+    return f"{name:58}" + "".join(f"{_share(row.get(f'at_{k}')):>10}" for k in FIRST)
+
+
+def _chance(row: dict[str, Any], name: str) -> str:
+    return f"{name:58}" + _overlap(row)
+
+
+_ANSWERS = {
+    "found_right": "found and right",
+    "found_wrong": "found and wrong",
+    "ambiguous": "ambiguous",
+    "not_found": "not found",
+}
+
+
+def _answers(found: dict[str, Any]) -> list[str]:
+    """A row for each thing that a robot may be told."""
+    if "answers" not in found:  # of figures that were kept before there were any
+        return []
+    told = found["answers"]
+    lines = [f"{'answers':18}{'share':>10}"]
+    lines += [f"{name:18}{_share(told[key]):>10}" for key, name in _ANSWERS.items()]
+    lines[2] += (
+        f"   beyond 50 cm or 15 deg {_share(told['grossly_wrong'])}, at most "
+        f"{_share(told['grossly_wrong_at_most'])}; called strong "
+        f"{_share(told['found_strong_wrong'])}; of what is found {_share(told['wrong_of_found'])}"
+    )
+    lines.append(
+        f"confidence    calibration error {_share(told['calibration_error'])}, of the likeliest "
+        "pose of each query"
+    )
+    return lines
+
+
+def _sentences(found: dict[str, Any]) -> list[str]:
+    v, d, a = found["validation"], found["diversity"], found["absent"]
+    lines = [
+        f"acceptance    precision {_share(v['precision'])}, recall {_share(v['recall'])}, where "
+        f"overlap is 30 % {_share(v['recall_overlap_30'])}; {v['accepted']} of {v['pairs']} pairs "
+        f"accepted, {v['accepted_strong']} strong",
+    ]
+    if v["pairs_of_other_scenes"]:
+        lines.append(
+            f"other scenes  {v['accepted_of_other_scenes']} of {v['pairs_of_other_scenes']} pairs "
+            f"accepted, {v['accepted_strong_of_other_scenes']} strong"
+        )
+    spread = ", ".join(
+        f"{row} {_share(of['mean_m'])} +- {_share(of['std_m'])}"
+        for row, of in d["translation"].items()
+    )
+    lines.append(f"translation   {spread} m")
+    if d["coverage"]["VR"] is not None:
+        c = d["coverage"]
+        lines.append(
+            f"coverage      VR {c['VR']:.0f}, VDR {c['VDR']:.0f} voxels of 2 cm: x "
+            f"{c['ratio_of_means']:.2f} (mean of ratios {c['mean_ratio']:.2f})"
+        )
+    lines.append(_lost(found))
+    if a["queries"]:
+        lines.append(
+            f"absent        {a['queries']} queries whose scene is not in the database: "
+            f"{_share(a['accepted_strong'])} accepted strong, {_share(a['accepted_weak'])} weak"
+        )
+    return lines
+
+
+def _lost(figures: dict[str, Any]) -> str:
+    counts = [f"{n} {place.replace('_', ' ')}" for place, n in figures["lost"].items() if n]
+    return f"queries       {', '.join(counts)}"
+
+
+def _left_out(found: dict[str, Any]) -> str:
+    first = found["left_out"][0]
+    more = len(found["left_out"]) - 1
+    name = first["name"] if first["name"].isprintable() else ascii(first["name"])
+    reason = first["reason"] if first["reason"].isprintable() else ascii(first["reason"])
+    rest = f"; and {more} more (all are named in --json)" if more else ""
+    return f"left out      {name}: {reason}{rest}"
+
+
+def _times(found: dict[str, Any]) -> str:
+    times = [
+        f"{stage.replace('_', ' ')} {ms:.1f}"
+        for stage, ms in found["milliseconds"].items()
+        if ms is not None
+    ]
+    return f"milliseconds  {', '.join(times)} (medians; validate: of one pair)"
+
+
+def _share(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,269 @@
+"""Build synthetic sites, sign their frames, and answer all their queries as a service does.
+
+kind, seed, index  --ask_site-->  SiteAnswer, ...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sceneprint.errors import UselessFrame
+from sceneprint.geometry.rigid import turned
+from sceneprint.geometry.views import view_parameters
+from sceneprint.models import Model
+from sceneprint.pipeline import Signer, prepare
+from sceneprint.places import PosePrior
+from sceneprint.types import AnyFrame, Cloud, Floats, Geometry
+from sceneprint_client.poses import rotation_of
+from sceneprint_lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
+from sceneprint_lab.evaluation.protocol import JudgedAnswer, SignedFrame, overlaps, view_of
+from sceneprint_lab.evaluation.surface_maps import join_frames, render_views
+from sceneprint_lab.synth import synthesise_lookalike, synthesise_lookalike_survey
+from sceneprint_lab.synth.lookalike_surveys import SURVEYED_KINDS
+from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY, LookalikeSite
+
+#: From this overlap, smaller direction, a frame of the map is enough to answer a query.
+ANSWERABLE = 0.3
+#: So near, in metres, a scan of the map is near enough to answer a query of a scanner.
+ANSWERABLE_M = 10.0
+#: Deviations that a robot states with its prior, and how far that is turned at most, degrees.
+PRIOR_M, PRIOR_DEG = 0.3, 10.0
+#: Least and greatest side of the voxels of a surface that a site's map is joined to, metres.
+CLOUD_VOXEL_M, MESH_VOXEL_M = (0.05, 0.2), (0.015, 0.03)
+#: Views of such a surface, at most.
+VIEWS = 150
+
+
+@dataclass(frozen=True)
+class SiteAnswer:
+    """The answer to one query at a site.
+
+    Parameters
+    ----------
+    site, kind, query : where the query was taken, and its number there
+    answerable : whether a frame of the map overlaps it enough, or a scan of the map is near
+    answer : see JudgedAnswer
+    """
+
+    site: str
+    kind: str
+    query: int
+    answerable: bool
+    answer: JudgedAnswer
+
+
+@dataclass(frozen=True)
+class MapFlaws:
+    """The flaws of a map: frames that are missing, and poses that drift.
+
+    Parameters
+    ----------
+    missing : largest share of the frames that are left out
+    drift_m, drift_rad : deviation of the error of a pose from that of the pose before, in each
+        direction; poses drift back to the truth, so that they stay within about twice as much
+    """
+
+    missing: float = 0.5
+    drift_m: float = 0.01
+    drift_rad: float = 0.003
+
+
+def with_flaws(
+    frames: Sequence[AnyFrame], flaws: MapFlaws, rng: np.random.Generator
+) -> list[AnyFrame]:
+    """Return some of a map's frames, in their order, with poses that drift.
+
+    Parameters
+    ----------
+    frames : of the map, with poses
+    flaws : of every site, a share from 0 to each of these is drawn
+    rng : decides which frames are missing, and how the poses drift
+    """
+    share = rng.uniform(0.0, 1.0, 3) * (flaws.missing, flaws.drift_m, flaws.drift_rad)
+    in_map = rng.uniform(size=len(frames)) >= share[0]
+    drift = np.zeros(6)
+    flawed: list[AnyFrame] = []
+    for frame, has_it in zip(frames, in_map, strict=True):
+        drift = 0.9 * drift + rng.standard_normal(6) * np.repeat(share[1:], 3)
+        if has_it and frame.pose is not None:
+            T = frame.pose.copy()
+            turned(frame.pose[:3, :3], drift[3:], T[:3, :3])
+            T[:3, 3] += drift[:3]
+            flawed.append(replace(frame, pose=T))
+    return flawed
+
+
+def signed(
+    frames: Sequence[AnyFrame], scene: str, signer: Signer, first: int
+) -> tuple[list[AnyFrame], list[SignedFrame], list[Geometry]]:
+    """Return those frames that show anything, as an evaluation has them, and their geometry."""
+    usable: list[AnyFrame] = []
+    members: list[SignedFrame] = []
+    geometries: list[Geometry] = []
+    for frame in frames:
+        try:
+            signature, geometry = prepare(frame, signer)
+        except UselessFrame:
+            continue
+        pose = np.eye(4) if frame.pose is None else frame.pose
+        number = first + len(members)
+        members.append(SignedFrame(number, frame.name, scene, pose, signature.vector))
+        geometries.append(geometry)
+        usable.append(frame)
+    return usable, members, geometries
+
+
+def prior_about(
+    pose: Floats, parent: str, least: float, most: float, rng: np.random.Generator
+) -> PosePrior:
+    """Return a prior that is off by `least` to `most` metres, any way, and up to 10 degrees.
+
+    It states deviations of 30 cm and 10 degrees, however far off it is.
+    """
+    directions = rng.standard_normal((2, 3))
+    shift, axis = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    T = np.eye(4)
+    half = np.deg2rad(rng.uniform(0.0, PRIOR_DEG)) / 2
+    T[:3, :3] = rotation_of(np.array([*(np.sin(half) * axis), np.cos(half)])) @ pose[:3, :3]
+    T[:3, 3] = pose[:3, 3] + shift * rng.uniform(least, most)
+    deviations = [PRIOR_M] * 3 + [np.deg2rad(PRIOR_DEG)] * 3
+    return PosePrior(parent, T, np.diag(np.square(deviations)))
+
+
+def kinds_of(model: Model) -> tuple[str, ...]:
+    """Return the kinds of sites of the sensor that a model was trained for."""
+    return SURVEYED_KINDS if _is_of_scans(model) else KINDS + ORDINARY
+
+
+def _is_of_scans(model: Model) -> bool:
+    return bool(model.provenance.get("training", {}).get("scenes") == "sites")
+
+
+def ask_site(
+    signer: Signer,
+    work: tuple[str, int, int],
+    *,
+    seed: int,
+    candidates: int = 10,
+    prior: tuple[float, float] | None = None,
+    flaws: MapFlaws | None = None,
+    confidence: float | None = None,
+    as_surface: bool = False,
+) -> list[SiteAnswer]:
+    """Build one site and ask all its queries.
+
+    Parameters
+    ----------
+    signer : see `open_signer`; its model decides whether sites are seen by a depth camera or
+        scanned by a laser
+    work : kind, of `kinds_of`, index and number of queries
+    seed : of the collection
+    candidates : size of C
+    prior : least and most metres that the robot's prior is off; None: it has none
+    flaws : of the map; None: it has all frames, and true poses
+    confidence : least of a pose that is found; default: that of LocalizationParameters
+    as_surface : whether the map is one surface, joined from its frames, of which views are rendered
+    """
+    kind, index, queries = work
+    of_scans = _is_of_scans(signer.model)
+    rng = np.random.default_rng([seed, index, kinds_of(signer.model).index(kind)])
+    site: LookalikeSite[AnyFrame] = (
+        synthesise_lookalike_survey(kind, seed, index, queries=queries)
+        if of_scans
+        else synthesise_lookalike(kind, seed, index, queries=queries)
+    )
+    frames: Sequence[AnyFrame] = site.map if flaws is None else with_flaws(site.map, flaws, rng)
+    if as_surface:
+        frames = _views_of(frames, signer.model, rng)
+    shown, database, of_map = signed(frames, site.name, signer, 0)
+    # of another place: a pose in its own frame is a pose in no map
+    scene = site.name if site.same_frame else f"{site.name}, elsewhere"
+    sent, queries_signed, of_queries = signed(site.queries, scene, signer, len(database))
+    if not database:
+        nothing = JudgedAnswer()
+        return [SiteAnswer(site.name, kind, n, False, nothing) for n in range(len(queries_signed))]
+    priors = [
+        None if prior is None else prior_about(query.pose, site.name, *prior, rng)
+        for query in queries_signed
+    ]
+    answers = answers_of(
+        signer, database, queries_signed, [*of_map, *of_queries], candidates, priors, confidence,
+        as_surface,
+    )  # fmt: skip
+    able = _answerable(site, shown, sent)
+    return [
+        SiteAnswer(site.name, kind, number, able[number], answer)
+        for number, answer in enumerate(answers)
+    ]
+
+
+def _views_of(
+    frames: Sequence[AnyFrame], model: Model, rng: np.random.Generator
+) -> Sequence[AnyFrame]:
+    """Return views of the surface that frames show together, and that somebody brings as a map."""
+    voxel = rng.uniform(*(CLOUD_VOXEL_M if _is_of_scans(model) else MESH_VOXEL_M))
+    surface = join_frames(frames, float(voxel), np.array([0.0, 0.0, 1.0]))
+    return render_views(surface, replace(view_parameters(model.parameters), most_views=VIEWS))[1]
+
+
+def answers_of(
+    signer: Signer, database: Sequence[SignedFrame], queries: Sequence[SignedFrame],
+    geometries: Sequence[Geometry], candidates: int = 10,
+    priors: Sequence[PosePrior | None] | None = None, confidence: float | None = None,
+    rendered: bool = False,
+) -> list[JudgedAnswer]:  # fmt: skip
+    """Answer queries on a map of some frames, as a service does.
+
+    Parameters
+    ----------
+    signer : its model answers
+    database, queries : numbered from 0, the queries after the database; see `signed`
+    geometries : of both, by number
+    candidates : size of C
+    priors : of each query; None: it has none
+    confidence : see `ask_site`
+    rendered : whether the frames of the map are views rendered from a surface
+    """
+    model = signer.model
+    judge = Judge(
+        geometries.__getitem__, "full", 0, model.parameters.validation, database=database,
+        answer=model.answer, unrelated_distance=model.unrelated_distance, rendered=rendered,
+    )  # fmt: skip
+    if confidence is not None:
+        judge = replace(judge, confidence=confidence)
+    ranked = rank(
+        np.stack([query.signature for query in queries]),
+        np.stack([frame.signature for frame in database]),
+        np.ones((len(queries), len(database)), np.bool_), metric=model.metric,
+        candidates=candidates,
+    )  # fmt: skip
+    rows, answers = np.arange(len(database)), []
+    for query, ranking, prior in zip(queries, ranked, priors or [None] * len(queries), strict=True):
+        among = tuple(
+            Candidate(j, j, database[j].scene, database[j].pose, 0.0, 0.0)
+            for j in ranking.selection
+        )
+        task = QueryTask(
+            query.number, query.scene, query.pose, [], ranking.selection, among, rows,
+            ranking.retrieved,
+        )  # fmt: skip
+        answers.append(answer_of(judge, task, prior))
+    return answers
+
+
+def _answerable(
+    site: LookalikeSite[AnyFrame], shown: Sequence[AnyFrame], sent: Sequence[AnyFrame]
+) -> list[bool]:
+    """Return, for each query, whether a frame of the map overlaps it enough, or a scan is near."""
+    if not site.present:
+        return [False] * len(sent)
+    if isinstance(sent[0], Cloud):
+        here, there = (np.array([f.pose[:3, 3] for f in frames if f.pose is not None])
+                       for frames in (sent, shown))  # fmt: skip
+        apart = np.linalg.norm(here[:, None] - there, axis=2)
+        return [bool(least < ANSWERABLE_M) for least in apart.min(axis=1)]
+    seen = overlaps([view_of(q) for q in sent], [view_of(d) for d in shown])
+    return [bool(most >= ANSWERABLE) for most in seen.least.max(axis=1)]

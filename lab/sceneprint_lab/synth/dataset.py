@@ -1,0 +1,230 @@
+"""From a seed to depth frames with exact poses.
+
+seed, index  --synthesise_room-->  SynthRoom: frames with poses
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sceneprint.types import Cloud, DepthFrame, Floats, Floats32, Intrinsics
+from sceneprint_lab.synth.large_scenes import Premises, make_block, make_hall, make_storey
+from sceneprint_lab.synth.mesh import SyntheticMesh
+from sceneprint_lab.synth.rooms import Room, make_room
+from sceneprint_lab.synth.sensors import (
+    KINECT_V1,
+    Caster,
+    KinectNoise,
+    Spinning,
+    cast_depth,
+    cast_faces,
+    kinect_noise,
+    own_scanner,
+    scan,
+)
+from sceneprint_lab.synth.trajectories import scattered, scattered_poses, trajectory, walk
+
+LEAST_VALID = 0.45  #: share of a scattered view that has depth; others are taken again
+
+#: the camera of 7-Scenes
+KINECT = Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)
+
+
+@dataclass(frozen=True, eq=False)
+class SynthRoom:
+    """One synthetic sequence.
+
+    Parameters
+    ----------
+    name : "room-000" and so on
+    seed, index : what it was made from
+    frames : depth in whole millimetres where noisy; pose is T_world_camera
+    """
+
+    name: str
+    seed: int
+    index: int
+    frames: tuple[DepthFrame, ...]
+
+
+def synthesise_room(
+    seed: int,
+    index: int,
+    views: int,
+    *,
+    along_path: bool = False,
+    step: int = 1,
+    noise: KinectNoise | None = KINECT_V1,
+    intrinsics: Intrinsics = KINECT,
+) -> SynthRoom:
+    """Furnish a room and take depth frames in it.
+
+    The outcome depends on the arguments only, so rooms can be made in any order and in
+    any process.
+
+    Parameters
+    ----------
+    seed, index : the room is number `index` of the collection `seed`
+    views : how many frames
+    along_path : whether the frames follow one hand-held path; else they are independent
+    step : along a path, take only each `step`-th view
+    noise : the sensor; None gives ideal depth
+
+    Raises
+    ------
+    MissingDependency : Embree cannot be imported.
+    """
+    room, rng = room_and_rng(seed, index)
+    sensor = own_sensor(noise, intrinsics, rng) if noise else None
+
+    def shots(poses: list[Floats]) -> list[tuple[Floats32, Floats]]:
+        if sensor is None:
+            return [(render(room, T, intrinsics), T) for T in poses]
+        return [(take(room, T, intrinsics, rng, sensor), T) for T in poses]
+
+    if along_path:
+        taken = shots(trajectory(room, views, rng)[::step])
+    else:
+        taken, least = [], LEAST_VALID
+        while len(taken) < views:
+            new = shots(scattered_poses(room, views - len(taken), rng))
+            taken += [(depth, T) for depth, T in new if np.mean(depth > 0) >= least]
+            least *= 0.98  # never for ever
+    name = f"room-{index:03d}"
+    frames = (
+        DepthFrame(depth, intrinsics, f"{name}/frame-{k:06d}", T)
+        for k, (depth, T) in enumerate(taken)
+    )
+    return SynthRoom(name, seed, index, tuple(frames))
+
+
+def room_and_rng(seed: int, index: int) -> tuple[Room, np.random.Generator]:
+    """Room number `index` of collection `seed`, and the generator as it stands after it."""
+    rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
+    return make_room(rng), rng
+
+
+def render(
+    scene: Room | SyntheticMesh | Caster, T_world_camera: Floats, intrinsics: Intrinsics = KINECT
+) -> Floats32:
+    """(H, W) float32 ideal depth in metres, 0 where nothing is met."""
+    return cast_depth(_caster(scene), T_world_camera, intrinsics)[0]
+
+
+def take(
+    scene: Room | SyntheticMesh | Caster,
+    T_world_camera: Floats,
+    intrinsics: Intrinsics,
+    rng: np.random.Generator,
+    noise: KinectNoise = KINECT_V1,
+) -> Floats32:
+    """(H, W) float32 depth as a Kinect gives it: whole millimetres, in metres, 0 missing."""
+    caster = _caster(scene)
+    depth, cosine, face = cast_faces(caster, T_world_camera, intrinsics)
+    loss = np.append(caster.mesh.loss, np.float32(0))[face]
+    noisy = kinect_noise(depth, cosine, intrinsics, rng, noise, loss)
+    return np.asarray(np.round(noisy * 1000) / 1000, np.float32)
+
+
+def _caster(scene: Room | SyntheticMesh | Caster) -> Caster:
+    if isinstance(scene, Room):
+        return scene.caster
+    return Caster(scene) if isinstance(scene, SyntheticMesh) else scene
+
+
+def own_sensor(noise: KinectNoise, intrinsics: Intrinsics, rng: np.random.Generator) -> KinectNoise:
+    """The sensor of one room: no two are quite equal."""
+    s = rng.uniform(0.8, 1.4)
+    most = intrinsics.width // 18 if rng.random() < 0.4 else 0
+    left, right, top, bottom = rng.integers(0, most + 1, 4).tolist()
+    return replace(
+        noise,
+        disparity_sigma=noise.disparity_sigma * s,
+        warp=noise.warp * s,
+        border=(left, right, top, bottom),
+    )
+
+
+# From a seed to the scans of a spinning laser in a hall, a storey or a block.
+#
+# seed, index  --synthesise_survey-->  Survey: clouds with poses
+
+LEAST_POINTS = 2000  #: of a scan; a scattered one of fewer is taken elsewhere
+_TRIES = 5
+
+_MAKERS = {"hall": make_hall, "storey": make_storey, "block": make_block}
+#: kinds in the order of indices: of five sites two are halls, two storeys and one is a block
+_ORDER = ("hall", "storey", "hall", "block", "storey")
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """The scans of one synthetic site.
+
+    Parameters
+    ----------
+    name : "site-000" and so on
+    kind : "hall", "storey" or "block"
+    sensor : what took them
+    clouds : sensor frame; pose is T_world_sensor
+    """
+
+    name: str
+    kind: str
+    sensor: Spinning
+    clouds: tuple[Cloud, ...]
+
+
+def synthesise_survey(
+    seed: int,
+    index: int,
+    views: int,
+    *,
+    along_path: bool = False,
+    kind: str | None = None,
+    sensor: Spinning | None = None,
+    perfect: bool = False,
+) -> Survey:
+    """Build a site and scan it.
+
+    The outcome depends on the arguments only, so sites can be made in any order and in any
+    process.
+
+    Parameters
+    ----------
+    seed, index : the site is number `index` of the collection `seed`
+    views : how many scans
+    along_path : whether they follow one walk, 1.5 m apart; else they are independent
+    kind : "hall", "storey" or "block"; default: by the index
+    sensor : default: one of its own for each site
+    perfect : whether it makes no errors and loses nothing
+
+    Raises
+    ------
+    MissingDependency : Embree cannot be imported.
+    """
+    premises, rng = premises_and_rng(seed, index, kind)
+    drawn = own_scanner(rng)
+    sensor = sensor or drawn
+    if perfect:
+        sensor = sensor.perfect()
+    name, clouds = f"site-{index:03d}", []
+    poses = walk(premises, views, rng) if along_path else scattered(premises, views, rng)
+    for number, first in enumerate(poses):
+        T, tries = first, 1
+        points = scan(premises.caster, T, sensor, rng)
+        while len(points) < LEAST_POINTS and tries < _TRIES and not along_path:
+            T, tries = scattered(premises, 1, rng)[0], tries + 1
+            points = scan(premises.caster, T, sensor, rng)
+        clouds.append(Cloud(points, name=f"{name}/scan-{number:06d}", pose=T))
+    return Survey(name, premises.kind, sensor, tuple(clouds))
+
+
+def premises_and_rng(
+    seed: int, index: int, kind: str | None = None
+) -> tuple[Premises, np.random.Generator]:
+    """Site number `index` of collection `seed`, and the generator as it stands after it."""
+    rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
+    return _MAKERS[kind or _ORDER[index % len(_ORDER)]](rng), rng

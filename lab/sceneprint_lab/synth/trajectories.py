@@ -1,0 +1,380 @@
+"""Where a hand-held camera is and where it looks.
+
+    Room, n, rng  --scattered_poses-->  n x T_world_camera (4, 4)
+
+A view is (x, y, z, yaw, pitch, roll): metres and radians; pitch is negative when the
+camera looks down; roll turns it about its optical axis.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from sceneprint.types import Floats, Intrinsics
+from sceneprint_lab.synth.large_scenes import Premises
+from sceneprint_lab.synth.mesh import rotation_x, rotation_z
+from sceneprint_lab.synth.rooms import Room, inside
+from sceneprint_lab.synth.sensors import pixel_rays
+
+CLEARANCE = 0.35  #: metres from the camera to the nearest surface, at least
+HEIGHTS = (0.8, 1.9)  #: metres over the floor
+_GOOD_SHARE = 0.75  #: of a view within 0.5 to 5 m
+_COARSE = Intrinsics(32, 24, 29.25, 29.25, 15.5, 11.5)  #: what a Kinect sees, in few rays
+
+
+def pose(view: Floats) -> Floats:
+    """T_world_camera (4, 4) of a view (6,); the optical frame is x right, y down, z forward."""
+    x, y, z, yaw, pitch, roll = view
+    forward = np.array(
+        [math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)]
+    )
+    right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
+    down = np.cross(forward, right)
+    c, s = math.cos(roll), math.sin(roll)
+    T = np.eye(4)
+    T[:3, 0], T[:3, 1], T[:3, 2] = c * right + s * down, c * down - s * right, forward
+    T[:3, 3] = x, y, z
+    return T
+
+
+def clear(room: Room, points: Floats, distance: float = CLEARANCE) -> NDArray[np.bool_]:
+    """(n,) whether points (n, 3) are in free space, that far from all surfaces.
+
+    Rays go out in 128 directions. One that meets the back of a face has started inside a
+    solid or outside the room.
+    """
+    directions = _directions(128)
+    origins = np.repeat(points.astype(np.float32), len(directions), axis=0)
+    rays = np.tile(directions, (len(points), 1)).astype(np.float32)
+    hits = room.caster.cast(origins, rays)
+    shape = (len(points), len(directions))
+    behind = (np.einsum("ij,ij->i", rays, hits.normal) > 0).reshape(shape)
+    near = hits.distance.reshape(shape).min(axis=1)
+    missed = (hits.face < 0).reshape(shape)
+    return np.asarray((near >= distance) & (behind.mean(axis=1) < 0.02) & ~missed.any(axis=1))
+
+
+def scattered_poses(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
+    """Independent views; each sees a good share of the room within 0.5 to 5 m.
+
+    Half of them look at some object from 0.7 to 3 m, half look about from anywhere.
+
+    Parameters
+    ----------
+    room : the scene
+    n : how many views
+
+    Returns
+    -------
+    poses : n T_world_camera, (4, 4)
+    """
+    found: list[Floats] = []
+    least = _GOOD_SHARE
+    while len(found) < n:
+        views = np.concatenate([looking_about(room, 8, rng), looking_at(room, 8, rng)])
+        views = views[clear(room, views[:, :3])]
+        for view in rng.permutation(views):
+            T = pose(view)
+            if len(found) < n and worth_seeing(room, T, least):
+                found.append(T)
+        least *= 0.98  # a crowded room offers little: be content with less
+    return found
+
+
+def looking_about(room: Room, n: int, rng: np.random.Generator) -> Floats:
+    """(n, 6) views from anywhere, slightly downward."""
+    yaw = rng.uniform(-math.pi, math.pi, n)
+    pitch = np.clip(np.radians(rng.normal(-15, 15, n)), -1.3, 0.6)
+    return np.column_stack([_positions(room, n, rng), yaw, pitch, _rolls(n, rng)])
+
+
+def looking_at(room: Room, n: int, rng: np.random.Generator) -> Floats:
+    """(n, 6) views whose middle is a point on some surface between knee and head."""
+    a, b, c = (room.mesh.vertices[room.mesh.faces[:, k]] for k in range(3))
+    middle = (a + b + c) / 3
+    weight = np.sqrt(np.linalg.norm(np.cross(b - a, c - a), axis=1))  # small things count too
+    weight *= (middle[:, 2] > 0.3) & (middle[:, 2] < 1.6)
+    target = middle[rng.choice(len(middle), n, p=weight / weight.sum())]
+    candidates = _positions(room, 6 * n, rng).reshape(n, 6, 3)
+    offsets = target[:, None] - candidates
+    distance = np.linalg.norm(offsets, axis=2)
+    wanted = rng.uniform(0.7, 3.0, n)
+    best = np.abs(distance - wanted[:, None]).argmin(axis=1)
+    rows = np.arange(n)
+    d = offsets[rows, best]
+    yaw = np.arctan2(d[:, 1], d[:, 0]) + rng.normal(0, 0.15, n)
+    pitch = np.arctan2(d[:, 2], np.hypot(d[:, 0], d[:, 1])) + rng.normal(0, 0.12, n)
+    pitch = np.clip(pitch, -1.2, 0.5)
+    return np.column_stack([candidates[rows, best], yaw, pitch, _rolls(n, rng)])
+
+
+def _positions(room: Room, n: int, rng: np.random.Generator) -> Floats:
+    low, high = room.outline.min(axis=0), room.outline.max(axis=0)
+    xy = rng.uniform(low, high, (8 * n, 2))
+    xy = xy[inside(room.outline, xy)]
+    while len(xy) < n:
+        more = rng.uniform(low, high, (8 * n, 2))
+        xy = np.concatenate([xy, more[inside(room.outline, more)]])
+    return np.column_stack([xy[:n], rng.uniform(*HEIGHTS, n)])
+
+
+def _rolls(n: int, rng: np.random.Generator) -> Floats:
+    spread = np.where(rng.random(n) < 0.1, 20.0, 5.0)
+    return np.asarray(np.radians(rng.normal(0, 1, n) * spread))
+
+
+def worth_seeing(room: Room, T_world_camera: Floats, least: float) -> bool:
+    """Whether a share `least` of the view lies within 0.5 to 5 m, on several surfaces.
+
+    Of the neighbours in a coarse grid of rays, a tenth must differ in depth or in normal,
+    and the normals must span more than one direction. Less is asked as `least` falls.
+    """
+    rays = pixel_rays(_COARSE) @ T_world_camera[:3, :3].T.astype(np.float32)
+    origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), rays.shape)
+    hits = room.caster.cast(origins, rays)
+    good = (hits.distance > 0.5) & (hits.distance < 5.0)
+    if good.mean() < least:
+        return False
+    normals = hits.normal[good].astype(np.float64)
+    spread = np.linalg.eigvalsh(normals.T @ normals / len(normals))
+    depth = hits.distance.reshape(_COARSE.height, _COARSE.width)
+    normal = hits.normal.reshape(_COARSE.height, _COARSE.width, 3)
+    step = np.abs(np.diff(depth, axis=1)) > 0.1 * depth[:, 1:]
+    bend = (normal[:, 1:] * normal[:, :-1]).sum(axis=2) < 0.9
+    ease = least / _GOOD_SHARE
+    return bool(spread[1] > 0.08 * ease and (step | bend).mean() > 0.1 * ease)
+
+
+def _directions(n: int) -> Floats:
+    """(n, 3) unit vectors spread evenly: a Fibonacci lattice."""
+    k = np.arange(n) + 0.5
+    z = 1 - 2 * k / n
+    r, turn = np.sqrt(1 - z * z), k * math.pi * (1 + math.sqrt(5))
+    return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
+
+
+# A circle around something: a camera that keeps looking at it.
+#
+# middle, radius, n, rng  --orbit-->  n x T_world_camera (4, 4), in order
+
+
+def orbit(
+    middle: tuple[float, float, float],
+    radius: float,
+    n: int,
+    rng: np.random.Generator,
+    *,
+    first: float | None = None,
+    sweep: float = 2 * math.pi,
+) -> list[Floats]:
+    """Hand-held views from a circle, slightly downward, each looking at its middle.
+
+    Distance, height and aim wander slowly, by a tenth of a metre or two.
+
+    Parameters
+    ----------
+    middle : what is looked at, metres
+    radius : of the circle, metres
+    n : how many views, evenly spread
+    first : azimuth of the first, rad; default: any
+    sweep : how far round they go, rad
+
+    Returns
+    -------
+    poses : n T_world_camera, (4, 4), in the order of the circle
+    """
+    start = float(rng.uniform(-math.pi, math.pi)) if first is None else first
+    azimuth = start + sweep * np.arange(n) / n
+    scale = (0.15, 0.15, 0.08, 0.08, 0.08, math.radians(4.0))
+    waves = rng.normal(0, 1, (6, 3)) * np.array(scale)[:, None] / math.sqrt(3)
+    phase = np.outer(np.arange(1, 4), 2 * math.pi * np.arange(n) / n)  # closed: 1 to 3 a turn
+    away, up, *aim, roll = waves @ np.cos(phase + rng.uniform(0, 2 * math.pi, (3, 1)))
+    r, z = radius + away, rng.uniform(1.05, 1.65) + up
+    eye = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), z])
+    eye[:, :2] += middle[:2]
+    to = np.array(middle) + np.column_stack(aim) + rng.normal(0, 0.015, (n, 3)) - eye
+    yaw, pitch = np.arctan2(to[:, 1], to[:, 0]), np.arctan2(to[:, 2], np.hypot(to[:, 0], to[:, 1]))
+    return [pose(view) for view in np.column_stack([eye, yaw, pitch, roll])]
+
+
+# A hand-held path: a camera that looks around and comes back.
+#
+#     Room, n, rng  --trajectory-->  n x T_world_camera (4, 4), in order
+#
+# Viewpoints are joined by straight clear ways to a network; the path wanders over it.
+
+
+def trajectory(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
+    """A smooth hand-held path that looks around and comes back to places it has seen.
+
+    The camera wanders between a few viewpoints, 3 to 8 cm or 1 to 3 degrees a frame,
+    whichever takes longer; its hand trembles a little.
+
+    Parameters
+    ----------
+    room : the scene
+    n : how many frames
+
+    Returns
+    -------
+    poses : n T_world_camera, (4, 4), in the order of the path
+    """
+    anchors, ways = _network(room, max(3, min(8, n // 40 + 3)), rng)
+    here = 0
+    path = [anchors[:1]]
+    length = 1
+    while length < n:
+        here, start = int(rng.choice(ways[here])), here
+        piece = _walk(anchors[start], anchors[here], rng)
+        path.append(piece)
+        length += len(piece)
+    views = np.concatenate(path)[:n]
+    views[:, 3] = np.unwrap(views[:, 3])
+    smooth = _smoothed(views, 5)
+    smooth += _smoothed(rng.normal(0, (0.01, 0.01, 0.01, 0.012, 0.012, 0.012), views.shape), 3)
+    return [pose(v) for v in smooth]
+
+
+def _network(room: Room, count: int, rng: np.random.Generator) -> tuple[Floats, list[list[int]]]:
+    """Viewpoints (k, 6) and, for each, those that a clear straight way leads to."""
+    anchors: list[Floats] = []
+    ways: list[list[int]] = []
+    for attempt in range(400):
+        views = np.concatenate([looking_about(room, 4, rng), looking_at(room, 4, rng)])
+        views = views[clear(room, views[:, :3], CLEARANCE + 0.08)]
+        good = [v for v in views if worth_seeing(room, pose(v), 0.7 - 0.001 * attempt)]
+        for view in good:
+            reached = [k for k, a in enumerate(anchors) if _way(room, a, view)]
+            if anchors and not reached:
+                continue
+            for k in reached:
+                ways[k].append(len(anchors))
+            anchors.append(view)
+            ways.append(reached)
+            if len(anchors) == count:
+                return np.array(anchors), ways
+    for k, near in enumerate(ways):  # a nook: look about on the spot
+        near.append(k)
+    return np.array(anchors), ways
+
+
+def _way(room: Room, a: Floats, b: Floats) -> bool:
+    steps = max(2, int(np.linalg.norm(a[:3] - b[:3]) / 0.15))
+    points = a[:3] + np.linspace(0, 1, steps)[:, None] * (b[:3] - a[:3])
+    return bool(clear(room, points, CLEARANCE + 0.05).all())
+
+
+def _walk(a: Floats, b: Floats, rng: np.random.Generator) -> Floats:
+    """Views from a (left out) to b; yaw goes the short way round."""
+    change = b - a
+    change[3] = (change[3] + math.pi) % (2 * math.pi) - math.pi
+    walked = np.linalg.norm(change[:3]) / rng.uniform(0.03, 0.08)
+    turned = np.linalg.norm(change[3:]) / math.radians(rng.uniform(1.0, 3.0))
+    steps = max(8, math.ceil(max(walked, turned)))
+    return np.asarray(a + np.linspace(0, 1, steps + 1)[1:, None] * change)
+
+
+def _smoothed(values: Floats, radius: int) -> Floats:
+    """Columns after a triangular moving mean over 2 radius + 1 rows, the ends held."""
+    kernel = np.bartlett(2 * radius + 3)[1:-1]
+    kernel /= kernel.sum()
+    padded = np.pad(values, ((radius, radius), (0, 0)), mode="edge")
+    return np.column_stack([np.convolve(c, kernel, mode="valid") for c in padded.T])
+
+
+# Where a scanner is carried: poses on a walk through large premises, or here and there.
+#
+# Premises, n, rng  --walk, scattered-->  T_world_sensor (4, 4), n of them
+
+STEP = 1.5  #: metres from scan to scan on a walk
+COARSE = 3  #: cells of the floor's grid to one of the grid that walks go on
+
+
+def scattered(premises: Premises, n: int, rng: np.random.Generator) -> list[Floats]:
+    """Poses anywhere in the premises, facing anywhere."""
+    spots = premises.floor.points[premises.walkable]
+    height = float(rng.uniform(0.5, 1.9))
+    chosen = spots[rng.integers(0, len(spots), n)]
+    return [scanner_pose(x, y, height, rng.uniform(-math.pi, math.pi), rng) for x, y in chosen]
+
+
+def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STEP) -> list[Floats]:
+    """Poses every `step` metres on a walk from place to place, facing ahead; it comes back often.
+
+    Parameters
+    ----------
+    n : how many
+    rng : of places, heights and wobble
+    step : metres
+    """
+    spots, graph = _ways(premises)
+    path = [spots[0][None]]
+    at, length = int(rng.integers(0, len(spots))), 0.0
+    aims = rng.integers(0, len(spots), max(3, n // 12))
+    while length < n * step:
+        aim = int(aims[int(rng.integers(0, len(aims)))])
+        _, before = dijkstra(graph, indices=[aim], return_predecessors=True)
+        leg = [at]
+        while leg[-1] != aim and before[0, leg[-1]] >= 0:
+            leg.append(int(before[0, leg[-1]]))
+        line = spots[leg]
+        length += max(float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()), 1e-3)
+        path.append(line)
+        at = leg[-1]
+        if len(path) > 50 * n:  # premises of a single spot
+            break
+    line = np.concatenate(path[1:])
+    line = ndimage.gaussian_filter1d(line, 1.5, axis=0, mode="nearest")
+    along = np.append(0.0, np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum())
+    s = np.minimum(np.arange(n) * step, along[-1])
+    xy = np.column_stack([np.interp(s, along, line[:, k]) for k in range(2)])
+    ahead = np.column_stack([np.interp(s + 0.5, along, line[:, k]) for k in range(2)]) - xy
+    height = float(rng.uniform(0.5, 1.9))
+    mounted = float(rng.uniform(-math.pi, math.pi))
+    return [
+        scanner_pose(x, y, height, mounted + math.atan2(dy, dx), rng)
+        for (x, y), (dx, dy) in zip(xy, ahead, strict=True)
+    ]
+
+
+def scanner_pose(x: float, y: float, z: float, yaw: float, rng: np.random.Generator) -> Floats:
+    """T_world_sensor (4, 4) of a scanner that is carried nearly upright, about 2 cm off z."""
+    roll, pitch = rng.normal(0, math.radians(1.5), 2)
+    T = np.eye(4)
+    across = rotation_z(math.pi / 2) @ rotation_x(float(pitch)) @ rotation_z(-math.pi / 2)
+    T[:3, :3] = rotation_z(yaw) @ across @ rotation_x(float(roll))
+    T[:3, 3] = x, y, z + rng.normal(0, 0.02)
+    return T
+
+
+def _ways(premises: Premises) -> tuple[Floats, csr_array]:
+    """Spots (n, 2) that one can walk on, and the distances of neighbours."""
+    free = premises.walkable[::COARSE, ::COARSE]
+    parts, count = ndimage.label(free, np.ones((3, 3)))
+    if count:
+        free = parts == 1 + int(np.bincount(parts.ravel())[1:].argmax())
+    else:
+        free = np.zeros_like(free)
+        free.flat[0] = True
+    spots = premises.floor.points[::COARSE, ::COARSE][free]
+    number = np.full(free.shape, -1)
+    number[free] = np.arange(len(spots))
+    rows, columns, lengths = [], [], []
+    pitch = COARSE * premises.floor.cell
+    for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        a = number[: free.shape[0] - dx, max(0, -dy) : free.shape[1] - max(0, dy)]
+        b = number[dx:, max(0, dy) : free.shape[1] + min(0, dy)]
+        both = (a >= 0) & (b >= 0)
+        rows.append(a[both])
+        columns.append(b[both])
+        lengths.append(np.full(int(both.sum()), pitch * math.hypot(dx, dy)))
+    i, j, d = np.concatenate(rows), np.concatenate(columns), np.concatenate(lengths)
+    n = len(spots)
+    both_ways = np.append(i, j), np.append(j, i)
+    return spots, csr_array((np.append(d, d), both_ways), shape=(n, n))

@@ -1,1 +1,0 @@
-"""Answers and maps as scenes that Foxglove and Rerun draw."""

@@ -1,0 +1,1 @@
+"""Answers and maps as scenes in MCAP files, which Foxglove and Rerun draw."""

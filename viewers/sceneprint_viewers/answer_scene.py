@@ -1,0 +1,407 @@
+"""Answers as moments of a scene: the query, its matches and its alternatives in their map.
+
+Answer  --AnswerScene.add-->  Moment
+Association  --association_scene-->  Moment: both sessions where it places them, and their edges
+
+Only what an answer supports is placed in the map: accepted and ambiguous matches with the poses
+that they vote for, and the answer's own pose or its alternatives. Rejected matches are in the text
+alone. A query that is not found lies in a space of its own.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneprint.errors import NotFound, NotIndexed
+from sceneprint.types import Floats
+from sceneprint_client import Client
+from sceneprint_client.api import Answer, Frame, Match, Transform
+from sceneprint_client.api.base import CameraIntrinsics
+from sceneprint_client.api.sessions import Association, Edge, Graph, Vertex
+from sceneprint_viewers.map_scene import (
+    MAP_FRAMES,
+    PosedRun,
+    evenly_taken,
+    map_entities,
+    map_runs,
+    placed_points,
+    points_of_each,
+    up_of_map,
+    up_of_runs,
+)
+from sceneprint_viewers.scene import (
+    CONFIRMED,
+    MAP_POINT_M,
+    MATCH_POINT_M,
+    OUTVOTED,
+    QUERY,
+    QUERY_POINT_M,
+    SESSIONS,
+    STRONG,
+    THIN_PX,
+    TRACK,
+    UNSURE,
+    WEAK,
+    Colour,
+    EntityPath,
+    LineSet,
+    Moment,
+    Placement,
+    PointSet,
+    SceneEntity,
+    SceneStream,
+    TextLabel,
+    TextPage,
+    UpAxis,
+    height_colours,
+    plain_colours,
+    point_size,
+    sensor_outline,
+)
+
+#: An id that the service made, and how many of its digits stand for it in a scene.
+_MADE_ID = re.compile(r"[0-9a-f]{32}", re.ASCII)
+SHORT_ID = 8
+#: Path of what is said of an answer; no space is called so.
+SUMMARY: EntityPath = ("answer",)
+#: Where a label stands over the sensor that it is of, metres along its up.
+_LABEL_M = 0.12
+
+
+@dataclass(frozen=True)
+class PointLimits:
+    """How many points of each frame of an answer are drawn.
+
+    Parameters
+    ----------
+    query : of the frame that was asked
+    match : of each match, and of the query at each alternative
+    """
+
+    query: int
+    match: int
+
+
+#: Of a single answer, and of each of many.
+ONE, MANY = PointLimits(20_000, 6_000), PointLimits(5_000, 1_500)
+
+
+class AnswerScene:
+    """Draws answers, and the maps that they are of where these first occur.
+
+    Parameters
+    ----------
+    stream : where to
+    client : that has asked
+    limits : of points
+    map_frames : frames of each map whose points are drawn; 0 for none
+    """
+
+    def __init__(
+        self, stream: SceneStream, client: Client, limits: PointLimits = ONE,
+        map_frames: int = MAP_FRAMES,
+    ) -> None:  # fmt: skip
+        self._stream, self._client = stream, client
+        self._limits, self._map_frames = limits, map_frames
+        self._drawn: set[str] = set()
+        self._axes: set[str] = set()
+
+    def add(
+        self, answer: Answer, name: str, text: str, camera: CameraIntrinsics | None,
+        index: int = 0, stamp_ns: int | None = None,
+    ) -> None:  # fmt: skip
+        """Add an answer as the next moment.
+
+        Parameters
+        ----------
+        answer : kept by the service, with the stage `validate`
+        name : of the frame that was asked
+        text : about the answer, for people
+        camera : of that frame; None of a cloud
+        index, stamp_ns : of the moment
+
+        Raises
+        ------
+        UnknownQuery : the answer is not stored, or no longer.
+        """
+        named = dict.fromkeys(one.map for one in placed(answer.matches))
+        for map_name in answer.maps if len(answer.maps) == 1 else named:
+            if map_name not in self._drawn:
+                self._draw_map(map_name, several=len(answer.maps) > 1)
+        drawing = _Drawing(self._client, answer, name, camera, self._limits)
+        entities = [*drawing.entities(), SceneEntity(SUMMARY, TextPage(text))]
+        axes = [one for one in drawing.axes() if one.path[0] not in self._axes]
+        if axes:
+            self._axes |= {one.path[0] for one in axes}
+            self._stream.write(Moment(axes))
+        self._stream.write(Moment(entities, index, stamp_ns))
+
+    def _draw_map(self, map_name: str, *, several: bool) -> None:
+        self._drawn.add(map_name)
+        runs = map_runs(self._client, map_name)
+        parents = sorted({run.parent_frame for run in runs})
+        up = up_of_map(self._client, map_name)
+        for parent in parents:
+            of_parent = [run for run in runs if run.parent_frame == parent]
+            space = space_name(map_name, parent, several=several)
+            most = self._map_frames // len(parents)
+            self._axes.add(space)
+            self._stream.write(Moment(map_entities(self._client, of_parent, space, up, most)))
+
+
+def space_name(map_name: str, parent_frame: str, *, several: bool) -> str:
+    """What the space of a parent frame is called; of several maps, with the map's name."""
+    return f"{map_name}: {parent_frame}" if several else parent_frame
+
+
+def short_name(frame_id: str, name: str | None = None) -> str:
+    """What a stored frame is called in labels: its file, else the start of its id."""
+    if name:
+        return name.rpartition("/")[2]
+    return frame_id[:SHORT_ID] if _MADE_ID.fullmatch(frame_id) else frame_id
+
+
+def placed(matches: Sequence[Match]) -> list[Match]:
+    """Matches whose transform the evidence supports."""
+    return [one for one in matches if one.validation.status in ("accepted", "ambiguous")]
+
+
+class _Drawing:
+    """One answer as entities."""
+
+    def __init__(
+        self, client: Client, answer: Answer, name: str, camera: CameraIntrinsics | None,
+        limits: PointLimits,
+    ) -> None:  # fmt: skip
+        self._client, self._answer, self._name = client, answer, name
+        self._camera, self._limits = camera, limits
+        self._several = len(answer.maps) > 1
+        self._points = np.zeros((0, 3))
+        with suppress(NotIndexed):  # asked without validation, so there are none
+            self._points = client.query_points(answer.query_id, limits.query).points
+
+    def entities(self) -> list[SceneEntity]:
+        """Query, alternatives and matches."""
+        found = [*self._query(), *self._alternatives()]
+        for number, match in enumerate(placed(self._answer.matches), start=1):
+            found += self._match(match, f"{number}")
+        return found
+
+    def axes(self) -> list[SceneEntity]:
+        """Which way is up in the query's space, where that is a sensor's own frame."""
+        if self._answer.location is not None:
+            return []
+        space, _ = self._query_space()
+        up = np.array([0.0, -1.0, 0.0] if self._answer.kind == "depth" else [0.0, 0.0, 1.0])
+        return [SceneEntity((space,), UpAxis(up))]
+
+    def _space(self, map_name: str | None, parent_frame: str) -> str:
+        return space_name(map_name or "", parent_frame, several=self._several)
+
+    def _query_space(self) -> tuple[str, Transform | None]:
+        """The space that the query lies in, and where; no pose where that is the query's own."""
+        location = self._answer.location
+        if location is not None:
+            return self._space(location.map, location.pose.parent_frame), location.pose
+        if self._answer.status == "found":  # in a map without poses: in the frame of the best
+            for match in placed(self._answer.matches):
+                if match.transform is not None:
+                    return match.transform.parent_frame, match.transform
+        return f"query.{'optical' if self._answer.kind == 'depth' else 'sensor'}", None
+
+    def _query(self) -> list[SceneEntity]:
+        space, pose = self._query_space()
+        path, label = (space, "query"), f"{self._name}: {self._answer.status.replace('_', ' ')}"
+        found = _sensor(path, self._points, self._camera, QUERY, label)
+        if pose is None:
+            return found
+        return [SceneEntity(path, Placement(np.array(pose.matrix), pose.child_frame)), *found]
+
+    def _alternatives(self) -> list[SceneEntity]:
+        """The poses of an ambiguous answer, none of which is the answer."""
+        found: list[SceneEntity] = []
+        some = self._points[:: max(len(self._points) // self._limits.match, 1)]
+        for number, one in enumerate(self._answer.alternatives, start=1):
+            path = (self._space(one.map, one.pose.parent_frame), "alternatives", f"{number}")
+            child = f"{one.pose.child_frame} alternative {number}"
+            sure = "" if one.confidence is None else f", confidence {one.confidence:.2f}"
+            label = f"alternative {number}: support {one.support}{sure}"
+            found.append(SceneEntity(path, Placement(np.array(one.pose.matrix), child)))
+            found += _sensor(path, some, self._camera, UNSURE, label)
+        return found
+
+    def _match(self, match: Match, name: str) -> list[SceneEntity]:
+        """A match where the map has it, with the pose of the query that it votes for.
+
+        It is called after its place in the answer: so paths stay few over many answers.
+        """
+        try:
+            frame = self._client.frame(match.map, match.frame_id)
+            points = self._client.frame_points(
+                match.map, match.frame_id, limit=self._limits.match
+            ).points
+        except (NotFound, NotIndexed):  # deleted since, or being signed anew
+            return []
+        path, placement = self._place_of_match(match, frame, name)
+        if path is None:
+            return []
+        colour, label = _look_of_match(match)
+        found = [] if placement is None else [SceneEntity(path, placement)]
+        found += _sensor(path, points, frame.intrinsics, colour, label)
+        if match.transform is not None:
+            vote = np.array([np.zeros(3), np.array(match.transform.matrix)[:3, 3]])
+            found.append(SceneEntity((*path, "vote"), LineSet([vote], [colour])))
+        return found
+
+    def _place_of_match(
+        self, match: Match, frame: Frame, name: str
+    ) -> tuple[EntityPath | None, Placement | None]:
+        """The path of a match, and where it lies in its space; no path where it lies in none."""
+        if frame.pose is not None:
+            space = self._space(match.map, frame.pose.parent_frame)
+            child = space_name(match.map, frame.pose.child_frame, several=self._several)
+            placement = Placement(np.array(frame.pose.matrix), child)
+            return (space, "matches", name), placement
+        space, _ = self._query_space()
+        if match.transform is not None and match.transform.parent_frame == space:
+            return (space, "matches", name), None
+        return None, None
+
+
+def _look_of_match(match: Match) -> tuple[Colour, str]:
+    """Colour and label of a match: rank, name, strength or status, overlap."""
+    v = match.validation
+    colour = STRONG if v.strength == "strong" else WEAK
+    if v.status == "ambiguous":
+        colour = UNSURE
+    overlap = "" if v.overlap is None else f" {v.overlap:.2f}"
+    return (
+        colour,
+        f"#{match.rank} {short_name(match.frame_id, match.name)} {v.strength or v.status}{overlap}",
+    )
+
+
+def _sensor(
+    path: EntityPath, points: Floats, camera: CameraIntrinsics | None, colour: Colour, label: str
+) -> list[SceneEntity]:
+    """Points, outline and label of a sensor, in its own frame."""
+    colours = plain_colours(len(points), colour)
+    base_m = QUERY_POINT_M if colour == QUERY else MATCH_POINT_M
+    size_m = point_size(base_m, cameras=camera is not None)
+    above = np.array([0.0, -_LABEL_M, 0.0] if camera is not None else [0.0, 0.0, _LABEL_M])
+    return [
+        SceneEntity((*path, "points"), PointSet(points, colours, size_m)),
+        SceneEntity((*path, "sensor"), sensor_outline(camera, colour)),
+        SceneEntity((*path, "label"), TextLabel(above, label, colour)),
+    ]
+
+
+# An association as a scene.
+
+#: Edges that are drawn.
+MOST_EDGES = 20_000
+
+
+def association_scene(client: Client, told: Association, text: str, most: int) -> Moment:
+    """What an association that has succeeded came to, at all times.
+
+    Frames lie where the pose graph has them: in one space where the sessions are joined, else each
+    session in its own, and then edges between the two cannot be drawn.
+
+    Parameters
+    ----------
+    client : to fetch with
+    text : about it, for people
+    most : frames whose points are drawn
+    """
+    graph = Graph.model_validate_json(client.graph(told.map, told.association_id, "json"))
+    runs = _runs(client, told, graph.vertices)
+    spaces = sorted({run.parent_frame for run in runs})
+    up_of_poses = up_of_map(client, told.map)
+    entities = [SceneEntity(SUMMARY, TextPage(text))]
+    for space in spaces:
+        there = [run for run in runs if run.parent_frame == space]
+        up = up_of_runs(there) if up_of_poses is None else up_of_poses
+        entities.append(SceneEntity((space,), UpAxis(up)))
+        alone = len(told.asked.sessions) == 1
+        for run in there:
+            colour = TRACK if alone else SESSIONS[_names(told).index(run.name)]
+            entities += _run_entities(client, run, up, colour, most // len(runs), alone=alone)
+    edges = itertools.islice(client.edges(told.map, told.association_id), MOST_EDGES)
+    entities += _edge_entities(edges, graph.vertices)
+    return Moment(entities)
+
+
+def _runs(client: Client, told: Association, vertices: list[Vertex]) -> list[PosedRun]:
+    """The posed vertices by session and the frame that they lie in; named after the session's
+    place among those that were asked.
+    """
+    found: defaultdict[tuple[str, str], list[Vertex]] = defaultdict(list)
+    for one in vertices:
+        if one.pose is not None:
+            found[_session_of(told, one), one.pose.parent_frame].append(one)
+    return [
+        PosedRun(
+            name, told.map, space, [one.frame_id for one in run],
+            [np.array(one.pose.matrix) for one in run if one.pose is not None],
+            client.frame(told.map, run[0].frame_id).kind == "depth",
+        )
+        for (name, space), run in found.items()
+    ]  # fmt: skip
+
+
+def _names(told: Association) -> list[str]:
+    """What the sessions are called, the first that was asked first."""
+    robots: Sequence[str | None] = told.asked.robots or [None] * len(told.asked.sessions)
+    pairs = zip(robots, told.asked.sessions, strict=True)
+    return [session if robot is None else f"{robot}/{session}" for robot, session in pairs]
+
+
+def _session_of(told: Association, vertex: Vertex) -> str:
+    """What the session of a vertex is called."""
+    names, known = _names(told), (vertex.session, f"{vertex.robot}/{vertex.session}")
+    return next((name for name in names if name in known), names[0])
+
+
+def _run_entities(
+    client: Client, run: PosedRun, up: Floats, colour: Colour, most: int, *, alone: bool
+) -> list[SceneEntity]:
+    """Points and line of a session: by height where there is no other to tell it from."""
+    chosen = evenly_taken([run], most)
+    path = (run.parent_frame, "sessions", run.name)
+    entities = []
+    if chosen:
+        limit = points_of_each(2 * len(chosen))
+        points = np.concatenate([placed_points(client, *one, limit) for one in chosen])
+        size_m = point_size(MAP_POINT_M, cameras=run.cameras)
+        colours = height_colours(points, up) if alone else plain_colours(len(points), colour)
+        entities.append(SceneEntity((*path, "points"), PointSet(points, colours, size_m)))
+    track = np.array([T[:3, 3] for T in run.poses])
+    return [*entities, SceneEntity((*path, "track"), LineSet([track], [colour]))]
+
+
+def _edge_entities(edges: itertools.islice[Edge], vertices: list[Vertex]) -> list[SceneEntity]:
+    """Lines between frames that edges join: confirmed, outvoted and unchecked ones apart."""
+    poses = {one.frame_id: one.pose for one in vertices if one.pose is not None}
+    kinds = {
+        True: ("confirmed", CONFIRMED),
+        False: ("outvoted", OUTVOTED),
+        None: ("unchecked", TRACK),
+    }
+    strips: defaultdict[tuple[str, str, Colour], list[Floats]] = defaultdict(list)
+    for edge in edges:
+        a, b = poses.get(edge.from_frame), poses.get(edge.to_frame)
+        if a is not None and b is not None and a.parent_frame == b.parent_frame:
+            ends = np.array([np.array(one.matrix)[:3, 3] for one in (a, b)])
+            strips[a.parent_frame, *kinds[edge.consistent]].append(ends)
+    return [
+        SceneEntity((space, "edges", kind), LineSet(lines, [colour] * len(lines), THIN_PX))
+        for (space, kind, colour), lines in strips.items()
+    ]

@@ -1,0 +1,263 @@
+"""What a map holds, as entities: points of posed frames by height, and the runs they were taken in.
+
+Client, map  --map_runs-->  runs of posed frames  --map_entities-->  entities that stay
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sceneprint.errors import NotFound, NotIndexed
+from sceneprint.geometry.rigid import moved
+from sceneprint.types import Floats
+from sceneprint_client import Client
+from sceneprint_client.api import Frame, FrameState
+from sceneprint_client.api.listing import Session
+from sceneprint_client.api.results import MOST_DRAWN
+from sceneprint_client.poses import rotation_of
+from sceneprint_viewers.scene import (
+    MAP_POINT_M,
+    TRACK,
+    EntityPath,
+    LineSet,
+    Moment,
+    Placement,
+    PointSet,
+    SceneEntity,
+    UpAxis,
+    height_colours,
+    point_size,
+    sensor_outline,
+    small_outline,
+    up_of_sensors,
+)
+
+#: Frames of a map whose points are drawn, unless another number is asked for.
+MAP_FRAMES = 120
+#: Points of a map, over all of these frames.
+MAP_POINTS = 300_000
+#: Poses of one run that its line is drawn through.
+TRACK_POSES = 1000
+#: A run is in the order in which it was taken, or where no frame says it, in that of arrival.
+CLOCKS: tuple[Literal["taken", "received"], ...] = ("taken", "received")
+#: Sessions, and frames without one, that are looked through for posed frames.
+MOST_LISTED = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class PosedRun:
+    """Frames of one run whose poses lead to one frame.
+
+    Parameters
+    ----------
+    name : for people
+    map_name, parent_frame : where they are
+    frame_ids : in the order of time
+    poses : of each, (4, 4) T_parent_sensor
+    cameras : whether they are depth images
+    """
+
+    name: str
+    map_name: str
+    parent_frame: str
+    frame_ids: Sequence[str]
+    poses: Sequence[Floats]
+    cameras: bool
+
+
+def map_runs(client: Client, map_name: str) -> list[PosedRun]:
+    """The runs of a map with poses, each through at most TRACK_POSES of them.
+
+    Raises
+    ------
+    UnknownMap : no such map.
+    """
+    runs, unnamed = [], False
+    for session in itertools.islice(client.sessions(map_name), MOST_LISTED):
+        if session.session is None:
+            unnamed = unnamed or session.with_pose > 0
+        elif session.with_pose:
+            runs += _runs_of_session(client, map_name, session)
+    if unnamed:
+        posed = client.frames(map_name, FrameState.INDEXED, has_pose=True)
+        frames = itertools.islice(posed, MOST_LISTED)
+        runs += listed_runs(frame for frame in frames if frame.session is None)
+    return runs
+
+
+def _runs_of_session(client: Client, map_name: str, session: Session) -> list[PosedRun]:
+    runs = []
+    for parent in session.parent_frames:
+        for clock in CLOCKS:
+            told = client.trajectory(
+                map_name, str(session.session), robot=session.robot, parent_frame=parent,
+                most=TRACK_POSES, clock=clock,
+            )  # fmt: skip
+            if told.frame_ids:
+                break
+        else:
+            continue
+        with suppress(NotFound):  # deleted meanwhile
+            kind = client.frame(map_name, told.frame_ids[0]).kind
+            poses = [_pose_of_row(row) for row in told.poses]
+            name = _run_name(session.robot, session.session)
+            poses, cameras = [_pose_of_row(row) for row in told.poses], kind == "depth"
+            runs.append(PosedRun(name, map_name, parent, told.frame_ids, poses, cameras))
+    return runs
+
+
+def listed_runs(frames: Iterable[Frame]) -> list[PosedRun]:
+    """Runs of the posed frames of a list, in its order."""
+    found: defaultdict[tuple[str, str, str, bool], list[Frame]] = defaultdict(list)
+    for one in frames:
+        if one.pose is not None:
+            name = _run_name(one.robot, one.session)
+            found[one.map, one.pose.parent_frame, name, one.kind == "depth"].append(one)
+    return [
+        PosedRun(
+            name, map_name, parent, [one.frame_id for one in run],
+            [np.array(one.pose.matrix) for one in run if one.pose is not None], cameras,
+        )
+        for (map_name, parent, name, cameras), run in found.items()
+    ]  # fmt: skip
+
+
+def _run_name(robot: str | None, session: str | None) -> str:
+    return "/".join(one for one in (robot, session) if one is not None) or "no session"
+
+
+def _pose_of_row(row: Sequence[float]) -> Floats:
+    """T (4, 4) of a line of a TUM file."""
+    T = np.eye(4)
+    T[:3, 3] = row[1:4]
+    T[:3, :3] = rotation_of(np.array(row[4:8]))
+    return T
+
+
+def map_entities(
+    client: Client, runs: Sequence[PosedRun], space: str, up: Floats | None, most: int
+) -> list[SceneEntity]:
+    """What a scene shows of runs in one space at all times.
+
+    Parameters
+    ----------
+    client : to fetch points with
+    runs : of one parent frame
+    space : name of that
+    up : (3,) unit vector in it; None to judge by the sensors
+    most : frames whose points are fetched, evenly taken along the runs
+    """
+    if up is None:
+        up = up_of_runs(runs)
+    entities = [SceneEntity((space,), UpAxis(up))]
+    chosen = evenly_taken(runs, most)
+    if chosen:
+        limit = points_of_each(len(chosen))
+        clouds = [placed_points(client, *one, limit) for one in chosen]
+        points = np.concatenate([*clouds, np.zeros((0, 3))])
+        colours = height_colours(points, up)
+        size_m = point_size(MAP_POINT_M, cameras=all(run.cameras for run in runs))
+        entities.append(SceneEntity((space, "map", "points"), PointSet(points, colours, size_m)))
+    for number, run in enumerate(runs, start=1):
+        track = np.array([T[:3, 3] for T in run.poses])
+        path = (space, "map", "tracks", f"{number} {run.name}")
+        entities.append(SceneEntity(path, LineSet([track], [TRACK])))
+    return entities
+
+
+def points_of_each(frames: int) -> int:
+    """How many points are drawn of each of so many frames."""
+    return min(max(MAP_POINTS // frames, 1), MOST_DRAWN)
+
+
+def up_of_runs(runs: Sequence[PosedRun]) -> Floats:
+    """The axis of the parent frame of runs that is likely up; of all, the longest run decides."""
+    longest = max(runs, key=lambda run: len(run.poses))
+    return up_of_sensors(longest.poses, cameras=longest.cameras)
+
+
+def up_of_map(client: Client, map_name: str) -> Floats | None:
+    """Return up (3,) in the parent frames of a map; None where the map does not say it."""
+    up = client.map(map_name).up
+    return None if up is None else np.array([up.x, up.y, up.z])
+
+
+def evenly_taken(runs: Sequence[PosedRun], most: int) -> list[tuple[str, str, Floats]]:
+    """Map, frame id and pose of at most so many frames, evenly taken over all runs in turn."""
+    every = [
+        (run.map_name, frame_id, T)
+        for run in runs
+        for frame_id, T in zip(run.frame_ids, run.poses, strict=True)
+    ]
+    count = min(most, len(every))
+    places = np.unique(np.linspace(0, len(every) - 1, count).round().astype(int))
+    return [every[i] for i in places]
+
+
+def placed_points(client: Client, map_name: str, frame_id: str, T: Floats, limit: int) -> Floats:
+    """At most so many points (N, 3) of an indexed frame, moved by its pose."""
+    try:
+        return moved(T, client.frame_points(map_name, frame_id, limit=limit).points)
+    except (NotFound, NotIndexed):
+        return np.zeros((0, 3))
+
+
+def frames_scene(client: Client, frames: Sequence[Frame], most: int) -> Moment:
+    """Return frames of a map at all times: points by height, runs, and the sensors of those drawn.
+
+    Parameters
+    ----------
+    client : to fetch points with
+    frames : of one map, at least one; those without a pose are left out
+    most : frames that are drawn, evenly taken
+    """
+    runs = listed_runs(frames)
+    parents = sorted({run.parent_frame for run in runs})
+    up = up_of_map(client, frames[0].map)
+    entities: list[SceneEntity] = []
+    for parent in parents:
+        of_parent = [run for run in runs if run.parent_frame == parent]
+        entities += map_entities(client, of_parent, parent, up, most // len(parents))
+    chosen = {frame_id for _, frame_id, _ in evenly_taken(runs, most)}
+    for one in frames:
+        if one.pose is not None and one.frame_id in chosen:
+            path = (one.pose.parent_frame, "frames", one.frame_id)
+            placement = Placement(np.array(one.pose.matrix), one.pose.child_frame)
+            entities.append(SceneEntity(path, placement))
+            outline = small_outline(one.intrinsics, TRACK)
+            entities.append(SceneEntity((*path, "sensor"), outline))
+    return Moment(entities)
+
+
+def frame_scene(client: Client, frame: Frame) -> Moment:
+    """One frame of a map at all times, in its parent frame, or its own where it has no pose.
+
+    Raises
+    ------
+    NotIndexed : nothing has been made of it, or not yet.
+    """
+    optical = frame.kind == "depth"
+    points = client.frame_points(frame.map, frame.frame_id).points
+    path: EntityPath = (f"{frame.frame_id}.{'optical' if optical else 'sensor'}",)
+    own_up = np.array([0.0, -1.0, 0.0] if optical else [0.0, 0.0, 1.0])
+    entities, up = [], own_up
+    if frame.pose is not None:
+        T = np.array(frame.pose.matrix)
+        path, up = (frame.pose.parent_frame, frame.frame_id), up_of_sensors([T], cameras=optical)
+        entities.append(SceneEntity(path, Placement(T, frame.pose.child_frame)))
+    colours, size_m = height_colours(points, own_up), point_size(MAP_POINT_M, cameras=optical)
+    return Moment(
+        [
+            SceneEntity(path[:1], UpAxis(up)),
+            *entities,
+            SceneEntity((*path, "points"), PointSet(points, colours, size_m)),
+            SceneEntity((*path, "sensor"), sensor_outline(frame.intrinsics, TRACK)),
+        ]
+    )
