@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import logging
 import os
 import secrets
@@ -155,6 +156,47 @@ def make_folder(folder: Path) -> None:
     folder.mkdir(PRIVATE_FOLDER, exist_ok=True)  # FileExistsError where it is a file
     for made in missing:
         sync_folder(made.parent)
+
+
+def put_new(part: Path, path: Path) -> None:
+    """Give a file its name where nothing has it; it survives the loss of power after that.
+
+    Raises
+    ------
+    FileExistsError : something has it.
+    """
+    try:
+        os.link(part, path)
+    except FileExistsError:
+        raise
+    except OSError as error:  # a file system without links
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from error
+        part.rename(path)
+    else:
+        part.unlink()
+    sync_folder(path.parent)
+
+
+@contextmanager
+def folder_turn(folder: Path) -> Iterator[bool]:
+    """Hold the right to write in a folder, which is made if need be; False where another has it.
+
+    The kernel releases the lock of a process that dies, however it dies.
+    """
+    make_folder(folder)
+    # of this call alone: flock then keeps out other threads as well as other processes
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
+    descriptor = os.open(folder / ".lock", flags, PRIVATE_FILE)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+        else:
+            yield True
+    finally:
+        os.close(descriptor)
 
 
 def _put(path: Path, data: bytes, *, private: bool, durable: bool) -> None:

@@ -6,8 +6,8 @@
       x BusyIndex               another process is building this index
       x StoreError
         - LostLease             the job has been given to another worker
-        - SnapshotError         a snapshot cannot be taken, or not be restored there
-          - DamagedSnapshot     its bytes are not those that were written
+        - BundleError           a bundle cannot be written, or not be restored there
+          - DamagedBundle       its bytes are not those that were written
       x TrainingError           too little data, or parameters that cannot be fitted
 
 They are the same classes: `except sceneprint.errors.UnknownMap` catches what a client raises.
@@ -76,14 +76,15 @@ from sceneprint_client.errors import (
 
 __all__ = [
     "AmbiguousKey",
+    "BundleError",
     "Busy",
     "BusyIndex",
     "CannotRetry",
     "Conflict",
     "DamagedBlob",
+    "DamagedBundle",
     "DamagedIndex",
     "DamagedSignature",
-    "DamagedSnapshot",
     "DatasetError",
     "DecoderFailure",
     "Forbidden",
@@ -115,7 +116,6 @@ __all__ = [
     "SceneprintError",
     "ServiceError",
     "SlowBody",
-    "SnapshotError",
     "StoreAway",
     "StoreError",
     "StoreFull",
@@ -161,12 +161,12 @@ class LostLease(StoreError):
     """The job's lease ran out, and it has been given to another worker."""
 
 
-class SnapshotError(StoreError):
-    """A snapshot cannot be taken, or cannot be restored there."""
+class BundleError(StoreError):
+    """A bundle cannot be written, or cannot be restored there."""
 
 
-class DamagedSnapshot(SnapshotError):
-    """The bytes of a snapshot are not those that were written."""
+class DamagedBundle(BundleError):
+    """The bytes of a bundle are not those that were written."""
 
 
 class TrainingError(SceneprintError):

@@ -9,14 +9,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
-from sceneprint.cli import whole_number
+from sceneprint.cli import positive, whole_number
 from sceneprint.cli.options import (
     add_service_options,
     ended_by_signals,
@@ -30,9 +29,9 @@ from sceneprint.errors import InvalidRequest
 from sceneprint.process import COMMAND, acting_as
 
 if TYPE_CHECKING:
+    from sceneprint.bundle.backup import Bundle
     from sceneprint.engine import Engine
     from sceneprint.maintenance.fsck.check import FindingOutcome
-    from sceneprint.maintenance.snapshot.creation import Snapshot
     from sceneprint.settings import Settings
     from sceneprint.store import Database
     from sceneprint_client.api import Map
@@ -256,37 +255,43 @@ def add_snapshot(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "snapshot",
-        help="back up database and blobs to one archive, while the service runs",
-        description="Write a consistent snapshot of database and blobs to an archive. The "
-        "service and its workers may keep running. Search indexes are left out, as they can be "
-        "rebuilt. Exit code 1 if a blob was missing or damaged and could not be included. The "
-        "archive contains all frames and the hashes of keys: protect it like the data folder.",
+        help="back up database and blobs as a bundle, while the service runs",
+        description="Write a bundle of database and blobs to a folder or an object store. The "
+        "service and its workers may keep running. What an earlier bundle there holds is not "
+        "written again. Search indexes are left out, as they can be rebuilt. Exit code 1 if a blob "
+        "was missing or damaged and could not be included. A bundle contains all frames and the "
+        "hashes of keys: protect it like the data folder.",
     )
     add_data_option(command)
     add_database_option(command)
     command.add_argument(
-        "--out",
-        type=Path,
-        metavar="FILE",
-        help="archive to write, or its folder (default: sceneprint-TIME.tar here)",
+        "--to",
+        required=True,
+        metavar="PLACE",
+        help="folder or URL such as s3://bucket/prefix, with bundles of this store alone",
+    )
+    command.add_argument(
+        "--keep",
+        type=positive,
+        metavar="N",
+        help="remove all but the newest N bundles afterwards (default: keep all)",
     )
     command.set_defaults(run=run_snapshot)
 
 
 def run_snapshot(options: argparse.Namespace) -> int:
-    """Take a snapshot; return 1 if blobs were damaged, and so are not in it."""
-    from sceneprint.maintenance.snapshot.creation import take_snapshot
+    """Write a bundle; return 1 if blobs were damaged, and so are not in it."""
+    from sceneprint.bundle.backup import take_backup
 
-    name = f"sceneprint-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tar"
-    path = Path(name) if options.out is None else options.out
-    if path.is_dir():
-        path = path / name
     start = time.perf_counter()
     settings = named_database(options)
-    with ended_by_signals(), byte_progress("snapshot") as progress:
-        snapshot = take_snapshot(settings, path, progress)
-    print(f"{one_line(str(path))}: {contents(snapshot)} in {time.perf_counter() - start:.1f} s")
-    return 1 if name_damaged(snapshot, "Run `sceneprint fsck` to see what can be repaired.") else 0
+    with ended_by_signals(), record_progress("snapshot") as progress:
+        bundle = take_backup(settings, options.to, progress, keep=options.keep)
+    print(
+        f"{one_line(options.to)}: bundle {bundle.manifest.name}, {contents(bundle)}, "
+        f"{bundle.written / 1e6:,.1f} MB of it new, in {time.perf_counter() - start:.1f} s"
+    )
+    return 1 if name_lost(bundle, "Run `sceneprint fsck` to see what can be repaired.") else 0
 
 
 def add_database_option(command: argparse.ArgumentParser) -> None:
@@ -331,9 +336,10 @@ def named_database(options: argparse.Namespace) -> Settings:
 
 
 @contextmanager
-def byte_progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar of bytes on a terminal; yields what is to be told of bytes done and in all."""
-    with tqdm(desc=what, unit="B", unit_scale=True, disable=None) as bar:
+def record_progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar of rows and blobs on a terminal; yield what sets how many are done, and of how
+    many."""
+    with tqdm(desc=what, unit="record", unit_scale=True, disable=None) as bar:
 
         def progress(done: int, total: int) -> None:
             bar.total = total
@@ -342,114 +348,118 @@ def byte_progress(what: str) -> Iterator[Callable[[int, int], None]]:
         yield progress
 
 
-def contents(snapshot: Snapshot) -> str:
-    """What is in a snapshot, in a few words."""
-    held = snapshot.manifest
+def contents(bundle: Bundle) -> str:
+    """Return the content of a bundle in a few words."""
+    held = bundle.manifest
     return (
-        f"{held.maps} maps, {held.n_frames} frames, {held.blobs.count} blobs, "
-        f"{held.bytes / 1e6:,.1f} MB"
+        f"{held.maps} maps, {held.n_frames} frames, {held.blobs} blobs, {held.bytes / 1e6:,.1f} MB"
     )
 
 
-def name_damaged(snapshot: Snapshot, advice: str) -> bool:
-    """Name on standard error what is not in a snapshot; whether there is any."""
-    if not snapshot.damaged:
+def name_lost(bundle: Bundle, advice: str) -> bool:
+    """Name on standard error the blobs that a bundle lacks; return whether there are any."""
+    if not bundle.lost:
         return False
-    for one in snapshot.damaged[:_SHOWN]:
+    for one in bundle.lost[:_SHOWN]:
         print(f"not in it: blob {one.digest[:12]}, {one.why}", file=sys.stderr)
-    more = len(snapshot.damaged) - _SHOWN
+    more = len(bundle.lost) - _SHOWN
     if more > 0:
-        print(f"... and {more} more, in damaged.jsonl of the archive", file=sys.stderr)
+        print(f"... and {more} more", file=sys.stderr)
     print(f"Everything else is included. {advice}", file=sys.stderr)
     return True
 
 
-# `sceneprint restore`: a data folder of a snapshot, or the store of a fleet.
+# `sceneprint restore`: a data folder of a bundle, or the store of a fleet.
 
 
 def add_restore(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "restore",
-        help="verify a snapshot and restore it to a data folder or a database",
-        description="Verify a snapshot and restore it to a data folder, all or nothing. With "
-        "the URL of an empty PostgreSQL database, its rows go there in one transaction, and its "
-        "blobs to SCENEPRINT_BLOB_URL or else the data folder. A folder that is not empty stays "
-        "untouched. Exit code 1 if the snapshot lists blobs that were "
-        "damaged when it was taken; 2 if nothing was restored.",
+        help="verify a bundle and restore it to a data folder or a database",
+        description="Restore a bundle to a data folder, verifying every byte. With the URL of an "
+        "empty PostgreSQL database, its rows go there in one transaction, and its blobs to "
+        "SCENEPRINT_BLOB_URL or else the data folder. A folder that is not empty stays untouched. "
+        "A restore that was interrupted goes on when you run it again. Exit code 1 if the bundle "
+        "lists blobs that were damaged when it was taken; 2 if nothing was restored.",
     )
     command.add_argument(
-        "archive",
-        type=Path,
-        metavar="ARCHIVE",
-        help="archive of `sceneprint snapshot`",
+        "place",
+        metavar="PLACE",
+        help="folder or URL that `sceneprint snapshot` wrote to",
     )
     add_data_option(command)
     add_database_option(command)
+    command.add_argument("--bundle", metavar="NAME", help="bundle to restore (default: the newest)")
     command.add_argument(
         "--verify-only",
         action="store_true",
-        help="read and check the whole snapshot without restoring it",
+        help="read and check the whole bundle without restoring it",
+    )
+    command.add_argument(
+        "--list", action="store_true", help="list the bundles of the place, and restore none"
     )
     command.set_defaults(run=run_restore)
 
 
 def run_restore(options: argparse.Namespace) -> int:
-    """Verify or restore; returns 1 where blobs were damaged when the snapshot was taken."""
+    """Verify or restore; return 1 if blobs were damaged when the bundle was taken."""
+    from sceneprint.bundle import restoration
+
     settings, start = named_database(options), time.perf_counter()
-    archive: Path = options.archive
-    with ended_by_signals():
+    if options.list:
+        return _list_bundles(options.place)
+    place, name = options.place, options.bundle
+    task = "verify" if options.verify_only else "restore"
+    with ended_by_signals(), record_progress(task) as go_on:
         if options.verify_only:
-            from sceneprint.maintenance.snapshot.restoration import verify_snapshot
-
-            with byte_progress("verify") as progress:
-                snapshot, done = verify_snapshot(archive, progress), "is complete"
+            bundle, done = restoration.verify_bundle(place, name, go_on), "is complete"
         elif settings.database_url is not None:
-            snapshot, done = _filled(archive, settings)
+            shown = _server(settings)
+            bundle = restoration.restore_to_server(place, settings, name, go_on)
+            done = f"is restored to {shown}"
         else:
-            snapshot, done = _restore_to_folder(archive, settings)
+            if settings.blob_url is not None:
+                raise InvalidRequest(
+                    "SCENEPRINT_BLOB_URL is set, but blobs are restored to the data folder, where "
+                    "no service would look for them. Unset the variable, or restore into a fleet "
+                    "with --database."
+                )
+            bundle = restoration.restore_to_folder(place, settings.data_dir, name, go_on)
+            done = f"is restored to {one_line(str(settings.data_dir))}"
     seconds = time.perf_counter() - start
-    shown = one_line(str(options.archive))
-    print(f"{shown} {done}: {contents(snapshot)} of "
-          f"{snapshot.manifest.created_at:%Y-%m-%dT%H:%M:%SZ} in {seconds:.1f} s")  # fmt: skip
+    print(f"{one_line(place)}: bundle {bundle.manifest.name} {done}: {contents(bundle)} "
+          f"in {seconds:.1f} s")  # fmt: skip
     advice = (
-        "These blobs were damaged when the snapshot was taken. Run `sceneprint fsck` on the "
-        "restored store to see whose they are."
+        "These blobs were damaged when the bundle was taken. Run `sceneprint fsck` on the restored "
+        "store to see whose they are."
     )
-    return 1 if name_damaged(snapshot, advice) else 0
+    return 1 if name_lost(bundle, advice) else 0
 
 
-def _filled(archive: Path, settings: Settings) -> tuple[Snapshot, str]:
-    """Restore into the database of a fleet."""
-    from sceneprint.maintenance.snapshot.postgres_restore import restore_to_fleet
+def _list_bundles(place: str) -> int:
+    from sceneprint.bundle.place import BundlePlace
+
+    there = BundlePlace.open(place)
+    for name in there.names():
+        held = there.read(name)
+        print(f"{name}  {held.maps} maps, {held.n_frames} frames, {held.bytes / 1e6:,.1f} MB")
+    return 0
+
+
+def _server(settings: Settings) -> str:
+    """Return the database of a fleet, to show."""
     from sceneprint.store.database import reach_database
 
     database = reach_database(settings.database)
     database.close()
     if database.is_sqlite:
         raise InvalidRequest(
-            "SCENEPRINT_DATABASE_URL is set to SQLite, but a snapshot is restored to the data "
+            "SCENEPRINT_DATABASE_URL is set to SQLite, but a bundle is restored to the data "
             "folder, where no service would look for it. Unset the variable, for the service "
             "too."
         )
-    with byte_progress("restore") as progress:
-        snapshot = restore_to_fleet(archive, settings, progress)
-    return snapshot, f"is restored to {one_line(database.shown)}"
-
-
-def _restore_to_folder(archive: Path, settings: Settings) -> tuple[Snapshot, str]:
-    """Restore to a folder."""
-    from sceneprint.maintenance.snapshot.restoration import restore_snapshot
-
-    if settings.blob_url is not None:
-        raise InvalidRequest(
-            "SCENEPRINT_BLOB_URL is set, but blobs are restored to the data folder, where no "
-            "service would look for them. Unset the variable, or restore into a fleet with "
-            "--database."
-        )
-    with byte_progress("restore") as progress:
-        snapshot = restore_snapshot(archive, settings.data_dir, progress)
-    return snapshot, f"is restored to {one_line(str(settings.data_dir))}"
+    return one_line(database.shown)
 
 
 # `sceneprint pull`: a robot's copies of maps, to localise without network.

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneprint.atomic_files import folder_turn
 from sceneprint.errors import DamagedIndex
 from sceneprint.geometry.retrieval.ranking import Metric, distances
 from sceneprint.index import generation_files
@@ -25,7 +26,6 @@ from sceneprint.index.generation_files import (
     GenerationManifest,
     Keys,
     SegmentFiles,
-    building,
     is_ours,
     manifests,
     read_manifest,
@@ -443,7 +443,7 @@ def publish(
     """
     if previous is not None and previous.model_id != model_id:
         raise ValueError(f"frames of model {model_id} appended to those of {previous.model_id}")
-    with building(folder) as mine:
+    with folder_turn(folder) as mine:
         if not mine or _overtaken(folder, previous):
             return None
         listed = manifests(folder)
@@ -492,7 +492,7 @@ def clear(folder: Path, but: int | None = None) -> bool:
 
     Readers that hold them go on undisturbed.
     """
-    with building(folder) as mine:
+    with folder_turn(folder) as mine:
         if mine:
             _clean(folder, {path for number, path in manifests(folder) if number == but})
         return mine

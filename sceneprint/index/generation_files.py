@@ -8,7 +8,6 @@ checksums, a file that two generations share is one file, and no file ever chang
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import json
 import mmap
@@ -17,7 +16,7 @@ import re
 import secrets
 import stat
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -26,9 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.atomic_files import (
-    PRIVATE_FILE,
     create_private,
-    make_folder,
     sync_folder,
     write_durable,
 )
@@ -155,27 +152,6 @@ def mapped(path: Path) -> mmap.mmap | bytes:
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
         raise DamagedIndex(f"{path}: cannot be read ({error.strerror or error}).") from error
-
-
-@contextmanager
-def building(folder: Path) -> Iterator[bool]:
-    """Hold the right to build in a folder, which is made if need be; False where another has it.
-
-    The kernel releases the lock of a process that dies, however it dies.
-    """
-    make_folder(folder)
-    # of this call alone: flock then keeps out other threads as well as other processes
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
-    descriptor = os.open(folder / ".lock", flags, PRIVATE_FILE)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            yield False
-        else:
-            yield True
-    finally:
-        os.close(descriptor)
 
 
 # Keys of frames, and where they stand in a list of keys.

@@ -121,7 +121,7 @@ class OpaqueIds:
     @property
     def owner(self) -> str:
         """32 digits that stand for the store itself, and tell nothing of its secret."""
-        return hmac.digest(self._secret, b"store", "sha256")[:16].hex()
+        return owner_of(self._secret)
 
     @cached_property
     def _cipher(self) -> AESSIV:
@@ -160,3 +160,8 @@ def invalid_cursor(cursor: str) -> InvalidRequest:
         f"The cursor {cursor!r:.40} is not valid. Use the `next_cursor` of a page.",
         (("cursor", "not a cursor of this service"),),
     )
+
+
+def owner_of(secret: bytes) -> str:
+    """Return the name of the store that has a secret; see `OpaqueIds.owner`."""
+    return hmac.digest(secret, b"store", "sha256")[:16].hex()

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from sqlalchemy import URL, Engine, create_engine, event
 
 from sceneprint.errors import UnusableStore
+from sceneprint.store import Blobs, FolderBlobs, open_blobs
 from sceneprint.store.database import (
     Database,
     current_revision,
@@ -103,3 +104,41 @@ def _state(path: Path) -> tuple[object, ...]:
 
 def _beside(path: Path, end: str) -> Path:
     return path.with_name(path.name + end)
+
+
+# Blobs opened for maintenance: what is missing is not made.
+
+
+@contextmanager
+def opened_blobs(place: Path | str, database: Database) -> Iterator[Blobs]:
+    """Open the blobs of a database.
+
+    Parameters
+    ----------
+    place : folder, or URL of an object store
+    database : whose they are
+
+    Raises
+    ------
+    UnusableStore : there is no such folder, or they are another database's.
+    """
+    if isinstance(place, Path):
+        require_folder(place)
+        yield FolderBlobs(place, make=False)
+        return
+    with closing(open_blobs(place, database, claim=False)) as blobs:
+        yield blobs
+
+
+def require_folder(place: Path) -> None:
+    """See that a folder of blobs is there: a disk that is not mounted is not made up for.
+
+    Raises
+    ------
+    UnusableStore : it is not.
+    """
+    if not place.is_dir():
+        raise UnusableStore(
+            f"{place}: there is no such folder. Name the data folder with --data, see that its "
+            "disk is mounted, or restore a backup."
+        )

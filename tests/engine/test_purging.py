@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from sqlalchemy import inspect, text, update
 
+from sceneprint.atomic_files import folder_turn
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.search.local_index import index_folder
@@ -22,7 +23,6 @@ from sceneprint.engine.upkeep import index_upkeep, purge
 from sceneprint.engine.upkeep.purge import Purging
 from sceneprint.errors import BusyIndex, UnknownJob, UnknownQuery
 from sceneprint.index import newest, newest_number
-from sceneprint.index.generation_files import building
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.store.frames import delete_frame, write_frame
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
@@ -262,7 +262,7 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
     first.delete_frame("hall", names[0])
     folder = index_folder(first.settings.indexes, first._row("hall"))
     before = newest_number(folder)
-    with building(folder):
+    with folder_turn(folder):
         with pytest.raises(BusyIndex, match="may still contain bytes of deleted frames"):
             second.purging.now()
         assert [worker.run().indexes for worker in workers] == [0, 0]

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from sqlalchemy import select
 
 from benchmarks.fleet.s3 import ObjectServer
+from sceneprint.atomic_files import folder_turn
 from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index, shared_index
 from sceneprint.engine.search.local_index import index_folder
@@ -25,7 +26,6 @@ from sceneprint.engine.search.shared_index import IN_USE_S, SharedIndexes
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import BusyIndex, DamagedIndex, UnusableStore
 from sceneprint.index import Generation, clear, manifests, newest, publish
-from sceneprint.index.generation_files import building
 from sceneprint.settings import Settings
 from sceneprint.store.blobs.object_client import Objects, open_objects
 from sceneprint.store.events import anchor_of_now
@@ -637,7 +637,7 @@ def test_a_folder_where_somebody_builds_is_left_alone(
     built: Engine, host: Callable[..., Engine]
 ) -> None:
     other = host("two")
-    with building(folder_of(other)) as mine:
+    with folder_turn(folder_of(other)) as mine:
         assert mine
         assert shared(other).sync(row_of(other)) is None
     assert shared(other).sync(row_of(other)) is not None

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
+from sceneprint.atomic_files import folder_turn
 from sceneprint.index import (
     Generation,
     clear,
@@ -23,7 +24,7 @@ from sceneprint.index import (
     newest_number,
     publish,
 )
-from sceneprint.index.generation_files import Block, building
+from sceneprint.index.generation_files import Block
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -243,9 +244,9 @@ def test_one_builds_at_a_time(walk: Walk, published: Publish, tmp_path: Path) ->
     folder, signatures = tmp_path / "map", walk(20)
     first = published(np.arange(10), signatures[:10])
     new: Block = (np.arange(10, 20), signatures[10:])
-    with building(folder) as mine:
+    with folder_turn(folder) as mine:
         assert mine
-        with building(folder) as another:  # of the same process as well
+        with folder_turn(folder) as another:  # of the same process as well
             assert not another
         assert publish(folder, model_id="model", revision=1, blocks=[new], previous=first) is None
         assert not clear(folder)

@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprint.atomic_files import PRIVATE_FILE
+from sceneprint.atomic_files import PRIVATE_FILE, folder_turn
 from sceneprint.engine.search.local_index import index_folder, is_index_folder, trusted
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
 from sceneprint.index import Generation, clear, manifests
@@ -35,7 +35,6 @@ from sceneprint.index.generation import remove_all_but, remove_unneeded
 from sceneprint.index.generation_files import (
     GenerationManifest,
     Keys,
-    building,
     decode_manifest,
     encode_manifest,
     is_file_name,
@@ -276,7 +275,7 @@ class SharedIndexes:
         if not self._make_room(sum(size for _, size in lacking), folder) and not needed:
             log.warning("no room for an index", extra={"map": row.name, "bytes": self._most_bytes})
             return None
-        with building(folder) as mine:
+        with folder_turn(folder) as mine:
             if not mine:
                 return None  # somebody fetches or builds it
             try:

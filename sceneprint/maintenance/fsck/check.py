@@ -39,14 +39,12 @@ from sceneprint.maintenance.fsck.findings import (
     Folder,
     Progress,
     is_of_rows,
-    opened_blobs,
-    require_folder,
 )
 from sceneprint.maintenance.fsck.indexes import check_indexes
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database, Store, open_store
 from sceneprint.store.maps import find_map
-from sceneprint.store.read_only import look_at
+from sceneprint.store.read_only import look_at, opened_blobs, require_folder
 from sceneprint.store.tables import frames
 from sceneprint_client.api import FrameState
 
@@ -157,7 +155,7 @@ def _open_store(settings: Settings, *, repair: bool) -> Iterator[Store]:
     if isinstance(settings.blobs, Path):
         require_folder(settings.blobs)
     # a repair makes no database
-    with look_at(settings.database) as database, opened_blobs(settings, database) as blobs:
+    with look_at(settings.database) as database, opened_blobs(settings.blobs, database) as blobs:
         if not repair:
             yield Store(database, blobs)
             return

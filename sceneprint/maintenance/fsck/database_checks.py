@@ -19,7 +19,6 @@ from sceneprint.maintenance.fsck.findings import (
     is_of_rows,
     sign_from_upload,
 )
-from sceneprint.maintenance.snapshot.database_copy import Form
 from sceneprint.models import PRESETS, parse_model, read_model, write_model
 from sceneprint.store.maps import counted_usage, list_maps, use_of
 from sceneprint.store.postgres.connection import allow
@@ -327,7 +326,7 @@ def check_server(folder: Folder, restore: str) -> Iterator[Finding]:
 
 def _dangling(folder: Folder, key: ForeignKeyConstraint, restore: str) -> Iterator[Finding]:
     child, parent = key.table, key.referred_table
-    form, pairs = Form(child), [(one.parent, one.column) for one in key.elements]
+    pairs = [(one.parent, one.column) for one in key.elements]
     lost = (
         select(*child.primary_key.columns)
         .join(parent, and_(*(own == its for own, its in pairs)), isouter=True)
@@ -340,7 +339,7 @@ def _dangling(folder: Folder, key: ForeignKeyConstraint, restore: str) -> Iterat
     for row in found:
         named = ", ".join(f"{value!r:.80}" for value in row)
         yield Finding(
-            "dangling-row", f"row {named} of table {form.table.name}", "damage",
+            "dangling-row", f"row {named} of table {child.name}", "damage",
             f"it refers to a row of {parent.name} that is not there", restore,
         )  # fmt: skip
 

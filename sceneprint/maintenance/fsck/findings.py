@@ -5,7 +5,6 @@ from __future__ import annotations
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -18,8 +17,7 @@ from sceneprint.engine.upkeep.repair import PRIORITY, reason_of_loss
 from sceneprint.errors import StoreError, UnreadableModel, UnusableStore
 from sceneprint.models import Model, parse_model
 from sceneprint.settings import Settings
-from sceneprint.store import Blobs, Database, FolderBlobs, Store, open_blobs
-from sceneprint.store.database import reach_database
+from sceneprint.store import Store
 from sceneprint.store.events import record_event
 from sceneprint.store.maps import find_map, map_of, next_revision
 from sceneprint.store.queue import enqueue
@@ -248,50 +246,3 @@ def quarantine_bytes(folder: Folder, name: str, data: bytes) -> Path:
     make_folder(place.parent)
     write_durable(place, data)
     return place
-
-
-# The blobs of a node's settings, opened for maintenance: what is missing is not made.
-
-
-@contextmanager
-def opened_blobs(settings: Settings, database: Database | None = None) -> Iterator[Blobs]:
-    """Open them, and give their connections back.
-
-    Parameters
-    ----------
-    settings : that say where they are
-    database : whose they are, where it is open already
-
-    Raises
-    ------
-    UnusableStore : there is no such folder, or they are another database's.
-    """
-    place = settings.blobs
-    if isinstance(place, Path):
-        require_folder(place)
-        yield FolderBlobs(place, make=False)
-        return
-    reached = database or reach_database(settings.database)
-    try:
-        blobs = open_blobs(place, reached, claim=False)
-        try:
-            yield blobs
-        finally:
-            blobs.close()
-    finally:
-        if database is None:
-            reached.close()
-
-
-def require_folder(place: Path) -> None:
-    """See that a folder of blobs is there: a disk that is not mounted is not made up for.
-
-    Raises
-    ------
-    UnusableStore : it is not.
-    """
-    if not place.is_dir():
-        raise UnusableStore(
-            f"{place}: there is no such folder. Name the data folder with --data, see that its "
-            "disk is mounted, or restore a snapshot."
-        )

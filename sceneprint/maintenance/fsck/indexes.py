@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from sqlalchemy import select
 
+from sceneprint.atomic_files import folder_turn
 from sceneprint.engine.search.local_index import (
     index_folder,
     is_index_folder,
@@ -22,7 +23,6 @@ from sceneprint.errors import DamagedIndex, StoreError
 from sceneprint.index import Generation, newest
 from sceneprint.index.generation_files import (
     GenerationManifest,
-    building,
     check,
     is_ours,
     manifests,
@@ -111,7 +111,7 @@ def _read(place: Path, name: str, size: int, *, verify: bool) -> None:
 
 def _remove_file(file: Path) -> str:
     """Remove a file and what needs it, so that a generation is there whole or not at all."""
-    with building(file.parent) as mine:
+    with folder_turn(file.parent) as mine:
         if not mine:
             raise StoreError("a worker is building this index; run it again when that is done")
         needing = [path for _, path in manifests(file.parent) if _needs(path, file.name)]
@@ -204,7 +204,7 @@ def _differences(folder: Folder, row: MapRow, generation: Generation) -> list[st
 
 
 def _remove_generations(place: Path) -> str:
-    with building(place) as mine:
+    with folder_turn(place) as mine:
         if not mine:
             raise StoreError("a worker is building this index; run it again when that is done")
         listed = manifests(place)

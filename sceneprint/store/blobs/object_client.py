@@ -93,7 +93,9 @@ MOST_PARTS = 9_000
 AWAY_S = 1.0
 _REFUSED = ("PermissionDeniedError", "UnauthenticatedError")
 _NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|bucket does not exist")
-_FULL = re.compile(r"\b507\b|StorageFull|QuotaExceeded|InsufficientStorage", re.IGNORECASE)
+_FULL = re.compile(
+    r"\b507\b|StorageFull|QuotaExceeded|InsufficientStorage|os error (?:27|28|122)\b", re.IGNORECASE
+)
 _SAID = re.compile(
     r"<Code>(\w{1,60})</Code>|(?:HTTP error: )([a-z ]{3,60})|\b([45]\d\d [A-Z][\w ]{2,40})"
 )

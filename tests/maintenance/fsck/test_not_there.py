@@ -142,8 +142,8 @@ def test_a_snapshot_makes_up_for_no_disk(
     house: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.rmtree(house.data / "blobs")
-    out = tmp_path / "out.tar"
-    refused(capsys, "snapshot", "--data", house.data, "--out", out)
+    out = tmp_path / "out"
+    refused(capsys, "snapshot", "--data", house.data, "--to", out)
     assert not out.exists()
     assert not (house.data / "blobs").exists()
     Engine(house.settings).close()  # nor does a service that starts

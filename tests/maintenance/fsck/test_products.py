@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sceneprint.bundle.backup import take_backup
+from sceneprint.bundle.restoration import restore_to_folder
 from sceneprint.engine import Engine
 from sceneprint.formats.depth_file import encode_png
 from sceneprint.maintenance.fsck.check import fsck
-from sceneprint.maintenance.snapshot.creation import take_snapshot
-from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 from sceneprint.settings import Settings
 from sceneprint.store import Store
 from sceneprint.store.maps import find_map
@@ -59,8 +59,8 @@ def names(store: Store, job_id: str) -> list[str]:
 @pytest.mark.sqlite_only("restores to a database of its own in the folder")
 def test_sound_files_of_jobs_are_no_finding_and_belong_to_a_snapshot(settings, made, tmp_path):
     assert list(fsck(settings, grace_s=0)) == []
-    take_snapshot(settings, tmp_path / "all.tar")
-    restore_snapshot(tmp_path / "all.tar", tmp_path / "again")
+    take_backup(settings, str(tmp_path / "all"))
+    restore_to_folder(str(tmp_path / "all"), tmp_path / "again")
     with Engine(Settings(data_dir=tmp_path / "again", database_url=None)) as engine:
         assert names(engine.store, made[0]) == ["mesh.ply", "picture.png"]
         assert engine.store.blobs.get(made[1]) == b"a mesh"
@@ -104,8 +104,8 @@ def tiled(settings: Settings) -> str:
 
 def test_sound_tiles_are_no_finding_and_belong_to_a_snapshot(settings, tiled, tmp_path):
     assert list(fsck(settings, grace_s=0)) == []
-    take_snapshot(settings, tmp_path / "all.tar")
-    restore_snapshot(tmp_path / "all.tar", tmp_path / "again")
+    take_backup(settings, str(tmp_path / "all"))
+    restore_to_folder(str(tmp_path / "all"), tmp_path / "again")
     with Engine(Settings(data_dir=tmp_path / "again", database_url=None)) as engine:
         assert engine.store.blobs.get(tiled) == b"cells"
 
@@ -162,8 +162,8 @@ def query_of(letter: str, *, listed: bool = True) -> NewQuery:
 @pytest.mark.sqlite_only("restores to a database of its own in the folder")
 def test_a_snapshot_has_kept_answers_and_what_can_be_restored(settings, deletion, tmp_path):
     assert list(fsck(settings, grace_s=0)) == []
-    take_snapshot(settings, tmp_path / "all.tar")
-    restore_snapshot(tmp_path / "all.tar", tmp_path / "again")
+    take_backup(settings, str(tmp_path / "all"))
+    restore_to_folder(str(tmp_path / "all"), tmp_path / "again")
     again = Settings(data_dir=tmp_path / "again", database_url=None)
     assert list(fsck(again, grace_s=0)) == []
     with Engine(again) as engine:

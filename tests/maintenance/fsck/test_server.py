@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import psycopg
 import pytest
 from pydantic import SecretStr
 
+from sceneprint.bundle.backup import take_backup
+from sceneprint.bundle.restoration import restore_to_server
 from sceneprint.engine import Engine
 from sceneprint.errors import StoreAway
 from sceneprint.maintenance.fsck.check import FindingOutcome, fsck
-from sceneprint.maintenance.snapshot.creation import take_snapshot
-from sceneprint.maintenance.snapshot.postgres_restore import restore_to_fleet
 from sceneprint.settings import Settings
 from sceneprint_client.api import JobState
 
@@ -50,20 +48,20 @@ class Fleet:
 
 
 @pytest.fixture(scope="session")
-def archive(copied, tmp_path_factory) -> Path:
-    place = tmp_path_factory.mktemp("archive")
+def bundles(copied, tmp_path_factory) -> str:
+    place = tmp_path_factory.mktemp("bundles")
     # of a copy: SQLite leaves an empty log beside what it has only read
-    take_snapshot(copied(place / "house").settings, place / "master.tar")
-    return place / "master.tar"
+    take_backup(copied(place / "house").settings, str(place / "bundles"))
+    return str(place / "bundles")
 
 
 @pytest.fixture
-def fleet(archive, master, postgres_url, tmp_path) -> Fleet:
+def fleet(bundles, master, postgres_url, tmp_path) -> Fleet:
     settings = Settings(
         data_dir=tmp_path / "node", database_url=SecretStr(postgres_url), index_dir=None,
         cache_dir=master.settings.cache_dir,
     )  # fmt: skip
-    restore_to_fleet(archive, settings)
+    restore_to_server(bundles, settings)
     return Fleet(settings, postgres_url)
 
 

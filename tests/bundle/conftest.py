@@ -1,4 +1,4 @@
-"""What the snapshot tests share: a data folder with something of every kind, and its snapshot."""
+"""What the tests of bundles share: a data folder with something of every kind, and its bundle."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
+from sceneprint.bundle.backup import take_backup
 from sceneprint.engine import Engine
-from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.settings import Settings
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import (
@@ -88,11 +88,11 @@ def data(master: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def archive(master: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A snapshot of `master`; not to be changed."""
-    path = tmp_path_factory.mktemp("archive") / "snapshot.tar"
-    take_snapshot(settings_of(master), path)
-    return path
+def place(master: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A folder with one bundle of `master`; not to be changed."""
+    folder = str(tmp_path_factory.mktemp("place") / "bundles")
+    take_backup(settings_of(master), folder)
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from sceneprint.atomic_files import make_folder, public_mode
+from sceneprint.bundle.backup import take_backup
+from sceneprint.bundle.restoration import restore_to_folder
 from sceneprint.cli.doctor import machine
 from sceneprint.engine import Engine
-from sceneprint.maintenance.snapshot.creation import take_snapshot
-from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 from sceneprint_client.api import NewMap, Query
 
 
@@ -47,9 +47,10 @@ def test_all_that_is_made_is_its_owners_alone(no_umask, tmp_path, uploads, setti
         assert public_paths(data.parent) == set()
     assert list((data / "queries").iterdir())  # written by then
     assert public_paths(data.parent) == set()
-    take_snapshot(settings(data), tmp_path / "backup.tar")
-    restore_snapshot(tmp_path / "backup.tar", tmp_path / "restored")
-    assert (tmp_path / "backup.tar").stat().st_mode & 0o777 == 0o600
+    take_backup(settings(data), str(tmp_path / "place"))
+    restore_to_folder(str(tmp_path / "place"), tmp_path / "restored")
+    closed = [tmp_path / "place", *(tmp_path / "place").glob("[bp]*s")]
+    assert [one.stat().st_mode & 0o777 for one in closed] == [0o700] * 3
     assert len(list((tmp_path / "restored").rglob("*"))) > 6
     assert public_paths(tmp_path / "restored") == set()
 

@@ -1,4 +1,4 @@
-"""A snapshot of a running service, whose robots upload and delete all the time."""
+"""Backups of a running service, whose robots upload and delete all the time."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
+from sceneprint.bundle.backup import take_backup
+from sceneprint.bundle.restoration import restore_to_folder
 from sceneprint.engine import Engine
-from sceneprint.maintenance.snapshot.creation import take_snapshot
-from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 from sceneprint_client import Client
 from sceneprint_lab.cli.demo import serving
 
@@ -78,27 +78,29 @@ def at_work(url: str, uploads: list) -> Iterator[list[Robot]]:
 @pytest.mark.thorough
 def test_it_holds_one_state_and_all_of_it(data, tmp_path, uploads, rows, answers, settings):
     asked = uploads[:6]
-    archives = [tmp_path / f"{i}.tar" for i in range(3)]
+    names = list[str]()
     with serving(data, 1) as url:
         with Client(url) as client:
             client.create_map("busy", model="depth")
             client.wait([row[0] for row in rows(data, "SELECT id FROM jobs")], timeout_s=PATIENCE_S)
         with at_work(url, uploads[6:]) as robots:
             began, ended = [], []
-            for path in archives:
+            for _ in range(3):
                 time.sleep(0.4)
                 began.append(time.monotonic())
-                assert take_snapshot(settings(data), path).damaged == []
+                taken = take_backup(settings(data), str(tmp_path / "place"))
                 ended.append(time.monotonic())
+                assert taken.lost == ()
+                names.append(taken.manifest.name)
         received = {k: v for robot in robots for k, v in robot.received.items()}
         deleting = {k: v for robot in robots for k, v in robot.deleting.items()}
     original = answers(data, asked)
     assert any(one.status == "found" for one in original)
     unfinished = 0
-    for path, start, end in zip(archives, began, ended, strict=True):
-        new = tmp_path / f"of {path.stem}"
-        snapshot = restore_snapshot(path, new)  # which finds every blob that is referred to
-        assert snapshot.damaged == []
+    for name, start, end in zip(names, began, ended, strict=True):
+        new = tmp_path / f"of {name}"
+        restored = restore_to_folder(str(tmp_path / "place"), new, name)  # which finds every blob
+        assert restored.lost == ()
         states = dict(rows(new, "SELECT id, state FROM frames"))
         # what was acknowledged before is in it; what was not yet asked to go when it ended, too
         for frame, at in received.items():

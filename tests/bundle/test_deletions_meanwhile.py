@@ -1,4 +1,4 @@
-"""Deletions while a snapshot is being taken: it misses nothing, and what stays is found later."""
+"""Deletions while a backup is being taken: it misses nothing, and what stays is found later."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import time
 
 import pytest
 
+from sceneprint.bundle.backup import take_backup
+from sceneprint.bundle.restoration import verify_bundle
 from sceneprint.engine import Engine
-from sceneprint.maintenance.snapshot.creation import take_snapshot
-from sceneprint.maintenance.snapshot.restoration import verify_snapshot
 
 
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
@@ -23,12 +23,12 @@ def test_what_is_deleted_meanwhile_is_in_it(data, tmp_path, settings, rows):
             while frames:
                 engine.delete_frame("hall", frames.pop())
 
-        taken = take_snapshot(settings(data), tmp_path / "a.tar", delete)
+        taken = take_backup(settings(data), str(tmp_path / "place"), delete)
         assert frames == []
-        assert taken.damaged == []
-        assert taken.manifest.blobs.count == 9
+        assert taken.lost == ()
+        assert taken.manifest.blobs == 9
         assert set(engine.store.blobs.digests()) == before
-        assert verify_snapshot(tmp_path / "a.tar").damaged == []
+        assert verify_bundle(str(tmp_path / "place")).lost == ()
         assert rows(data, "SELECT DISTINCT state FROM frames") == [("deleted",)]
 
 
@@ -37,12 +37,12 @@ def test_after_it_deletions_remove_blobs_again(data, tmp_path, settings):
         blobs = engine.store.blobs
         count = len(list(blobs.digests()))
         first, second, *_ = [one.frame_id for one in engine.list_frames("hall").items]
-        with blobs.kept(), blobs.kept():  # two snapshots do not mind each other
+        with blobs.kept(), blobs.kept():  # two backups do not mind each other
             engine.delete_frame("hall", first)
         assert len(list(blobs.digests())) == count
         engine.delete_frame("hall", second)
         assert len(list(blobs.digests())) == count - 2  # those of the first are for fsck
-        take_snapshot(settings(data), tmp_path / "a.tar")
+        take_backup(settings(data), str(tmp_path / "place"))
         engine.delete_map("hall")
         assert len(list(blobs.digests())) == 2  # the artifact of the first, and the orphan
 
@@ -54,7 +54,7 @@ def test_a_sweep_under_way_is_waited_for(data, tmp_path, settings):
         (frame, *_) = [one.frame_id for one in engine.list_frames("hall").items]
 
         def take() -> None:
-            taken.append(take_snapshot(settings(data), tmp_path / "a.tar"))
+            taken.append(take_backup(settings(data), str(tmp_path / "place")))
 
         thread = threading.Thread(target=take)
         with engine.store.blobs.removing() as allowed:
@@ -62,15 +62,13 @@ def test_a_sweep_under_way_is_waited_for(data, tmp_path, settings):
             with engine.store.blobs.removing() as second:
                 assert not second
             thread.start()
-            workplaces = list(tmp_path.glob(".sceneprint-snapshot-*"))
-            while not workplaces:
+            while not (tmp_path / "place").exists():
                 time.sleep(0.01)
-                workplaces = list(tmp_path.glob(".sceneprint-snapshot-*"))
             time.sleep(0.3)
-            assert list(workplaces[0].iterdir()) == []
+            assert list((tmp_path / "place").glob("parts/??")) == []
             assert thread.is_alive()
             engine.delete_frame("hall", frame)
         thread.join()
-    assert taken[0].damaged == []
+    assert taken[0].lost == ()
     assert taken[0].manifest.frames == {"deleted": 2, "indexed": 3, "received": 1}
-    assert taken[0].manifest.blobs.count == 7
+    assert taken[0].manifest.blobs == 7

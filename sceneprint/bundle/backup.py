@@ -1,0 +1,331 @@
+"""Backups: a bundle of everything that a store must not lose, taken while the service runs.
+
+    database and blobs  --take_backup-->  bundle in a place
+
+All rows are read in one transaction, and then the blobs that they refer to are copied. Blobs never
+change, and none is removed while this runs, so the bundle holds one state, and all of it. Parts
+that are in the place already are not written again.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from itertools import islice
+from typing import IO, Any, Literal, TypeVar
+
+from sqlalchemy import Connection
+
+from sceneprint.bundle.place import BundleManifest, BundlePlace, Part
+from sceneprint.bundle.rows import last_numbers, read_rows, row_parts, table_parts, tables
+from sceneprint.errors import BundleError, DamagedBlob, UnusableStore
+from sceneprint.settings import Settings
+from sceneprint.store import Blobs, Database
+from sceneprint.store.blobs.folder import is_digest
+from sceneprint.store.database import current_revision, is_there, known_revisions, reach_database
+from sceneprint.store.opaque_ids import OpaqueIds
+from sceneprint.store.postgres.connection import allow
+from sceneprint.store.read_only import opened_blobs
+from sceneprint_client.api import FrameState
+
+#: Parts and blobs that are written at once: each waits for its disk, or for the network.
+THREADS = 8
+#: Blobs that one thread copies after the other: most are there already.
+_TOGETHER = 32
+#: Bytes above which a blob is copied in parts, and not held in memory.
+LARGE = 8 << 20
+#: Rows and blobs that are done, and all of them.
+Progress = Callable[[int, int], None]
+#: Columns of a list of blobs: the digest, its bytes, and why it is not in the bundle.
+BLOB_COLUMNS = ("digest", "bytes", "lost")
+
+#: The digests of all blobs that have to be there.
+_REFERRED = (
+    "SELECT blob AS digest FROM frames WHERE deletion IS NOT NULL OR state NOT IN"
+    f" ('{FrameState.DELETED}', '{FrameState.REDUNDANT}')"
+    " UNION SELECT geometry FROM signatures"
+    " UNION SELECT blob FROM job_files"
+    " UNION SELECT blob FROM surface_tiles WHERE blob IS NOT NULL"
+    " UNION SELECT draft FROM surface_tiles WHERE draft IS NOT NULL"
+)
+
+A = TypeVar("A")
+B = TypeVar("B")
+
+
+#: Why a blob is not in a bundle.
+Loss = Literal["missing", "damaged"]
+#: Digest and bytes of a blob in the list of a bundle, and why it is not in it.
+ListedBlob = tuple[str, int, Loss | None]
+
+
+@dataclass(frozen=True)
+class LostBlob:
+    """A blob that a backup does not hold, as it was missing or damaged in the store."""
+
+    digest: str
+    why: Loss
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A bundle that was written, verified or restored.
+
+    Parameters
+    ----------
+    manifest : its content
+    lost : blobs that it does not hold
+    written : bytes that were written for it; the rest was there
+    """
+
+    manifest: BundleManifest
+    lost: tuple[LostBlob, ...]
+    written: int = 0
+
+
+def take_backup(
+    settings: Settings, place: str, progress: Progress | None = None, *, keep: int | None = None
+) -> Bundle:
+    """Write a bundle of all that must not be lost; service and workers may go on.
+
+    It holds what was acknowledged before this was called, and perhaps some that came later. A blob
+    that is missing or damaged is left out and named: what else there is can still be saved.
+
+    Parameters
+    ----------
+    settings : whose database and blobs are saved
+    place : folder or URL of an object store; a folder is made if it is missing
+    progress : called with the rows and blobs that are done, and all of them
+    keep : number of bundles that stay there, this one among them; default: all
+
+    Raises
+    ------
+    BundleError : the place is another store's, or another process writes there.
+    UnusableStore, NewerSchema : the database or the place cannot be used, or is damaged.
+    """
+    with _opened(settings.database) as database, opened_blobs(settings.blobs, database) as blobs:
+        there = BundlePlace.open(place, create=True)
+        there.claim(OpaqueIds(database).owner)
+        with there.turn(), blobs.kept():  # before rows are read: what they refer to must not go
+            backup = _Backup(there, progress or (lambda _done, _total: None))
+            bundle = backup.write(database, blobs)
+            if keep is not None:
+                needed = set[str]()
+                for name in there.names()[:keep]:
+                    needed |= set(part_digests(there, there.read(name)))
+                there.prune(needed, keep)
+    return bundle
+
+
+@contextmanager
+def _opened(url: str) -> Iterator[Database]:
+    """Open a database that may be in use; nothing is written to it.
+
+    Raises
+    ------
+    UnusableStore, NewerSchema : it is missing, cannot be read, or is of another schema.
+    """
+    database = reach_database(url)
+    with closing(database):
+        if database.is_sqlite and database.file is None:
+            raise BundleError("A database in memory has no backup. Name one in a file.")
+        if not is_there(url):
+            shown = database.file or database.shown
+            raise UnusableStore(f"{shown}: there is no database. Name its folder with --data.")
+        head, _ = known_revisions()
+        with database.read() as connection:
+            found = current_revision(connection)
+        if found != head:
+            raise UnusableStore(
+                f"{database.shown} has schema {found}, and this version works with {head}. Any "
+                "other use of it, such as `sceneprint serve`, brings it there."
+            )
+        yield database
+
+
+class _Backup:
+    """Writes one bundle."""
+
+    def __init__(self, place: BundlePlace, progress: Progress) -> None:
+        self._place, self._progress = place, progress
+        self._done = self._total = self._written = 0
+
+    def write(self, database: Database, blobs: Blobs) -> Bundle:
+        begun, parts = datetime.now(UTC), list[Part]()
+        with tempfile.TemporaryFile() as digests:
+            with database.read() as connection:
+                allow(connection, 0)  # what is on the way may be large, and the place slow
+                check_sound(connection, database.shown)
+                self._total = _count(connection)
+                for table in tables():
+                    parts += self._parts(f"rows/{table.name}", table_parts(connection, table))
+                summary = summary_of(connection)
+                for digest in referred(connection):
+                    digests.write(f"{digest}\n".encode())
+            digests.seek(0)
+            listed = _Listed()
+            rows = self._blobs(blobs, digests, listed)
+            parts += self._parts("blobs", row_parts(BLOB_COLUMNS, rows))
+        manifest = BundleManifest(
+            created_at=begun, sceneprint=version("sceneprint"), schema_revision=known_revisions()[0],
+            blobs=listed.count, blob_bytes=listed.bytes, lost=len(listed.lost),
+            parts=tuple(parts), **summary,
+        )  # fmt: skip
+        self._place.publish(manifest)
+        return Bundle(manifest, tuple(listed.lost), self._written)
+
+    def _parts(self, kind: str, found: Iterable[tuple[bytes, int]]) -> Iterator[Part]:
+        for (digest, new), size, rows in in_order(
+            lambda one: (self._place.put(one[0]), len(one[0]), one[1]), found
+        ):
+            self._written += size if new else 0
+            if kind != "blobs":
+                self._go_on(rows)
+            yield Part(kind=kind, digest=digest, bytes=size, rows=rows)
+
+    def _blobs(
+        self, blobs: Blobs, digests: IO[bytes], listed: _Listed
+    ) -> Iterator[tuple[str, ListedBlob]]:
+        """Copy blobs, and yield the rows of the list of them."""
+        names = (line.decode().rstrip("\n") for line in digests)
+        some = iter(lambda: list(islice(names, _TOGETHER)), [])
+        for found in in_order(lambda block: [self._copy(blobs, one) for one in block], some):
+            for digest, size, why, new in found:
+                listed.add(digest, size, why)
+                self._written += size if new else 0
+                yield digest, (digest, size, why)
+            self._go_on(len(found))
+
+    def _copy(self, blobs: Blobs, digest: str) -> tuple[str, int, Loss | None, bool]:
+        """Copy a blob unless it is there; return its size, and why it cannot be copied."""
+        if not is_digest(digest):  # of a database that somebody has edited
+            return digest, 0, "missing", False
+        there = self._place.size(digest)
+        if there is not None:
+            return digest, there, None, False
+        size = blobs.size(digest)
+        if size is not None and size > LARGE:
+            condition = blobs.condition(digest)
+            if condition != "sound":
+                return digest, 0, condition, False
+            with closing(blobs.open(digest)) as file:
+                self._place.put_file(digest, file)
+            return digest, size, None, True
+        try:
+            data = blobs.get(digest)
+        except DamagedBlob:
+            return digest, 0, "damaged" if blobs.holds(digest) else "missing", False
+        self._place.put(data)
+        return digest, len(data), None, True
+
+    def _go_on(self, rows: int) -> None:
+        self._done += rows
+        self._progress(self._done, max(self._total, self._done))
+
+
+class _Listed:
+    """Counts the blobs of a bundle."""
+
+    def __init__(self) -> None:
+        self.count = self.bytes = 0
+        self.lost = list[LostBlob]()
+
+    def add(self, digest: str, size: int, why: Loss | None) -> None:
+        if why is not None:
+            self.lost.append(LostBlob(digest, why))
+            return
+        self.count, self.bytes = self.count + 1, self.bytes + size
+
+
+def in_order(work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
+    """Yield what `work` returns for each item, in order; some items are worked at at once."""
+    with ThreadPoolExecutor(THREADS, thread_name_prefix="bundle") as pool:
+        waiting: deque[Future[B]] = deque()
+        try:
+            for item in items:
+                waiting.append(pool.submit(work, item))
+                if len(waiting) >= 2 * THREADS:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for one in waiting:
+                one.cancel()
+
+
+def referred(connection: Connection) -> Iterator[str]:
+    """Yield the digests of all blobs that have to be there, each once, in order."""
+    # as text, whatever a database that somebody has edited holds
+    order = ' COLLATE "C"' if connection.dialect.name == "postgresql" else ""
+    statement = f"SELECT CAST(digest AS TEXT){order} AS d FROM ({_REFERRED}) AS found ORDER BY d"
+    options = {"stream_results": True}
+    for (digest,) in connection.exec_driver_sql(statement, execution_options=options):
+        yield digest
+
+
+def listed_blobs(place: BundlePlace, manifest: BundleManifest) -> Iterator[ListedBlob]:
+    """Yield digest, bytes and, where it is not in the bundle, why, of each blob of a bundle."""
+    lists = (one for one in manifest.parts if one.kind == "blobs")
+    for data in in_order(lambda one: place.get(one.digest), lists):
+        for digest, size, why in read_rows(data, BLOB_COLUMNS):
+            if not is_digest(digest) or not isinstance(size, int) or why not in (
+                None, "missing", "damaged",
+            ):  # fmt: skip
+                raise place.damaged(str(digest)[:64], "is listed as no blob can be")
+            yield digest, size, why
+
+
+def part_digests(place: BundlePlace, manifest: BundleManifest) -> Iterator[str]:
+    """Yield the digests of all parts of a bundle, its blobs among them."""
+    yield from (one.digest for one in manifest.parts)
+    yield from (digest for digest, _, why in listed_blobs(place, manifest) if why is None)
+
+
+def summary_of(connection: Connection) -> dict[str, Any]:
+    """Return how many maps, signatures and frames in each state there are, and the numbers."""
+    states = connection.exec_driver_sql(
+        "SELECT state, count(*) FROM frames GROUP BY state ORDER BY state"
+    )
+    return {
+        "maps": _rows_of(connection, "maps"),
+        "frames": dict(tuple(one) for one in states),
+        "signatures": _rows_of(connection, "signatures"),
+        "numbers": last_numbers(connection),
+    }
+
+
+def check_sound(connection: Connection, shown: str) -> None:
+    """See that what SQLite reads is whole: rows that contradict each other cannot be restored.
+
+    Raises
+    ------
+    UnusableStore : it is not.
+    """
+    if connection.dialect.name != "sqlite":
+        return  # PostgreSQL enforces its constraints
+    wrong = str(connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one())
+    lost = connection.exec_driver_sql("PRAGMA foreign_key_check").first()
+    if lost is not None:
+        wrong = f"a row of {lost[0]} refers to one of {lost[2]} that is missing"
+    if wrong != "ok":
+        raise UnusableStore(
+            f"{shown}: the database is damaged ({' '.join(wrong.split())}), and a backup of it "
+            "could not be restored. Run `sceneprint fsck`, or restore an earlier bundle."
+        )
+
+
+def _count(connection: Connection) -> int:
+    """Return the number of rows and blobs that a backup goes through."""
+    blobs = f"SELECT count(*) FROM ({_REFERRED}) AS found"
+    rows = sum(_rows_of(connection, one.name) for one in tables())
+    return rows + int(connection.exec_driver_sql(blobs).scalar_one())
+
+
+def _rows_of(connection: Connection, name: str) -> int:
+    return int(connection.exec_driver_sql(f"SELECT count(*) FROM {name}").scalar_one())

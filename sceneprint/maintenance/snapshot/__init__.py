@@ -1,1 +1,0 @@
-"""A store copied to one archive while it works, and restored from it."""

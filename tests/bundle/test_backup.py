@@ -1,0 +1,452 @@
+"""What is in a bundle, and what another one costs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import SecretStr
+from sqlalchemy import insert
+
+from sceneprint.bundle import backup
+from sceneprint.bundle import place as place_module
+from sceneprint.bundle.backup import listed_blobs, take_backup
+from sceneprint.bundle.place import BundlePlace
+from sceneprint.bundle.restoration import restore_to_folder, verify_bundle
+from sceneprint.bundle.rows import row_parts
+from sceneprint.engine import Engine
+from sceneprint.errors import BundleError, UnusableStore
+from sceneprint.settings import Settings
+from sceneprint.store import FolderBlobs, open_database
+from sceneprint.store.events import record_event
+from sceneprint.store.frames import refers_to
+from sceneprint.store.tables import keys
+
+file_only = pytest.mark.sqlite_only("looks at the database as a file of the data folder")
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def parts_in(folder: Path) -> dict[str, bytes]:
+    return {one.name: one.read_bytes() for one in folder.glob("parts/??/*")}
+
+
+def lines_of(data: bytes) -> list[Any]:
+    return [json.loads(line) for line in zlib.decompress(data).split(b"\n")]
+
+
+def blobs_of(folder: str | Path) -> dict[str, int]:
+    there = BundlePlace.open(str(folder))
+    return {digest: size for digest, size, _ in listed_blobs(there, there.read())}
+
+
+@file_only
+def test_what_is_in_a_bundle(master, place, rows):
+    """Read by zlib and JSON alone, and checked against the folder by hand."""
+    assert names_in(Path(place)) == [".lock", "bundles", "parts", "place.json"]
+    (name,) = names_in(Path(place) / "bundles")
+    manifest = json.loads((Path(place) / "bundles" / name).read_bytes())
+    held = parts_in(Path(place))
+    assert all(hashlib.sha256(data).hexdigest() == digest for digest, data in held.items())
+    parts = manifest.pop("parts")
+    assert {one["digest"]: one["bytes"] for one in parts}.items() <= {
+        digest: len(data) for digest, data in held.items()
+    }.items()
+    of = {one["kind"]: one for one in parts}
+    head, *frames = lines_of(held[of["rows/frames"]["digest"]])
+    assert of["rows/frames"]["rows"] == len(frames) == 6
+    columns = ", ".join(f'"{one}"' for one in head)
+    assert [tuple(one) for one in frames] == [
+        tuple(bool(x) if n == "depth_along_ray" else x for n, x in zip(head, row, strict=True))
+        for row in rows(master, f"SELECT {columns} FROM frames ORDER BY number")
+    ]
+    head, *listed = lines_of(held[of["blobs"]["digest"]])
+    uploads = rows(master, "SELECT blob FROM frames WHERE state != 'deleted'")
+    artifacts = rows(master, "SELECT geometry FROM signatures")
+    assert (len(uploads), len(artifacts)) == (5, 4)
+    wanted = sorted(digest for (digest,) in uploads + artifacts)
+    assert listed == [[one, len(held[one]), None] for one in wanted]
+    begun = datetime.fromisoformat(manifest.pop("created_at"))
+    assert f"{begun:%Y%m%dT%H%M%S-%f}Z.json" == name
+    assert 0 <= (datetime.now(UTC) - begun).total_seconds() < 3600
+    assert re.fullmatch("[0-9a-f]{64}", manifest.pop("sha256"))
+    ((revision,),) = rows(master, "SELECT version_num FROM alembic_version")
+    assert manifest.pop("sceneprint")
+    numbers = manifest.pop("numbers")
+    assert (numbers["frames"], numbers["jobs"], numbers["samples"]) == (6, 6, 0)
+    assert manifest == {
+        "format": "sceneprint-bundle", "version": 1, "schema_revision": revision, "maps": 1,
+        "frames": {"deleted": 1, "indexed": 4, "received": 1}, "signatures": 4, "blobs": 9,
+        "lost": 0, "blob_bytes": sum(len(held[one]) for one in wanted),
+    }  # fmt: skip
+
+
+def test_the_blobs_are_those_that_no_sweep_would_remove(master, place, settings):
+    held = set(blobs_of(place))
+    with Engine(settings(master)) as engine, engine.store.database.read() as connection:
+        all_there = set(engine.store.blobs.digests())
+        assert held == {digest for digest in all_there if refers_to(connection, digest)}
+    assert len(all_there) == len(held) + 1  # the orphan
+
+
+def test_parts_end_where_their_rows_say():
+    """A row that comes in between changes its own part, and no other."""
+    rows = [(str(i), [i, "x" * 50]) for i in range(20_000)]
+    before = list(row_parts(["number", "text"], rows))
+    assert sum(count for _, count in before) == 20_000
+    ends = [i for i in range(20_000) if zlib.crc32(str(i).encode()) % 1024 == 0]
+    assert len(before) == len(ends) + 1 > 10
+    rows.insert(10_000, ("new", [-1, "y"]))
+    after = list(row_parts(["number", "text"], rows))
+    changed = {data for data, _ in after} - {data for data, _ in before}
+    assert len(changed) == 1
+    large = list(row_parts(["text"], [(f"{i}-", ["x" * (3 << 20)]) for i in range(7)]))
+    assert [count for _, count in large] == [3, 3, 1]  # of 8 MiB and what is over
+
+
+@file_only
+def test_another_bundle_costs_what_is_new(data, tmp_path, settings, uploads):
+    folder = tmp_path / "place"
+    first = take_backup(settings(data), str(folder))
+    held = parts_in(folder)
+    assert first.written == sum(map(len, held.values()))
+    again = take_backup(settings(data), str(folder))
+    assert again.written == 0
+    assert parts_in(folder) == held
+    with Engine(settings(data)) as engine:
+        engine.add_frame("hall", uploads[9].data, uploads[9].meta)
+    third = take_backup(settings(data), str(folder))
+    new = set(parts_in(folder)) - set(held)
+    tables = {one.kind for one in third.manifest.parts if one.digest in new}
+    assert tables == {"blobs", "rows/events", "rows/frames", "rows/jobs", "rows/maps"}
+    assert len(new) == len(tables) + 1  # and the upload
+    assert first.manifest.name < again.manifest.name < third.manifest.name
+    assert BundlePlace.open(str(folder)).names()[-1] == first.manifest.name
+    restore_to_folder(str(folder), tmp_path / "first", first.manifest.name)
+    restore_to_folder(str(folder), tmp_path / "third")
+    for name, count in (("first", 5), ("third", 6)):
+        with Engine(settings(tmp_path / name)) as engine:
+            assert len(engine.list_frames("hall").items) == count
+
+
+@file_only
+def test_old_bundles_go_with_their_parts(data, tmp_path, settings):
+    """Of parts that no bundle names, those that were written a moment ago stay."""
+    folder = tmp_path / "place"
+    gone = take_backup(settings(data), str(folder))
+    with Engine(settings(data)) as engine:
+        engine.delete_map("hall")
+    second = take_backup(settings(data), str(folder), keep=1)
+    assert names_in(folder / "bundles") == [f"{second.manifest.name}.json"]
+    assert len(parts_in(folder)) > 9
+    for path in folder.glob("parts/??/*"):
+        os.utime(path, (0, time.time() - place_module.GRACE_S - 1))
+    (folder / "parts" / "ab").mkdir(exist_ok=True)
+    (folder / "parts" / "ab" / "half#1").touch()
+    os.utime(folder / "parts" / "ab" / "half#1", (0, 0))
+    third = take_backup(settings(data), str(folder), keep=2)
+    assert len(names_in(folder / "bundles")) == 2
+    needed = {one.digest for one in (*second.manifest.parts, *third.manifest.parts)}
+    assert set(parts_in(folder)) == needed
+    with pytest.raises(BundleError, match="holds no bundle"):
+        verify_bundle(str(folder), gone.manifest.name)
+    assert verify_bundle(str(folder)).manifest.maps == 0
+
+
+@file_only
+def test_the_commands(master, tmp_path, sceneprint, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = sceneprint("snapshot", "--data", master, "--to", "place")
+    held = r"1 maps, 5 frames, 9 blobs, \d\.\d MB"
+    found = re.fullmatch(
+        rf"place: bundle (\S+), {held}, (\S+) MB of it new, in \S+ s\n", said.stdout
+    )
+    assert found is not None
+    assert float(found[2]) > 0
+    assert said.stderr == ""
+    assert ", 0.0 MB of it new," in sceneprint("snapshot", "--data", master, "--to", "place").stdout
+    said = sceneprint("restore", "place", "--list").stdout.splitlines()
+    assert [line.partition(" ")[0] for line in said] == BundlePlace.open("place").names()
+    said = sceneprint("restore", "--verify-only", "place", "--bundle", found[1])
+    assert re.fullmatch(rf"place: bundle {found[1]} is complete: {held} in \S+ s\n", said.stdout)
+    said = sceneprint("restore", "place", "--data", "new")
+    assert re.search(rf" is restored to new: {held} in ", said.stdout)
+    assert names_in(tmp_path) == ["new", "place"]
+    sceneprint("snapshot", "--data", master, "--to", "place", "--keep", "1")
+    assert len(names_in(Path("place/bundles"))) == 1
+
+
+@file_only
+def test_it_is_in_nobodys_way(data, tmp_path, settings):
+    """Taken while somebody holds the right to write, with his changes not yet committed."""
+    with closing(sqlite3.connect(data / "sceneprint.db", isolation_level=None)) as writer:
+        writer.execute("BEGIN IMMEDIATE")
+        writer.execute("UPDATE maps SET title = 'half done'")
+        taken = take_backup(settings(data), str(tmp_path / "place"))
+        writer.execute("COMMIT")
+    assert taken.lost == ()
+    restore_to_folder(str(tmp_path / "place"), tmp_path / "new")
+    with closing(sqlite3.connect(tmp_path / "new" / "sceneprint.db")) as new:
+        assert new.execute("SELECT title FROM maps").fetchall() == [(None,)]
+
+
+@file_only
+@pytest.mark.parametrize("large", [backup.LARGE, 20])
+def test_damaged_blobs_are_left_out_and_named(
+    large, data, tmp_path, sceneprint, rows, settings, monkeypatch
+):
+    """Blobs that are copied in parts as well as those that memory holds."""
+    monkeypatch.setattr(backup, "LARGE", large)
+    (first, second) = rows(data, "SELECT id, blob FROM frames WHERE state = 'indexed' LIMIT 2")
+    ((artifact,),) = rows(
+        data, "SELECT geometry FROM signatures JOIN frames ON number = frame_number"
+        f" WHERE id = '{second[0]}'"
+    )  # fmt: skip
+    path = data / "blobs" / first[1][:2] / first[1]
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    (data / "blobs" / artifact[:2] / artifact).unlink()
+    folder = tmp_path / "place"
+    said = sceneprint("snapshot", "--data", data, "--to", folder, expect=1)
+    why = sorted([(first[1], "damaged"), (artifact, "missing")])
+    lines = [f"not in it: blob {digest[:12]}, {why}" for digest, why in why]
+    assert said.stderr.splitlines()[:-1] == lines
+    assert not {digest for digest, _ in why} & set(parts_in(folder))
+    assert (
+        sceneprint("restore", "--verify-only", folder, expect=1).stderr.splitlines()[:-1] == lines
+    )
+    said = sceneprint("restore", folder, "--data", tmp_path / "new", expect=1)
+    assert said.stderr.splitlines()[:-1] == lines
+    with Engine(settings(tmp_path / "new")) as engine:
+        assert len(engine.list_frames("hall").items) == 5
+        assert len(list(engine.store.blobs.digests())) == 7
+
+
+@file_only
+def test_what_cannot_be_taken(data, tmp_path, sceneprint, monkeypatch):
+    folder = tmp_path / "place"
+
+    def refused(text: str, data: Path = data, to: object = folder) -> None:
+        assert text in sceneprint("snapshot", "--data", data, "--to", to, expect=2).stderr
+        assert not (folder / "bundles").exists() or names_in(folder / "bundles") == []
+
+    refused("there is no database", tmp_path / "typo")
+    refused("names no object store", to="s3://")
+    (tmp_path / "file").touch()
+    refused("is no folder", to=tmp_path / "file")
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "a.txt").touch()
+    refused("holds a.txt", to=tmp_path / "notes")
+    assert names_in(tmp_path / "notes") == ["a.txt"]
+    monkeypatch.setenv("SCENEPRINT_DATABASE_URL", "postgresql://u:secret@127.0.0.1:1/maps")
+    said = sceneprint("snapshot", "--data", data, "--to", folder, expect=2)
+    assert "postgresql://u@127.0.0.1:1/maps: connection failed" in said.stderr
+    assert "secret" not in said.stderr
+    monkeypatch.setenv("SCENEPRINT_DATABASE_URL", f"sqlite:///{tmp_path}/other.db")
+    said = sceneprint("restore", folder, "--data", tmp_path / "new", expect=2)
+    assert "SCENEPRINT_DATABASE_URL is set" in said.stderr
+    monkeypatch.delenv("SCENEPRINT_DATABASE_URL")
+    with closing(sqlite3.connect(data / "sceneprint.db")) as database:
+        database.execute("PRAGMA foreign_keys = OFF")
+        database.execute("DELETE FROM maps")
+        database.commit()
+    refused("refers to one of maps that is missing")
+    with closing(sqlite3.connect(data / "sceneprint.db")) as database:
+        database.execute("UPDATE alembic_version SET version_num = '9999'")
+        database.execute("UPDATE schema_range SET least_revision = '9999'")
+        database.commit()
+    refused("9999")
+    with closing(sqlite3.connect(data / "sceneprint.db")) as database:
+        database.execute("DROP TABLE alembic_version")
+        database.commit()
+    refused("sceneprint.db")
+    (data / "sceneprint.db").write_bytes(b"SQLite format 3\0" + bytes(5000))
+    refused("sceneprint.db")
+
+
+@file_only
+def test_a_row_that_is_none_is_named(data, tmp_path, settings):
+    with closing(sqlite3.connect(data / "sceneprint.db")) as database:
+        database.execute("UPDATE maps SET title = x'00ff'")
+        database.commit()
+    with pytest.raises(UnusableStore, match=r"A row of table maps cannot be read .*fsck"):
+        take_backup(settings(data), str(tmp_path / "place"))
+
+
+def test_a_place_is_one_stores_and_one_writers(master, data, tmp_path, settings):
+    folder, inner = str(tmp_path / "place"), list[Exception]()
+
+    def come(_done: int, _total: int) -> None:
+        try:
+            take_backup(settings(data), folder)
+        except BundleError as error:
+            inner.append(error)
+
+    take_backup(settings(master), folder, come)
+    assert "another process is writing" in str(inner[0])
+    with Engine(settings(tmp_path / "other")):
+        pass
+    with pytest.raises(BundleError, match="the bundles of another store"):
+        take_backup(settings(tmp_path / "other"), folder)
+
+
+AS_NOBODY = """
+import os, sys
+from pathlib import Path
+from sceneprint.bundle.backup import take_backup
+from sceneprint.settings import Settings
+os.setgroups([]), os.setgid(65534), os.setuid(65534)
+folder = Path(sys.argv[1])
+settings = Settings(data_dir=folder / "data", database_url=None)
+taken = take_backup(settings, str(folder / "out"))
+print(taken.manifest.blobs, len(taken.lost))
+"""
+
+
+@file_only
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_a_read_only_folder_can_be_taken(master):
+    """By another user, who may write nothing there; nor is anything written."""
+    with tempfile.TemporaryDirectory() as name:  # pytest's own folders are closed to others
+        folder = Path(name)
+        folder.chmod(0o755)
+        data, out = Path(shutil.copytree(master, folder / "data")), folder / "out"
+        out.mkdir()
+        out.chmod(0o777)
+        for path in (data, *data.rglob("*")):  # of its owner alone, as it was made
+            path.chmod(0o755 if path.is_dir() else 0o644)
+        before = names_in(data)
+        done = subprocess.run(
+            [sys.executable, "-c", AS_NOBODY, name], capture_output=True, text=True
+        )
+        assert done.stdout == "9 0\n", done.stderr
+        assert names_in(data) == before
+        assert verify_bundle(str(out)).manifest.blobs == 9
+
+
+@file_only
+def test_large_blobs_go_in_parts(data, tmp_path, settings, monkeypatch):
+    """The same parts."""
+    opened: list[str] = []
+    call = FolderBlobs.open
+    monkeypatch.setattr(
+        FolderBlobs, "open", lambda blobs, digest: (opened.append(digest), call(blobs, digest))[1]
+    )
+    take_backup(settings(data), str(tmp_path / "small"))
+    assert opened == []
+    monkeypatch.setattr(backup, "LARGE", 20)
+    take_backup(settings(data), str(tmp_path / "large"))
+    assert len(opened) == 9
+    assert parts_in(tmp_path / "small") == parts_in(tmp_path / "large")
+
+
+def test_interrupted_it_leaves_no_bundle(master, tmp_path, settings):
+    def stop(done: int, total: int) -> None:
+        if done > total // 2:
+            raise KeyboardInterrupt
+
+    folder = str(tmp_path / "place")
+    with pytest.raises(KeyboardInterrupt):
+        take_backup(settings(master), folder, stop)
+    assert BundlePlace.open(folder).names() == []
+    taken = take_backup(settings(master), folder)
+    assert 0 < taken.written < sum(map(len, parts_in(Path(folder)).values()))
+    with pytest.raises(KeyboardInterrupt):
+        restore_to_folder(folder, tmp_path / "new", progress=stop)
+    assert names_in(tmp_path / "new") == [".restoring"]
+    restore_to_folder(folder, tmp_path / "new")
+    assert names_in(tmp_path / "new") == ["blobs", "sceneprint.db"]
+
+
+@pytest.mark.parametrize("kind", ["snapshot", "verify"])
+def test_progress_goes_from_nothing_to_all(kind, master, place, tmp_path, settings):
+    seen: list[tuple[int, int]] = []
+    if kind == "snapshot":
+        take_backup(settings(master), str(tmp_path / "place"), lambda *one: seen.append(one))
+    else:
+        verify_bundle(place, progress=lambda *one: seen.append(one))
+    done = [one for one, _ in seen]
+    assert done == sorted(done)
+    assert {total for _, total in seen} == {done[-1]}
+
+
+@pytest.fixture
+def longest_file() -> Iterator[Callable[[int], None]]:
+    """Let no file of this process grow beyond a limit, as on a disk that becomes full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+@file_only
+def test_where_there_is_no_room(master, place, tmp_path, sceneprint, longest_file):
+    """In a part, in a blob that is restored, and in the database; then there is."""
+    longest_file(40_000)
+    said = sceneprint("snapshot", "--data", master, "--to", tmp_path / "place", expect=2)
+    assert "has no room" in said.stderr
+    assert names_in(tmp_path / "place" / "bundles") == []
+    for size in (40_000, max(map(len, parts_in(Path(place)).values()))):
+        longest_file(size)
+        sceneprint("restore", place, "--data", tmp_path / "new", expect=2)
+        assert names_in(tmp_path / "new") == [".restoring"]
+    longest_file(1 << 30)
+    sceneprint("restore", place, "--data", tmp_path / "new")
+    assert names_in(tmp_path / "new") == ["blobs", "sceneprint.db"]
+
+
+@pytest.mark.sqlite_only("has a server of its own")
+def test_it_is_one_state(postgres_url, tmp_path):
+    """What is committed while it is written is not in it, whatever table is next."""
+    database, late = open_database(postgres_url), open_database(postgres_url)
+
+    def key(name: str) -> dict[str, object]:
+        return {"id": name, "name": name, "digest": name, "grants": {}, "created_at": 0.0}
+
+    fleet = Settings(
+        data_dir=tmp_path / "fleet", database_url=SecretStr(postgres_url), index_dir=None
+    )
+    with closing(database), closing(late), Engine(fleet):
+        (tmp_path / "fleet" / "blobs").mkdir(parents=True)  # as the first upload does
+        with late.write() as connection:
+            connection.execute(insert(keys), [key("early")])
+            record_event(connection, "map.created", "hall")
+        for frame in ("a", "b"):
+            with late.write(map_number=1) as connection:
+                record_event(connection, "frame.received", "hall", frame)
+        done: list[int] = []
+
+        def go_on(count: int, _total: int) -> None:
+            if not done:
+                with late.write() as connection:
+                    connection.execute(insert(keys), [key("late")])
+            done.append(count)
+
+        take_backup(fleet, str(tmp_path / "place"), go_on)
+    restore_to_folder(str(tmp_path / "place"), tmp_path / "copy")
+    with closing(sqlite3.connect(tmp_path / "copy" / "sceneprint.db")) as copy:
+        assert copy.execute("SELECT id, grants FROM keys").fetchall() == [("early", "{}")]
+        found = copy.execute("SELECT kind, frame_id FROM events ORDER BY number").fetchall()
+        assert copy.execute("SELECT count(*) FROM pending_events").fetchall() == [(0,)]
+    assert found[-3:] == [
+        ("map.created", None), ("frame.received", "a"), ("frame.received", "b"),
+    ]  # fmt: skip

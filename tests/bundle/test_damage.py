@@ -1,0 +1,194 @@
+"""Bundles that are not as they were written, by accident or on purpose: named, and refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+import shutil
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sceneprint.bundle.restoration import restore_to_folder, verify_bundle
+from sceneprint.errors import BundleError, DamagedBundle, NewerSchema
+
+Record = dict[str, Any]
+
+
+@pytest.fixture
+def copy(place: str, tmp_path: Path) -> Path:
+    """A copy of the place, to be damaged."""
+    return Path(shutil.copytree(place, tmp_path / "copy"))
+
+
+@pytest.fixture
+def refused(copy: Path, tmp_path: Path) -> Callable[..., None]:
+    """Check that the copy is refused, and that no store comes of it."""
+
+    def check(text: str, kind: type[Exception] = DamagedBundle) -> None:
+        for attempt in (
+            lambda: verify_bundle(str(copy)),
+            lambda: restore_to_folder(str(copy), tmp_path / "new"),
+        ):
+            with pytest.raises(kind, match=text) as raised:
+                attempt()
+            assert "\n" not in str(raised.value)
+        assert not (tmp_path / "new" / "sceneprint.db").exists()
+        assert not (tmp_path / "new" / "blobs").exists()
+
+    return check
+
+
+def manifest_of(folder: Path) -> tuple[Path, Record]:
+    (path,) = folder.glob("bundles/*.json")
+    return path, json.loads(path.read_bytes())
+
+
+def rewrite(folder: Path, change: Callable[[Record], object]) -> None:
+    """Change a manifest, and let its checksum fit, as somebody who means harm."""
+    path, record = manifest_of(folder)
+    del record["sha256"]
+    change(record)
+    text = json.dumps(record, sort_keys=True, separators=(",", ":"))
+    record["sha256"] = hashlib.sha256(text.encode()).hexdigest()
+    path.write_text(json.dumps(record))
+
+
+def replace_part(folder: Path, kind: str, change: Callable[[list[Any]], object]) -> None:
+    """Change the lines of a part, which gets the digest of what it then holds."""
+
+    def put(record: Record) -> None:
+        part = next(one for one in record["parts"] if one["kind"] == kind)
+        old = folder / "parts" / part["digest"][:2] / part["digest"]
+        lines = [json.loads(line) for line in zlib.decompress(old.read_bytes()).split(b"\n")]
+        change(lines)
+        data = zlib.compress("\n".join(json.dumps(one) for one in lines).encode())
+        digest = hashlib.sha256(data).hexdigest()
+        new = folder / "parts" / digest[:2] / digest
+        new.parent.mkdir(exist_ok=True)
+        new.write_bytes(data)
+        part |= {"digest": digest, "bytes": len(data), "rows": len(lines) - 1}
+
+    rewrite(folder, put)
+
+
+def test_every_part_that_is_flipped_cut_missing_or_swapped_is_named(copy, tmp_path):
+    rng, parts = random.Random(8), sorted(copy.glob("parts/??/*"))
+    assert len(parts) > 15
+    for path in parts:
+        good = path.read_bytes()
+        flipped = bytearray(good)
+        flipped[rng.randrange(len(good))] ^= rng.randrange(1, 256)
+        other = next(one for one in parts if one != path).read_bytes()
+        for bad in (bytes(flipped), good[:-1], good + b"x", b"", other, None):
+            path.unlink() if bad is None else path.write_bytes(bad)
+            with pytest.raises(DamagedBundle, match=path.name):
+                verify_bundle(str(copy))
+        path.write_bytes(good)
+    assert verify_bundle(str(copy)).lost == ()
+
+
+def test_a_manifest_with_one_other_byte(copy, place):
+    rng, (path, _) = random.Random(3), manifest_of(copy)
+    good, sound = path.read_bytes(), verify_bundle(place)
+    for _ in range(60):
+        bad = bytearray(good)
+        bad[rng.randrange(len(good))] ^= rng.choice([1, 32, 128])
+        path.write_bytes(bad)
+        try:
+            assert verify_bundle(str(copy)) == sound  # a blank that became another
+        except BundleError as error:
+            assert "bundle" in str(error)  # noqa: PT017
+    for length in (0, 1, len(good) // 2, len(good) - 2):
+        path.write_bytes(good[:length])
+        with pytest.raises(DamagedBundle, match="no manifest of a bundle"):
+            verify_bundle(str(copy))
+
+
+def test_manifests_that_lie(copy, place, refused):
+    path, record = manifest_of(copy)
+    good = path.read_bytes()
+
+    def lies(change: Callable[[Record], object], text: str, kind: type = DamagedBundle) -> None:
+        rewrite(copy, change)
+        refused(text, kind)
+        path.write_bytes(good)
+
+    rewrite(copy, lambda one: None)
+    assert verify_bundle(str(copy)) == verify_bundle(place)
+    lies(lambda one: one.update(version=3), "a bundle of version 3", BundleError)
+    lies(lambda one: one.update(schema_revision="9999"), "9999", NewerSchema)
+    for other in ({"format": "other"}, {"more": 1}, {"maps": "1"}):
+        lies(lambda one, other=other: one.update(other), "no manifest of a bundle, or damaged")
+    lies(lambda one: one.update(maps=2), "the rows that it holds")
+    lies(lambda one: one["frames"].update(indexed=3), "the rows that it holds")
+    lies(lambda one: one.update(blobs=8), "its list of blobs")
+    lies(lambda one: one["parts"][0].update(digest="../../../../etc/passwd"), "no manifest")
+    lies(lambda one: one["parts"][0].update(rows=99), "its rows of table")
+    without = [one for one in record["parts"] if one["kind"] != "rows/maps"]
+    lies(lambda one: one.update(parts=without), "refers to one of maps|the rows that it holds")
+
+
+def test_rows_that_are_none_of_ours(copy, place, refused):
+    shutil.copytree(copy, again := copy.with_name("again"))
+
+    def lies(kind: str, change: Callable[[list[Any]], object], text: str) -> None:
+        replace_part(copy, kind, change)
+        refused(text)
+        shutil.rmtree(copy)
+        shutil.copytree(again, copy)
+
+    replace_part(copy, "rows/frames", lambda lines: None)
+    assert verify_bundle(str(copy)).manifest.blobs == 9
+    blob = manifest_of(copy) and json.loads(
+        zlib.decompress(part_of(copy, "rows/frames")).split(b"\n")[0]
+    ).index("blob")
+    lies("rows/frames", lambda lines: lines[1].pop(), "another number of columns")
+    lies("rows/frames", lambda lines: lines[0].reverse(), "it has other columns")
+    lies("rows/frames", lambda lines: lines.insert(1, {}), "another number of columns")
+    for value in (5, ["x"], True):
+        lies(
+            "rows/frames", lambda lines, value=value: lines[1].__setitem__(blob, value),
+            r"A row of table frames .*\(column blob holds a ",
+        )  # fmt: skip
+    lies("rows/secrets", lambda lines: lines[1].__setitem__(1, "?"), "A row of table secrets")
+    for name in ("../evil", "0" * 64):
+        lies(
+            "rows/frames", lambda lines, name=name: lines[1].__setitem__(blob, name),
+            "the blobs that its rows refer to",
+        )  # fmt: skip
+    lies("blobs", lambda lines: lines.pop(), "its list of blobs")
+    lies("blobs", lambda lines: lines[1].__setitem__(2, "gone"), "is listed as no blob can be")
+    lies("blobs", lambda lines: lines[1].__setitem__(0, "../../evil"), "listed as no blob can be")
+    lies("blobs", lambda lines: lines.insert(1, ["0" * 64, 5, None]), "is missing")
+
+
+def part_of(folder: Path, kind: str) -> bytes:
+    _, record = manifest_of(folder)
+    digest = next(one["digest"] for one in record["parts"] if one["kind"] == kind)
+    return (folder / "parts" / digest[:2] / digest).read_bytes()
+
+
+def test_a_part_of_gigabytes_takes_no_memory(copy, refused):
+    """Zeros that unpack to more than any part has."""
+    data = zlib.compress(bytes(300 << 20), 9)
+    digest = hashlib.sha256(data).hexdigest()
+    path = copy / "parts" / digest[:2] / digest
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(data)
+    rewrite(copy, lambda one: one["parts"][0].update(digest=digest, bytes=len(data)))
+    refused("longer than any that is written")
+
+
+def test_places_without_a_bundle(tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(BundleError, match="holds no bundle"):
+        verify_bundle(str(tmp_path / "empty"))
+    with pytest.raises(BundleError, match="there is no such folder"):
+        verify_bundle(str(tmp_path / "typo"))
+    with pytest.raises(BundleError, match="holds no bundle '2020'"):
+        verify_bundle(str(tmp_path / "empty"), "2020")
