@@ -149,7 +149,7 @@ class Fleet:
     def fsck(self) -> tuple[int, int]:
         """Files that nothing refers to, and what is damaged; see `sceneprint fsck`."""
         with self._here() as settings:
-            found = Counter(one.finding.severity for one in fsck(settings, grace_s=0.0))
+            found = Counter(one.severity for one in fsck(settings, grace_s=0.0))
         return found["leftover"], found["damage"]
 
     def stop(self) -> None:

@@ -31,14 +31,14 @@ from sceneprint.process import COMMAND, acting_as
 if TYPE_CHECKING:
     from sceneprint.bundle.backup import Bundle
     from sceneprint.engine import Engine
-    from sceneprint.maintenance.fsck.check import FindingOutcome
+    from sceneprint.maintenance.fsck.findings import Finding
     from sceneprint.settings import Settings
     from sceneprint.store import Database
     from sceneprint_client.api import Map
 
 #: What was looked at, in the order in which it is told.
 _COUNTED = (
-    "models", "frames", "signatures", "blobs", "files", "generations", "tables",
+    "models", "frames", "signatures", "blobs", "files", "generations",
 )  # fmt: skip
 
 
@@ -95,8 +95,8 @@ def add_fsck(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "fsck",
-        help="check and repair database, blobs and caches",
-        description="Check rows, signatures, uploads, artifacts and caches of a data folder, "
+        help="check and repair database, blobs and indexes",
+        description="Check rows, signatures, blobs and indexes of a data folder, "
         "and report problems and what --repair would do. Changes nothing without --repair. The "
         "service may be running. Exit code 1 if problems remain, 2 if the folder cannot be "
         "checked.",
@@ -129,70 +129,59 @@ def add_fsck(commands: Any) -> None:
 def run_fsck(options: argparse.Namespace) -> int:
     """Check, tell, and repair if asked to; returns 1 where something is left."""
     from sceneprint.engine import Engine
-    from sceneprint.maintenance.fsck.check import GRACE_S, fsck
+    from sceneprint.maintenance.fsck.check import fsck
+    from sceneprint.maintenance.fsck.findings import GRACE_S
 
     if options.json is not None:
         check_writable(options.json)
-    counts, outcomes = Counter[str](), []
+    counts, findings = Counter[str](), []
     with acting_as(COMMAND), ended_by_signals(), _progress_bar() as progress:
-        for outcome in fsck(
+        for finding in fsck(
             settings_of(options), map_name=options.map, repair=options.repair,
             quick=options.quick, progress=progress, counts=counts,
             grace_s=GRACE_S if options.grace is None else min(options.grace, 10**10),
         ):  # fmt: skip
-            outcomes.append(outcome)
-            tqdm.write(_line(outcome))
-    repaired = sum(each.done is not None for each in outcomes)
+            findings.append(finding)
+            tqdm.write(_line(finding))
+    repaired = sum(each.done is not None for each in findings)
     if repaired:
         with acting_as(COMMAND), Engine(settings_of(options)) as engine:
             engine.audit.record("store.repaired", options.map, repaired=repaired)
     if options.json is not None:
-        record = {"checked": dict(counts), "findings": [_record(each) for each in outcomes]}
+        record = {"checked": dict(counts), "findings": [_record(each) for each in findings]}
         write_whole(options.json, (json.dumps(record, indent=1) + "\n").encode())
     print("checked " + ", ".join(f"{counts[name]} {name}" for name in _COUNTED))
-    print(_summary(outcomes, repair=options.repair))
-    return 1 if any(each.left for each in outcomes) else 0
+    print(_summary(findings, repair=options.repair))
+    return 1 if any(each.left for each in findings) else 0
 
 
-def _line(outcome: FindingOutcome) -> str:
-    finding = outcome.finding
-    if outcome.done is not None:
-        then = f"done: {outcome.done}"
-    elif outcome.error is not None:
-        then = f"NOT REPAIRED: {outcome.error}"
+def _line(finding: Finding) -> str:
+    if finding.done is not None:
+        then = f"; done: {finding.done}"
+    elif finding.error is not None:
+        then = f"; NOT REPAIRED: {finding.error}"
     else:
-        then = "" if finding.would is None else f"would: {finding.would}"
-    text = f"{finding.severity:8}  {finding.kind}  {finding.what}: {finding.means}"
-    return one_line(f"{text}; {then}" if then else text)
+        then = "" if finding.would is None else f"; would: {finding.would}"
+    return one_line(f"{finding.severity:8}  {finding.kind}  {finding.what}: {finding.means}{then}")
 
 
-def _summary(outcomes: list[FindingOutcome], *, repair: bool) -> str:
-    kinds = Counter(each.finding.severity for each in outcomes)
-    damaged, unneeded, left = kinds["damage"], kinds["leftover"], sum(o.left for o in outcomes)
+def _summary(findings: list[Finding], *, repair: bool) -> str:
+    kinds = Counter(each.severity for each in findings)
+    damaged, unneeded, left = kinds["damage"], kinds["leftover"], sum(o.left for o in findings)
     if not damaged and not unneeded:
         return "no problems found"
     found = f"{damaged} damaged, {unneeded} left over"
     if repair:
         done = f"{damaged + unneeded - left} repaired, {left} not"
         return f"{found}: {done}. Run it again once workers have signed the queued frames."
-    possible = sum(o.finding.repair is not None for o in outcomes)
+    possible = sum(each.repair is not None for each in findings)
     return f"{found}; nothing was changed: `sceneprint fsck --repair` can repair {possible}"
 
 
-def _record(outcome: FindingOutcome) -> dict[str, object]:
-    finding = outcome.finding
-    return {
-        "kind": finding.kind,
-        "severity": finding.severity,
-        "what": finding.what,
-        "means": finding.means,
-        "would": finding.would,
-        "map": finding.map,
-        "frame_id": finding.frame_id,
-        "path": None if finding.path is None else str(finding.path),
-        "done": outcome.done,
-        "error": outcome.error,
-    }
+def _record(finding: Finding) -> dict[str, object]:
+    names = ("kind", "severity", "what", "means", "would", "map", "frame_id", "done", "error")
+    path = None if finding.path is None else str(finding.path)
+    return {name: getattr(finding, name) for name in names} | {"path": path}
 
 
 @contextmanager

@@ -10,15 +10,12 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-
-from sqlalchemy import select
+from collections.abc import Callable
+from dataclasses import replace
 
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import NotFound, SceneprintError
-from sceneprint.maintenance.fsck.blobs import check_artifacts, check_signatures, check_uploads
-from sceneprint.maintenance.fsck.check import GRACE_S
+from sceneprint.maintenance.fsck.check import check_bytes
 from sceneprint.maintenance.fsck.findings import Finding, Folder
 from sceneprint.settings import Settings
 from sceneprint.store import Store
@@ -33,7 +30,6 @@ from sceneprint.store.scrub_rows import (
     read_scrub,
     record_slice,
 )
-from sceneprint.store.tables import frames, signatures
 
 log = logging.getLogger(__name__)
 
@@ -41,20 +37,6 @@ log = logging.getLogger(__name__)
 AT_ONCE, TURN_S = 16, 0.2
 #: Seconds after which a process that has begun scrubs: it has other things to do first.
 BEGIN_S = 60.0
-#: Of what is damaged, what can be made again from the upload.
-_DERIVED = ("damaged-artifact", "missing-artifact", "damaged-signature")
-
-
-@dataclass(frozen=True, eq=False)
-class _Slice(Folder):
-    """A data folder of which a few frames are looked at."""
-
-    chosen: tuple[int, ...] = ()
-
-    def numbers(self, subject: str) -> Iterator[list[int]]:
-        """Numbers of the frames that are looked at."""
-        self.progress(subject, 0, len(self.chosen))
-        yield list(self.chosen)
 
 
 class Scrub:
@@ -102,31 +84,25 @@ class Scrub:
             return None
 
     def _read(self, row: ScrubRow, may_go_on: Callable[[], bool]) -> ScrubRow:
-        until, left = time.monotonic() + TURN_S, self._budget
-        finished, over = False, False
+        until, folder = time.monotonic() + TURN_S, Folder(self._settings, self._store)
+        damaged, finished, over = 0, False, False
         while not over:  # a few frames at least, so that every pass ends
             with self._store.database.read() as connection:
                 numbers = frames_behind(connection, row.position, AT_ONCE)
             if not numbers:
                 finished = True
                 break
-            size = self._size(numbers)
-            folder = _Slice(
-                self._settings, self._store, None, False, GRACE_S, lambda *_: None,
-                chosen=tuple(numbers),
-            )  # fmt: skip
-            damaged = 0
-            for check in (check_uploads, check_artifacts, check_signatures):
-                for finding in check(folder):
-                    if finding.severity == "damage":
-                        damaged += 1
-                        self._tell(finding)
-            left -= size
-            row = replace(
-                row, position=numbers[-1], blobs=row.blobs + folder.counts["blobs"],
-                bytes=row.bytes + size, damaged=row.damaged + damaged,
-            )  # fmt: skip
-            over = left <= 0 or time.monotonic() >= until or not may_go_on()
+            for finding in check_bytes(folder, numbers):
+                if finding.severity == "damage":
+                    damaged += 1
+                    self._report(finding)
+            row = replace(row, position=numbers[-1])
+            spent = folder.counts["bytes"] >= self._budget
+            over = spent or time.monotonic() >= until or not may_go_on()
+        row = replace(
+            row, blobs=row.blobs + folder.counts["blobs"],
+            bytes=row.bytes + folder.counts["bytes"], damaged=row.damaged + damaged,
+        )  # fmt: skip
         with self._store.database.write() as connection:
             record_slice(connection, row, finished=finished)
         if finished:
@@ -134,18 +110,8 @@ class Scrub:
             log.info("scrub finished", extra=about)
         return row
 
-    def _size(self, numbers: list[int]) -> int:
-        """Bytes of the blobs of some frames."""
-        with self._store.database.read() as connection:
-            uploads = connection.execute(select(frames.c.blob).where(frames.c.number.in_(numbers)))
-            made = connection.execute(
-                select(signatures.c.geometry).where(signatures.c.frame_number.in_(numbers))
-            )
-            digests = [*uploads.scalars(), *made.scalars()]
-        return sum(self._store.blobs.size(one) or 0 for one in digests)
-
-    def _tell(self, finding: Finding) -> None:
-        """Say what was found; what can be made again is signed again."""
+    def _report(self, finding: Finding) -> None:
+        """Log what was found, and have signed again what can be."""
         about = {"map": finding.map, "frame_id": finding.frame_id, "finding": finding.kind}
         log.error("damage found", extra=about | {"means": finding.means})
         if finding.map is None or finding.frame_id is None:
@@ -156,7 +122,7 @@ class Scrub:
                 frame = find_frame(connection, row, finding.frame_id)
         except NotFound:  # deleted meanwhile
             return
-        if finding.kind in _DERIVED:
+        if not finding.kind.endswith("-upload"):
             resign_frames(self._store, row, [frame.number], row.model_id)
             return
         with self._store.database.write() as connection:

@@ -440,10 +440,7 @@ def _mapped(path: Path, model: Model) -> PairTable | None:
 
 def _head(packed: Floats32) -> bytes:
     """First bytes of the file: what it is, and a checksum of the rest (20 ms to verify)."""
-    return _head_of(zlib.crc32(packed.view(np.uint8).data))
-
-
-def _head_of(checksum: int) -> bytes:
+    checksum = zlib.crc32(packed.view(np.uint8).data)
     return f"sceneprint table {CACHE_VERSION} {checksum:08x}".encode().ljust(HEAD)
 
 
@@ -467,22 +464,3 @@ def _build(model: Model, progress: Progress | None) -> Floats32:
         if progress is not None:
             progress(last, n)
     return packed
-
-
-def is_sound_table(path: Path) -> bool:
-    """Whether a cached table has the bytes that were written, whatever model it is of.
-
-    Parameters
-    ----------
-    path : of the file
-
-    Raises
-    ------
-    OSError : it cannot be read.
-    """
-    with path.open("rb") as file:
-        head = file.read(HEAD)
-        if len(head) < HEAD or path.stat().st_size == HEAD:
-            return False
-        packed = np.memmap(path, np.uint8, "r", offset=HEAD)
-    return head == _head_of(zlib.crc32(packed.data))

@@ -101,13 +101,6 @@ def refers_to(connection: Connection, blob: str) -> bool:
     return bool(referred_blobs(connection, [blob]))
 
 
-def is_frame_id(connection: Connection, frame_id: str) -> bool:
-    """Return whether a frame of any map that is there, or a tombstone, has an id."""
-    of_any = frames.c.map_number.in_(select(maps.c.number))  # as the index of ids begins
-    asked = select(frames.c.number).where(of_any, frames.c.id == frame_id, not_purged()).limit(1)
-    return connection.execute(asked).first() is not None
-
-
 def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
     """Those of at most a thousand blobs that a row of any kind refers to."""
     has_upload = or_(frames.c.state.not_in(ROOMLESS), frames.c.deletion.is_not(None))

@@ -22,7 +22,7 @@ from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store import Store
 from sceneprint.store.blobs.folder import LONGEST_S
 from sceneprint.store.deletion import doom, doomed_blobs, settle
-from sceneprint.store.frames import is_frame_id, referred_blobs, refers_to
+from sceneprint.store.frames import referred_blobs, refers_to
 
 log = logging.getLogger(__name__)
 
@@ -31,9 +31,8 @@ log = logging.getLogger(__name__)
 SWEPT_AT_ONCE = 200
 #: Seconds to wait for another removal.
 _PATIENCE_S = 5.0
-#: Names of files in quarantine.
-_BLOB = re.compile("blob-(?P<digest>[0-9a-f]{64})")
-_SIGNATURE = re.compile(r"signature-(?P<frame_id>.+)-[0-9a-f]{12}\.bin")
+#: Name of a file in quarantine.
+_BLOB = re.compile("blob-([0-9a-f]{64})")
 #: Blobs of deleted frames that are asked for at once.
 _LEFT_AT_ONCE = 1_000
 
@@ -105,7 +104,7 @@ def collect_quarantined(store: Store, folder: Path) -> int:
 
     Parameters
     ----------
-    folder : with `blob-DIGEST` and `signature-FRAME-MODEL.bin`
+    folder : with `blob-DIGEST`; what else lies there is none of ours
 
     Returns
     -------
@@ -113,12 +112,11 @@ def collect_quarantined(store: Store, folder: Path) -> int:
     """
     removed = 0
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        blob, signature = _BLOB.fullmatch(path.name), _SIGNATURE.fullmatch(path.name)
+        blob = _BLOB.fullmatch(path.name)
+        if blob is None:
+            continue
         with store.database.read() as connection:
-            if blob is not None:
-                needed = refers_to(connection, blob["digest"])
-            else:  # what else lies there is none of ours
-                needed = signature is None or is_frame_id(connection, signature["frame_id"])
+            needed = refers_to(connection, blob[1])
         if not needed:
             path.unlink(missing_ok=True)
             removed += 1

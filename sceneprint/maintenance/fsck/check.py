@@ -1,6 +1,6 @@
 """A check of a whole data folder: what is lost, damaged or left over, and its repair.
 
-    Settings  --fsck-->  Outcomes, as they are found
+    Settings  --fsck-->  Findings, as they are found
 
 Without repair nothing at all is written. With it each finding is repaired as it comes, in a
 transaction that looks again first: services and workers may be at work meanwhile.
@@ -11,30 +11,24 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 from sqlalchemy import select
 
 from sceneprint.errors import SceneprintError, UnusableStore
-from sceneprint.maintenance.fsck.blobs import (
-    check_artifacts,
-    check_files,
-    check_products,
-    check_signatures,
-    check_surfaces,
-    check_tables,
-    check_uploads,
-)
+from sceneprint.maintenance.fsck.blobs import check_blobs, check_files, check_products
 from sceneprint.maintenance.fsck.database_checks import (
     FATAL,
     check_counts,
     check_database,
     check_models,
     check_rows,
+    check_signatures,
     damaged_database,
 )
 from sceneprint.maintenance.fsck.findings import (
+    GRACE_S,
     Finding,
     Folder,
     Progress,
@@ -48,40 +42,33 @@ from sceneprint.store.read_only import look_at, opened_blobs, require_folder
 from sceneprint.store.tables import frames
 from sceneprint_client.api import FrameState
 
-#: Seconds in which a file that nothing refers to may be part of an upload that goes on.
-GRACE_S = 3600.0
 
+def check_bytes(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
+    """Check all stored bytes of some frames: signatures, uploads and artifacts."""
+    if not folder.quick:
+        yield from check_signatures(folder, numbers)
+    yield from check_blobs(folder, "upload", numbers)
+    yield from check_blobs(folder, "artifact", numbers)
+
+
+def _check_frames(folder: Folder) -> Iterator[Finding]:
+    for numbers in folder.numbers("frames"):
+        yield from check_rows(folder, numbers)
+        yield from check_bytes(folder, numbers)
+
+
+#: Files before frames: what a repair of a frame dooms is no leftover.
 _CHECKS: tuple[Callable[[Folder], Iterator[Finding]], ...] = (
-    check_database, check_models, check_rows, check_counts, check_signatures, check_uploads,
-    check_artifacts, check_products, check_surfaces, check_files, check_indexes,
-    check_tables,
+    check_database, check_models, check_counts, check_files, _check_frames, check_products,
+    check_indexes,
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class FindingOutcome:
-    """What became of a finding.
-
-    Parameters
-    ----------
-    done : what the repair did; None where none was asked for, or there is none
-    error : why it could not be repaired
-    """
-
-    finding: Finding
-    done: str | None = None
-    error: str | None = None
-
-    @property
-    def left(self) -> bool:
-        """Whether something is still to be done."""
-        return self.finding.severity != "note" and self.done is None
 
 
 def fsck(
     settings: Settings, *, map_name: str | None = None, repair: bool = False, quick: bool = False,
-    grace_s: float = GRACE_S, progress: Progress | None = None, counts: Counter[str] | None = None,
-) -> Iterator[FindingOutcome]:  # fmt: skip
+    grace_s: float = GRACE_S, progress: Progress = lambda *_: None,
+    counts: Counter[str] | None = None,
+) -> Iterator[Finding]:  # fmt: skip
     """Check a data folder; the service may run.
 
     Parameters
@@ -95,7 +82,7 @@ def fsck(
 
     Yields
     ------
-    what was found, as it is found
+    what was found, as it is found, and repaired
 
     Raises
     ------
@@ -106,10 +93,8 @@ def fsck(
     if quick and repair:
         raise ValueError("a quick look cannot repair")
     with _open_store(settings, repair=repair) as store:
-        folder = Folder(
-            settings, store, map_name, quick, grace_s, progress or (lambda *_: None),
-            Counter() if counts is None else counts,
-        )  # fmt: skip
+        counts = Counter() if counts is None else counts
+        folder = Folder(settings, store, map_name, quick, grace_s, progress, counts)
         if map_name is not None:
             with store.database.read() as connection:
                 find_map(connection, map_name)
@@ -117,36 +102,29 @@ def fsck(
         for check in _CHECKS:
             for finding in _findings_of(check, folder):
                 trusted &= finding.kind not in FATAL
-                yield _outcome(finding, repair, trusted)
+                yield _repaired(finding, trusted) if repair and finding.repair else finding
 
 
 def _findings_of(check: Callable[[Folder], Iterator[Finding]], folder: Folder) -> Iterator[Finding]:
-    """What a check finds; that the database cannot be read on is a finding too."""
+    """Yield what a check finds; that the database cannot be read on is a finding too."""
     try:
         yield from check(folder)
-    except UnusableStore as error:
+    except (ValueError, TypeError, KeyError, UnusableStore) as error:
         if not is_of_rows(error):
             raise
-        yield damaged_database(str(error))
-    except (ValueError, TypeError, KeyError) as error:
         yield damaged_database(f"{type(error).__name__}: {error}")
 
 
-def _outcome(finding: Finding, repair: bool, trusted: bool) -> FindingOutcome:
-    if not repair or finding.repair is None:
-        return FindingOutcome(finding)
+def _repaired(finding: Finding, trusted: bool) -> Finding:
+    assert finding.repair is not None
     if not trusted:
-        return FindingOutcome(
-            finding, error="the database itself is damaged: restore a snapshot first"
-        )
+        return replace(finding, error="the database itself is damaged: restore a backup first")
     try:
-        return FindingOutcome(finding, done=finding.repair())
+        return replace(finding, done=finding.repair())
     except SceneprintError as error:
-        return FindingOutcome(finding, error=str(error))
+        return replace(finding, error=str(error))
     except OSError as error:
-        return FindingOutcome(
-            finding, error=f"{error.filename or 'a file'}: {error.strerror or error}"
-        )
+        return replace(finding, error=f"{error.filename or 'a file'}: {error.strerror or error}")
 
 
 @contextmanager
@@ -159,7 +137,7 @@ def _open_store(settings: Settings, *, repair: bool) -> Iterator[Store]:
         if not repair:
             yield Store(database, blobs)
             return
-        _check_blobs(database, blobs, settings.blobs)
+        _require_blobs(database, blobs, settings.blobs)
     store = open_store(settings.database, settings.blobs)
     try:
         yield store
@@ -167,20 +145,20 @@ def _open_store(settings: Settings, *, repair: bool) -> Iterator[Store]:
         store.close()
 
 
-def _check_blobs(database: Database, blobs: Blobs, place: Path | str) -> None:
+def _require_blobs(database: Database, blobs: Blobs, place: Path | str) -> None:
     """See that a folder without a single blob is not taken for the loss of all.
 
     Raises
     ------
     UnusableStore : frames refer to blobs, and there is none.
     """
+    kept = FrameState.DELETED, FrameState.REDUNDANT
+    refers = select(frames.c.number).where(frames.c.state.not_in(kept)).limit(1)
     with database.read() as connection:
-        kept = FrameState.DELETED, FrameState.REDUNDANT
-        refers = select(frames.c.number).where(frames.c.state.not_in(kept)).limit(1)
         if connection.execute(refers).first() is None:
             return
     if next(blobs.digests(), None) is None:
         raise UnusableStore(
             f"{place}: not one upload is there, and nothing was changed. See that its "
-            "disk is mounted, or restore a snapshot."
+            "disk is mounted, or restore a backup."
         )

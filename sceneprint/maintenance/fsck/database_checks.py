@@ -1,28 +1,44 @@
-"""Rows that contradict each other: each is true by itself, and together they cannot be."""
+"""The database itself, and rows that contradict each other, are damaged, or cannot be read.
+
+Where the database's pages or references are damaged nothing is repaired: what the rows say cannot
+be relied upon, and a repair by them might remove what is sound.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
+from zlib import crc32
 
-from sqlalchemy import Connection, ForeignKeyConstraint, and_, delete, insert, select, text, update
+from sqlalchemy import (
+    Connection,
+    ForeignKeyConstraint,
+    and_,
+    delete,
+    insert,
+    select,
+    text,
+    update,
+)
+from sqlalchemy.exc import DBAPIError
 
-from sceneprint.engine.upkeep.garbage_collection import collect_blobs
-from sceneprint.engine.upkeep.repair import is_known_loss, without_loss
-from sceneprint.errors import UnreadableModel, UnusableStore
+from sceneprint.engine.upkeep.repair import PRIORITY
 from sceneprint.maintenance.fsck.findings import (
     GONE,
     Finding,
     Folder,
-    each,
-    is_of_rows,
+    read_rows,
     sign_from_upload,
 )
-from sceneprint.models import PRESETS, parse_model, read_model, write_model
-from sceneprint.store.maps import counted_usage, list_maps, use_of
+from sceneprint.models import PRESETS, read_model, write_model
+from sceneprint.store.deletion import doom
+from sceneprint.store.maps import counted_usage, list_maps, next_revision, use_of
 from sceneprint.store.postgres.connection import allow
-from sceneprint.store.queue import enqueue
+from sceneprint.store.queue import PENDING, enqueue
+from sceneprint.store.reencoding_rows import REENCODE
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
@@ -35,11 +51,121 @@ from sceneprint.store.tables import (
     models,
     signatures,
 )
-from sceneprint_client.api import FrameState, JobState
+from sceneprint_client.api import FrameState
+
+#: Kinds of findings after which nothing is repaired.
+FATAL = frozenset({"damaged-database", "dangling-row"})
+#: Findings of one kind that are named.
+_MOST = 20
+_RESTORE = (
+    "restore a backup of the data folder (`sceneprint restore`); nothing is repaired in a "
+    "damaged database"
+)
+
+
+def check_database(folder: Folder) -> Iterator[Finding]:
+    """Check the pages and indexes of SQLite, and in either database that each row refers to one.
+
+    PostgreSQL enforces foreign keys, but not while a dump is loaded without triggers. Its pages
+    are the concern of its own pg_amcheck.
+    """
+    database = folder.store.database
+    if database.is_sqlite:
+        # it alone reads all indexes: where one differs from its table, no row is relied upon
+        pragma = "quick_check" if folder.quick else "integrity_check"
+        with database.read() as connection:
+            lines = connection.execute(text(f"PRAGMA {pragma}({_MOST})")).scalars().all()
+        for line in lines:
+            if line != "ok":
+                yield damaged_database(" ".join(line.split()))
+    keys = [] if folder.quick else [
+        key for table in metadata.sorted_tables
+        for key in sorted(table.foreign_key_constraints, key=lambda one: str(one.name))
+    ]  # fmt: skip
+    for done, key in enumerate(keys):
+        folder.progress("database", done, len(keys))
+        yield from _dangling(folder, key)
+
+
+def _dangling(folder: Folder, key: ForeignKeyConstraint) -> Iterator[Finding]:
+    child, parent = key.table, key.referred_table
+    pairs = [(one.parent, one.column) for one in key.elements]
+    lost = (
+        select(*child.primary_key.columns)
+        .join(parent, and_(*(own == its for own, its in pairs)), isouter=True)
+        .where(*(own.is_not(None) for own, _ in pairs), *(its.is_(None) for _, its in pairs))
+        .limit(_MOST)
+    )
+    with folder.store.database.read() as connection:
+        allow(connection, 0)
+        found = connection.execute(lost).all()
+    for row in found:
+        named = ", ".join(f"{value!r:.80}" for value in row)
+        yield Finding(
+            "dangling-row", f"row {named} of table {child.name}", "damage",
+            f"it refers to a row of {parent.name} that is not there", _RESTORE,
+        )  # fmt: skip
+
+
+def damaged_database(message: str) -> Finding:
+    """Return the finding that the database cannot be read, or contradicts itself."""
+    return Finding("damaged-database", "the database", "damage", message, _RESTORE)
+
+
+def check_models(folder: Folder) -> Iterator[Finding]:
+    """Find models whose file is damaged: nothing can be signed or searched with them."""
+    with folder.store.database.read() as connection:
+        stored = connection.execute(select(models.c.id)).scalars().all()
+    for model_id in stored:
+        folder.counts["models"] += 1
+        if folder.model(model_id) is not None:
+            continue
+        source = next((name for name in PRESETS if read_model(name).id == model_id), None)
+        yield Finding(
+            "damaged-model", f"model {model_id[:12]}", "damage",
+            "its file is not the one that was stored: its maps can be neither signed nor searched",
+            "restore a backup" if source is None else f"put the preset {source} in its place",
+            repair=None if source is None else partial(_put_preset, folder, model_id, source),
+        )  # fmt: skip
+
+
+def _put_preset(folder: Folder, model_id: str, source: str) -> str:
+    put = update(models).where(models.c.id == model_id)
+    with folder.store.database.write() as connection:
+        found = connection.execute(put.values(content=write_model(read_model(source))))
+    return f"the preset {source} is in its place" if found.rowcount else GONE
+
+
+def check_counts(folder: Folder) -> Iterator[Finding]:
+    """Find maps that are counted to hold more or less than they do: quotas use the counts."""
+    with folder.store.database.read() as connection:
+        found = list_maps(connection)
+    for row in found:
+        if folder.quick or folder.map_name not in (None, row.name):
+            continue
+        with folder.store.database.read() as connection:
+            allow(connection, 0)
+            counted, there = use_of(connection, row.number), counted_usage(connection, row.number)
+        if counted != there:
+            yield Finding(
+                "stale-value", f"map {row.name}", "damage",
+                f"it is counted to hold {counted.frames} frames of {counted.bytes} bytes, and "
+                f"holds {there.frames} of {there.bytes}", "count anew",
+                map=row.name, repair=partial(_count_anew, folder, row.number),
+            )  # fmt: skip
+
+
+def _count_anew(folder: Folder, number: int) -> str:
+    own = update(maps).where(maps.c.number == number)
+    with folder.store.database.write() as connection:
+        there = counted_usage(connection, number)
+        connection.execute(own.values(used_frames=there.frames, used_bytes=there.bytes))
+    return f"{there.frames} frames of {there.bytes} bytes are counted"
+
+
+# Rows of frames, and what other tables say of them.
 
 _BEING_SIGNED = (FrameState.RECEIVED, FrameState.SIGNING)
-#: More changes than any map has had.
-_MOST_REVISIONS = 1 << 48
 _GONE = (FrameState.DELETED, FrameState.REDUNDANT, FrameState.REJECTED)
 
 
@@ -56,86 +182,71 @@ class _Known:
 
 @dataclass(frozen=True)
 class _Fault:
-    """What is wrong with a frame; `fix` does what `would` says, and names blobs to be swept."""
+    """What is wrong with a frame; `fix` does what `would` says, and says what it did."""
 
     kind: str
     means: str
     would: str
-    fix: Callable[[Folder, Connection, _Known], tuple[str, list[str]]]
-    leftover: bool = False
+    fix: Callable[[Folder, Connection, _Known], str]
 
 
-def check_rows(folder: Folder) -> Iterator[Finding]:
-    """Frames whose rows contradict each other, or cannot be read."""
-    for numbers in folder.numbers("rows"):
-        for one in each(folder, numbers, _frames_at_once):
-            folder.counts["frames"] += 1
-            if isinstance(one, tuple):
-                number, error = one
-                message = " ".join(str(error).split())
-                yield Finding(
-                    "unreadable-row", f"frame number {number}", "damage",
-                    f"its row cannot be read: {type(error).__name__}: {message:.200}",
-                    "restore a snapshot; the frames around it are not affected",
-                )  # fmt: skip
-                continue
-            for fault in _faults(folder, one):
-                yield Finding(
-                    fault.kind, f"frame {one.frame.id} of map {one.map.name}",
-                    "leftover" if fault.leftover else "damage", fault.means, fault.would,
-                    map=one.map.name, frame_id=one.frame.id,
-                    repair=partial(_repair_row, folder, one.frame.number, fault.kind),
-                )  # fmt: skip
+def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
+    """Find frames whose rows contradict each other, or cannot be read."""
+    for one in read_rows(folder, numbers, _known_frames):
+        folder.counts["frames"] += 1
+        if isinstance(one, tuple):
+            number, error = one
+            message = " ".join(str(error).split())
+            yield Finding(
+                "unreadable-row", f"frame number {number}", "damage",
+                f"its row cannot be read: {type(error).__name__}: {message:.200}",
+                "restore a backup; the frames around it are not affected",
+            )  # fmt: skip
+            continue
+        folder.counts["signatures"] += len(one.signed)
+        for fault in _faults(one):
+            yield Finding(
+                fault.kind, f"frame {one.frame.id} of map {one.map.name}",
+                "leftover" if fault.kind == "stray-signature" else "damage",
+                fault.means, fault.would, map=one.map.name, frame_id=one.frame.id,
+                repair=partial(_repair_row, folder, one.frame.number, fault.kind),
+            )  # fmt: skip
 
 
 def _repair_row(folder: Folder, number: int, kind: str) -> str:
     with folder.store.database.write() as connection:
-        done, blobs = GONE, list[str]()
-        for one in _frames_at_once(connection, [number]):  # somebody may have been at it since
-            for fault in _faults(folder, one):
+        for one in _known_frames(connection, [number]):  # somebody may have been at it since
+            for fault in _faults(one):
                 if fault.kind == kind:
-                    done, blobs = fault.fix(folder, connection, one)
-    if blobs:
-        collect_blobs(folder.store, blobs)
-    return done
+                    return fault.fix(folder, connection, one)
+    return GONE
 
 
-def _frames_at_once(connection: Connection, numbers: list[int]) -> list[_Known]:
-    """All that is looked at of some frames, as one transaction sees it."""
+def _known_frames(connection: Connection, numbers: list[int]) -> list[_Known]:
+    """Read all that is looked at of some frames, as one transaction sees it."""
     known = {row.number: row for row in list_maps(connection)}
-    found = connection.execute(select(frames).where(frames.c.number.in_(numbers))).mappings().all()
-    tags: dict[int, set[str]] = {}
-    for number, tag in connection.execute(
-        select(frame_tags.c.frame_number, frame_tags.c.tag).where(
-            frame_tags.c.frame_number.in_(numbers)
-        )
-    ):
-        tags.setdefault(number, set()).add(tag)
-    signed: dict[int, set[str]] = {}
-    for number, model_id in connection.execute(
-        select(signatures.c.frame_number, signatures.c.model_id).where(
-            signatures.c.frame_number.in_(numbers)
-        )
-    ):
-        signed.setdefault(number, set()).add(model_id)
-    busy = connection.execute(
-        select(jobs.c.frame_number).where(
-            jobs.c.frame_number.in_(numbers),
-            jobs.c.kind == "sign",
-            jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING)),
-        )
+
+    def of_frames(owner: Any, value: Any) -> dict[int, set[str]]:
+        found = defaultdict[int, set[str]](set)
+        for number, one in connection.execute(select(owner, value).where(owner.in_(numbers))):
+            found[number].add(one)
+        return found
+
+    tags = of_frames(frame_tags.c.frame_number, frame_tags.c.tag)
+    signed = of_frames(signatures.c.frame_number, signatures.c.model_id)
+    waiting = select(jobs.c.frame_number).where(
+        jobs.c.frame_number.in_(numbers), jobs.c.kind == "sign", jobs.c.state.in_(PENDING)
     )
-    at_work = set(busy.scalars())
+    busy = set(connection.execute(waiting).scalars())
+    found = connection.execute(select(frames).where(frames.c.number.in_(numbers))).mappings().all()
     return [
-        _Known(
-            frame_row(row), known[row["map_number"]], frozenset(tags.get(row["number"], ())),
-            frozenset(signed.get(row["number"], ())), row["number"] in at_work,
-        )
+        _Known(frame_row(row), known[row["map_number"]], frozenset(tags[row["number"]]),
+               frozenset(signed[row["number"]]), row["number"] in busy)
         for row in found
     ]  # fmt: skip
 
 
-def _faults(folder: Folder, one: _Known) -> Iterator[_Fault]:
+def _faults(one: _Known) -> Iterator[_Fault]:
     frame, row = one.frame, one.map
     if frame.state in _BEING_SIGNED and not one.busy:
         yield _Fault(
@@ -145,35 +256,24 @@ def _faults(folder: Folder, one: _Known) -> Iterator[_Fault]:
     if frame.state == FrameState.INDEXED and row.model_id not in one.signed:
         yield _Fault(
             "frame-without-signature", "it is indexed, and has no signature: it is not found",
-            "have it signed again from its upload", _sign,
+            "have it signed again from its upload",
+            lambda folder, connection, one: sign_from_upload(folder, connection, one.frame.number),
         )  # fmt: skip
     if _stray(one):
         yield _Fault(
             "stray-signature", "it has a signature of a model, or in a state, that is not its own",
-            "remove that signature", _remove_stray, leftover=True,
+            "remove that signature", _remove_stray,
         )  # fmt: skip
-    if frame.state != FrameState.DELETED and one.tags != frozenset(frame.tags):
+    placed = (frame.pose_x, frame.pose_y, frame.pose_z) == _place(frame)
+    if not placed or (frame.state != FrameState.DELETED and one.tags != frozenset(frame.tags)):
         yield _Fault(
-            "other-tags", "the tags that are searched are not those of the frame",
-            "write them anew from the frame", _write_tags,
-        )  # fmt: skip
-    if (frame.pose_x, frame.pose_y, frame.pose_z) != _place(frame):
-        yield _Fault(
-            "other-position", "the position that is searched is not that of its pose",
-            "write it anew from the pose", _write_place,
+            "stale-value", f"the {'tags' if placed else 'position'} by which it is searched "
+            "are not its own", "write them anew from the frame", _write_derived,
         )  # fmt: skip
     if frame.revision is not None and frame.revision > row.revision:
-        far = frame.revision > _MOST_REVISIONS  # no map has changed so often
         yield _Fault(
             "revision-ahead", f"its revision {frame.revision} is beyond its map's {row.revision}",
-            "sign it again" if far else "count the map's revisions from there",
-            _queue_signature if far else _count_on,
-        )  # fmt: skip
-    if is_known_loss(frame.reason) and folder.store.blobs.condition(frame.blob) == "sound":
-        yield _Fault(
-            "found-upload", "its reason says that its upload is lost, and it is there",
-            "clear the reason, and sign it where it had failed for that",
-            _clear_reason, leftover=True,
+            "give it the map's next revision", _take_revision,
         )  # fmt: skip
 
 
@@ -192,239 +292,119 @@ def _place(frame: FrameRow) -> tuple[float | None, ...]:
     return (None,) * 3 if frame.pose is None else tuple(row[3] for row in frame.pose[:3])
 
 
-def _queue(_: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
-    connection.execute(
-        update(frames)
-        .where(frames.c.number == one.frame.number)
-        .values(state=FrameState.RECEIVED, reason=None)
-    )
-    job = enqueue(connection, "sign", one.frame.number)
-    return f"job {job.id} is queued", []
+def _queue(_: Folder, connection: Connection, one: _Known) -> str:
+    own = update(frames).where(frames.c.number == one.frame.number)
+    connection.execute(own.values(state=FrameState.RECEIVED, reason=None))
+    return f"job {enqueue(connection, 'sign', one.frame.number).id} is queued"
 
 
-def _sign(folder: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
-    return sign_from_upload(folder, connection, one.frame.number), []
+def _remove_stray(_: Folder, connection: Connection, one: _Known) -> str:
+    _remove_signatures(connection, one.frame.number, _stray(one))
+    return f"{len(_stray(one))} removed"
 
 
-def _queue_signature(folder: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
-    removed = connection.execute(
-        delete(signatures)
-        .where(signatures.c.frame_number == one.frame.number)
-        .returning(signatures.c.geometry)
-    )
-    blobs = list(removed.scalars())
-    return sign_from_upload(folder, connection, one.frame.number), blobs
+def _write_derived(_: Folder, connection: Connection, one: _Known) -> str:
+    number, (x, y, z) = one.frame.number, _place(one.frame)
+    own = update(frames).where(frames.c.number == number)
+    connection.execute(own.values(pose_x=x, pose_y=y, pose_z=z))
+    if one.frame.state != FrameState.DELETED:
+        connection.execute(delete(frame_tags).where(frame_tags.c.frame_number == number))
+        named = [{"frame_number": number, "tag": tag} for tag in sorted(set(one.frame.tags))]
+        if named:
+            connection.execute(insert(frame_tags), named)
+    return "written"
 
 
-def _remove_stray(_: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
-    removed = connection.execute(
-        delete(signatures)
-        .where(
-            signatures.c.frame_number == one.frame.number,
-            signatures.c.model_id.in_(_stray(one)),
-        )
-        .returning(signatures.c.geometry)
-    )
-    blobs = list(removed.scalars())
-    return f"{len(blobs)} removed", blobs
+def _take_revision(_: Folder, connection: Connection, one: _Known) -> str:
+    revision = next_revision(connection, one.map.number)
+    own = update(frames).where(frames.c.number == one.frame.number)
+    connection.execute(own.values(revision=revision))
+    return f"it is at revision {revision}"
 
 
-def _write_tags(_: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
-    number = one.frame.number
-    connection.execute(delete(frame_tags).where(frame_tags.c.frame_number == number))
-    named = [{"frame_number": number, "tag": tag} for tag in sorted(set(one.frame.tags))]
-    if named:
-        connection.execute(insert(frame_tags), named)
-    return f"{len(named)} written", []
+# Signatures whose bytes are not those that were stored.
+
+#: Signatures that are read in one transaction; one may have 125,000 bytes.
+_BLOCK = 32
 
 
-def _write_place(_: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
-    x, y, z = _place(one.frame)
-    connection.execute(
-        update(frames)
-        .where(frames.c.number == one.frame.number)
-        .values(pose_x=x, pose_y=y, pose_z=z)
-    )
-    return "written", []
+@dataclass(frozen=True)
+class _Stored:
+    """A signature as it lies in the database: of its map's model, or of the one to come."""
+
+    number: int
+    frame_id: str | None
+    map: str | None
+    model_id: str
+    searched: bool  # whether it is of its map's model
+    sound: bool
 
 
-def _count_on(_: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
-    connection.execute(
-        update(maps).where(maps.c.number == one.map.number).values(revision=one.frame.revision)
-    )
-    return f"the map is at revision {one.frame.revision}", []
-
-
-def _clear_reason(folder: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
-    if one.frame.state == FrameState.FAILED:  # for want of its upload alone
-        return _queue(folder, connection, one)
-    connection.execute(
-        update(frames)
-        .where(frames.c.number == one.frame.number)
-        .values(reason=without_loss(one.frame.reason))
-    )
-    return "cleared", []
-
-
-# What maps are counted to hold, against what they hold: a quota is asked of the former.
-
-
-def check_counts(folder: Folder) -> Iterator[Finding]:
-    """Maps that are counted to hold more or less than they do."""
-    with folder.store.database.read() as connection:
-        found = list_maps(connection)
-    for row in found:
-        if folder.quick or folder.map_name not in (None, row.name):
-            continue
-        with folder.store.database.read() as connection:
-            allow(connection, 0)
-            told, there = use_of(connection, row.number), counted_usage(connection, row.number)
-        if told != there:
+def check_signatures(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
+    """Check the signatures of indexed frames, each against its checksum and its model."""
+    read = partial(_signatures, folder)
+    for start in range(0, len(numbers), _BLOCK):
+        for one in read_rows(folder, numbers[start : start + _BLOCK], read):
+            if isinstance(one, tuple):  # its columns cannot even be read
+                one = _Stored(one[0], None, None, "", True, False)
+            if one.sound:
+                continue
+            frame = f"{one.frame_id} of map {one.map}" if one.map else f"number {one.number}"
             yield Finding(
-                "other-use", f"map {row.name}", "damage",
-                f"it is counted to hold {told.frames} frames of {told.bytes} bytes, and holds "
-                f"{there.frames} of {there.bytes}: its quota is asked of the former",
-                "count anew", map=row.name, repair=partial(_repair_count, folder, row.number),
+                "damaged-signature", f"the signature of frame {frame}", "damage",
+                "its bytes are not those that were stored: queries pass it over",
+                "remove it, and have the frame signed again from its upload",
+                map=one.map, frame_id=one.frame_id,
+                repair=partial(_repair_signature, folder, one.number),
             )  # fmt: skip
 
 
-def _repair_count(folder: Folder, number: int) -> str:
-    with folder.store.database.write() as connection:
-        there = counted_usage(connection, number)
-        if use_of(connection, number) == there:
-            return GONE
-        connection.execute(
-            update(maps)
-            .where(maps.c.number == number)
-            .values(used_frames=there.frames, used_bytes=there.bytes)
+def _signatures(folder: Folder, connection: Connection, numbers: list[int]) -> list[_Stored]:
+    """Read the signatures that are searched, or will be: others are strays."""
+    c = signatures.c
+    found = connection.execute(
+        select(c.frame_number, frames.c.id, maps.c.name, c.model_id, c.model_id == maps.c.model_id,
+               c.vector, c.checksum, c.n_patches, c.n_pairs)
+        .join(frames, frames.c.number == c.frame_number)
+        .join(maps, maps.c.number == frames.c.map_number)
+        .where(
+            c.frame_number.in_(numbers), frames.c.state == FrameState.INDEXED,
+            c.model_id.in_((maps.c.model_id, maps.c.next_model_id)),
         )
-    return f"{there.frames} frames of {there.bytes} bytes are counted"
+    ).all()  # fmt: skip
+    stored = []
+    for number, frame_id, name, model_id, searched, vector, checksum, *_ in found:
+        model = folder.model(model_id)
+        fits = model is None or len(vector) == model.signature_bytes
+        sound = fits and crc32(vector) == checksum
+        stored.append(_Stored(number, frame_id, name, model_id, bool(searched), sound))
+    return stored
 
 
-# What refers to what on PostgreSQL: its foreign keys are enforced, but not while a dump is loaded
-# without triggers. Pages are the concern of its own pg_amcheck.
-
-
-def check_server(folder: Folder, restore: str) -> Iterator[Finding]:
-    """Rows that refer to none.
-
-    Parameters
-    ----------
-    restore : what to do about it
-    """
-    if folder.quick:
-        return
-    keys = [
-        key for table in metadata.sorted_tables
-        for key in sorted(table.foreign_key_constraints, key=lambda one: str(one.name))
-    ]  # fmt: skip
-    for done, key in enumerate(keys):
-        folder.progress("database", done, len(keys))
-        yield from _dangling(folder, key, restore)
-    folder.progress("database", len(keys), len(keys))
-
-
-def _dangling(folder: Folder, key: ForeignKeyConstraint, restore: str) -> Iterator[Finding]:
-    child, parent = key.table, key.referred_table
-    pairs = [(one.parent, one.column) for one in key.elements]
-    lost = (
-        select(*child.primary_key.columns)
-        .join(parent, and_(*(own == its for own, its in pairs)), isouter=True)
-        .where(*(own.is_not(None) for own, _ in pairs), *(its.is_(None) for _, its in pairs))
-        .limit(_MOST)
-    )
-    with folder.store.database.read() as connection:
-        allow(connection, 0)
-        found = connection.execute(lost).all()
-    for row in found:
-        named = ", ".join(f"{value!r:.80}" for value in row)
-        yield Finding(
-            "dangling-row", f"row {named} of table {child.name}", "damage",
-            f"it refers to a row of {parent.name} that is not there", restore,
-        )  # fmt: skip
-
-
-# The database as a whole: its pages, what refers to what, and the models in it.
-#
-# Where these are damaged nothing is repaired: what the rows say cannot be relied upon, and a repair
-# by them might remove what is sound.
-
-#: Kinds of findings after which nothing is repaired.
-FATAL = frozenset({"damaged-database", "dangling-row"})
-#: Findings of one kind that are named.
-_MOST = 20
-_RESTORE = (
-    "restore a snapshot of the data folder (`sceneprint restore`); nothing is repaired in a "
-    "damaged database"
-)
-
-
-def check_database(folder: Folder) -> Iterator[Finding]:
-    """What the database says of its own file, and rows that refer to none."""
-    database = folder.store.database
-    if not database.is_sqlite:
-        yield from check_server(folder, _RESTORE)
-        return
-    subject = "database"
-    folder.progress(subject, 0, 2)
-    # it alone reads all indexes: where one differs from its table, rows are not to be relied upon
-    pragma = "quick_check" if folder.quick else "integrity_check"
-    try:
-        with database.read() as connection:
-            told = connection.execute(text(f"PRAGMA {pragma}({_MOST})")).scalars().all()
-            folder.progress(subject, 1, 2)
-            dangling = connection.execute(text("PRAGMA foreign_key_check")).all()
-    except UnusableStore as error:
-        if not is_of_rows(error):
-            raise
-        yield damaged_database(str(error.__cause__ and getattr(error.__cause__, "orig", error)))
-        return
-    folder.progress(subject, 2, 2)
-    for line in told:
-        if line != "ok":
-            yield damaged_database(" ".join(line.split()))
-    for table, row, parent, _ in dangling[:_MOST]:
-        yield Finding(
-            "dangling-row", f"row {row} of table {table}", "damage",
-            f"it refers to a row of {parent} that is not there", _RESTORE,
-        )  # fmt: skip
-
-
-def damaged_database(message: str) -> Finding:
-    """The finding that the database cannot read all of its files, or finds them contradict."""
-    return Finding("damaged-database", "the database", "damage", message, _RESTORE)
-
-
-def check_models(folder: Folder) -> Iterator[Finding]:
-    """Models whose file is damaged: nothing can be signed or searched with them."""
-    with folder.store.database.read() as connection:
-        stored = connection.execute(select(models.c.id, models.c.content)).all()
-    for done, (model_id, content) in enumerate(stored):
-        folder.progress("models", done, len(stored))
-        folder.counts["models"] += 1
-        if _is_sound(model_id, bytes(content)):
-            continue
-        source = next((name for name in PRESETS if read_model(name).id == model_id), None)
-        yield Finding(
-            "damaged-model", f"model {model_id[:12]}", "damage",
-            "its file is not the one that was stored: its maps can be neither signed nor searched",
-            "restore a snapshot" if source is None else f"put the preset {source} in its place",
-            repair=None if source is None else partial(_put_preset, folder, model_id, source),
-        )  # fmt: skip
-    folder.progress("models", len(stored), len(stored))
-
-
-def _is_sound(model_id: str, content: bytes) -> bool:
-    try:
-        return parse_model(content, model_id).id == model_id
-    except UnreadableModel:
-        return False
-
-
-def _put_preset(folder: Folder, model_id: str, source: str) -> str:
-    content = write_model(read_model(source))
+def _repair_signature(folder: Folder, number: int) -> str:
     with folder.store.database.write() as connection:
-        found = connection.execute(
-            update(models).where(models.c.id == model_id).values(content=content)
-        )
-    return f"the preset {source} is in its place" if found.rowcount else GONE
+        try:
+            damaged = [one for one in _signatures(folder, connection, [number]) if not one.sound]
+        except (ValueError, TypeError, DBAPIError):  # not even its columns can be read
+            _remove_signatures(connection, number)
+            return sign_from_upload(folder, connection, number)
+        done = GONE
+        for one in damaged:
+            _remove_signatures(connection, number, {one.model_id})
+            if one.searched:
+                done = sign_from_upload(folder, connection, number)
+            else:  # meanwhile the frame is found by its other signature
+                enqueue(connection, REENCODE, number, PRIORITY, one.model_id)
+                done = "a worker makes it again from the upload"
+        return done
+
+
+def _remove_signatures(
+    connection: Connection, number: int, of: Collection[str] | None = None
+) -> None:
+    """Remove the signatures of a frame, of all models or some, and doom what they refer to."""
+    own = [signatures.c.frame_number == number]
+    if of is not None:
+        own.append(signatures.c.model_id.in_(of))
+    removed = connection.execute(delete(signatures).where(*own).returning(signatures.c.geometry))
+    doom(connection, removed.scalars())

@@ -16,7 +16,8 @@ from sqlalchemy import NullPool, create_engine, make_url
 
 from sceneprint.engine import Engine
 from sceneprint.engine.maps.tombstones import Tombstones
-from sceneprint.maintenance.fsck.check import FindingOutcome, fsck
+from sceneprint.maintenance.fsck.check import fsck
+from sceneprint.maintenance.fsck.findings import Finding
 from sceneprint.models import Model, open_table, write_model
 from sceneprint.settings import Settings
 from sceneprint.store.maps import add_map, keep_model
@@ -45,7 +46,11 @@ class House:
             tail_frames=HALL // 2 - 1,
         )  # fmt: skip
 
-    def look(self, **how: Any) -> list[FindingOutcome]:
+    @property
+    def is_sqlite(self) -> bool:
+        return make_url(self.settings.database).get_backend_name() == "sqlite"
+
+    def look(self, **how: Any) -> list[Finding]:
         return list(fsck(self.settings, **how))
 
     def files(self) -> dict[str, int | None]:
@@ -59,7 +64,7 @@ class House:
 
     def sql(self, asked: str, *values: object) -> list[tuple[Any, ...]]:
         """Ask or change the database past what it would refuse, and leave no log behind."""
-        if make_url(self.settings.database).get_backend_name() == "sqlite":
+        if self.is_sqlite:
             with closing(sqlite3.connect(self.data / "sceneprint.db")) as database:
                 found = database.execute(asked, values).fetchall()
                 database.commit()
@@ -72,6 +77,18 @@ class House:
 
     def blob(self, digest: str) -> Path:
         return self.data / "blobs" / digest[:2] / digest
+
+    def damage(self, path: Path, condition: str = "damaged", at: int = 7, bit: int = 0) -> bytes:
+        """Flip a bit of a file, or remove it; return the bytes that are left."""
+        data = bytearray(path.read_bytes())
+        data[at] ^= 1 << bit
+        path.unlink()
+        if condition == "damaged":
+            path.write_bytes(data)
+        return bytes(data)
+
+    def quarantined(self) -> list[bytes]:
+        return [path.read_bytes() for path in self.data.glob("quarantine/*")]
 
     def work(self) -> list[JobState | None]:
         """Do all jobs, and publish what is due."""

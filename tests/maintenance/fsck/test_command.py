@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import shutil
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,7 @@ from PIL import Image
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
+from sceneprint.engine import Engine
 from sceneprint_client import Client
 from sceneprint_lab.cli.demo import serving
 
@@ -41,7 +45,7 @@ def test_it_says_what_it_would_do_and_what_it_did(
     house: Any, fsck: Callable[..., str], tmp_path: Any
 ) -> None:
     assert fsck(expect=0).splitlines() == [
-        "checked 1 models, 15 frames, 13 signatures, 27 blobs, 27 files, 2 generations, 1 tables",
+        "checked 1 models, 15 frames, 13 signatures, 27 blobs, 27 files, 2 generations",
         "no problems found",
     ]
     house.sql("INSERT INTO frame_tags VALUES (1, 'other')")
@@ -51,22 +55,22 @@ def test_it_says_what_it_would_do_and_what_it_did(
     before = house.files()
     lines = fsck("--json", record, expect=1).splitlines()
     assert house.files() == before
-    assert lines[0] == (
-        f"damage    other-tags  frame {frame} of map hall: the tags that are searched are not "
-        "those of the frame; would: write them anew from the frame"
+    assert lines[1] == (
+        f"damage    stale-value  frame {frame} of map hall: the tags by which it is searched are "
+        "not its own; would: write them anew from the frame"
     )
-    assert lines[1].startswith("note      foreign-file  ")
+    assert lines[0].startswith("note      foreign-file  ")
     assert lines[-1] == (
         "1 damaged, 0 left over; nothing was changed: `sceneprint fsck --repair` can repair 1"
     )
     told = json.loads(record.read_text())
     assert told["checked"]["frames"] == 15
     assert [(one["kind"], one["frame_id"], one["done"]) for one in told["findings"]] == [
-        ("other-tags", frame, None),
         ("foreign-file", None, None),
+        ("stale-value", frame, None),
     ]
     lines = fsck("--repair", expect=0).splitlines()
-    assert lines[0].endswith("; done: 2 written")
+    assert lines[1].endswith("; done: written")
     assert lines[-1].startswith("1 damaged, 0 left over: 1 repaired, 0 not. Run it again")
     assert fsck("--map", "hall", expect=0).splitlines()[-1] == "no problems found"
 
@@ -77,13 +81,34 @@ def test_what_cannot_be_checked_or_repaired_has_its_own_code(
 ) -> None:
     assert fsck("--map", "cellar", expect=2).startswith("sceneprint fsck: There is no map 'cellar'")
     house.sql("UPDATE frames SET tags = '[' WHERE number = 3")
-    assert "would: restore a snapshot" in fsck("--repair", expect=1)
+    assert "would: restore a backup" in fsck("--repair", expect=1)
     with pytest.raises(SystemExit):
         fsck("--repair", "--quick", expect=2)
+    with pytest.raises(ValueError, match="quick"):
+        house.look(quick=True, repair=True)
+    assert "is not valid UTF-8" in fsck("--map", os.fsdecode(b"caf\xe9"), expect=2)
+    fsck("--grace", "1" + "0" * 400, expect=1)
     (house.data / "blobs").rename(house.data / "away")
     said = fsck("--repair", expect=2)
     assert "there is no such folder" in said
     assert said.count("\n") == 1
+
+
+def test_what_is_not_there_is_not_made(
+    house: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    typo, out = tmp_path / "typo", tmp_path / "out"
+    shutil.rmtree(house.data / "blobs")
+    for command in (
+        ["purge", "--data", typo],
+        ["reencode", "hall", "--status", "--data", typo],
+        ["snapshot", "--data", house.data, "--to", out],
+    )[0 if house.is_sqlite else 2 :]:
+        assert main([str(one) for one in command]) == 2
+        said = capsys.readouterr()
+        assert (said.out, said.err.count("\n")) == ("", 1)
+    Engine(house.settings).close()  # nor does a service that starts
+    assert not any(path.exists() for path in (typo, out, house.data / "blobs"))
 
 
 def variant(upload: Any, n: int) -> bytes:
@@ -128,7 +153,7 @@ def test_beside_a_service_nothing_is_lost(house: Any, uploads: Any) -> None:
         thread.join()
         assert ended == [(0, "")] * 2
         # what may be found is a blob before its commit, or after its frame was deleted
-        assert {one["kind"] for one in found} <= {"unreferenced-blob"}
+        assert {one["kind"] for one in found} <= {"unreferenced-file"}
         client.wait([job for job, _ in kept.values()], timeout_s=PATIENCE_S)
         assert client.map("busy").frames == {"deleted": deleted, "indexed": len(kept)}
     for frame, (_, data) in kept.items():

@@ -1,15 +1,12 @@
-"""Rows that contradict each other: named, and brought together again."""
+"""Rows and signatures that contradict each other or are damaged: named, and repaired."""
 
 from __future__ import annotations
 
 import zlib
 from typing import Any
 
+import numpy as np
 import pytest
-
-from sceneprint.engine import Engine
-from sceneprint.store.tables import frames
-from sceneprint_client.api import Query
 
 FIRST = "(SELECT MIN(number) FROM frames WHERE state = 'indexed')"
 WAITING = "(SELECT number FROM frames WHERE state = 'received')"
@@ -58,19 +55,19 @@ FAULTS = {
     ),
     "a tag too many": (
         f"INSERT INTO frame_tags VALUES ({FIRST}, 'other')",
-        "other-tags",
+        "stale-value",
         f"SELECT tag FROM frame_tags WHERE frame_number = {FIRST} ORDER BY tag",
         [("all",), ("view-0",)],
     ),
     "a tag that is not there": (
         f"DELETE FROM frame_tags WHERE frame_number = {FIRST} AND tag = 'all'",
-        "other-tags",
+        "stale-value",
         f"SELECT tag FROM frame_tags WHERE frame_number = {FIRST} ORDER BY tag",
         [("all",), ("view-0",)],
     ),
     "another position": (
         f"UPDATE frames SET pose_y = pose_y + 1 WHERE number = {FIRST}",
-        "other-position",
+        "stale-value",
         # another sample of the same view
         "SELECT pose_y = (SELECT pose_y FROM frames WHERE number = 2) FROM frames WHERE number = 1",
         [(1,)],
@@ -81,20 +78,19 @@ FAULTS = {
         "SELECT revision FROM maps WHERE name = 'hall'",
         [(12,)],
     ),
-    "a reason that holds no more": (
-        "UPDATE frames SET reason = 'its upload is lost: it can be found, but not signed again;"
-        f" upload it again to heal' WHERE number = {FIRST}",
-        "found-upload",
-        "SELECT reason FROM frames WHERE number = 1",
-        [(None,)],
+    "a revision that no map can have": (
+        f"UPDATE frames SET revision = 9223372036854775807 WHERE number = {FIRST}",
+        "revision-ahead",
+        "SELECT MAX(frames.revision), maps.revision FROM frames JOIN maps"
+        " ON map_number = maps.number WHERE maps.name = 'hall' GROUP BY maps.revision",
+        [(13, 13)],
     ),
 }
 
 
-def told(outcomes: Any) -> list[Any]:
-    """All but what a fault of these brings with it."""
-    brought = ("damaged-model", "foreign-index")
-    return [one for one in outcomes if one.finding.kind not in brought]
+def faults(findings: Any) -> list[Any]:
+    """Leave out what one of these faults brings with it."""
+    return [one for one in findings if one.kind != "damaged-model"]
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -103,14 +99,14 @@ def test_a_fault_is_named_and_repaired(house: Any, fault: str) -> None:
     for change in changes if isinstance(changes, tuple) else (changes,):
         house.sql(change)
     before = house.files()
-    found = told(house.look())
-    assert [one.finding.kind for one in found] == [kind]
-    assert found[0].finding.frame_id
+    found = faults(house.look())
+    assert [one.kind for one in found] == [kind]
+    assert found[0].frame_id
     assert found[0].left
     assert house.files() == before
-    assert [one.left for one in told(house.look(repair=True))] == [False]
+    assert [one.left for one in faults(house.look(repair=True))] == [False]
     assert house.sql(asked) == after
-    assert told(house.look()) == []
+    assert faults(house.look()) == []
 
 
 def test_what_a_map_is_counted_to_hold(house: Any) -> None:
@@ -119,8 +115,8 @@ def test_what_a_map_is_counted_to_hold(house: Any) -> None:
     house.sql("UPDATE maps SET used_frames = used_frames + 1 WHERE name = 'hall'")
     assert house.look(quick=True) == house.look(map_name="attic") == []
     [found] = house.look()
-    assert (found.finding.kind, found.finding.map) == ("other-use", "hall")
-    assert f"to hold {before[0][0] + 1} frames of {before[0][1]} bytes" in found.finding.means
+    assert (found.kind, found.map) == ("stale-value", "hall")
+    assert f"to hold {before[0][0] + 1} frames of {before[0][1]} bytes" in found.means
     assert [one.left for one in house.look(repair=True)] == [False]
     assert (house.sql(asked), house.look()) == (before, [])
 
@@ -139,13 +135,12 @@ def test_one_map_is_looked_at_alone(house: Any) -> None:
     house.sql(f"UPDATE jobs SET state = 'cancelled' WHERE frame_number = {WAITING}")  # of `attic`
     (house.data / "blobs" / "notes.txt").write_text("mine")
     kinds = {
-        name: [one.finding.kind for one in house.look(map_name=name)]
-        for name in ("hall", "attic", None)
+        name: [one.kind for one in house.look(map_name=name)] for name in ("hall", "attic", None)
     }
     assert kinds == {
-        "hall": ["other-tags"],
+        "hall": ["stale-value"],
         "attic": ["frame-without-job"],
-        None: ["other-tags", "frame-without-job", "foreign-file"],
+        None: ["foreign-file", "stale-value", "frame-without-job"],
     }
 
 
@@ -156,71 +151,75 @@ def test_a_row_that_cannot_be_read_does_not_hide_the_others(house: Any) -> None:
     house.sql("UPDATE frames SET state = 'indexee' WHERE number = 4")
     house.sql("UPDATE frames SET pose_x = 7 WHERE number = 5")
     (tags, state, position) = house.look(repair=True)
-    assert [tags.finding.kind, state.finding.kind] == ["unreadable-row"] * 2
-    assert (tags.finding.what, state.finding.what) == ("frame number 3", "frame number 4")
+    assert [tags.kind, state.kind] == ["unreadable-row"] * 2
+    assert (tags.what, state.what) == ("frame number 3", "frame number 4")
     assert (tags.left, state.left, position.left) == (True, True, False)
-    assert position.finding.kind == "other-position"
+    assert position.kind == "stale-value"
 
 
-@pytest.mark.sqlite_only("PostgreSQL holds no such row")
-def test_a_signature_whose_counts_cannot_be_read_is_made_again(house: Any) -> None:
-    sound = house.sql("SELECT * FROM signatures ORDER BY frame_number")
-    house.sql("UPDATE signatures SET n_pairs = CAST(x'5b31ff5d' AS TEXT) WHERE frame_number = 3")
-    house.sql("UPDATE signatures SET n_patches = '[1, 2, 3]' WHERE frame_number = 5")
-    checksum = zlib.crc32(b"\0")  # which fits: the length alone does not
-    house.sql("UPDATE signatures SET vector = x'00', checksum = ? WHERE frame_number = 7", checksum)
+def test_a_damaged_signature_is_made_again(house: Any, truth: Any, uploads: Any) -> None:
+    """Its bytes, its length, and counts that cannot be read; meanwhile it is not compared."""
+    asked = "SELECT * FROM signatures ORDER BY frame_number"
+    sound, checksum = house.sql(asked), zlib.crc32(b"\0")  # which fits: the length does not
+    change = "UPDATE signatures SET {} WHERE frame_number = {}".format
+    house.sql(change("vector = SUBSTR(vector, 2) || SUBSTR(vector, 1, 1)", 1))
+    house.sql(change("vector = ?, checksum = ?", 3), b"\0", checksum)
+    numbers = [1, 3]
+    if house.is_sqlite:  # PostgreSQL holds no such row
+        house.sql(change("n_pairs = CAST(x'5b31ff5d' AS TEXT)", 5))
+        numbers.append(5)
+    house.sql("UPDATE frames SET novelty = 1.0 WHERE number = 1")  # others like it came since
     found = house.look(repair=True)
-    assert [one.finding.kind for one in found] == ["damaged-signature"] * 3
-    assert [one.left for one in found] == [False] * 3
+    assert [(one.kind, one.done) for one in found] == [
+        ("damaged-signature", "a worker signs it again from its upload")
+    ] * len(numbers)
     assert house.look() == []
+    rows = house.sql(f"SELECT id FROM frames WHERE number IN {tuple(numbers)}")
+    others = {frame_id for each in house.answers(uploads[:12]) for frame_id, _ in each}
+    assert others
+    assert not others & {frame_id for (frame_id,) in rows}
     assert set(house.work()) == {"succeeded"}
-    made = house.sql("SELECT * FROM signatures ORDER BY frame_number")
-    assert [one for one in made if one[0] <= 13] == [one for one in sound if one[0] <= 13]
-
-
-def test_an_index_that_differs_from_the_database_is_made_again(
-    house: Any, truth: Any, uploads: Any
-) -> None:
-    """All its checksums hold: it was made of other signatures, or lacks one."""
-    house.sql(  # both frames have the signature of the second, with its checksum
-        "UPDATE signatures SET (vector, checksum) = (SELECT vector, checksum FROM signatures"
-        " WHERE frame_number = 2) WHERE frame_number = 1"
-    )
-    house.sql("UPDATE frames SET revision = 1 WHERE number = 14")  # of `attic`: no index there
-    (found,) = house.look(repair=True)
-    assert found.finding.kind == "other-index"
-    ((first,),) = house.sql("SELECT id FROM frames WHERE number = 1")
-    assert found.finding.means.endswith(f": frames {first}")
-    assert not found.left
+    assert [one for one in house.sql(asked) if one[0] <= 13] == [o for o in sound if o[0] <= 13]
     assert house.look() == []
-    with Engine(house.settings) as engine:
-        assert engine.publish_due() == 1
-        query = Query(stages=("retrieve",), k=2)
-        answer = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, query)
-    assert [match.distance for match in answer.matches] == [0, 0]
-    assert answer.index_generation == 1
+    assert house.answers(uploads[:12]) == truth
+
+
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
+@pytest.mark.parametrize("times", [4, pytest.param(12, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("kind", ["keys", "faiss", "json", "upload", "artifact", "signature"])
+def test_a_flipped_bit_is_named_and_nothing_else_is(house: Any, kind: str, times: int) -> None:
+    rng = np.random.default_rng(7)
+    stored = house.sql(
+        "SELECT f.id, f.blob, s.geometry, s.vector FROM frames f JOIN signatures s"
+        " ON s.frame_number = f.number JOIN maps m ON m.number = f.map_number"
+        " WHERE m.name = 'hall' ORDER BY f.number"
+    )
+    database = house.data / "sceneprint.db"
+    data = database.read_bytes()
+    # each lies there alone, and on one page: some are split, or like another's
+    whole = [(one[3], one[0]) for one in stored if data.count(one[3]) == 1]
+    places = {
+        "upload": [(house.blob(one[1]), one[0]) for one in stored],
+        "artifact": [(house.blob(one[2]), one[0]) for one in stored],
+    }
+    before = house.files()
+    for _ in range(times):
+        if kind == "signature":
+            vector, what = whole[rng.integers(len(whole))]
+            path, at = database, data.index(vector) + int(rng.integers(len(vector)))
+        else:
+            files = sorted((house.data / "index").rglob(f"*.{kind}"))
+            some = places.get(kind) or [(one, str(one)) for one in files]
+            path, what = some[rng.integers(len(some))]
+            at = int(rng.integers(path.stat().st_size))
+        bit = int(rng.integers(8))
+        house.damage(path, at=at, bit=bit)
+        flipped = house.files()
+        (found,) = house.look()
+        wanted = kind if kind in (*places, "signature") else "index"
+        assert (found.kind, found.frame_id or str(found.path)) == (f"damaged-{wanted}", what)
+        assert (found.severity, found.done, found.left) == ("damage", None, True)
+        assert house.files() == flipped  # to look changes nothing
+        house.damage(path, at=at, bit=bit)
+    assert house.files() == before
     assert house.look() == []
-
-
-def test_an_index_that_lacks_a_frame_is_made_again(house: Any) -> None:
-    """As one that was published while a signature was damaged."""
-    columns = {column.name: column.name for column in frames.columns}
-    columns |= {"number": "99", "id": "'ff'", "content_id": "'ff'"}
-    house.sql(  # a frame of `hall` that its index has never heard of, though as old as others
-        f"INSERT INTO frames ({', '.join(columns)})"
-        f" SELECT {', '.join(columns.values())} FROM frames WHERE number = 1"
-    )
-    house.sql(
-        "INSERT INTO signatures SELECT 99, model_id, vector, checksum, geometry, n_patches,"
-        " n_pairs FROM signatures WHERE frame_number = 1"
-    )
-    house.sql("INSERT INTO frame_tags SELECT 99, tag FROM frame_tags WHERE frame_number = 1")
-    house.sql(
-        "UPDATE maps SET used_frames = used_frames + 1,"
-        " used_bytes = used_bytes + (SELECT bytes FROM frames WHERE number = 99)"
-        " WHERE name = 'hall'"
-    )
-    (found,) = house.look(repair=True)
-    assert (found.finding.kind, found.left) == ("other-index", False)
-    assert found.finding.means.endswith(": frames ff")
-    assert list((house.data / "index").glob("hall*/*.json")) == []

@@ -10,7 +10,8 @@ from sceneprint.bundle.backup import take_backup
 from sceneprint.bundle.restoration import restore_to_server
 from sceneprint.engine import Engine
 from sceneprint.errors import StoreAway
-from sceneprint.maintenance.fsck.check import FindingOutcome, fsck
+from sceneprint.maintenance.fsck.check import fsck
+from sceneprint.maintenance.fsck.findings import Finding
 from sceneprint.settings import Settings
 from sceneprint_client.api import JobState
 
@@ -33,11 +34,11 @@ class Fleet:
             found = [connection.execute(one) for one in asked][-1]
             return found.fetchall() if found.description else []
 
-    def look(self, **how: object) -> list[FindingOutcome]:
+    def look(self, **how: object) -> list[Finding]:
         return list(fsck(self.settings, **how))
 
     def kinds(self, **how: object) -> list[str]:
-        return [one.finding.kind for one in self.look(**how)]
+        return [one.kind for one in self.look(**how)]
 
     def work(self) -> set[JobState | None]:
         with Engine(self.settings) as engine:
@@ -65,41 +66,28 @@ def fleet(bundles, master, postgres_url, tmp_path) -> Fleet:
     return Fleet(settings, postgres_url)
 
 
-def test_rows_are_checked_and_mended(fleet):
+def test_rows_and_blobs_are_checked_and_mended(fleet):
     assert fleet.kinds() == fleet.kinds(quick=True) == []
+    [(geometry,)] = fleet.sql(f"SELECT geometry FROM signatures WHERE frame_number = {FIRST} + 4")
+    (fleet.settings.blob_dir / geometry[:2] / geometry).write_bytes(b"other")
     fleet.sql(
         f"UPDATE signatures SET vector = 'x' || substr(vector, 2) WHERE frame_number = {FIRST}",
         f"DELETE FROM signatures WHERE frame_number = {FIRST} + 1",
         f"UPDATE frames SET pose_x = pose_x + 1 WHERE number = {FIRST} + 2",
-        f"DELETE FROM frame_tags WHERE frame_number = {FIRST} + 2",
+        f"DELETE FROM frame_tags WHERE frame_number = {FIRST} + 3",
         f"UPDATE jobs SET state = 'dead' WHERE frame_number = {WAITING}",
         "UPDATE maps SET revision = 11, used_bytes = used_bytes - 1 WHERE name = 'hall'",
     )
     wanted = [
-        "damaged-signature", "frame-without-job", "frame-without-signature", "other-position",
-        "other-tags", "other-use", "revision-ahead",
+        "damaged-artifact", "damaged-signature", "frame-without-job", "frame-without-signature",
+        "revision-ahead", "stale-value", "stale-value", "stale-value",
     ]  # fmt: skip
     assert sorted(fleet.kinds()) == wanted
     repaired = fleet.look(repair=True)
-    assert sorted(one.finding.kind for one in repaired) == wanted
+    assert sorted(one.kind for one in repaired) == wanted
     assert [one.error for one in repaired if one.left] == []
     assert fleet.work() == {JobState.SUCCEEDED}
     assert fleet.kinds() == []
-    [moved] = (fleet.settings.data_dir / "quarantine").iterdir()
-    assert moved.name.startswith("signature-")
-
-
-def test_blobs_are_checked_and_mended(fleet):
-    blob, state = fleet.sql(f"SELECT blob, state FROM frames WHERE number = {WAITING}")[0]
-    [(geometry,)] = fleet.sql(f"SELECT geometry FROM signatures WHERE frame_number = {FIRST}")
-    blobs = fleet.settings.blob_dir
-    (blobs / blob[:2] / blob).unlink()
-    (blobs / geometry[:2] / geometry).write_bytes(b"other")
-    assert state == "received"
-    assert sorted(fleet.kinds()) == ["damaged-artifact", "missing-upload"]
-    assert [one.error for one in fleet.look(repair=True) if one.left] == []
-    assert fleet.work() == {JobState.SUCCEEDED}
-    assert [one.finding.severity for one in fleet.look()] == ["note"]  # the loss is known
 
 
 def test_rows_that_refer_to_none_are_fatal(fleet):
@@ -107,16 +95,16 @@ def test_rows_that_refer_to_none_are_fatal(fleet):
               "WHERE name = 'attic'")  # fmt: skip
     found = fleet.look(repair=True)
     assert ("dangling-row", "row 22, 'x' of table frame_tags") in [
-        (one.finding.kind, one.finding.what) for one in found
+        (one.kind, one.what) for one in found
     ]
     assert all(one.done is None for one in found)
-    assert any("refers to a row of maps" in one.finding.means for one in found)
+    assert any("refers to a row of maps" in one.means for one in found)
 
 
 def test_a_server_that_is_away_is_no_damage(fleet, postgres):
     fleet.sql("UPDATE maps SET used_bytes = used_bytes - 1 WHERE name = 'hall'")
     seen = fsck(fleet.settings)
-    assert next(seen).finding.kind == "other-use"  # the next check finds the connections gone
+    assert next(seen).kind == "stale-value"  # the next check finds the connections gone
     name = fleet.settings.database.rsplit("/")[-1]
     postgres.execute(f"ALTER DATABASE {name} ALLOW_CONNECTIONS false")
     postgres.execute(

@@ -1,0 +1,73 @@
+"""Search indexes: a file that is damaged, and what differs from the database; both made again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.store.tables import frames
+from sceneprint_client.api import Query
+
+
+@pytest.mark.parametrize("kind", ["keys", "faiss", "json"])
+def test_a_damaged_index_is_removed_and_made_again(
+    house: Any, kind: str, truth: Any, uploads: Any
+) -> None:
+    path = sorted((house.data / "index").rglob(f"*.{kind}"))[-1]
+    house.damage(path)
+    (found,) = house.look(repair=True)
+    assert (found.kind, found.path, found.done) == (
+        "damaged-index", path, "the index is removed"
+    )  # fmt: skip
+    assert [one.suffix for one in path.parent.iterdir() if one.name != ".lock"] == []
+    assert house.look() == []
+    assert house.answers(uploads[:12]) == truth
+    with Engine(house.settings) as engine:
+        engine.publish_due()
+        ask = Query(stages=("retrieve",))
+        answer = engine.queries.upload(["hall"], uploads[0].data, uploads[0].meta, ask)
+    assert answer.index_generation > 0
+    assert house.look() == []
+    assert house.answers(uploads[:12]) == truth
+
+
+def test_an_index_that_differs_from_the_database_is_made_again(house: Any, uploads: Any) -> None:
+    """All its checksums hold: it was made of other signatures."""
+    house.sql(  # both frames have the signature of the second, with its checksum
+        "UPDATE signatures SET (vector, checksum) = (SELECT vector, checksum FROM signatures"
+        " WHERE frame_number = 2) WHERE frame_number = 1"
+    )
+    house.sql("UPDATE frames SET revision = 1 WHERE number = 14")  # of `attic`: no index there
+    (found,) = house.look(repair=True)
+    ((first,),) = house.sql("SELECT id FROM frames WHERE number = 1")
+    assert (found.kind, found.left) == ("damaged-index", False)
+    assert f"has not the signatures of frames {first}:" in found.means
+    assert house.look() == []
+    with Engine(house.settings) as engine:
+        assert engine.publish_due() == 1
+        query = Query(stages=("retrieve",), k=2)
+        answer = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, query)
+    assert [match.distance for match in answer.matches] == [0, 0]
+    assert answer.index_generation == 1
+    assert house.look() == []
+
+
+def test_an_index_that_lacks_a_frame_is_removed(house: Any) -> None:
+    """As one that was published while a signature was damaged."""
+    columns = {column.name: column.name for column in frames.columns}
+    columns |= {"number": "99", "id": "'ff'", "content_id": "'ff'"}
+    house.sql(  # a frame of `hall` that its index has never heard of, though as old as others
+        f"INSERT INTO frames ({', '.join(columns)})"
+        f" SELECT {', '.join(columns.values())} FROM frames WHERE number = 1"
+    )
+    house.sql(
+        "INSERT INTO signatures SELECT 99, model_id, vector, checksum, geometry, n_patches,"
+        " n_pairs FROM signatures WHERE frame_number = 1"
+    )
+    house.sql("INSERT INTO frame_tags SELECT 99, tag FROM frame_tags WHERE frame_number = 1")
+    found = {one.kind: one for one in house.look(repair=True)}
+    assert sorted(found) == ["damaged-index", "stale-value"]  # the latter: it was not counted
+    assert "has not the signatures of frames ff:" in found["damaged-index"].means
+    assert list((house.data / "index").glob("hall*/*.json")) == []
