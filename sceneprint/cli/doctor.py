@@ -13,7 +13,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -354,7 +353,6 @@ def machine(settings: Settings) -> Iterator[Check]:
         yield from server(settings)
     yield from object_stores(settings)
     yield _decoders(settings)
-    yield _embree()
     yield _open3d()
 
 
@@ -458,15 +456,6 @@ def _folder(data_dir: Path) -> Iterator[Check]:
         )
         yield Check("note", "permissions", text)
     yield disk_check("disk", shutil.disk_usage(there).free)
-
-
-def _embree() -> Check:
-    try:
-        import_module("embreex.rtcore_scene")
-    except ImportError as error:
-        text = f"cannot be imported ({error}); only `synth`, `train` and `demo` need it"
-        return Check("note", "embreex", text)
-    return Check("ok", "embreex", "can be imported (needed for synthetic rooms)")
 
 
 def _open3d() -> Check:

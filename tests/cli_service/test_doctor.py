@@ -61,7 +61,7 @@ def test_a_sound_machine(sceneprint: Run, data_folder: Path, working: str) -> No
     found = verdicts(done.stdout)
     assert list(found) == [
         "python", "sqlite", "kernels", "table depth", "table lidar", "table paper", "data folder",
-        "disk", "database", "decoders", "embreex", "open3d", *SERVICE,
+        "disk", "database", "decoders", "open3d", *SERVICE,
     ]  # fmt: skip
     for needed in ("python", "sqlite", "data folder", "database", "service", "workers"):
         assert found[needed] == "ok"

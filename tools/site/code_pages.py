@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from prometheus_client.metrics import MetricWrapperBase
 
 from sceneprint import settings
-from sceneprint.cli import parser
+from sceneprint.cli import COMMANDS, parser
 from service.metrics import Metrics
 from tools.site.markup import cell, code, fenced, page, plain, table
 
@@ -184,10 +184,12 @@ def commands_page() -> str:
     """Markdown that describes every command with its options."""
     found = commands()
     (listed,) = (one for one in parser()._actions if isinstance(one, argparse._SubParsersAction))
+    added = ", ".join(f"`{name}`" for name in found if name not in COMMANDS)
     shorts = {one.dest: one.help or "" for one in listed._choices_actions}
     return page(
         "# Command line",
-        f"The {len(found)} commands of `sceneprint`. `sceneprint COMMAND --help` prints the same.",
+        f"The {len(found)} commands of `sceneprint`. `sceneprint COMMAND --help` prints the same. "
+        f"`sceneprint-lab` adds {added}.",
         table(
             ("command", "what it does"),
             ((f"[`{name}`](#{name})", cell(shorts[name])) for name in found),
