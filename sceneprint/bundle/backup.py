@@ -173,7 +173,8 @@ class _Backup:
             rows = self._blobs(blobs, digests, listed)
             parts += self._parts("blobs", row_parts(BLOB_COLUMNS, rows))
         manifest = BundleManifest(
-            created_at=begun, sceneprint=version("sceneprint"), schema_revision=known_revisions()[0],
+            created_at=begun, sceneprint=version("sceneprint"),
+            schema_revision=known_revisions()[0],
             blobs=listed.count, blob_bytes=listed.bytes, lost=len(listed.lost),
             parts=tuple(parts), **summary,
         )  # fmt: skip

@@ -17,7 +17,6 @@ from sceneprint.geometry.validation.inspection import patches_at, residuals
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.geometry.views import Renderer, choose_views, view_parameters
 from sceneprint.index import Tail, search
-from sceneprint.index.sketches import make_sketches
 from sceneprint.models import Model, parse_model, read_model
 from sceneprint.pipeline import Signer, open_signer, prepare, validate
 from sceneprint.store import Database
@@ -125,7 +124,6 @@ def warm_signing(signer: Signer) -> bytes:
     pairwise_distances(rows, metric)
     rows.flags.writeable = False  # as a mapped file is: another compilation
     distances(signature.vector.copy(), rows, metric)
-    make_sketches(rows).candidates(signature.vector, 1, None)
     return write_geometry(seen)
 
 

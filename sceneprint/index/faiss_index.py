@@ -18,7 +18,7 @@ from sceneprint.errors import DamagedIndex
 from sceneprint.types import Bytes
 
 if TYPE_CHECKING:
-    from faiss import IndexScalarQuantizer
+    from faiss import IndexBinaryFlat, IndexScalarQuantizer
 
 #: Distances from here on may be rounded: the first integers that 32 bits of floats do not all hold.
 ROUNDED = 1 << 24
@@ -67,15 +67,19 @@ def _view(index: Any, *, read_only: bool) -> Bytes:
     return np.asarray(_Codes(index, read_only))
 
 
-def write_index(index: IndexScalarQuantizer, take: Callable[[bytes], None]) -> None:
-    """Give an index as bytes, block by block.
+def write_index(
+    index: IndexScalarQuantizer | IndexBinaryFlat, take: Callable[[bytes], None]
+) -> None:
+    """Pass an index to `take` as bytes, block by block.
 
     Raises
     ------
     Exception : of `take`
     """
     faiss = library()
-    faiss.write_index(index, faiss.PyCallbackIOWriter(take))
+    binary = isinstance(index, faiss.IndexBinaryFlat)
+    write = faiss.write_index_binary if binary else faiss.write_index
+    write(index, faiss.PyCallbackIOWriter(take))
 
 
 def map_index(path: Path, n: int, dimension: int) -> IndexScalarQuantizer:
@@ -106,6 +110,32 @@ def map_index(path: Path, n: int, dimension: int) -> IndexScalarQuantizer:
     return found
 
 
+def map_binary(path: Path, n: int, bits: int) -> IndexBinaryFlat:
+    """Map an index over bits into memory, as `map_index` does.
+
+    Raises
+    ------
+    DamagedIndex : missing, another kind or shape, or of a FAISS that this one cannot read.
+    """
+    faiss = library()
+    try:
+        index: Any = faiss.read_index_binary(str(path), faiss.IO_FLAG_MMAP_IFC)
+    except RuntimeError as error:
+        raise DamagedIndex(f"{path}: FAISS cannot read it: {error}") from error
+    if not isinstance(index, faiss.IndexBinaryFlat) or (index.d, index.ntotal) != (bits, n):
+        raise DamagedIndex(f"{path}: no FAISS index of {n} sketches of {bits} bits.")
+    found: IndexBinaryFlat = index
+    return found
+
+
+def selection(free: NDArray[np.bool_] | None) -> Any:
+    """Return the parameters of a search of the rows (n,) that are free; None: all of them."""
+    if free is None:
+        return None
+    faiss = library()
+    return faiss.SearchParameters(sel=faiss.IDSelectorBitmap(np.packbits(free, bitorder="little")))
+
+
 def nearest(
     index: IndexScalarQuantizer, query: Bytes, count: int, free: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
@@ -124,11 +154,7 @@ def nearest(
     """
     if count == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    faiss, parameters = library(), None
-    if free is not None:
-        selector = faiss.IDSelectorBitmap(np.packbits(free, bitorder="little"))
-        parameters = faiss.SearchParameters(sel=selector)
-    found, rows = index.search(query[None].astype(np.float32), count, params=parameters)
+    found, rows = index.search(query[None].astype(np.float32), count, params=selection(free))
     if found.max() >= ROUNDED:
         return None
     return rows[0], found[0].astype(np.int64)

@@ -32,8 +32,9 @@ from sceneprint.atomic_files import (
 from sceneprint.errors import DamagedIndex
 from sceneprint.types import Bytes
 
-#: What the keys, the FAISS index, the sketches and the deleted keys of a segment are called.
-KINDS = ("keys", "faiss", "sketches", "gone")
+#: Endings of the files of a segment: its keys, FAISS indexes of its signatures and of their
+#: sketches, the means by which those were made, and the deleted keys.
+KINDS = ("keys", "faiss", "sketches", "means", "gone")
 #: Bytes that are read at once where a file is checked.
 BLOCK_BYTES = 8 << 20
 _NAME = re.compile(rf"[0-9a-f]{{64}}\.({'|'.join(KINDS)})")
@@ -227,8 +228,8 @@ class SegmentFiles:
 
     Parameters
     ----------
-    files : (name, bytes) of its keys, of the FAISS index of their signatures, of their sketches,
-        if there are any, and of the keys that count no longer, if there are any
+    files : (name, bytes) of its keys, of the FAISS index of their signatures, of their sketches
+        and the means, if there are any, and of the keys that count no longer, if there are any
     recall : as measured when it was written
     """
 

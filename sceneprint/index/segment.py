@@ -47,7 +47,6 @@ from sceneprint.index.sketches import (
     make_sketches,
     map_sketches,
     measure_sketches,
-    write_sketches,
 )
 from sceneprint.types import Bytes
 
@@ -249,7 +248,10 @@ def open_segment(folder: Path, record: SegmentFiles, dimension: int) -> Segment:
     keys, sketches = _rising_keys(names["keys"]), None
     index = map_index(names["faiss"], len(keys), dimension)
     if "sketches" in names:
-        sketches = map_sketches(names["sketches"], len(keys), dimension, record.recall.probes)
+        if "means" not in names:
+            raise DamagedIndex(f"{names['sketches']}: of no means.")
+        files, probes = (names["sketches"], names["means"]), record.recall.probes
+        sketches = map_sketches(*files, len(keys), dimension, probes)
     gone = np.empty(0, np.int64)
     if "gone" in names:
         gone = _rising_keys(names["gone"])
@@ -393,14 +395,18 @@ def write_segment(
         put(folder, "faiss", lambda take: faiss_index.write_index(index, take)),
     ]
     if vectors.nbytes > flat_bytes:
-        made, recall = _put_sketches(folder, vectors)
-        files.append(made)
+        sketches, recall = _put_sketches(folder, vectors)
+        files += sketches
     return SegmentFiles(tuple(files), recall)
 
 
-def _put_sketches(folder: Path, vectors: Bytes) -> tuple[tuple[str, int], Recall]:
-    made, recall = measure_sketches(make_sketches(vectors), vectors)
-    return put(folder, "sketches", lambda take: write_sketches(made, take)), recall
+def _put_sketches(folder: Path, vectors: Bytes) -> tuple[list[tuple[str, int]], Recall]:
+    sketches, recall = measure_sketches(make_sketches(vectors), vectors)
+    files = [
+        put(folder, "sketches", lambda take: faiss_index.write_index(sketches.index, take)),
+        put(folder, "means", lambda take: take(sketches.means.tobytes())),
+    ]
+    return files, recall
 
 
 def _merged_keys(sources: Sequence[SegmentSource]) -> tuple[Keys, NDArray[np.int64]]:
@@ -422,14 +428,15 @@ def _renamed(folder: Path, segment: Segment, gone: Keys, flat_bytes: float) -> S
     Of a map that has become large its older segments get sketches, which no search needed before.
     """
     files = [one for one in segment.record.files if one[0].endswith((".keys", ".faiss"))]
-    recall, sketches = segment.record.recall, segment.record.file("sketches")
+    recall = segment.record.recall
+    sketches = [segment.record.file(kind) for kind in ("sketches", "means")]
     if segment.vectors.nbytes <= flat_bytes:
         recall = _flat_recall(len(segment.keys))
-    elif sketches is not None:
-        files.append(sketches)
+    elif segment.sketches is not None:
+        files += [one for one in sketches if one is not None]
     else:
-        made, recall = _put_sketches(folder, segment.vectors)
-        files.append(made)
+        more, recall = _put_sketches(folder, segment.vectors)
+        files += more
     before = segment.record.file("gone")
     if before is not None and len(gone) == len(segment.gone):
         files.append(before)

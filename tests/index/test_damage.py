@@ -23,7 +23,7 @@ Publish = Callable[..., Generation]
 LENGTH = 32
 
 
-KINDS = ["json", "keys", "faiss", "sketches"]
+KINDS = ["json", "keys", "faiss", "sketches", "means"]
 RECALL = {"share": 1.0, "near": 10, "sample": 0, "probes": 0, "frames": 0}
 
 
@@ -145,7 +145,7 @@ def test_a_damaged_file_is_written_again_when_its_content_is(
 ) -> None:
     """Names come from content, so that a name may be there already, with other bytes."""
     for path in folder.iterdir():
-        if path.suffix in {".faiss", ".keys", ".sketches"}:
+        if path.suffix in {".faiss", ".keys", ".sketches", ".means"}:
             path.write_bytes(b"damaged")
     signatures = walk(45, LENGTH)
     # the very bytes of the first generation
@@ -223,14 +223,20 @@ def test_another_kind_of_faiss_index_is_refused(
         map_index(tmp_path / "other", 45, LENGTH)
 
 
-def test_sketches_of_other_signatures_are_refused(folder: Path) -> None:
-    path = own_files(folder)["sketches"]
-    assert len(map_sketches(path, 45, LENGTH, 1)) == 45
-    for n, dimension in ((44, LENGTH), (45, LENGTH + 1)):
-        with pytest.raises(DamagedIndex, match="no sketches of"):
-            map_sketches(path, n, dimension, 1)
+def test_sketches_of_other_signatures_are_refused(folder: Path, tmp_path: Path) -> None:
+    path, means = (own_files(folder)[kind] for kind in ("sketches", "means"))
+    assert len(map_sketches(path, means, 45, LENGTH, 1)) == 45
+    for n, dimension in ((44, LENGTH), (45, LENGTH + 8)):
+        with pytest.raises(DamagedIndex, match=rf"no FAISS index of {n} sketches"):
+            map_sketches(path, means, n, dimension, 1)
+    with pytest.raises(DamagedIndex, match="no means of signatures of 31 bytes"):
+        map_sketches(path, means, 45, LENGTH - 1, 1)  # as many bytes of bits
     data = path.read_bytes()
-    for wrong in (b"", data[:20], data[:-1], b"X" + data[1:], data[:6] + b"\x09" + data[7:]):
+    for wrong in (b"", data[:20], data[:-1], b"X" + data[1:]):
         path.write_bytes(wrong)
-        with pytest.raises(DamagedIndex, match="no sketches of"):
-            map_sketches(path, 45, LENGTH, 1)
+        with pytest.raises(DamagedIndex, match="FAISS cannot read it"):
+            map_sketches(path, means, 45, LENGTH, 1)
+    other = faiss.IndexBinaryHash(LENGTH, 8)
+    faiss.write_index_binary(other, str(tmp_path / "other"))
+    with pytest.raises(DamagedIndex, match="no FAISS index of 0 sketches"):
+        map_sketches(tmp_path / "other", means, 0, LENGTH, 1)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from sceneprint.index import Generation, Tail, newest, search, sketches
 from sceneprint.index.generation_files import draw
@@ -37,6 +38,11 @@ def sketches_of(generation: Generation | None) -> Sketches:
     return found
 
 
+def codes_of(own: Sketches) -> NDArray[np.uint8]:
+    """The bits of all rows, packed."""
+    return np.stack([own.index.reconstruct(row) for row in range(len(own))])
+
+
 def differing_bits(query: Bytes, vectors: Bytes, means: Bytes) -> list[int]:
     """The oracle: bits in which sketches differ, one by one."""
     return [int(((row > means) != (query > means)).sum()) for row in vectors]
@@ -60,9 +66,8 @@ def test_a_map_that_is_large_has_sketches(
         own = sketches_of(generation)
         assert (len(own), own.probes) == (3000, generation.manifest.recall.probes)
         np.testing.assert_array_equal(own.means, signatures.mean(axis=0).astype(np.uint8))
-        bits, rows = own.differing(query, None)
-        assert bits.tolist() == differing_bits(query, signatures, own.means)
-        assert rows.tolist() == np.bincount(bits, minlength=LENGTH + 1).tolist()
+        bits = differing_bits(query, signatures, own.means)
+        assert [bits[row] for row in own.nearest(query, 400)] == sorted(bits)[:400]
         hits = search_l2(query, generation, EMPTY, 10)
         assert not hits.exact
         assert LEAST_SELECTED <= hits.compared < 1500
@@ -83,7 +88,7 @@ def test_nothing_of_a_deleted_frame_is_in_sketches(walk: Walk, published: Publis
     after = published(*none, previous=after, flat_bytes=0, clean=True)
     left, alone = sketches_of(after), make_sketches(np.delete(signatures, 7, axis=0))
     np.testing.assert_array_equal(left.means, alone.means)
-    np.testing.assert_array_equal(left.words, alone.words)
+    np.testing.assert_array_equal(codes_of(left), codes_of(alone))
     assert (left.means < sketches_of(made).means).any()
 
 
@@ -159,29 +164,29 @@ def test_sketches_by_hand() -> None:
     vectors = np.array([[0, 0, 9], [9, 9, 9], [0, 8, 0], [9, 9, 0]], np.uint8)
     own = make_sketches(vectors)
     assert own.means.tolist() == [4, 6, 4]
-    assert own.words.tolist() == [[0b100], [0b111], [0b010], [0b011]]
+    assert codes_of(own).tolist() == [[0b100], [0b111], [0b010], [0b011]]
     own = replace(own, probes=1)
-    query = np.array([5, 9, 4], np.uint8)  # 0b011
-    bits, rows = own.differing(query, None)
-    assert (bits.tolist(), rows.tolist()) == ([3, 1, 1, 0], [1, 2, 0, 1])
+    query = np.array([5, 9, 4], np.uint8)  # 0b011: 3, 1, 1 and 0 bits are others
+    assert own.nearest(query, 4).tolist()[::3] == [3, 0]
     assert own.candidates(query, 0, None).tolist() == [3]
-    assert replace(own, probes=2).candidates(query, 0, None).tolist() == [1, 2, 3]
+    assert replace(own, probes=3).candidates(query, 0, None).tolist() == [1, 2, 3]
     assert own.candidates(query, 1, None).tolist() == [0, 1, 2, 3]  # four times as many
     free = np.array([True, True, False, False])
-    bits, rows = own.differing(query, free)
-    assert (bits.tolist(), rows.tolist()) == ([3, 1, 4, 4], [0, 1, 0, 1])
     assert own.candidates(query, 0, free).tolist() == [1]
     assert own.candidates(query, 9, free).tolist() == [0, 1]
+    assert own.candidates(query, 9, ~free & False).tolist() == []
 
 
 @pytest.mark.parametrize("length", [1, 63, 64, 65, 448])
-def test_bits_are_counted_whatever_the_length(length: int) -> None:
+def test_bits_are_compared_whatever_the_length(length: int) -> None:
     rows = np.random.default_rng(length).integers(0, 256, (300, length), np.uint8)
-    own = make_sketches(rows)
-    assert own.words.shape == (300, -(-length // 64))
-    bits, counts = own.differing(rows[5], None)
-    assert bits.tolist() == differing_bits(rows[5], rows, own.means)
-    assert counts.tolist() == np.bincount(bits, minlength=length + 1).tolist()
+    own, free = make_sketches(rows), np.arange(300) % 3 > 0
+    assert codes_of(own).shape == (300, -(-length // 8))
+    bits = differing_bits(rows[5], rows, own.means)
+    assert [bits[row] for row in own.nearest(rows[5], 300)] == sorted(bits)
+    some = own.nearest(rows[5], 100, free)
+    assert free[some].all()
+    assert [bits[row] for row in some] == sorted(np.array(bits)[free].tolist())[:100]
 
 
 def test_means_are_of_a_sample_and_blocks_make_no_difference(
@@ -190,7 +195,7 @@ def test_means_are_of_a_sample_and_blocks_make_no_difference(
     signatures = walk(500, LENGTH)
     whole = make_sketches(signatures)
     monkeypatch.setattr(sketches, "BLOCK_BYTES", 7 * LENGTH)
-    np.testing.assert_array_equal(make_sketches(signatures.copy()).words, whole.words)
+    np.testing.assert_array_equal(codes_of(make_sketches(signatures.copy())), codes_of(whole))
     monkeypatch.setattr(sketches, "MEASURED", 90)
     means = signatures[draw(500, 90, 0)].mean(axis=0).astype(np.uint8)
     np.testing.assert_array_equal(make_sketches(signatures).means, means)
