@@ -130,7 +130,7 @@ def views(client: httpx.Client, made: list[Shot]) -> list[View]:
     key = client.post("/v1/keys", json=few).raise_for_status().json()["secret"]
     both = {"sessions": ["room-0/ann", "room-0/bob"]}
     found = client.post(f"/v1/maps/{MAP}/associations", json=both).raise_for_status().json()
-    _done(client, found["association_id"])
+    _done(client, found["job_id"])
     for name in (MAP, HALL, SIDES):
         fuse(client, name)
     for name in (MAP, SIDES):
@@ -161,7 +161,7 @@ def _listed(client: httpx.Client, name: str, state: str | None = None) -> list[d
 def _measure_coverage(client: httpx.Client, name: str) -> None:
     asked = {"not_within_s": 0}
     told = client.post(f"/v1/maps/{name}/coverage", json=asked).raise_for_status().json()
-    _done(client, told["coverage_id"])
+    _done(client, told["job_id"])
 
 
 def _done(client: httpx.Client, job: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from typing import Any, BinaryIO, TypeVar
 
 from fastapi import Request, Response
@@ -11,7 +12,8 @@ from fastapi.responses import StreamingResponse
 from starlette.background import BackgroundTask
 
 from sceneprint.engine.maps.map_frames import Output
-from sceneprint.errors import InvalidRequest
+from sceneprint.errors import DamagedBlob, InvalidRequest
+from sceneprint.store.queue import JobFile
 from service.auth import Context
 from service.problems import declared, problem
 
@@ -194,6 +196,30 @@ def send_file(
         _chunks(file, first, last), 206 if partial else 200, headers, media_type,
         background=BackgroundTask(file.close),
     )  # fmt: skip
+
+
+def send_product_file(
+    request: Request, here: Context, find: Callable[[], JobFile], name: str
+) -> Response:
+    """Return a file that a job has made, or the range that the request names; see `send_file`.
+
+    Parameters
+    ----------
+    find : returns the file; raises UnknownJob where the job was deleted
+    name : what to call the file when it is saved
+
+    Raises
+    ------
+    DamagedBlob : its bytes are lost.
+    """
+    file, blobs = find(), here.engine.store.blobs
+    if is_known(request, file.blob) or blobs.condition(file.blob) == "sound":
+        with suppress(FileNotFoundError):
+            return send_file(
+                request, lambda: blobs.open(file.blob), file.media_type, file.blob, name
+            )
+    find()  # the job may have been deleted meanwhile
+    raise DamagedBlob(f"{file.name} of the job is damaged. Delete its result, and begin it again.")
 
 
 def _wanted(request: Request, tag: str, size: int) -> tuple[int, int]:

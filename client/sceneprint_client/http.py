@@ -40,7 +40,7 @@ from sceneprint_client.api import (
     Stage,
     ValidationOptions,
 )
-from sceneprint_client.api.admin import Event
+from sceneprint_client.api.admin import Event, Product
 from sceneprint_client.api.base import checked, is_loopback
 from sceneprint_client.errors import (
     NotFound,
@@ -152,19 +152,9 @@ def job_path(job_id: str) -> str:
     return f"/v1/jobs/{_part(job_id, 'job', UnknownJob)}"
 
 
-def association_path(map_name: str, association_id: str) -> str:
-    """Path of an association; UnknownMap or UnknownJob as `map_path`."""
-    return f"{map_path(map_name)}/associations/{_part(association_id, 'association', UnknownJob)}"
-
-
-def coverage_path(map_name: str, coverage_id: str) -> str:
-    """Path of a coverage job; UnknownMap or UnknownJob as `map_path`."""
-    return f"{map_path(map_name)}/coverage/{_part(coverage_id, 'coverage', UnknownJob)}"
-
-
-def difference_path(map_name: str, difference_id: str) -> str:
-    """Path of a difference; UnknownMap or UnknownJob as `map_path`."""
-    return f"{map_path(map_name)}/differences/{_part(difference_id, 'difference', UnknownJob)}"
+def product_path(kind: type[Product], map_name: str, job_id: str) -> str:
+    """Path of a product; UnknownMap or UnknownJob as `map_path`."""
+    return f"{map_path(map_name)}/{kind.collection}/{_part(job_id, kind.noun, UnknownJob)}"
 
 
 def surface_path(map_name: str) -> str:

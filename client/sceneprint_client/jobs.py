@@ -20,7 +20,7 @@ from sceneprint_client.api import (
     Progress,
     ValidationOptions,
 )
-from sceneprint_client.api.admin import RetriedJobs
+from sceneprint_client.api.admin import Product, RetriedJobs
 from sceneprint_client.api.base import checked
 from sceneprint_client.api.coverage import (
     CoverageChanges,
@@ -42,14 +42,12 @@ from sceneprint_client.api.surface import NewReconstruction, Reconstruction
 from sceneprint_client.errors import InvalidRequest, UnreadableArchive, UnreadableCloud
 from sceneprint_client.http import (
     ServiceConnection,
-    association_path,
-    coverage_path,
-    difference_path,
     error_of,
     given,
     growing_pauses,
     job_path,
     map_path,
+    product_path,
     query_path,
     read_record,
     reconstruction_path,
@@ -60,7 +58,8 @@ if TYPE_CHECKING:
 
 
 #: A record of what a job does, with its `state`.
-_Begun = TypeVar("_Begun", Association, MapCoverage, Difference, Reconstruction)
+_Begun = TypeVar("_Begun", bound=Product | Reconstruction)
+_Product = TypeVar("_Product", bound=Product)
 #: Jobs that are looked at in one round; workers take them in about this order.
 _WINDOW = 8
 #: Bytes of an archive that are sent at once.
@@ -277,6 +276,53 @@ class JobMethods(ServiceConnection):
             raise error_of(response)
         return read_record(Job, response)
 
+    # products of maps: coverage, associations and differences of sessions
+
+    def product(self, kind: type[_Product], map_name: str, job_id: str) -> _Product:
+        """A product of a map as it is now; UnknownMap or UnknownJob if it does not exist.
+
+        Parameters
+        ----------
+        kind : MapCoverage, Association or Difference
+        map_name, job_id : of the product
+        """
+        return self._ask(kind, "GET", product_path(kind, map_name, job_id))
+
+    def products(self, kind: type[_Product], map_name: str) -> Iterator[_Product]:
+        """Products of a map, newest first, coverage without plans; UnknownMap if it does not exist.
+
+        Parameters
+        ----------
+        kind, map_name : see `product`
+        """
+        page: type[Page[_Product]] = Page[kind]  # type: ignore[valid-type]
+        return self._items(page, f"{map_path(map_name)}/{kind.collection}")
+
+    def delete_product(self, kind: type[Product], map_name: str, job_id: str) -> None:
+        """Delete a product with its results, also while a worker computes it; see `product`.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : it does not exist.
+        JoinStands : it is an association, whose join must be undone first.
+        """
+        self._delete(product_path(kind, map_name, job_id))
+
+    def wait_for_product(
+        self, product: _Product, *, timeout_s: float = 3600.0,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> _Product:  # fmt: skip
+        """A product once it has ended, or when the time ran out.
+
+        Parameters
+        ----------
+        product : as it is known
+        timeout_s : seconds to wait
+        progress : called with the number of finished steps and the total
+        """
+        kind, of = type(product), (product.map, product.job_id)
+        return self._until_over(product, lambda: self.product(kind, *of), timeout_s, progress)
+
     # associations
 
     def associate(
@@ -324,23 +370,9 @@ class JobMethods(ServiceConnection):
             seed=seed, min_overlap=min_overlap, join=join, **fields,
         )  # fmt: skip
         begun = self._begin(Association, f"{map_path(map_name)}/associations", wanted)
-        return self.wait_for_association(begun, timeout_s=timeout_s, progress=progress)
+        return self.wait_for_product(begun, timeout_s=timeout_s, progress=progress)
 
-    def wait_for_association(
-        self, association: Association, *, timeout_s: float = 3600.0,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> Association:  # fmt: skip
-        """An association once it has ended, or when the time ran out; see `associate`."""
-        return self._until_over(
-            association, lambda: self.association(association.map, association.association_id),
-            timeout_s, progress,
-        )  # fmt: skip
-
-    def association(self, map_name: str, association_id: str) -> Association:
-        """An association; UnknownMap or UnknownJob if it does not exist."""
-        return self._ask(Association, "GET", association_path(map_name, association_id))
-
-    def undo_join(self, map_name: str, association_id: str) -> Association:
+    def undo_join(self, map_name: str, job_id: str) -> Association:
         """Undo the join of an association: poses are again as they were sent, or in the parent
         frame that other joins lead to. The map's sessions are not joined again automatically.
 
@@ -349,28 +381,18 @@ class JobMethods(ServiceConnection):
         UnknownMap, UnknownJob : it does not exist.
         NotIndexed : it has not succeeded.
         """
-        path = f"{association_path(map_name, association_id)}/join"
+        path = f"{product_path(Association, map_name, job_id)}/join"
         return self._ask(Association, "DELETE", path)
 
-    def delete_association(self, map_name: str, association_id: str) -> None:
-        """Delete an association with its edges; UnknownMap or UnknownJob if it does not exist, and
-        JoinStands if its join must be undone first.
-        """
-        self._delete(association_path(map_name, association_id))
-
-    def associations(self, map_name: str) -> Iterator[Association]:
-        """Associations of a map, newest first; UnknownMap if it does not exist."""
-        return self._items(Page[Association], f"{map_path(map_name)}/associations")
-
     def edges(
-        self, map_name: str, association_id: str, *, min_overlap: float = 0.0,
+        self, map_name: str, job_id: str, *, min_overlap: float = 0.0,
         consistent: bool | None = None,
     ) -> Iterator[Edge]:  # fmt: skip
         """Edges of an association in the order they were found.
 
         Parameters
         ----------
-        map_name, association_id : of the association
+        map_name, job_id : of the association
         min_overlap : least overlap
         consistent : only edges that a second edge or a join supports (True), or that were outvoted
             (False); default: all
@@ -382,19 +404,19 @@ class JobMethods(ServiceConnection):
         """
         _check_overlap(min_overlap)
         return self._items(
-            Page[Edge], f"{association_path(map_name, association_id)}/edges",
+            Page[Edge], f"{product_path(Association, map_name, job_id)}/edges",
             min_overlap=min_overlap, consistent=consistent,
         )  # fmt: skip
 
     def graph(
-        self, map_name: str, association_id: str, kind: GraphFormat = "g2o", *,
+        self, map_name: str, job_id: str, kind: GraphFormat = "g2o", *,
         min_overlap: float = 0.0, odometry: bool = False, consistent: bool = True,
     ) -> str:  # fmt: skip
         """The pose graph of an association that has succeeded, as a file.
 
         Parameters
         ----------
-        map_name, association_id : of the association
+        map_name, job_id : of the association
         kind : g2o, tum or json
         min_overlap : least overlap of an edge
         odometry : add an edge between consecutive frames, from their poses
@@ -418,7 +440,7 @@ class JobMethods(ServiceConnection):
             "format": kind, "min_overlap": min_overlap, "odometry": odometry,
             "consistent": consistent,
         }  # fmt: skip
-        path = f"{association_path(map_name, association_id)}/graph"
+        path = f"{product_path(Association, map_name, job_id)}/graph"
         return self._bytes(path, params=asked).decode()
 
     # coverage
@@ -464,30 +486,12 @@ class JobMethods(ServiceConnection):
         )  # fmt: skip
         if like is not None:
             width = None if like.result is None else like.result.cell_m
-            wanted = like.asked.model_copy(update=given(cell_m=width))
+            wanted = like.request.model_copy(update=given(cell_m=width))
         begun = self._begin(MapCoverage, f"{map_path(map_name)}/coverage", wanted)
-        return self.wait_for_coverage(begun, timeout_s=timeout_s, progress=progress)
-
-    def wait_for_coverage(
-        self, coverage: MapCoverage, *, timeout_s: float = 3600.0,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> MapCoverage:  # fmt: skip
-        """A coverage job once it has ended, or when the time ran out; see `coverage`."""
-        return self._until_over(
-            coverage, lambda: self.coverage_result(coverage.map, coverage.coverage_id), timeout_s,
-            progress,
-        )  # fmt: skip
-
-    def coverage_result(self, map_name: str, coverage_id: str) -> MapCoverage:
-        """A coverage job as it is now; UnknownMap or UnknownJob if it does not exist."""
-        return self._ask(MapCoverage, "GET", coverage_path(map_name, coverage_id))
-
-    def coverage_jobs(self, map_name: str) -> Iterator[MapCoverage]:
-        """Coverage jobs of a map without plans, newest first; UnknownMap if it does not exist."""
-        return self._items(Page[MapCoverage], f"{map_path(map_name)}/coverage")
+        return self.wait_for_product(begun, timeout_s=timeout_s, progress=progress)
 
     def coverage_frames(
-        self, map_name: str, coverage_id: str, outcome: CoverageOutcome | None = None
+        self, map_name: str, job_id: str, outcome: CoverageOutcome | None = None
     ) -> Iterator[CoverageFrame]:
         """Queried frames of a coverage job, optionally only those with one outcome.
 
@@ -495,10 +499,10 @@ class JobMethods(ServiceConnection):
         ------
         UnknownMap, UnknownJob : it does not exist.
         """
-        path = f"{coverage_path(map_name, coverage_id)}/frames"
+        path = f"{product_path(MapCoverage, map_name, job_id)}/frames"
         return self._items(Page[CoverageFrame], path, outcome=outcome)
 
-    def coverage_changes(self, map_name: str, coverage_id: str, since: str) -> CoverageChanges:
+    def coverage_changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
         """Which cells became better or worse since an earlier result with the same options.
 
         Raises
@@ -507,12 +511,8 @@ class JobMethods(ServiceConnection):
         NotIndexed : one of them has not ended, or did not succeed.
         InvalidRequest : they cannot be compared.
         """
-        path = f"{coverage_path(map_name, coverage_id)}/changes"
+        path = f"{product_path(MapCoverage, map_name, job_id)}/changes"
         return self._ask(CoverageChanges, "GET", path, params={"since": since})
-
-    def delete_coverage(self, map_name: str, coverage_id: str) -> None:
-        """Delete a coverage job with its result; UnknownMap or UnknownJob if it does not exist."""
-        self._delete(coverage_path(map_name, coverage_id))
 
     # differences of sessions
 
@@ -545,19 +545,9 @@ class JobMethods(ServiceConnection):
             **given(parent_frame=parent_frame),
         )  # fmt: skip
         begun = self._begin(Difference, f"{map_path(map_name)}/differences", wanted)
-        return self._until_over(
-            begun, lambda: self.difference(map_name, begun.difference_id), timeout_s, progress
-        )
+        return self.wait_for_product(begun, timeout_s=timeout_s, progress=progress)
 
-    def difference(self, map_name: str, difference_id: str) -> Difference:
-        """A difference as it is now; UnknownMap or UnknownJob if it does not exist."""
-        return self._ask(Difference, "GET", difference_path(map_name, difference_id))
-
-    def differences(self, map_name: str) -> Iterator[Difference]:
-        """Differences of a map, newest first; UnknownMap if it does not exist."""
-        return self._items(Page[Difference], f"{map_path(map_name)}/differences")
-
-    def difference_points(self, map_name: str, difference_id: str) -> SurfacePoints:
+    def difference_points(self, map_name: str, job_id: str) -> SurfacePoints:
         """Cells of both sessions as points. `patches` gives the kind of each: SAME, GONE, NEW,
         UNSEEN_AFTER or UNSEEN_BEFORE of `sceneprint_client.api.sessions`.
 
@@ -569,11 +559,7 @@ class JobMethods(ServiceConnection):
         """
         from sceneprint_client.surface_encoding import decode_points  # loads numpy
 
-        return decode_points(self._bytes(f"{difference_path(map_name, difference_id)}/points"))
-
-    def delete_difference(self, map_name: str, difference_id: str) -> None:
-        """Delete a difference with its points; UnknownMap or UnknownJob if it does not exist."""
-        self._delete(difference_path(map_name, difference_id))
+        return decode_points(self._bytes(f"{product_path(Difference, map_name, job_id)}/points"))
 
     # reconstructions
 

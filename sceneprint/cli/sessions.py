@@ -290,7 +290,7 @@ def run_associate(options: argparse.Namespace) -> int:
             join=options.join, progress=progress,
         )  # fmt: skip
         if kind is not None and told.state is JobState.SUCCEEDED:
-            graph = client.graph(options.map, told.association_id, kind, odometry=options.odometry)
+            graph = client.graph(options.map, told.job_id, kind, odometry=options.odometry)
             write_whole(options.out, graph.encode())
         if scene is not None and told.state is JobState.SUCCEEDED:
             scene.add_association(told, "\n".join(association_lines(told)))
@@ -302,7 +302,7 @@ def run_associate(options: argparse.Namespace) -> int:
 
 def association_lines(told: Association) -> list[str]:
     """An association for people: what was found, and whether the sessions are joined."""
-    name = f"association {told.association_id}"
+    name = f"association {told.job_id}"
     if told.result is None:
         why = "" if told.error is None else f": {one_line(told.error)}"
         return [f"{name} is {told.state}{why}"]
@@ -313,7 +313,7 @@ def association_lines(told: Association) -> list[str]:
         "unsupported",
     ]
     lines += [line for one in r.joins for line in _join(one)]
-    if len(told.asked.sessions) == 2 and not r.joins:
+    if len(told.request.sessions) == 2 and not r.joins:
         lines.append("not joined: no edge connects frames with poses")
     return lines
 

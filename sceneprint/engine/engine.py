@@ -22,13 +22,16 @@ from sceneprint.engine.jobs.lifecycle import Work, put_back
 from sceneprint.engine.jobs.tasks import LongJob, Tasks
 from sceneprint.engine.maps import map_lifecycle
 from sceneprint.engine.maps.map_copy import MapCopies
-from sceneprint.engine.maps.map_coverage import COVERAGE, CoverageHandler, CoverageJobs
 from sceneprint.engine.maps.map_frames import FrameFiles, list_frames
 from sceneprint.engine.maps.map_lifecycle import Reencodings
 from sceneprint.engine.maps.map_surface import MapSurfaces, SurfaceUpkeep
 from sceneprint.engine.maps.surface_job import SURFACE, SurfaceHandler
 from sceneprint.engine.maps.tombstones import Tombstones
-from sceneprint.engine.reconstruction import ReconstructionJobs
+from sceneprint.engine.products.associations import Associations
+from sceneprint.engine.products.join_upkeep import JoinUpkeep
+from sceneprint.engine.products.map_coverage import Coverages
+from sceneprint.engine.products.reconstruction import ReconstructionJobs
+from sceneprint.engine.products.session_differences import Differences
 from sceneprint.engine.results.query_entry import SentQuery
 from sceneprint.engine.results.query_log import QueryLog
 from sceneprint.engine.results.result_views import Inspection, PointClouds
@@ -37,14 +40,6 @@ from sceneprint.engine.search.query import Queries
 from sceneprint.engine.search.retrieval import Readers
 from sceneprint.engine.search.shared_index import open_shared
 from sceneprint.engine.serializers import frame_records, map_record
-from sceneprint.engine.sessions.association_job import Associating
-from sceneprint.engine.sessions.associations import ASSOCIATE, AssociationJobs
-from sceneprint.engine.sessions.join_upkeep import JoinUpkeep
-from sceneprint.engine.sessions.session_differences import (
-    DIFFERENCE,
-    DifferenceHandler,
-    DifferenceJobs,
-)
 from sceneprint.engine.signers import Signers, warm
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
@@ -130,12 +125,9 @@ class Engine:
             self.store, self.signers, self.uploads, self.queries, 0.75 * settings.job_s
         )
         self.tasks.register(MAP_KIND, map_importer)
-        self.associations = AssociationJobs(self.store, self.tasks)
-        self.tasks.register(ASSOCIATE, Associating(self.store, self.signers, self._readers))
-        self.coverage = CoverageJobs(self.store, self.tasks)
-        self.tasks.register(COVERAGE, CoverageHandler(self.store, self.signers, self.queries))
-        self.differences = DifferenceJobs(self.store, self.tasks)
-        self.tasks.register(DIFFERENCE, DifferenceHandler(self.store, self.signers))
+        self.associations = Associations(self.store, self.tasks, self.signers, self._readers)
+        self.coverage = Coverages(self.store, self.tasks, self.signers, self.queries)
+        self.differences = Differences(self.store, self.tasks, self.signers)
         self.surfaces = MapSurfaces(self.store, self.bell)
         self.tasks.register(SURFACE, SurfaceHandler(self.store, self.signers))
         self._surface_upkeep = SurfaceUpkeep(

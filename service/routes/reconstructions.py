@@ -6,7 +6,7 @@ from contextlib import suppress
 
 from fastapi import Request, Response
 
-from sceneprint.engine.reconstruction import MEDIA_TYPE, MESH
+from sceneprint.engine.products.reconstruction import MEDIA_TYPE, MESH
 from sceneprint.engine.results.query_entry import StoredAnswer, unknown_query
 from sceneprint.errors import DamagedBlob
 from sceneprint.store.queue import unknown_job

@@ -1,4 +1,4 @@
-"""Associations by client, raw HTTP and command."""
+"""Associations by client, raw HTTP and command: edges, graphs, joins."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import httpx
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
-from sceneprint.errors import InvalidRequest, UnknownJob, UnknownMap
+from sceneprint.errors import InvalidRequest, UnknownMap
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
+from sceneprint_client.api.sessions import Association
 
 MAP = "associated"
 
@@ -44,8 +44,7 @@ def test_edges_and_graphs(associated: Filled) -> None:
     client, steps = associated.client, []
     found = client.associate(MAP, "a", "b", k=2, seed=3, progress=lambda *n: steps.append(n))
     assert found.state is JobState.SUCCEEDED
-    name = found.association_id
-    assert client.association(MAP, name) == found
+    name = found.job_id
     edges = list(client.edges(MAP, name))
     assert found.result is not None
     assert found.result.edges == len(edges) > 4
@@ -60,17 +59,12 @@ def test_edges_and_graphs(associated: Filled) -> None:
     assert len([row for row in rows if row[0] != "#"]) == 6
 
 
-def test_list_remove_and_refusals(associated: Filled) -> None:
+def test_refusals(associated: Filled) -> None:
     client = associated.client
-    before = [one.association_id for one in client.associations(MAP)]
-    begun = client.associate(MAP, "a", apart=2, timeout_s=0)
-    assert [one.association_id for one in client.associations(MAP)] == [
-        begun.association_id, *before,
-    ]  # fmt: skip
-    done = client.wait_for_association(begun, timeout_s=PATIENCE_S)
-    assert done.result is not None
-    assert done.result.frames == 3
-    of = MAP, begun.association_id
+    found = client.associate(MAP, "a", apart=2)
+    assert found.result is not None
+    assert found.result.frames == 3
+    of = MAP, found.job_id
     for ask, field in (
         (lambda: client.graph(*of, "gtsam"), "format"),  # type: ignore[arg-type]
         (lambda: client.graph(*of, min_overlap=2.0), "min_overlap"),
@@ -79,11 +73,6 @@ def test_list_remove_and_refusals(associated: Filled) -> None:
         with pytest.raises(InvalidRequest) as caught:
             ask()
         assert [name for name, _ in caught.value.fields] == [field]
-    client.delete_association(MAP, begun.association_id)
-    assert [one.association_id for one in client.associations(MAP)] == before
-    for name in (begun.association_id, "../jobs"):
-        with pytest.raises(UnknownJob):
-            client.association(MAP, name)
     with pytest.raises(UnknownMap):
         client.associate("nowhere", "a")
     with pytest.raises(InvalidRequest):
@@ -92,49 +81,24 @@ def test_list_remove_and_refusals(associated: Filled) -> None:
         client.associate(MAP, "a", "a")
 
 
-def test_over_http(associated: Filled, service_url: str) -> None:
+def test_graphs_and_edges_over_http(associated: Filled) -> None:
     client = associated.client
-    root = f"/v1/maps/{MAP}/associations"
-    with httpx.Client(base_url=service_url, trust_env=False, timeout=PATIENCE_S) as http:
-        answer = http.post(root, json={"sessions": ["a", "b"]})
-        assert answer.status_code == 202
-        begun = client.wait_for_association(
-            client.association(MAP, answer.json()["association_id"]), timeout_s=PATIENCE_S
-        )
-        place = answer.headers["Location"]
-        assert place == f"{root}/{begun.association_id}"
-        assert http.get(place).json()["state"] == "succeeded"
-        assert http.get(f"/v1/jobs/{begun.association_id}").json()["kind"] == "associate"
-        for kind, media in (
-            ("g2o", "text/x-g2o"), ("tum", "text/plain; charset=utf-8"),
-            ("json", "application/json"),
-        ):  # fmt: skip
-            by_name = http.get(f"{place}/graph", params={"format": kind})
-            by_type = http.get(f"{place}/graph", headers={"Accept": media.partition(";")[0]})
-            assert by_name.headers["Content-Type"].partition(";")[0] == media.partition(";")[0]
-            assert by_name.content == by_type.content
-            assert by_name.text == client.graph(MAP, begun.association_id, kind)  # type: ignore[arg-type]
-        page = http.get(f"{place}/edges", params={"limit": 3, "consistent": "true"}).json()
-        assert [edge["number"] for edge in page["items"]] == [0, 1, 2]
-        rest = http.get(f"{place}/edges", params={"cursor": page["next_cursor"]}).json()
-        assert rest["items"][0]["number"] == 3
-        for status, method, path, more in (
-            (404, "GET", f"{root}/{'0' * 32}", {}),
-            (404, "GET", f"/v1/maps/nowhere/associations/{begun.association_id}", {}),
-            (404, "DELETE", f"{root}/nothing", {}),
-            (422, "GET", f"{place}/edges", {"params": {"min_overlap": 2}}),
-            (422, "GET", f"{place}/graph", {"params": {"format": "gtsam"}}),
-            (422, "POST", root, {"json": {"sessions": ["a", "b", "c"]}}),
-            (422, "POST", root, {"json": []}),
-            (422, "POST", root, {"json": {"sessions": ["nobody"]}}),
-            (415, "POST", root, {"content": b"sessions=a"}),
-            (400, "POST", root, {"content": b"{", "headers": {"Content-Type": "application/json"}}),
-        ):
-            refused = http.request(method, path, **more)
-            assert refused.status_code == status, (method, path)
-            assert refused.headers["Content-Type"] == "application/problem+json"
-        assert http.delete(place).status_code == 204
-        assert http.get(f"{place}/edges").status_code == 404
+    found, http = client.associate(MAP, "a", "b"), client._http
+    place = f"/v1/maps/{MAP}/associations/{found.job_id}"
+    for kind, media in (
+        ("g2o", "text/x-g2o"), ("tum", "text/plain; charset=utf-8"), ("json", "application/json"),
+    ):  # fmt: skip
+        by_name = http.get(f"{place}/graph", params={"format": kind})
+        by_type = http.get(f"{place}/graph", headers={"Accept": media.partition(";")[0]})
+        assert by_name.headers["Content-Type"].partition(";")[0] == media.partition(";")[0]
+        assert by_name.content == by_type.content
+        assert by_name.text == client.graph(MAP, found.job_id, kind)  # type: ignore[arg-type]
+    page = http.get(f"{place}/edges", params={"limit": 3, "consistent": "true"}).json()
+    assert [edge["number"] for edge in page["items"]] == [0, 1, 2]
+    rest = http.get(f"{place}/edges", params={"cursor": page["next_cursor"]}).json()
+    assert rest["items"][0]["number"] == 3
+    for path, more in (("edges", {"min_overlap": 2}), ("graph", {"format": "gtsam"})):
+        assert http.get(f"{place}/{path}", params=more).status_code == 422
 
 
 def test_the_command(
@@ -145,28 +109,28 @@ def test_the_command(
     of = ["associate", MAP, "--url", service_url, "--session", "a"]
     assert main([*of, "--session", "b", "--out", str(out), "--odometry"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    newest = next(iter(client.associations(MAP)))
+    newest = next(iter(client.products(Association, MAP)))
     assert newest.result is not None
-    assert lines[0].startswith(f"association {newest.association_id}: {newest.result.edges} edges")
+    assert lines[0].startswith(f"association {newest.job_id}: {newest.result.edges} edges")
     assert lines[2].startswith("joined surely, ann/a onto ann/b: ") or lines[2].startswith(
         "joined weakly (check it before you rely on it)"
     )
     assert lines[-1] == f"wrote {out}"
-    assert out.read_text() == client.graph(MAP, newest.association_id, odometry=True)
+    assert out.read_text() == client.graph(MAP, newest.job_id, odometry=True)
     undo = ["associate", MAP, "--url", service_url, "--undo"]
-    assert main([*undo, newest.association_id]) == 0
+    assert main([*undo, newest.job_id]) == 0
     assert capsys.readouterr().out.splitlines() == lines[:-1]  # it moved no pose
     assert main([*undo, "0" * 32]) == 2
     assert "There is no association" in capsys.readouterr().err
     assert main([*of, "--apart", "2", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["asked"]["apart"] == 2
+    assert told["request"]["apart"] == 2
     assert told["result"]["joins"] == []
     assert main([*of, "--out", str(tmp_path / "graph.gtsam")]) == 2
     assert "has no known file type" in capsys.readouterr().err
-    begun = len(list(client.associations(MAP)))
+    begun = len(list(client.products(Association, MAP)))
     assert main([*of, "--out", str(tmp_path / "no" / "graph.g2o")]) == 2  # before it is begun
     assert "No such file or directory" in capsys.readouterr().err
-    assert len(list(client.associations(MAP))) == begun
+    assert len(list(client.products(Association, MAP))) == begun
     assert main([*of, "--session", "nobody"]) == 2
     assert "no indexed frame" in capsys.readouterr().err

@@ -29,6 +29,7 @@ from sceneprint.settings import Settings
 from sceneprint_client import Client
 from sceneprint_client.api import FrameState
 from sceneprint_client.api.admin import Scope
+from sceneprint_client.api.coverage import MapCoverage
 
 ID = "0" * 32
 KEYS: dict[str, dict[str, Scope]] = {
@@ -72,7 +73,7 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Cl
 #: Arguments of every call by their names in its signature.
 GIVEN: dict[str, Any] = {
     "map_name": "hall", "name": "hall", "frame_id": ID, "job_id": ID, "query_id": ID,
-    "association_id": ID, "coverage_id": ID, "difference_id": ID, "before": "s", "after": "t",
+    "before": "s", "after": "t", "kind": MapCoverage,
     "since": ID, "session": "s",
     "changes": {"title": "x"},
     "model": "depth", "grants": {"*": "read"}, "query": ID, "job_ids": [ID],
@@ -93,11 +94,11 @@ def test_no_call_gets_by_without_a_key(
     own = GIVEN | {
         "frame": references[0], "frames": [references[0]], "archive": archive,
         "file": archive, "path": archive, "target": tmp_path / "target", "into": tmp_path / "into",
-        "association": None, "coverage": None, "deletion_id": "0",
+        "deletion_id": "0",
     }  # fmt: skip
     asked = []
     for name, method in inspect.getmembers(Client, inspect.isfunction):
-        if name.startswith("_") or name in OPEN | {"wait_for_association", "wait_for_coverage"}:
+        if name.startswith("_") or name in OPEN | {"wait_for_product"}:
             continue
         needed = {
             one.name: own[one.name]

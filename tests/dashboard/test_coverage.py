@@ -37,7 +37,7 @@ def measured(
     """The result of a job that was begun on the page, which shows it."""
     del four_sides  # its map is measured
     path = "/v1/maps/four-sides/coverage"
-    known = {one["coverage_id"] for one in station.client.get(path).json()["items"]}
+    known = {one["job_id"] for one in station.client.get(path).json()["items"]}
     page.goto(f"{station.home}#/maps/four-sides/coverage")
     settle(page)
     if not known:
@@ -50,12 +50,10 @@ def measured(
     dialog.get_by_role("button", name="Start").click()
     expect(page.get_by_text("Coverage was measured.")).to_be_visible()
     settle(page)
-    (one,) = (
-        one for one in station.client.get(path).json()["items"] if one["coverage_id"] not in known
-    )
-    assert (one["asked"]["not_within_s"], one["asked"]["cell_m"]) == (0, 0.5)
-    told: dict[str, Any] = station.client.get(f"{path}/{one['coverage_id']}").json()
-    frames = station.client.get(f"{path}/{one['coverage_id']}/frames").json()["items"]
+    (one,) = (one for one in station.client.get(path).json()["items"] if one["job_id"] not in known)
+    assert (one["request"]["not_within_s"], one["request"]["cell_m"]) == (0, 0.5)
+    told: dict[str, Any] = station.client.get(f"{path}/{one['job_id']}").json()
+    frames = station.client.get(f"{path}/{one['job_id']}/frames").json()["items"]
     return {**told, "frames": frames}
 
 
@@ -110,7 +108,7 @@ def test_a_result_is_begun_shown_and_explained(
     page.set_viewport_size({"width": 390, "height": 844})
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     # the numbers are those of the API
-    path = f"/v1/maps/four-sides/coverage/{measured['coverage_id']}"
+    path = f"/v1/maps/four-sides/coverage/{measured['job_id']}"
     with page.expect_download() as waited:
         page.get_by_role("button", name="JSON").click()
     assert Path(waited.value.path()).read_bytes() == station.client.get(path).content
@@ -131,7 +129,7 @@ def test_two_results_are_compared(
     del four_sides  # its map is measured twice, by three of its frames
     path = "/v1/maps/four-sides/coverage"
     before, after = (
-        station.client.post(path, json={"not_within_s": 0, "every": 4}).json()["coverage_id"]
+        station.client.post(path, json={"not_within_s": 0, "every": 4}).json()["job_id"]
         for _ in range(2)
     )
     for one in (before, after):

@@ -51,7 +51,7 @@ def test_sessions_that_share_no_frame_are_joined_on_the_page_where_that_is_sure(
     # one frame of each is no proof
     expect(page.get_by_role("heading", name="These sessions are not joined")).to_be_visible()
     (told,) = station.client.get(f"{path}/associations").json()["items"]
-    assert (told["asked"]["sessions"], told["state"]) == (["tuesday", "monday"], "succeeded")
+    assert (told["request"]["sessions"], told["state"]) == (["tuesday", "monday"], "succeeded")
     assert all(join["root"] is None for join in told["result"]["joins"])
     page.goto(f"{station.home}#/")
     settle(page)

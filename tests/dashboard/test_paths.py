@@ -89,8 +89,8 @@ def test_runs_are_joined_from_here(
     expect(page.locator(".paths-joins li")).to_contain_text(
         f"{join['support']} of {join['votes']} edges agree"
     )
-    expect(page.locator("#paths-association")).to_have_value(one["association_id"])
-    assert f"association={one['association_id']}" in page.url
+    expect(page.locator("#paths-association")).to_have_value(one["job_id"])
+    assert f"association={one['job_id']}" in page.url
 
     # bob's third frame, by the API's own transform, about the first pose that is drawn
     b_from_a = np.array(join["transform"]["matrix"])
@@ -142,7 +142,7 @@ def test_a_join_is_undone_from_here(
     assert station.client.get(path).json()["parent_frames"] == 1
     page.goto(f"{station.home}#/maps/alike/place")
     settle(page)
-    name = station.client.get(job).json()["association_id"]
+    name = station.client.get(job).json()["job_id"]
     page.locator("#paths-association").select_option(name)
     root = station.client.get(job).json()["result"]["joins"][0]["root"]
     expect(page.locator(".paths-joins li")).to_contain_text(f"All poses are in {root} now")
@@ -344,7 +344,7 @@ def test_numbers_behind_the_picture(page: Page, station: Any, settle: Any) -> No
         {"transform": {"matrix": turn.tolist()}, "from_parent": "c", "to_parent": "d",
          "strength": "strong", "support": 9, "undone": True},
     ]  # fmt: skip
-    told = [{"association_id": "x", "result": {"joins": joins}}]
+    told = [{"job_id": "x", "result": {"joins": joins}}]
     reached = run("joined", """[...m.reach("a", m.bridges(given[0]))]
         .map(([name, one]) => [name, one.matrix, one.over.length])""", told)  # fmt: skip
     assert [(name, over) for name, _, over in reached] == [("a", 0), ("b", 1), ("c", 2)]

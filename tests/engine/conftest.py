@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from sqlalchemy import select, update
 
 from sceneprint.engine import Engine
+from sceneprint.engine.jobs.tasks import LongJob
+from sceneprint.engine.products.product import Products
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.formats.dataset import decode_frame, write_depth_png
 from sceneprint.geometry.signature.fisher_vector import Whitening
@@ -193,3 +196,31 @@ def due_now() -> Callable[..., None]:
             connection.execute(update(jobs).where(running).values(leased_until=1.0))
 
     return turn
+
+
+@pytest.fixture(scope="session")
+def each_slice_lost_once(due_now: Callable[[Engine], None]) -> Callable[..., int]:
+    """Do a job of a product, a step a slice, while a worker dies after each; returns how many
+    slices there were.
+    """
+
+    def work(engine: Engine, products: Products[Any, Any], job_id: str) -> int:
+        slices = 0
+        while not products.get("hall", job_id).state.over:
+            lost = engine.claim("dies")
+            assert isinstance(lost, LongJob)
+            first = products.run_slice(lost, lambda: True)
+            due_now(engine)
+            again = engine.claim("lives")
+            assert isinstance(again, LongJob)
+            assert engine.tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
+            second = products.run_slice(again, lambda: True)
+            assert asdict(first) == asdict(second)
+            engine.tasks._keep(again, second)
+            slices += 1
+            progress = products.get("hall", job_id).progress
+            assert progress is not None
+            assert progress.done == min(slices, progress.total or 0)
+        return slices
+
+    return work

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,9 @@ from sqlalchemy import select, update
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import list_jobs
 from sceneprint.engine.jobs.tasks import LongJob
-from sceneprint.engine.sessions import associations
-from sceneprint.engine.sessions.association_job import Associating, finish_association
-from sceneprint.engine.sessions.join_upkeep import JoinUpkeep
+from sceneprint.engine.products import associations
+from sceneprint.engine.products.edge_consensus import finish_association
+from sceneprint.engine.products.join_upkeep import JoinUpkeep
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.settings import Settings
@@ -80,13 +79,13 @@ def done(engine: Engine, work_off: Callable[[Engine], Any], **asked: Any) -> Ass
     begun = engine.associations.begin("hall", NewAssociation.model_validate(asked))
     assert begun.state is JobState.QUEUED
     work_off(engine)
-    return engine.associations.get("hall", begun.association_id)
+    return engine.associations.get("hall", begun.job_id)
 
 
-def stored(engine: Engine, association_id: str) -> list[Any]:
+def stored(engine: Engine, job_id: str) -> list[Any]:
     """Everything that a job found."""
     with engine.store.database.read() as connection:
-        own = select(jobs.c.number).where(jobs.c.id == association_id).scalar_subquery()
+        own = select(jobs.c.number).where(jobs.c.id == job_id).scalar_subquery()
         asked = select(job_items.c.data).where(job_items.c.job_number == own)
         return list(connection.execute(asked.order_by(job_items.c.number)).scalars())
 
@@ -114,7 +113,7 @@ def test_two_robots_maps_are_joined(engine: Engine, work_off: Callable[[Engine],
     assert told_between == ("bob/b", "ann/a")
     # x_b = T_b_room T_room_a x_a
     T, true = np.array(join.transform.matrix), inverse(ORIGINS["bob/b"]) @ ORIGINS["ann/a"]
-    for edge in engine.associations.edges("hall", told.association_id).items:
+    for edge in engine.associations.edges("hall", told.job_id).items:
         here = pose_of(engine, edge.from_frame)
         assert difference(T @ here, true @ here)[0] < 0.02
     assert difference(T, true)[1] < np.radians(0.5)
@@ -130,10 +129,10 @@ def test_parent_frames_are_associated_unasked(
 ) -> None:
     def look(*, auto: bool = True) -> list[NewAssociation]:
         """What a process asks for that looks for the first time."""
-        before = {one.association_id for one in engine.associations.list_all("hall").items}
+        before = {one.job_id for one in engine.associations.list_all("hall").items}
         JoinUpkeep(engine.store, engine.bell, auto=auto).run()
         after = engine.associations.list_all("hall").items
-        return [one.asked for one in after if one.association_id not in before]
+        return [one.request for one in after if one.job_id not in before]
 
     assert look(auto=False) == []
     assert look() == [NewAssociation(sessions=["b", "a"], robots=["bob", "ann"])]
@@ -142,13 +141,13 @@ def test_parent_frames_are_associated_unasked(
     assert look() == []  # the two sessions have not grown
     sides = {"source": [1, 2, 3, 4], "target": [5, 6, 7, 8, 9]}
     with engine.store.database.write() as connection:  # 9 frames, and 12 are a quarter more
-        of_kind = jobs.c.kind == associations.ASSOCIATE
+        of_kind = jobs.c.kind == associations.Associations.kind
         connection.execute(update(jobs).where(of_kind).values(progress=sides))
     (request,) = look()
     assert request.sessions == ["b", "a"]
     # but never again once it was undone, whatever the sessions have become
     work_off(engine)
-    begun = engine.associations.list_all("hall").items[0].association_id
+    begun = engine.associations.list_all("hall").items[0].job_id
     with engine.store.database.write() as connection:
         assert join_parent(connection, 1, ParentJoin("bob/b", "ann/a", np.eye(4)), begun)
     undone = engine.associations.undo_join("hall", begun)
@@ -167,7 +166,7 @@ def pose_of(engine: Engine, frame_id: str) -> Floats:
 
 def test_edges_hold_against_the_truth(engine: Engine, work_off: Callable[[Engine], Any]) -> None:
     told = done(engine, work_off, sessions=["a", "b"], k=2)
-    edges = engine.associations.edges("hall", told.association_id).items
+    edges = engine.associations.edges("hall", told.job_id).items
     assert [edge.number for edge in edges] == list(range(len(edges)))
     assert {edge.from_session for edge in edges} == {"a"}
     for edge in edges:
@@ -186,7 +185,7 @@ def test_edges_hold_against_the_truth(engine: Engine, work_off: Callable[[Engine
 
 
 def test_pages_and_filters_of_edges(engine: Engine, work_off: Callable[[Engine], Any]) -> None:
-    name = done(engine, work_off, sessions=["a", "b"]).association_id
+    name = done(engine, work_off, sessions=["a", "b"]).job_id
     every = engine.associations.edges("hall", name).items
     found, cursor = [], None
     while True:
@@ -209,32 +208,14 @@ def test_pages_and_filters_of_edges(engine: Engine, work_off: Callable[[Engine],
 
 
 def test_a_slice_that_was_lost_is_done_again_with_the_same_edges(
-    engine: Engine, work_off: Callable[[Engine], Any], due_now: Callable[[Engine], None]
+    engine: Engine, work_off: Callable[[Engine], Any], each_slice_lost_once: Callable[..., int]
 ) -> None:
     whole = done(engine, work_off, sessions=["a", "b"])
     begun = engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
-    handler = Associating(engine.store, engine.signers, engine._readers)
-    slices = 0
-    while True:  # a frame a slice, and each is lost once
-        lost = engine.claim("dies")
-        assert isinstance(lost, LongJob)
-        first = handler(lost, lambda: True)
-        due_now(engine)
-        again = engine.claim("lives")
-        assert isinstance(again, LongJob)
-        assert engine.tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
-        second = handler(again, lambda: True)
-        assert asdict(first) == asdict(second)
-        engine.tasks._keep(again, second)
-        slices += 1
-        told = engine.associations.get("hall", begun.association_id)
-        if told.state.over:
-            break
-        assert told.progress is not None
-        assert told.progress.done == slices
-    assert slices == 7  # the last concludes
+    assert each_slice_lost_once(engine, engine.associations, begun.job_id) == 7  # one concludes
+    told = engine.associations.get("hall", begun.job_id)
     assert told.result == whole.result
-    assert stored(engine, told.association_id) == stored(engine, whole.association_id)
+    assert stored(engine, told.job_id) == stored(engine, whole.job_id)
 
 
 def concluded(
@@ -299,7 +280,7 @@ def test_loop_closures_are_with_frames_long_before(
     told = done(engine, work_off, sessions=["a"], apart=2)
     pairs = [
         (order.index(edge.from_frame), order.index(edge.to_frame))
-        for edge in engine.associations.edges("hall", told.association_id).items
+        for edge in engine.associations.edges("hall", told.job_id).items
     ]
     assert pairs
     assert min(i - j for i, j in pairs) == 2
@@ -309,7 +290,7 @@ def test_loop_closures_are_with_frames_long_before(
     timed = done(engine, work_off, sessions=["a"], not_within_s=4.0)
     pairs = [
         (order.index(edge.from_frame), order.index(edge.to_frame))
-        for edge in engine.associations.edges("hall", timed.association_id).items
+        for edge in engine.associations.edges("hall", timed.job_id).items
     ]
     assert min(i - j for i, j in pairs) == 3
     none = done(engine, work_off, sessions=["a"])  # 100 apart, and there are six
@@ -321,7 +302,7 @@ def test_loop_closures_are_with_frames_long_before(
 def test_graphs(
     engine: Engine, work_off: Callable[[Engine], Any], sessions: list[str]
 ) -> None:  # the frame of ann is that of the graph, whichever way the join leads
-    name = done(engine, work_off, sessions=sessions).association_id
+    name = done(engine, work_off, sessions=sessions).job_id
     whole = json.loads(engine.associations.graph("hall", name, "json", odometry=True))
     edges = len(engine.associations.edges("hall", name).items)
     kinds = [edge["kind"] for edge in whole["edges"]]
@@ -350,11 +331,11 @@ def test_graphs(
 
 def test_deleted_frames_vanish(engine: Engine, work_off: Callable[[Engine], Any]) -> None:
     begun = engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
-    handler = Associating(engine.store, engine.signers, engine._readers)
+    handler = engine.associations.run_slice
     task = engine.claim("w")
     assert isinstance(task, LongJob)
     engine.tasks._keep(task, handler(task, lambda: True))
-    name = begun.association_id
+    name = begun.job_id
     before = engine.associations.edges("hall", name).items
     assert before
     assert before[0].consistent is None
@@ -380,8 +361,8 @@ def test_listed_and_removed(engine: Engine, work_off: Callable[[Engine], Any]) -
     first = done(engine, work_off, sessions=["a", "b"], candidates=1, k=1)
     second = engine.associations.begin("hall", NewAssociation(sessions=["b"]))
     listed = engine.associations.list_all("hall")
-    assert [one.association_id for one in listed.items] == [
-        second.association_id, first.association_id,
+    assert [one.job_id for one in listed.items] == [
+        second.job_id, first.job_id,
     ]  # fmt: skip
     page = engine.associations.list_all("hall", limit=1)
     rest = engine.associations.list_all("hall", page.next_cursor)
@@ -389,10 +370,10 @@ def test_listed_and_removed(engine: Engine, work_off: Callable[[Engine], Any]) -
     task = engine.claim("w")
     assert isinstance(task, LongJob)
     for one in (first, second):  # the second while a worker is at it
-        engine.associations.remove("hall", one.association_id)
-        assert stored(engine, one.association_id) == []
+        engine.associations.remove("hall", one.job_id)
+        assert stored(engine, one.job_id) == []
         with pytest.raises(UnknownJob):
-            engine.associations.get("hall", one.association_id)
+            engine.associations.get("hall", one.job_id)
     assert engine.run(task) is None
     assert engine.associations.list_all("hall").items == []
     with pytest.raises(UnknownMap):
@@ -461,7 +442,7 @@ def test_a_map_that_is_deleted_meanwhile_ends_the_job_quietly(engine: Engine) ->
     engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
     task = engine.claim("w")
     assert isinstance(task, LongJob)
-    handler = Associating(engine.store, engine.signers, engine._readers)
+    handler = engine.associations.run_slice
     engine.tasks._keep(task, handler(task, lambda: True))
     task = engine.claim("w")
     assert isinstance(task, LongJob)

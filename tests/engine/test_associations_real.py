@@ -52,7 +52,7 @@ def test_halves_with_unrelated_origins_are_joined(
     asked = NewAssociation(sessions=["second", "first"])
     begun = empty.associations.begin("hall", asked)
     work_off(empty)
-    told = empty.associations.get("hall", begun.association_id)
+    told = empty.associations.get("hall", begun.job_id)
     assert told.result is not None
     (join,) = told.result.joins
     assert join.transform is not None
@@ -62,7 +62,7 @@ def test_halves_with_unrelated_origins_are_joined(
         metres, radians = difference(T @ here, wanted @ here)
         assert metres < 0.06
         assert radians < math.radians(2.0)
-    edges = empty.associations.edges("hall", told.association_id).items
+    edges = empty.associations.edges("hall", told.job_id).items
     assert len(edges) >= 15
     for edge in edges:
         truth = inverse(true[edge.to_frame]) @ true[edge.from_frame]

@@ -14,7 +14,7 @@ from sqlalchemy import select
 from sceneprint.decoders import LocalDecoders
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.frame_decoder import content_id, read_upload
-from sceneprint.engine.reconstruction import JobView, fused
+from sceneprint.engine.products.reconstruction import JobView, fused
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.export import write_ply

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,8 @@ from sqlalchemy import select
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import Work, cancel
 from sceneprint.engine.jobs.tasks import LongJob
-from sceneprint.engine.maps.map_coverage import CoverageHandler, frames_to_query
 from sceneprint.engine.maps.map_lifecycle import edit_frame
+from sceneprint.engine.products.map_coverage import frames_to_query
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
@@ -100,7 +100,7 @@ def rooms(
         for one in uploads[6:10]:
             add("hall", replace(one.frame, pose=one.pose), one.room, "c")
         assert set(work_off(engine)) == {JobState.SUCCEEDED}
-        done = [measured(engine, work_off, **asked).coverage_id for asked in (WHOLE, LATER_DAY)]
+        done = [measured(engine, work_off, **asked).job_id for asked in (WHOLE, LATER_DAY)]
     return Rooms(folder, positions, (path.name, uploads[6].room), *done)
 
 
@@ -116,11 +116,11 @@ def measured(
     begun = engine.coverage.begin(map_name, NewMapCoverage.model_validate(asked))
     assert begun.state is JobState.QUEUED
     assert work_off(engine)[-1] is JobState.SUCCEEDED
-    return engine.coverage.get(map_name, begun.coverage_id)
+    return engine.coverage.get(map_name, begun.job_id)
 
 
 def frames_of(engine: Engine, told: MapCoverage) -> list[CoverageFrame]:
-    return engine.coverage.frames(told.map, told.coverage_id).items
+    return engine.coverage.frames(told.map, told.job_id).items
 
 
 def test_equal_rooms_are_ambiguous_and_linked(engine: Engine, rooms: Rooms) -> None:
@@ -192,11 +192,11 @@ def test_only_another_session_of_an_equal_room_gives_wrong_poses(
         assert frame.error_deg < 2
         (other,) = frame.look_alikes
         assert by_id[other].session == "b"
-    wrong = engine.coverage.frames("hall", told.coverage_id, outcome="wrong", limit=3)
+    wrong = engine.coverage.frames("hall", told.job_id, outcome="wrong", limit=3)
     assert wrong.items == frames[:3]
-    rest = engine.coverage.frames("hall", told.coverage_id, wrong.next_cursor, outcome="wrong")
+    rest = engine.coverage.frames("hall", told.job_id, wrong.next_cursor, outcome="wrong")
     assert rest.items == frames[3:]
-    assert engine.coverage.frames("hall", told.coverage_id, outcome="found").items == []
+    assert engine.coverage.frames("hall", told.job_id, outcome="found").items == []
     wide = measured(engine, work_off, **LATER_DAY, every=5, tolerance_m=APART_M + 1)
     assert wide.result is not None
     assert (wide.result.frames, wide.result.found) == (1, 1)
@@ -241,49 +241,30 @@ def at_once() -> bool:
     return True
 
 
-def stored(engine: Engine, coverage_id: str) -> list[Any]:
+def stored(engine: Engine, job_id: str) -> list[Any]:
     with engine.store.database.read() as connection:
-        own = select(jobs.c.number).where(jobs.c.id == coverage_id).scalar_subquery()
+        own = select(jobs.c.number).where(jobs.c.id == job_id).scalar_subquery()
         asked = select(job_items.c.data).where(job_items.c.job_number == own)
         return list(connection.execute(asked.order_by(job_items.c.number)).scalars())
 
 
 def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
-    engine: Engine, work_off: WorkOff, due_now: Callable[[Engine], None]
+    engine: Engine, work_off: WorkOff, each_slice_lost_once: Callable[..., int]
 ) -> None:
     asked = {"every": 5, "not_within_s": 0.0}  # a frame of each room
     whole = measured(engine, work_off, **asked)
     begun = engine.coverage.begin("hall", NewMapCoverage.model_validate(asked))
-    handler = CoverageHandler(engine.store, engine.signers, engine.queries)
-    slices = 0
-    while True:  # a frame a slice, and each is lost once
-        lost = engine.claim("dies")
-        assert isinstance(lost, LongJob)
-        first = handler(lost, at_once)
-        due_now(engine)
-        again = engine.claim("lives")
-        assert isinstance(again, LongJob)
-        assert engine.tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
-        second = handler(again, at_once)
-        assert asdict(first) == asdict(second)
-        engine.tasks._keep(again, second)
-        slices += 1
-        told = engine.coverage.get("hall", begun.coverage_id)
-        if told.state.over:
-            break
-        assert told.progress is not None
-        assert told.progress.done == slices
-        assert len(frames_of(engine, told)) == slices  # told while more are queried
-    assert slices == 4  # the last concludes
+    assert each_slice_lost_once(engine, engine.coverage, begun.job_id) == 4  # one concludes
+    told = engine.coverage.get("hall", begun.job_id)
     assert (told.result, told.plans) == (whole.result, whole.plans)
-    assert stored(engine, told.coverage_id) == stored(engine, whole.coverage_id)
+    assert stored(engine, told.job_id) == stored(engine, whole.job_id)
 
 
 def test_an_upload_goes_before_the_next_slice(
     engine: Engine, work_off: WorkOff, uploads: Any
 ) -> None:
     engine.coverage.begin("hall", NewMapCoverage(session="c"))
-    handler = CoverageHandler(engine.store, engine.signers, engine.queries)
+    handler = engine.coverage.run_slice
     task = engine.claim("w")
     assert isinstance(task, LongJob)
     engine.tasks._keep(task, handler(task, at_once))
@@ -301,7 +282,7 @@ def test_cells_that_became_better_are_told(engine: Engine, work_off: WorkOff, ro
         if frame.session == "b":
             engine.delete_frame("hall", frame.frame_id)
     after = measured(engine, work_off, **how)
-    told = engine.coverage.changes("hall", after.coverage_id, before.coverage_id)
+    told = engine.coverage.changes("hall", after.job_id, before.job_id)
     assert (told.result_before, told.result_after) == (before.result, after.result)
     assert (told.result_before.ambiguous, told.result_after.found) == (5, 5)
     assert told.result_after.revision == told.result_before.revision + 5
@@ -310,16 +291,16 @@ def test_cells_that_became_better_are_told(engine: Engine, work_off: WorkOff, ro
     assert {(cell.column, cell.row) for cell in plan.cells} == places
     assert {cell.trend for cell in plan.cells} == {"better"}
     assert told.trends == dict.fromkeys(told.trends, 0) | {"better": len(places)}
-    backwards = engine.coverage.changes("hall", before.coverage_id, after.coverage_id)
+    backwards = engine.coverage.changes("hall", before.job_id, after.job_id)
     assert backwards.trends["worse"] == len(places)
     # frames that were deleted since are in no list and are no look-alikes
     whole = frames_of(engine, engine.coverage.get("hall", rooms.whole))
     assert {frame.session for frame in whole} == {"a", "c"}
     assert not any(frame.look_alikes for frame in whole)
     wider = measured(engine, work_off, **(how | {"cell_m": 1.0}))
-    for other, why in ((rooms.whole, "session of"), (wider.coverage_id, "0.5 m and 1 m")):
+    for other, why in ((rooms.whole, "session of"), (wider.job_id, "0.5 m and 1 m")):
         with pytest.raises(InvalidRequest, match=why):
-            engine.coverage.changes("hall", other, before.coverage_id)
+            engine.coverage.changes("hall", other, before.job_id)
 
 
 def test_what_cannot_be_measured_is_refused(
@@ -333,18 +314,12 @@ def test_what_cannot_be_measured_is_refused(
         NewMapCoverage(other_sessions=True, not_within_s=3.0)
     queued = engine.coverage.begin("hall", NewMapCoverage(every=6))
     with pytest.raises(NotIndexed, match="is queued"):
-        engine.coverage.changes("hall", queued.coverage_id, queued.coverage_id)
+        engine.coverage.changes("hall", queued.job_id, queued.job_id)
     with pytest.raises(UnknownJob, match="no coverage"):
-        engine.coverage.get("pair", queued.coverage_id)
-    cancel(engine.store, queued.coverage_id)
-    assert engine.coverage.get("hall", queued.coverage_id).state is JobState.CANCELLED
+        engine.coverage.get("pair", queued.job_id)
+    cancel(engine.store, queued.job_id)
+    assert engine.coverage.get("hall", queued.job_id).state is JobState.CANCELLED
     assert work_off(engine) == []
-    listed = engine.coverage.list_all("hall", limit=1)
-    assert [one.coverage_id for one in listed.items] == [queued.coverage_id]
-    engine.coverage.remove("hall", queued.coverage_id)
-    rest = engine.coverage.list_all("hall", listed.next_cursor).items
-    assert rest == engine.coverage.list_all("hall").items
-    assert [one.coverage_id for one in rest] == [rooms.later_day, rooms.whole]
 
 
 def test_frames_that_went_meanwhile_are_skipped(
@@ -353,13 +328,13 @@ def test_frames_that_went_meanwhile_are_skipped(
     begun = engine.coverage.begin("hall", NewMapCoverage(session="c", not_within_s=0.0))
     task = engine.claim("w")
     assert isinstance(task, LongJob)
-    handler = CoverageHandler(engine.store, engine.signers, engine.queries)
+    handler = engine.coverage.run_slice
     engine.tasks._keep(task, handler(task, at_once))
     last = [one for one in engine.list_frames("hall").items if one.session == "c"][-1]
     engine.delete_frame("hall", last.frame_id)
     due_now(engine)
     work_off(engine)
-    told = engine.coverage.get("hall", begun.coverage_id)
+    told = engine.coverage.get("hall", begun.job_id)
     assert told.result is not None
     assert (told.result.frames, told.result.skipped, told.result.found) == (3, 1, 3)
     assert told.result.last_revision == told.result.revision + 1

@@ -80,7 +80,7 @@ def test_edges_and_odometry_follow_the_order_taken(
     found, graphs, texts = [], [], []
     for name in ("sorted", "shuffled"):
         asked = NewAssociation.model_validate({"sessions": ["run"], "apart": 3, "k": 2})
-        begun = two_orders.associations.begin(name, asked).association_id
+        begun = two_orders.associations.begin(name, asked).job_id
         work_off(two_orders)
         edges = two_orders.associations.edges(name, begun).items
         found.append(

@@ -4,15 +4,14 @@ frame that is deleted afterwards."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.engine.jobs.tasks import LongJob
-from sceneprint.engine.sessions.session_differences import DifferenceHandler
+from sceneprint.engine.products.session_differences import POINTS
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
 from sceneprint.geometry.rigid import inverse, moved
 from sceneprint_client.api import JobState
@@ -50,11 +49,11 @@ def difference(engine: Engine, work_off: WorkOff, before: str, after: str) -> Di
     begun = engine.differences.begin("hall", NewDifference(before=before, after=after))
     assert begun.state is JobState.QUEUED
     assert work_off(engine)[-1] is JobState.SUCCEEDED
-    return engine.differences.get("hall", begun.difference_id)
+    return engine.differences.get("hall", begun.job_id)
 
 
 def points_of(engine: Engine, told: Difference) -> SurfacePoints:
-    file = engine.differences.points("hall", told.difference_id)
+    file = engine.differences.file("hall", told.job_id, POINTS)
     return decode_points(engine.store.blobs.get(file.blob))
 
 
@@ -85,31 +84,18 @@ def test_what_came_is_new_and_what_went_is_gone(compared: Any, work_off: WorkOff
 
 
 def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
-    compared: Any, work_off: WorkOff, due_now: Callable[[Engine], None]
+    compared: Any, work_off: WorkOff, each_slice_lost_once: Callable[..., int]
 ) -> None:
     engine, _ = compared
     whole = difference(engine, work_off, "a", "b")
     begun = engine.differences.begin("hall", NewDifference(before="a", after="b"))
     with pytest.raises(NotIndexed, match="is queued"):
-        engine.differences.points("hall", begun.difference_id)
-    handler = DifferenceHandler(engine.store, engine.signers)
-    slices = 0
-    while not engine.differences.get("hall", begun.difference_id).state.over:
-        lost = engine.claim("dies")
-        assert isinstance(lost, LongJob)
-        first = handler(lost, lambda: True)
-        due_now(engine)
-        again = engine.claim("lives")
-        assert isinstance(again, LongJob)
-        assert engine.tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
-        second = handler(again, lambda: True)
-        assert asdict(first) == asdict(second)
-        engine.tasks._keep(again, second)
-        slices += 1
+        engine.differences.file("hall", begun.job_id, POINTS)
+    slices = each_slice_lost_once(engine, engine.differences, begun.job_id)
     assert slices == 12  # each frame is fused, and judges
-    told = engine.differences.get("hall", begun.difference_id)
+    told = engine.differences.get("hall", begun.job_id)
     assert told.result == whole.result
-    files = [engine.differences.points("hall", one.difference_id) for one in (whole, told)]
+    files = [engine.differences.file("hall", one.job_id, POINTS) for one in (whole, told)]
     assert files[0].blob == files[1].blob
     # the frames of a comparison are shown by it: with one of them it goes
     assert engine.differences.forget() == 0
@@ -118,7 +104,7 @@ def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
     engine.purging.now()
     for one in (whole, told):
         with pytest.raises(UnknownJob):
-            engine.differences.get("hall", one.difference_id)
+            engine.differences.get("hall", one.job_id)
     assert not engine.store.blobs.holds(files[0].blob)
 
 

@@ -143,7 +143,7 @@ def test_joined_sessions_are_shown_in_one_space(
     told = json.loads(said.stdout)
     assert told["result"]["joins"][0]["transform"] is not None
     rows = mcap_rows(mcap)
-    graph = json.loads(client.graph("halves", told["association_id"], "json"))
+    graph = json.loads(client.graph("halves", told["job_id"], "json"))
     poses = {one["frame_id"]: np.array(one["pose"]["matrix"]) for one in graph["vertices"]}
     space = graph["frame"]
     for name in ("even", "odd"):

@@ -109,7 +109,7 @@ def rooms(
     made = Rooms(served, path, list(room.frames[2::3]), shoot, {}, "", of_bob[0])
     found = made.post("associations", sessions=["evening", "morning"])
     (join,) = found["result"]["joins"]
-    return replace(made, join=join, association=f"{path}/associations/{found['association_id']}")
+    return replace(made, join=join, association=f"{path}/associations/{found['job_id']}")
 
 
 def test_every_answer_is_in_the_parent_frame_of_the_first_session(rooms: Rooms) -> None:
@@ -198,7 +198,7 @@ def test_a_join_is_undone(rooms: Rooms) -> None:
         assert join == rooms.join | {"root": None, "undone": True}
     assert client.get(url).json() == undone.json()
     lines = client.get("/v1/audit", params={"action": "association.undone"}).json()["items"]
-    assert [one["target"] for one in lines] == [undone.json()["association_id"]]
+    assert [one["target"] for one in lines] == [undone.json()["job_id"]]
     sessions = client.get(f"{rooms.path}/sessions").json()["items"]
     assert {one["robot"]: one["parent_frames"] for one in sessions} == {
         "ann": ["ann/morning"], "bob": ["bob/evening"],

@@ -101,17 +101,17 @@ def live(one: Twin, small_model: Any) -> None:
     for _ in range(2):
         begun = one.ask("boss", "POST", f"{path}/associations", json=body)
         assert begun.status_code == 202, begun.text
-        one.ids["association"] = begun.json()["association_id"]
+        one.ids["association"] = begun.json()["job_id"]
         one.disturb()
     for _ in range(2):
         measured = one.ask("boss", "POST", f"{path}/coverage", json={"not_within_s": 0})
         assert measured.status_code == 202, measured.text
-        one.ids["coverage"] = measured.json()["coverage_id"]
+        one.ids["coverage"] = measured.json()["job_id"]
         one.disturb()
     body = {"before": "run", "after": "run-2"}
     compared = one.ask("boss", "POST", f"{path}/differences", json=body)
     assert compared.status_code == 202, compared.text
-    one.ids["difference"] = compared.json()["difference_id"]
+    one.ids["difference"] = compared.json()["job_id"]
     one.disturb()
     built = one.ask("boss", "POST", f"{path}/surface")
     assert built.status_code == 202, built.text

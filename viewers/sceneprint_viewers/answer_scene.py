@@ -321,7 +321,7 @@ def association_scene(client: Client, told: Association, text: str, most: int) -
     text : about it, for people
     most : frames whose points are drawn
     """
-    graph = Graph.model_validate_json(client.graph(told.map, told.association_id, "json"))
+    graph = Graph.model_validate_json(client.graph(told.map, told.job_id, "json"))
     runs = _runs(client, told, graph.vertices)
     spaces = sorted({run.parent_frame for run in runs})
     up_of_poses = up_of_map(client, told.map)
@@ -330,11 +330,11 @@ def association_scene(client: Client, told: Association, text: str, most: int) -
         there = [run for run in runs if run.parent_frame == space]
         up = up_of_runs(there) if up_of_poses is None else up_of_poses
         entities.append(SceneEntity((space,), UpAxis(up)))
-        alone = len(told.asked.sessions) == 1
+        alone = len(told.request.sessions) == 1
         for run in there:
             colour = TRACK if alone else SESSIONS[_names(told).index(run.name)]
             entities += _run_entities(client, run, up, colour, most // len(runs), alone=alone)
-    edges = itertools.islice(client.edges(told.map, told.association_id), MOST_EDGES)
+    edges = itertools.islice(client.edges(told.map, told.job_id), MOST_EDGES)
     entities += _edge_entities(edges, graph.vertices)
     return Moment(entities)
 
@@ -359,8 +359,8 @@ def _runs(client: Client, told: Association, vertices: list[Vertex]) -> list[Pos
 
 def _names(told: Association) -> list[str]:
     """What the sessions are called, the first that was asked first."""
-    robots: Sequence[str | None] = told.asked.robots or [None] * len(told.asked.sessions)
-    pairs = zip(robots, told.asked.sessions, strict=True)
+    robots: Sequence[str | None] = told.request.robots or [None] * len(told.request.sessions)
+    pairs = zip(robots, told.request.sessions, strict=True)
     return [session if robot is None else f"{robot}/{session}" for robot, session in pairs]
 
 

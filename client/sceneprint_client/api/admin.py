@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AwareDatetime, Field, StringConstraints
 
@@ -327,9 +327,14 @@ class Progress(ApiRecord):
     tested: int | None = Field(default=None, description="Other views that were looked up.")
 
 
-class MapJob(ApiRecord):
-    """A job that computes something of a map."""
+class Product(ApiRecord):
+    """What a job computes from a map."""
 
+    #: What it is called, and the end of the path that lists it.
+    noun: ClassVar[str]
+    collection: ClassVar[str]
+
+    job_id: str = Field(description="Also the id of its job: GET /v1/jobs/{job_id}.")
     map: str
     state: JobState
     progress: Progress | None = Field(description="Null until it has begun.")

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 from pydantic import Field, model_validator
 
-from sceneprint_client.api.admin import MapJob
+from sceneprint_client.api.admin import Product
 from sceneprint_client.api.base import ApiRecord, Given, Label, Vector
 from sceneprint_client.api.query import Cause
 
@@ -141,11 +141,12 @@ class CoveragePlan(ApiRecord):
     )
 
 
-class MapCoverage(MapJob):
+class MapCoverage(Product):
     """A coverage job of a map and its result. Its steps are queried frames."""
 
-    coverage_id: str = Field(description="Also the id of its job: GET /v1/jobs/{job_id}.")
-    asked: NewMapCoverage
+    noun = collection = "coverage"
+
+    request: NewMapCoverage
     result: CoverageResult | None = Field(description="When it has succeeded.")
     plans: list[CoveragePlan] | None = Field(
         default=None,

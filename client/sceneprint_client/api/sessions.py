@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sceneprint_client.api.admin import MapJob
+from sceneprint_client.api.admin import Product
 from sceneprint_client.api.base import ApiRecord, Given, Label, Transform
 from sceneprint_client.api.listing import Filter
 from sceneprint_client.api.query import ValidationOptions
@@ -183,11 +183,12 @@ class AssociationResult(ApiRecord):
     )
 
 
-class Association(MapJob):
+class Association(Product):
     """An association of sessions: a job and what it came to. Its steps are frames."""
 
-    association_id: str = Field(description="Also the id of its job: GET /v1/jobs/{job_id}.")
-    asked: NewAssociation
+    noun, collection = "association", "associations"
+
+    request: NewAssociation
     result: AssociationResult | None = Field(description="When it has succeeded.")
 
 
@@ -274,9 +275,10 @@ class DifferenceResult(ApiRecord):
     skipped: int = Field(description="Frames that were deleted meanwhile, or are damaged.")
 
 
-class Difference(MapJob):
+class Difference(Product):
     """A comparison of two sessions and its result. Its steps are frames; each is used twice."""
 
-    difference_id: str = Field(description="Also the id of its job: GET /v1/jobs/{job_id}.")
-    asked: NewDifference
+    noun, collection = "difference", "differences"
+
+    request: NewDifference
     result: DifferenceResult | None = Field(description="When it has succeeded.")

@@ -29,8 +29,8 @@ from sceneprint.engine.ingest.archive_import import (
 )
 from sceneprint.engine.ingest.uploads import Upload, Uploads
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult
-from sceneprint.engine.maps.map_coverage import outcome_of
 from sceneprint.engine.maps.map_plans import QueriedPosition, coverage_plans
+from sceneprint.engine.products.map_coverage import outcome_of
 from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, prepare_upload
 from sceneprint.engine.search.up_vectors import PlanAxes, plan_axes

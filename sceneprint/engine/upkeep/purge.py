@@ -22,9 +22,9 @@ from pathlib import Path
 from sqlalchemy import Connection
 
 from sceneprint.engine.maps.tombstones import Tombstones
-from sceneprint.engine.reconstruction import ReconstructionJobs
+from sceneprint.engine.products.reconstruction import ReconstructionJobs
+from sceneprint.engine.products.session_differences import Differences
 from sceneprint.engine.results.query_log import QueryLog
-from sceneprint.engine.sessions.session_differences import DifferenceJobs
 from sceneprint.engine.upkeep.garbage_collection import (
     collect_deleted_blobs,
     collect_doomed_blobs,
@@ -177,7 +177,7 @@ class Purging:
 
     def __init__(
         self, store: Store, upkeep: Upkeep, query_log: QueryLog, tombstones: Tombstones,
-        reconstructions: ReconstructionJobs, differences: DifferenceJobs, purge_s: float,
+        reconstructions: ReconstructionJobs, differences: Differences, purge_s: float,
         quarantine: Path,
     ) -> None:  # fmt: skip
         self._store, self._upkeep, self._log = store, upkeep, query_log

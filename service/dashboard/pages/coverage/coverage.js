@@ -2,13 +2,14 @@
 import { at, get, save, send } from "../lib/api.js";
 import { h, once, put } from "../lib/dom.js";
 import { count, metres, percent, time } from "../lib/format.js";
+import { followJob, goesOn } from "../lib/products.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { confirm, empty, toast } from "../lib/states.js";
 import { flat, nameOf } from "../plan/axes.js";
 import { cornersOf, laySurface, surfaceOf, unseen } from "../plan/backdrop.js";
 import { Plan } from "../plan/plan.js";
-import { beginCoverage, cancelCoverage, followJob, goesOn } from "./measurement.js";
+import { beginCoverage, cancelCoverage } from "./measurement.js";
 import { checkedIn, outcomeMark, outcomesIn, TRENDS } from "./outcomes.js";
 import { areaCard, cellsTable, changesCard, countsCard, worstCard } from "./panels.js";
 import { cellAt, drawCells, drawFrames, hit, keyOf } from "./sheet.js";
@@ -28,7 +29,7 @@ export async function render(root, { params: { map }, search, signal, go, title,
     names: { sessions: distinct(sessions.items, "session"), robots: distinct(sessions.items, "robot") }, indexed: about.frames.indexed ?? 0 });
   actions(may("write", map) && page.indexed > 0 && h("button", { class: "button primary", type: "button", id: "cover-begin", onClick: () => page.begin() }, "Measure coverage…"));
   await page.show();
-  for (const one of told.items.filter(goesOn)) page.follow(one.coverage_id);
+  for (const one of told.items.filter(goesOn)) page.follow(one.job_id);
 }
 
 const distinct = (items, key) => [...new Set(items.map((one) => one[key]).filter((one) => one !== null))].sort();
@@ -74,9 +75,9 @@ class Page {
   async show() {
     const turn = this.#turn += 1;
     this.#progress();
-    const wanted = this.results.find((one) => one.coverage_id === this.seen.result) ?? this.results[0];
+    const wanted = this.results.find((one) => one.job_id === this.seen.result) ?? this.results[0];
     if (!wanted) { put(this.body, this.#nothing()); return; }
-    const id = wanted.coverage_id;
+    const id = wanted.job_id;
     const [shown, frames, changes] = await Promise.all([
       get(`${this.path}/${id}`, { signal: this.signal }), this.#framesOf(id), this.#changesOf(id)]);
     if (turn !== this.#turn || this.signal.aborted) return;
@@ -182,17 +183,17 @@ class Page {
   #flat(place) { return flat(this.axes, [place.x, place.y, place.z]); }
 
   #toolbar() {
-    const { coverage_id: id, created_at: when } = this.shown, same = JSON.stringify(this.shown.asked);
+    const { job_id: id, created_at: when } = this.shown, same = JSON.stringify(this.shown.request);
     const name = (one) => `${one.created_at.slice(0, 16).replace("T", " ")} · ${percent(one.result.found / Math.max(checkedIn(one.result), 1))} of ${count(one.result.frames)} found`;
-    const earlier = this.results.filter((one) => one.created_at < when && JSON.stringify(one.asked) === same);
+    const earlier = this.results.filter((one) => one.created_at < when && JSON.stringify(one.request) === same);
     return h("div", { class: "toolbar cover-bar" },
       h("label", { class: "cover-field" }, h("span", { class: "muted" }, "Result"),
         h("select", { id: "cover-result", onChange: (event) => this.#look({ result: event.target.value, since: null, cell: null, frame: null }) },
-          this.results.map((one) => h("option", { value: one.coverage_id, selected: one.coverage_id === id }, name(one))))),
+          this.results.map((one) => h("option", { value: one.job_id, selected: one.job_id === id }, name(one))))),
       earlier.length > 0 && h("label", { class: "cover-field" }, h("span", { class: "muted" }, "Compare with"),
         h("select", { id: "cover-since", onChange: (event) => this.#look({ since: event.target.value || null }) },
           h("option", { value: "" }, "nothing"),
-          earlier.map((one) => h("option", { value: one.coverage_id, selected: one.coverage_id === this.seen.since }, name(one))))),
+          earlier.map((one) => h("option", { value: one.job_id, selected: one.job_id === this.seen.since }, name(one))))),
       h("span", { class: "muted cover-when" }, "measured ", time(this.shown.finished_at)),
       h("div", { class: "toolbar", role: "group", "aria-label": "Download" },
         h("button", { class: "button", type: "button", onClick: () => save(`${this.path}/${id}`, { name: `coverage-${this.map}.json` }) }, "JSON"),
@@ -245,7 +246,7 @@ class Page {
 
   /** Query with a frame as the job did, and lay it on what it is mistaken for. */
   async #overlay(one, other) {
-    const { asked } = this.shown, left = asked.other_sessions ? FOREVER_S : asked.not_within_s;
+    const { request: asked } = this.shown, left = asked.other_sessions ? FOREVER_S : asked.not_within_s;
     const json = { frame_id: one.frame_id, seed: asked.seed, record: false, ...(left > 0 ? { filter: { not_within_s: left } } : {}) };
     let answer;
     try {
@@ -264,7 +265,7 @@ class Page {
   }
 
   #address() {
-    const newest = this.results[0]?.coverage_id, { coverage_id: id } = this.shown;
+    const newest = this.results[0]?.job_id, { job_id: id } = this.shown;
     this.go(link("maps", this.map, "coverage", { ...this.seen, result: id === newest ? null : id }), { replace: true, quiet: true });
   }
 
@@ -275,7 +276,7 @@ class Page {
       const text = one.state === "queued" && !done ? "Coverage waits for a worker" : total === null ? "Measuring coverage" : `Measuring coverage: ${count(done)} of ${count(total)} frames queried`;
       return h("section", { class: "card cover-progress", "aria-label": "Coverage under way" },
         h("span", { role: "status" }, text), h("progress", { max: total ?? 1, value: done, "aria-label": "Progress" }),
-        may("write", this.map) && h("button", { class: "button", type: "button", onClick: once(() => cancelCoverage(one.coverage_id)) }, "Cancel"));
+        may("write", this.map) && h("button", { class: "button", type: "button", onClick: once(() => cancelCoverage(one.job_id)) }, "Cancel"));
     }));
   }
 
@@ -284,13 +285,13 @@ class Page {
       this.all.unshift(begun);
       if (this.results.length === 0) put(this.body, this.#nothing());
       this.#progress();
-      this.follow(begun.coverage_id);
+      this.follow(begun.job_id);
     });
   }
 
   async follow(id) {
     await followJob(`${this.path}/${id}`, (now) => {
-      const place = this.all.findIndex((one) => one.coverage_id === id);
+      const place = this.all.findIndex((one) => one.job_id === id);
       if (now === null) { this.all.splice(place, 1); this.show(); return; }
       this.all[place] = now;
       if (goesOn(now)) { this.#progress(); return; }
@@ -303,7 +304,7 @@ class Page {
   async #remove(id) {
     if (!(await confirm({ title: "Delete this result?", text: "Its counts, plan and frames are deleted. The map’s frames stay.", action: "Delete result" }))) return;
     await send("DELETE", `${this.path}/${id}`);
-    this.all = this.all.filter((one) => one.coverage_id !== id);
+    this.all = this.all.filter((one) => one.job_id !== id);
     toast("The result was deleted.");
     await this.#look({ result: null, since: null, cell: null, frame: null });
     if (document.activeElement === document.body) document.getElementById("title").focus({ preventScroll: true });

@@ -1,9 +1,9 @@
 // Two sessions of a map compared: begun here, followed, and shown in one view.
-import { followJob, goesOn } from "../coverage/measurement.js";
 import { at, bytes, get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, metres } from "../lib/format.js";
 import { coded } from "../lib/prose.js";
+import { followJob, goesOn } from "../lib/products.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { empty } from "../lib/states.js";
@@ -73,20 +73,20 @@ class Page {
   /** Show the newest comparison of the two sessions, or that there is none. */
   async show() {
     const turn = this.#turn += 1, { before, after } = this.seen;
-    const one = this.all.find(({ asked }) => asked.before === before && asked.after === after);
+    const one = this.all.find(({ request }) => request.before === before && request.after === after);
     this.#viewer?.destroy();
     this.#viewer = null;
     this.button.disabled = before === after || Boolean(one && goesOn(one));
     put(this.said, this.#status(one));
     if (one?.state === "succeeded") {
-      const data = await bytes(`${this.path}/${one.difference_id}/points`, { signal: this.signal });
+      const data = await bytes(`${this.path}/${one.job_id}/points`, { signal: this.signal });
       if (turn === this.#turn && !this.signal.aborted) this.#draw(one, parsePoints(data));
       return;
     }
     if (one && goesOn(one)) put(this.body);
     else if (one) put(this.body, empty({ title: "The comparison did not succeed", text: coded(one.error ?? one.state) }));
     else put(this.body, empty({ title: "Not compared yet", text: before === after ? "Choose two sessions." : `Compare ${before} with ${after} to see what is gone and what is new.` }));
-    if (one && goesOn(one)) this.#follow(one.difference_id, turn); // the page is there meanwhile
+    if (one && goesOn(one)) this.#follow(one.job_id, turn); // the page is there meanwhile
   }
 
   async begin() {
@@ -114,7 +114,7 @@ class Page {
     try {
       const { data } = await send("POST", path, { json: { sessions: [after, before] } });
       put(this.said, "Joining: waiting for a worker…");
-      await followJob(`${path}/${data.association_id}`, (now) => {
+      await followJob(`${path}/${data.job_id}`, (now) => {
         if (turn !== this.#turn) return;
         if (now && goesOn(now)) {
           if (now.progress?.total) put(this.said, `Joining: ${count(now.progress.done)} of ${count(now.progress.total)} frames`);
@@ -133,7 +133,7 @@ class Page {
 
   async #follow(id, turn) {
     await followJob(`${this.path}/${id}`, (now) => {
-      this.all = this.all.flatMap((one) => (one.difference_id !== id ? [one] : now ? [now] : []));
+      this.all = this.all.flatMap((one) => (one.job_id !== id ? [one] : now ? [now] : []));
       if (turn !== this.#turn) return;
       if (now && goesOn(now)) put(this.said, this.#status(now));
       else this.show();
@@ -151,7 +151,7 @@ class Page {
     const canvas = h("canvas", { class: "overlay-canvas" });
     const legend = h("div", {}), bar = h("div", { class: "overlay-bar" });
     put(this.body, h("section", { class: "card overlay-view", "aria-label": "The view" }, bar, h("div", { class: "overlay-stage" }, canvas), legend));
-    const viewer = this.#viewer = createViewer(canvas, { label: `Difference of ${one.asked.before} and ${one.asked.after}`, up: "z" });
+    const viewer = this.#viewer = createViewer(canvas, { label: `Difference of ${one.request.before} and ${one.request.after}`, up: "z" });
     canvas.viewer = viewer; // for who measures it
     const middle = points.extent.map((x) => -x / 2), matrix = upright(one.result.up);
     let at = points.offset;
@@ -166,7 +166,7 @@ class Page {
       for (const button of bar.querySelectorAll("[data-show]")) button.setAttribute("aria-pressed", String(button.getAttribute("data-show") === show));
       put(legend, h("ul", { class: "overlay-legend", "aria-label": "Legend" }, KINDS.filter(({ name }) => wanted.includes(name)).map((kind) =>
         h("li", { dataset: { kind: kind.name } }, h("span", { class: "overlay-swatch", style: { background: `var(--${kind.tint})` } }),
-          h("span", {}, kind.text(one.asked), h("span", { class: "muted" }, ` ${count(one.result[kind.name])} cells`))))),
+          h("span", {}, kind.text(one.request), h("span", { class: "muted" }, ` ${count(one.result[kind.name])} cells`))))),
       h("p", { class: "muted overlay-keys" }, "Drag to turn, with Shift to move, wheel or pinch to zoom."));
     };
     put(bar, h("div", { class: "overlay-row" },

@@ -1,21 +1,19 @@
 // Associations beside the picture: which one is drawn, what it came to, and how a new one is begun.
 
-import { at, get, send } from "../lib/api.js";
+import { at, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, metres, degrees } from "../lib/format.js";
+import { goesOn } from "../lib/products.js";
 import { coded } from "../lib/prose.js";
-import { confirm, sheet, toast } from "../lib/states.js";
+import { confirm, sheet } from "../lib/states.js";
 import { EDGES } from "./scene.js";
-
-const OVER = new Set(["succeeded", "failed", "dead", "cancelled"]);
-const POLL_MS = 700;
 
 /** @param {Object<string, any>} edge of the API @returns {string} kind of EDGES */
 export const kindOf = (edge) => (edge.consistent === null ? "unchecked" : edge.consistent ? "consistent" : "inconsistent");
 
 /** Name of an association in a list. @param {Object<string, any>} one */
 export function titleOf(one) {
-  const sessions = one.asked.sessions.map((name, i) => (one.asked.robots?.[i] ? `${name} (${one.asked.robots[i]})` : name));
+  const sessions = one.request.sessions.map((name, i) => (one.request.robots?.[i] ? `${name} (${one.request.robots[i]})` : name));
   const what = sessions.length === 1 ? `${sessions[0]}, loops` : sessions.join(" – ");
   return one.state === "succeeded" ? `${what} · ${count(one.result.edges)} edges` : `${what} · ${one.state}`;
 }
@@ -27,7 +25,7 @@ export function titleOf(one) {
 export function associationsPanel({ associations, chosen, edges, maywrite, onchoose, onbegin, onundo }) {
   const select = h("select", { id: "paths-association", onChange: () => onchoose(select.value || null) },
     h("option", { value: "" }, associations.length ? "None" : "No associations yet"),
-    associations.map((one) => h("option", { value: one.association_id, selected: one === chosen }, titleOf(one))));
+    associations.map((one) => h("option", { value: one.job_id, selected: one === chosen }, titleOf(one))));
   select.disabled = associations.length === 0;
   return h("section", { class: "card paths-section", "aria-labelledby": "paths-associations" },
     h("h2", { id: "paths-associations" }, "Associations"),
@@ -39,7 +37,7 @@ export function associationsPanel({ associations, chosen, edges, maywrite, oncho
 }
 
 function told(one, edges) {
-  if (!OVER.has(one.state)) return progress(one);
+  if (goesOn(one)) return progress(one);
   if (one.state !== "succeeded") return h("p", { class: "paths-note" }, `It ${one.state === "cancelled" ? "was cancelled" : "failed"}. ${one.error ?? ""}`);
   const kinds = EDGES.map(({ kind }) => h("li", {},
     h("span", { class: "paths-line", dataset: { kind } }), h("span", {}, kind),
@@ -114,27 +112,3 @@ export async function undo(map, id) {
   await send("DELETE", at("maps", map, "associations", id, "join"));
   return true;
 }
-
-/**
- * Follow an association until it is over.
- * @param {string} map @param {string} id
- * @param {(now: Object<string, any>) => void} onchange
- * @param {AbortSignal} signal
- */
-export async function follow(map, id, onchange, signal) {
-  for (;;) {
-    // a service that restarts does not end it: it is asked again
-    const now = await get(at("maps", map, "associations", id), { signal })
-      .catch((error) => { if (error.status === 0 || error.status === 503) return null; throw error; });
-    if (now) onchange(now);
-    if (now && OVER.has(now.state)) {
-      if (now.state !== "succeeded") toast(`The association ${now.state === "cancelled" ? "was cancelled" : "failed"}. ${now.error ?? ""}`, { kind: "bad" });
-      return;
-    }
-    await new Promise((resolve) => { setTimeout(resolve, POLL_MS); });
-    if (signal.aborted) return;
-  }
-}
-
-/** Whether it goes on. @param {Object<string, any>} one */
-export const goesOn = (one) => !OVER.has(one.state);

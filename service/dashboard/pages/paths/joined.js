@@ -19,7 +19,7 @@ export function bridges(associations) {
       if (join.transform === null || join.undone || join.from_parent === join.to_parent) continue;
       found.push({
         from: join.from_parent, to: join.to_parent, matrix: ofRows(join.transform.matrix),
-        strength: join.strength, support: join.support, association: one.association_id,
+        strength: join.strength, support: join.support, association: one.job_id,
       });
     }
   }

@@ -1,14 +1,17 @@
 // The runs of a map in its picture: where they went, what joins them, and the query of an answer
 // among them.
 
+import { at } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count } from "../lib/format.js";
+import { followJob, goesOn } from "../lib/products.js";
 import { plain } from "../lib/prose.js";
 import { go } from "../lib/router.js";
 import { may } from "../lib/session.js";
+import { toast } from "../lib/states.js";
 import { multiply, ofRows } from "../viewer/matrix.js";
 import { askedPanel } from "./asked.js";
-import { associationsPanel, begin, follow, goesOn, kindOf, undo } from "./associations.js";
+import { associationsPanel, begin, kindOf, undo } from "./associations.js";
 import { chooser } from "./card.js";
 import { edgesOf, MOST_DRAWN, MOST_RUNS, pathOf } from "./data.js";
 import { bridges, reach } from "./joined.js";
@@ -77,10 +80,10 @@ export class Runs {
     this.joined = search.get("joined") !== "no";
     const wanted = search.get("association");
     const over = this.associations.find((one) => one.state === "succeeded");
-    this.association = wanted === null ? over ?? null : this.associations.find((one) => one.association_id === wanted) ?? null;
+    this.association = wanted === null ? over ?? null : this.associations.find((one) => one.job_id === wanted) ?? null;
     this.up = ["z", "y", "-y"].includes(search.get("up") ?? "") ? search.get("up") : null;
     this.#build();
-    for (const one of this.associations.filter(goesOn)) this.#follow(one.association_id);
+    for (const one of this.associations.filter(goesOn)) this.#follow(one.job_id);
   }
 
   #build() {
@@ -203,10 +206,10 @@ export class Runs {
     /** @type {Object<string, any> | null} */
     let told = null;
     if (one?.state === "succeeded") {
-      if (this.#edges?.of !== one.association_id) {
-        const found = await edgesOf(this.map, one.association_id, this.signal);
-        if (one.association_id !== this.association?.association_id) return; // another was chosen meanwhile
-        this.#edges = { of: one.association_id, ...found };
+      if (this.#edges?.of !== one.job_id) {
+        const found = await edgesOf(this.map, one.job_id, this.signal);
+        if (one.job_id !== this.association?.job_id) return; // another was chosen meanwhile
+        this.#edges = { of: one.job_id, ...found };
       }
       const drawn = this.#edges.edges.map((edge) => ({ kind: kindOf(edge), from: this.#end(edge.from_pose), to: this.#end(edge.to_pose) }))
         .filter((edge) => edge.from && edge.to);
@@ -222,14 +225,14 @@ export class Runs {
     put(this.joinsBox, associationsPanel({
       associations: this.associations, chosen: this.association, edges: told, maywrite: may("write", this.map),
       onchoose: async (id) => {
-        this.association = this.associations.find((one) => one.association_id === id) ?? null;
+        this.association = this.associations.find((one) => one.job_id === id) ?? null;
         await this.#association();
         this.onchange();
         document.getElementById("paths-association")?.focus();
       },
       onbegin: () => begin(this.map, this.runs.filter((one, i, all) => all.findIndex((other) => other.session === one.session && other.robot === one.robot) === i), (begun) => this.#begun(begun)),
       // runs are other ones then: all is fetched again
-      onundo: async () => { if (await undo(this.map, this.association.association_id)) go(location.hash, { replace: true }); },
+      onundo: async () => { if (await undo(this.map, this.association.job_id)) go(location.hash, { replace: true }); },
     }));
     put(this.words, h("summary", {}, "Tables"), h("h3", {}, "Runs"), runsTable(this.#drawn, this.parent),
       told && [h("h3", {}, "Edges"), edgesTable(this.map, told.edges, told.more)]);
@@ -246,23 +249,25 @@ export class Runs {
     this.association = one;
     this.#panel(null);
     this.scene.edges([]);
-    this.#follow(one.association_id);
+    this.#follow(one.job_id);
     this.onchange();
   }
 
   async #follow(id) {
-    await follow(this.map, id, async (now) => {
-      const place = this.associations.findIndex((one) => one.association_id === id);
-      const shown = this.association?.association_id === id;
+    await followJob(at("maps", this.map, "associations", id), async (now) => {
+      const place = this.associations.findIndex((one) => one.job_id === id);
+      if (now === null) { this.associations.splice(place, 1); this.#panel(null); return; } // somebody deleted it
+      const shown = this.association?.job_id === id;
       this.associations[place] = now;
       if (shown) this.association = now;
       if (now.state === "succeeded") {
         this.#joins = bridges(this.associations);
         await this.draw();
         put(this.said, `The association has succeeded: ${count(now.result.edges)} edges.`);
-      } else if (shown) {
-        this.#panel(null);
+        return;
       }
+      if (!goesOn(now)) toast(`The association ${now.state === "cancelled" ? "was cancelled" : "failed"}. ${now.error ?? ""}`, { kind: "bad" });
+      if (shown) this.#panel(null);
     }, this.signal);
   }
 
@@ -290,7 +295,7 @@ export class Runs {
   get search() {
     return {
       query: this.asked?.id ?? this.gone, parent: this.parent, joined: this.joined ? null : "no", up: this.up,
-      association: this.association?.association_id ?? (this.associations.length ? "none" : null),
+      association: this.association?.job_id ?? (this.associations.length ? "none" : null),
     };
   }
 }

@@ -1,4 +1,4 @@
-"""Two sessions of a map compared: jobs begun, listed, done in slices, read and removed.
+"""Two sessions of a map compared: what is gone, and what is new.
 
     frames of both sessions  --add_views-->  cells of each  --frame_verdicts-->  their counts
     counts  --cell_states-->  same, gone, new, unseen
@@ -11,22 +11,19 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any, Literal
 
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.map_jobs import MapJobs
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Tasks, ends_within
 from sceneprint.engine.maps.surface_job import cell_width, surface_points
+from sceneprint.engine.products.product import SLICE_S, Products
 from sceneprint.engine.search.up_vectors import parent_axes
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import (
     DamagedBlob,
     InvalidRequest,
-    UnknownJob,
-    UnknownMap,
     UnreadableGeometry,
 )
 from sceneprint.formats.artifact import read_geometry
@@ -56,41 +53,34 @@ from sceneprint.store.frame_queries import (
     posed_in_session,
     stops_of,
 )
-from sceneprint.store.maps import find_map, geometry_blobs, living_map, map_of
-from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
+from sceneprint.store.maps import geometry_blobs, living_map
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import sessions as api
 from sceneprint_client.api.sessions import Difference, DifferenceResult, NewDifference
 from sceneprint_client.surface_encoding import NO_SESSION
 
-#: Kind of the jobs.
-DIFFERENCE = "difference"
-#: As of coverage: a worker does a slice when nothing else waits.
-PRIORITY = REENCODING_PRIORITY - 1
-#: Seconds of a slice, at most: so long a frame that has just come waits for a worker.
-SLICE_S = 3.0
 #: Cells of a session: with more, the job begins again with cells twice as wide.
 MOST_CELLS = 500_000
 #: Cells of views that are held before they are fused.
 _HELD = 1_000_000
-#: Files of such a job: how far it came, until it is over; and the points.
+#: Files of a job: how far it came, until it is over; and the points.
 STATE, POINTS = "state.npz", "points"
 
 Side = Literal["before", "after"]
 SIDES: tuple[Side, Side] = ("before", "after")
 
 
-def shared_parent(connection: Connection, row: MapRow, asked: NewDifference) -> str:
-    """The parent frame in which two sessions are compared.
+def shared_parent(connection: Connection, row: MapRow, request: NewDifference) -> str:
+    """Return the parent frame in which two sessions are compared.
 
     Raises
     ------
-    InvalidRequest : a session is not there, has no poses, or they share no parent frame.
+    InvalidRequest : a session does not exist, has no poses, or they share no parent frame.
     """
     counts = {}
     for side in SIDES:
-        name: str = getattr(asked, side)
+        name: str = getattr(request, side)
         counts[side] = parents_of_session(connection, row.number, name)
         if not counts[side]:
             raise InvalidRequest(
@@ -100,98 +90,62 @@ def shared_parent(connection: Connection, row: MapRow, asked: NewDifference) -> 
             )
     before, after = (counts[side] for side in SIDES)
     shared = sorted(before.keys() & after.keys(), key=lambda p: (-min(before[p], after[p]), p))
-    if asked.parent_frame is not None and asked.parent_frame not in shared:
+    if request.parent_frame is not None and request.parent_frame not in shared:
         raise InvalidRequest(
-            f"Sessions {asked.before!r:.80} and {asked.after!r:.80} do not both have poses in "
-            f"parent frame {asked.parent_frame!r:.80}. "
+            f"Sessions {request.before!r:.80} and {request.after!r:.80} do not both have poses in "
+            f"parent frame {request.parent_frame!r:.80}. "
             + (f"Choose from {', '.join(shared)!r:.300}." if shared else "They share none."),
             (("parent_frame", "not of both sessions"),),
         )
     if not shared:
         raise InvalidRequest(
-            f"Session {asked.before!r:.80} has poses in {', '.join(before)!r:.200}, session "
-            f"{asked.after!r:.80} in {', '.join(after)!r:.200}: they share no parent frame. "
+            f"Session {request.before!r:.80} has poses in {', '.join(before)!r:.200}, session "
+            f"{request.after!r:.80} in {', '.join(after)!r:.200}: they share no parent frame. "
             "Associate the sessions: a strong join gives their poses one parent frame.",
             (("after", "no parent frame in common"),),
         )
-    return asked.parent_frame or shared[0]
+    return request.parent_frame or shared[0]
 
 
-class DifferenceJobs(MapJobs[Difference]):
+class Differences(Products[NewDifference, Difference]):
     """Differences of sessions."""
 
-    def __init__(self, store: Store, tasks: Tasks) -> None:
-        super().__init__(
-            store, tasks, Difference, kind=DIFFERENCE, noun="difference", path="differences",
-            priority=PRIORITY,
-        )  # fmt: skip
+    kind = "difference"
+    request, record = NewDifference, Difference
 
-    def begin(self, map_name: str, asked: NewDifference) -> Difference:
-        """Queue a comparison.
+    def __init__(self, store: Store, tasks: Tasks, signers: Signers) -> None:
+        super().__init__(store, tasks)
+        self._signers = signers
 
-        Raises
-        ------
-        UnknownMap : no such map.
-        InvalidRequest : the sessions cannot be compared.
-        """
-        with self._store.database.read() as connection:
-            shared_parent(connection, find_map(connection, map_name), asked)
-        return self.queue(map_name, asked)
-
-    def points(self, map_name: str, job_id: str) -> queue.JobFile:
-        """The file of its points.
-
-        Raises
-        ------
-        UnknownMap, UnknownJob : there is none.
-        NotIndexed : it did not succeed.
-        DamagedBlob : its points are lost.
-        """
-        with self._store.database.read() as connection:
-            job = self.find(connection, map_name, job_id)
-            self.require_success(job, map_name, "its points exist")
-            found = queue.files_of(connection, job.number).get(POINTS)
-        if found is None:
-            raise DamagedBlob(
-                f"The points of difference {job_id} are lost. Delete it and compare the sessions "
-                "again."
+    def start(self, connection: Connection, row: MapRow, request: NewDifference) -> dict[str, Any]:
+        """Choose the frames to compare, and their parent frame; see `shared_parent`."""
+        parent = shared_parent(connection, row, request)
+        frames = {
+            side: _spread(
+                posed_in_session(connection, row.number, getattr(request, side), parent),
+                api.MOST_COMPARED,
             )
-        return found
+            for side in SIDES
+        }
+        return {
+            "done": 0, "total": 2 * sum(map(len, frames.values())), "skipped": 0,
+            "frames": frames, "parent": parent,
+        }  # fmt: skip
 
-    def forget(self) -> int:
-        """Remove those of which any frame was deleted since: they show it; returns how many."""
-        with self._store.database.read() as connection:
-            gone = [
-                (map_of(connection, job.map_number).name, job.id)
-                for job in queue.jobs_with_files(connection, DIFFERENCE)
-                if job.map_number is not None and any_gone(connection, _frames_of(job))
-            ]
-        for name, job_id in gone:
-            with suppress(UnknownMap, UnknownJob):  # somebody else has
-                self.remove(name, job_id)
-        return len(gone)
+    def shows_deleted(self, connection: Connection, job: JobRow) -> bool:
+        """Return whether any frame that a job compares was deleted."""
+        return any_gone(connection, _frames_of(job))
 
-
-class DifferenceHandler:
-    """Does the jobs."""
-
-    def __init__(self, store: Store, signers: Signers) -> None:
-        self._store, self._signers = store, signers
-
-    def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """A slice: at least one frame fused, or one that judges cells; the last concludes."""
-        asked = NewDifference.model_validate(task.data)
+    def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
+        """Fuse at least one frame, or have one judge cells; the last slice concludes."""
         is_over = ends_within(is_over, SLICE_S)
+        request = NewDifference.model_validate(task.data)
+        progress = dict(task.progress) or self.restart(task.of_map, request)
         with self._store.database.read() as connection:
             row = living_map(connection, task.of_map)
+            file = queue.files_of(connection, task.job.number).get(STATE)
         parameters = self._signers(row.model_id).model.parameters  # while no connection is held
-        with self._store.database.read() as connection:
-            if task.progress:
-                progress = dict(task.progress)
-                file = queue.files_of(connection, task.job.number).get(STATE)
-            else:
-                cell_m = cell_width(parameters.cloud.voxel_size)
-                progress, file = _begin(connection, row, asked, cell_m), None
+        progress.setdefault("cell_m", cell_width(parameters.cloud.voxel_size))
         state = _State() if file is None else _State.read(self._store.blobs.get(file.blob))
         if progress["done"] < progress["total"] // 2:
             self._fuse(row, progress, state, is_over)
@@ -257,7 +211,7 @@ class DifferenceHandler:
         return queue.JobFile(name, self._store.blobs.put(data), len(data), MEDIA_TYPE)
 
     def _conclude(self, row: MapRow, progress: dict[str, Any], state: _State) -> SliceResult:
-        """Counts, and the points of all cells by what they are."""
+        """Return counts, and the points of all cells by what they are."""
         frames = progress["frames"]
         positions, states = {}, {}
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
@@ -326,24 +280,6 @@ class _State:
         file = io.BytesIO()
         np.savez(file, **arrays)
         return file.getvalue()
-
-
-def _begin(
-    connection: Connection, row: MapRow, asked: NewDifference, cell_m: float
-) -> dict[str, Any]:
-    """Progress of a job that begins: the frames that it compares, and where."""
-    parent = shared_parent(connection, row, asked)
-    frames = {
-        side: _spread(
-            posed_in_session(connection, row.number, getattr(asked, side), parent),
-            api.MOST_COMPARED,
-        )
-        for side in SIDES
-    }
-    return {
-        "done": 0, "total": 2 * sum(map(len, frames.values())), "skipped": 0, "frames": frames,
-        "parent": parent, "cell_m": cell_m,
-    }  # fmt: skip
 
 
 def _order(frames: dict[Side, list[int]]) -> list[tuple[Side, int]]:

@@ -14,14 +14,14 @@ from collections.abc import Sequence
 from pydantic import ValidationError
 from sqlalchemy import Connection
 
-from sceneprint.engine.sessions.associations import ASSOCIATE, MOST_FRAMES, sessions_of
+from sceneprint.engine.products.associations import MOST_FRAMES, Associations, sessions_of
+from sceneprint.engine.products.product import BACKGROUND
 from sceneprint.errors import SceneprintError
 from sceneprint.store import Store
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import list_maps, map_of
 from sceneprint.store.parent_joins import ParentRun, posed_runs, undone_pairs
 from sceneprint.store.queue import enqueue, list_jobs
-from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import FrameState, JobState
@@ -31,8 +31,6 @@ log = logging.getLogger(__name__)
 
 #: Seconds between two looks at all maps.
 LOOK_S = 5.0
-#: As of surfaces: a worker does a slice when nothing else waits.
-PRIORITY = REENCODING_PRIORITY - 1
 #: Frames that either session needs: a strong join has ten votes from five frames of each.
 LEAST_FRAMES = 5
 #: How many times as many frames as in the last association of two sessions are worth another.
@@ -82,7 +80,8 @@ class JoinUpkeep:
             request = _due(connection, row)  # another process may have been first
             if request is not None:
                 data = request.model_dump(mode="json", exclude_unset=True)
-                enqueue(connection, ASSOCIATE, None, PRIORITY, map_number=row.number, data=data)
+                kind = Associations.kind
+                enqueue(connection, kind, None, BACKGROUND, map_number=row.number, data=data)
         self._bell.ring()
         return False
 
@@ -99,7 +98,8 @@ def _due(connection: Connection, row: MapRow) -> NewAssociation | None:
     largest = _largest(runs)
     if len(largest) < 2:
         return None
-    jobs = [one.job for one in list_jobs(connection, None, _JOBS, None, ASSOCIATE, [row.name])]
+    kind = Associations.kind
+    jobs = [one.job for one in list_jobs(connection, None, _JOBS, None, kind, [row.name])]
     if any(not job.state.over for job in jobs):
         return None
     undone = undone_pairs(connection, row.number)

@@ -1,0 +1,1 @@
+"""What jobs compute from maps: coverage, associations and differences of sessions, surfaces."""

@@ -1,0 +1,431 @@
+"""Sessions associated with each other, or one session with itself, frame by frame.
+
+sessions  --start-->  frames  --step-->  edges  --finish_association-->  verdicts, joins
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection
+
+from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
+from sceneprint.engine.products.edge_consensus import finish_association
+from sceneprint.engine.products.pose_graph import graph_text, pose_graph
+from sceneprint.engine.products.product import StepwiseProducts
+from sceneprint.engine.search.local_index import IndexView
+from sceneprint.engine.search.retrieval import Readers
+from sceneprint.engine.search.up_vectors import known_ups
+from sceneprint.engine.search.verification import thresholds
+from sceneprint.engine.serializers import sensor_frame, transform
+from sceneprint.engine.signers import Signers
+from sceneprint.engine.upkeep.repair import resign_frames
+from sceneprint.errors import DamagedBlob, InvalidRequest, JoinStands, UnreadableGeometry
+from sceneprint.formats.export import information_of
+from sceneprint.geometry.retrieval.ranking import (
+    Ranking,
+    diversify,
+    pairwise_distances,
+    ranking_size,
+    similarity,
+)
+from sceneprint.geometry.rigid import inverse
+from sceneprint.geometry.validation.map_verification import MapParameters
+from sceneprint.index.generation_files import Keys
+from sceneprint.models import Model
+from sceneprint.pipeline import PairMatch, associate
+from sceneprint.store import Store
+from sceneprint.store.events import record_event
+from sceneprint.store.frame_queries import (
+    PathFrame,
+    QueryOrigin,
+    numbers_of_session,
+    passing,
+    stops_of,
+)
+from sceneprint.store.maps import find_map, frames_of, geometry_blobs, unknown_map
+from sceneprint.store.parent_joins import (
+    ParentJoin,
+    is_joined_by,
+    join_parent,
+    posed_runs,
+    undo_joins,
+)
+from sceneprint.store.queue import items_of, replace_result
+from sceneprint.store.signatures import stored_signatures
+from sceneprint.store.tables import JobRow, MapRow
+from sceneprint.types import Geometry
+from sceneprint_client.api import Page
+from sceneprint_client.api.base import Transform
+from sceneprint_client.api.sessions import (
+    APART,
+    Association,
+    Edge,
+    GraphFormat,
+    NewAssociation,
+)
+
+#: Most frames of both sessions together: more are hours, and edges past what a page holds.
+MOST_FRAMES = 5000
+
+
+def sessions_of(request: NewAssociation) -> list[tuple[str, str | None]]:
+    """Return session and robot of both sides; of the one side for loop closures."""
+    robots: list[str | None] = [*(request.robots or [])] or [None] * len(request.sessions)
+    return list(zip(request.sessions, robots, strict=True))
+
+
+def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> list[list[PathFrame]]:
+    """Return the frames of each session that pass the filter, in the order of time.
+
+    Raises
+    ------
+    InvalidRequest : a session has no indexed frame, or frames of several robots; or there are too
+        many frames.
+    """
+    sides, found = sessions_of(request), []
+    numbers = [numbers_of_session(connection, row.number, *side) for side in sides]
+    if request.filter is not None:
+        passed = passing(connection, row.number, request.filter, QueryOrigin(None, None, None))
+        kept = set(passed.tolist())
+        numbers = [[number for number in own if number in kept] for own in numbers]
+    if sum(map(len, numbers)) > MOST_FRAMES:
+        raise InvalidRequest(
+            f"The sessions have {sum(map(len, numbers))} frames, but an association takes at "
+            f"most {MOST_FRAMES}. Narrow them with `filter`, for example by captured_after "
+            "and captured_before.",
+            (("sessions", "too many frames"),),
+        )
+    for own in numbers:
+        stops = stops_of(connection, own)
+        found.append([stops[number] for number in own if number in stops])
+    for stops_found, (session, robot) in zip(found, sides, strict=True):
+        robots = sorted({stop.robot or "" for stop in stops_found})
+        if not robots:
+            whose = "" if robot is None else f" of robot {robot!r:.80}"
+            raise InvalidRequest(
+                f"Session {session!r:.80}{whose} has no indexed frame in map {row.name!r} that "
+                f"passes the filter. See GET /v1/maps/{row.name}/sessions.",
+                (("sessions", "no indexed frame"),),
+            )
+        if len(robots) > 1:
+            raise InvalidRequest(
+                f"Session {session!r:.80} exists for several robots: {', '.join(robots)!r:.200}. "
+                "Name one in `robots`.",
+                (("robots", "needed"),),
+            )
+    return found
+
+
+def eligible(request: NewAssociation, progress: Mapping[str, Any]) -> Keys:
+    """Return the frames that the next one may be found near, in rising order: those of the other
+    session, or earlier ones of its own.
+    """
+    place, target = progress["done"], progress["target"]
+    if len(request.sessions) == 2:
+        return np.sort(np.array(target, np.int64))
+    apart = request.apart or (1 if request.not_within_s is not None else APART)
+    before = np.array(target[: max(place - apart + 1, 0)], np.int64)
+    if request.not_within_s is not None:
+        taken = np.array(progress["taken"], float)  # NaN where not known, which is before nothing
+        before = before[taken[: len(before)] < taken[place] - request.not_within_s]
+    return np.sort(before)
+
+
+class Associations(StepwiseProducts[NewAssociation, Association]):
+    """Associations of the sessions of maps."""
+
+    kind = "associate"
+    request, record = NewAssociation, Association
+    priority = 0
+    item_count = "edges"
+
+    def __init__(self, store: Store, tasks: Tasks, signers: Signers, readers: Readers) -> None:
+        super().__init__(store, tasks)
+        self._signers, self._readers = signers, readers
+
+    def start(self, connection: Connection, row: MapRow, request: NewAssociation) -> dict[str, Any]:
+        """Fix the frames of both sessions, in the order of time; see `runs_of`."""
+        runs = runs_of(connection, row, request)
+        source, target = runs[0], runs[-1]
+        return {
+            "done": 0, "total": len(source), "validated": 0, "skipped": 0,
+            "source": [stop.number for stop in source],
+            "target": [stop.number for stop in target],
+            "taken": [stop.captured_at for stop in source],
+        }  # fmt: skip
+
+    def step(
+        self, task: LongJob, request: NewAssociation, progress: dict[str, Any]
+    ) -> list[dict[str, Any]]:
+        """Return the edges of one frame; skip a frame that is deleted or damaged."""
+        number, among = progress["source"][progress["done"]], eligible(request, progress)
+        if not len(among):
+            return []
+        row, model, view = self._view(task.of_map)
+        with self._store.database.read() as connection:
+            vectors = stored_signatures(connection, [number], row.model_id)
+            alive = number in frames_of(connection, [number])
+            blobs = geometry_blobs(connection, [number], row.model_id)
+        geometry = self._geometry(row, number, blobs)
+        if number not in vectors or not alive or geometry is None:
+            if alive:  # damaged: it is signed again
+                resign_frames(self._store, row, [number], row.model_id)
+            progress["skipped"] += 1
+            return []
+        among = among[view.has(among)]
+        hits = view.search(
+            np.frombuffer(vectors[number], np.uint8), ranking_size(len(among)), dead=view.dead,
+            among=among, exact=True,
+        )  # fmt: skip
+        if not len(hits):
+            return []
+        shares = similarity(hits.distances, model.unrelated_distance)
+        ranking = Ranking(hits.keys.astype(np.intp), hits.distances, shares)
+        distances = pairwise_distances(view.signatures(hits.keys), view.metric)
+        chosen = diversify(ranking.distances, distances, request.candidates).indices.tolist()
+        with self._store.database.read() as connection:
+            ups = known_ups(connection, [number, *ranking.indices.tolist()])
+            blobs = geometry_blobs(connection, ranking.indices[chosen].tolist(), row.model_id)
+        matches = associate(
+            geometry, ranking, chosen, lambda key: self._geometry(row, key, blobs), request.k,
+            request.seed, *thresholds(request.validation, model.parameters.validation),
+            up=ups.get(number), up_of=ups.get,
+        )  # fmt: skip
+        progress["validated"] += len(matches)
+        order = {number: i for i, number in enumerate(ranking.indices.tolist())}
+        accepted = sorted(
+            (one for one in matches if one.validation.status == "accepted"),
+            key=lambda one: order[one.index],
+        )
+        # a frame that is deleted from here on is left out where edges are listed
+        return [
+            _item(number, one) for one in accepted if one.validation.overlap >= request.min_overlap
+        ]
+
+    def finish(
+        self, task: LongJob, request: NewAssociation, progress: dict[str, Any],
+        items: list[dict[str, Any]],
+    ) -> SliceResult:  # fmt: skip
+        """Check the edges against each other, and join the sessions where they agree."""
+        source, target = progress["source"], progress["target"]
+        with self._store.database.read() as connection:
+            found = items_of(connection, task.job.number) + items
+            stops = stops_of(connection, {*source, *target})
+        scale = self._signers(task.of_map.model_id).model.answer.map.same_m / MapParameters().same_m
+        verdicts, counts, joins = finish_association(found, source, target, stops, request, scale)
+        rooted = self._rooted(task, joins) if request.join and len(request.sessions) == 2 else []
+        result = {
+            "frames": len(source), "skipped": progress["skipped"],
+            "validated": progress["validated"], "edges": len(found), **counts, "joins": joins,
+        }  # fmt: skip
+        return SliceResult(
+            True, progress, items + verdicts, result=result, event="association.found",
+            write=partial(_apply, task, rooted) if rooted else None,
+        )  # fmt: skip
+
+    def _rooted(self, task: LongJob, joins: list[dict[str, Any]]) -> list[ParentJoin]:
+        """Return what strong joins lead to: the parent frame whose frames came first is the root.
+
+        Each of these joins comes to name it.
+        """
+        with self._store.database.read() as connection:
+            parents = [run.parent for run in posed_runs(connection, task.of_map.number)]
+        place = {name: i for i, name in enumerate(dict.fromkeys(parents))}
+        found: dict[str, ParentJoin] = {}
+        for one in joins:
+            ends = one["from_parent"], one["to_parent"]
+            if one["strength"] != "strong" or ends[0] == ends[1] or not place.keys() >= {*ends}:
+                continue
+            root, parent = sorted(ends, key=place.__getitem__)
+            T = np.array(one["transform"]["matrix"])
+            if parent in found or root in found:  # by a pair of frames before: one is enough
+                continue
+            one["root"] = root
+            found[parent] = ParentJoin(parent, root, T if root == ends[1] else inverse(T))
+        return list(found.values())
+
+    def _geometry(self, row: MapRow, number: int, blobs: Mapping[int, str]) -> Geometry | None:
+        """The artifact of a frame, of those that `blobs` names; None where it is damaged."""
+        if number not in blobs:  # deleted in the meantime
+            return None
+        try:
+            return self._store.geometries.read(blobs[number])
+        except (DamagedBlob, UnreadableGeometry):  # one frame must not cost the others
+            resign_frames(self._store, row, [number], row.model_id)
+            return None
+
+    def _view(self, of: MapRow) -> tuple[MapRow, Model, IndexView]:
+        """The map as it is now: frames of it may be deleted, and its model may change.
+
+        Raises
+        ------
+        UnknownMap : it was deleted, whether or not another has its name.
+        """
+        row = of
+        while True:  # its signer opened while no connection is held
+            model = self._signers(row.model_id).model
+            with self._store.database.read() as connection:
+                row = find_map(connection, of.name)
+                if row.number != of.number:
+                    raise unknown_map(of.name)
+                if row.model_id == model.id:
+                    return row, model, self._readers.view(connection, row)
+
+    def undo_join(self, map_name: str, job_id: str) -> Association:
+        """Undo the join of an association: all frames have the poses that the other joins give
+        them, those of no join as they were sent. Without a join that stands nothing changes.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob, NotIndexed : it does not exist, or did not succeed.
+        """
+        with self._store.database.write() as connection:
+            job = self.find(connection, map_name, job_id)
+            result = self.require_success(job, map_name, "its join can be undone")
+            if job.map_number is not None and undo_joins(connection, job.map_number, job.id):
+                joins = [
+                    one if one["root"] is None else one | {"root": None, "undone": True}
+                    for one in result["joins"]
+                ]
+                job = replace_result(connection, job, result | {"joins": joins})
+                record_event(connection, "association.undone", map_name, None, job.id)
+            return self.record_of(job, map_name)
+
+    def check_removal(self, connection: Connection, job: JobRow) -> None:
+        """Raise JoinStands where poses of the map follow from an association."""
+        if job.map_number is not None and is_joined_by(connection, job.map_number, job.id):
+            raise JoinStands(
+                f"Association {job.id} joined parent frames of its map, and only with it this can "
+                "be undone. Undo its join first: DELETE the path of the association with /join."
+            )
+
+    def items(
+        self, connection: Connection, job: JobRow, first: int, limit: int
+    ) -> list[dict[str, Any]]:
+        """Return edges, with their verdicts when the association is over."""
+        found = super().items(connection, job, first, limit)
+        verdicts = [dict[str, Any](consistent=None, loops=None, closed=None)] * len(found)
+        if job.result is not None:  # as many verdicts follow the edges
+            after = job.result["edges"] + first
+            verdicts = items_of(connection, job.number, after, len(found))
+        return [item | verdict for item, verdict in zip(found, verdicts, strict=True)]
+
+    def edges(
+        self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
+        min_overlap: float = 0.0, *, consistent: bool | None = None,
+    ) -> Page[Edge]:  # fmt: skip
+        """Return edges between frames that exist, in the order in which they were found.
+
+        Parameters
+        ----------
+        map_name, job_id, cursor, limit : see `page_of_items`
+        min_overlap : least overlap
+        consistent : those that others support, or those that were outvoted; default: all
+        """
+
+        def records(connection: Connection, block: list[dict[str, Any]]) -> list[Edge]:
+            stops = stops_of(connection, {item[s] for item in block for s in ("from", "to")})
+            return [
+                _edge(item, stops)
+                for item in block
+                if item["overlap"] >= min_overlap
+                and consistent in (None, item["consistent"])
+                and {item["from"], item["to"]} <= stops.keys()
+            ]
+
+        items, more = self.page_of_items(map_name, job_id, cursor, limit, records)
+        return Page[Edge](items=items, next_cursor=more)
+
+    def graph(
+        self, map_name: str, job_id: str, kind: GraphFormat = "g2o", min_overlap: float = 0.0,
+        *, odometry: bool = False, consistent: bool = True,
+    ) -> str:  # fmt: skip
+        """Return the pose graph of an association that is over, as a file of a kind.
+
+        It has the edges of at least `min_overlap` that a second edge or a join supports, or, unless
+        `consistent`, all that were not outvoted; and with `odometry` one between each two
+        consecutive frames.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob, NotIndexed : it does not exist, or did not succeed.
+        """
+        with self._store.database.read() as connection:
+            row = find_map(connection, map_name)
+            job = self.find(connection, map_name, job_id)
+            result = self.require_success(job, row.name, "its graph exists")
+            items = self.items(connection, job, 0, result["edges"])
+            progress = job.progress or {}
+            numbers = [progress["source"], progress["target"]]
+            stops = stops_of(connection, {number for run in numbers for number in run})
+        distinct = numbers[:1] if numbers[0] == numbers[1] else numbers
+        runs = [[stops[n] for n in run if n in stops] for run in distinct]
+        chosen = [
+            item
+            for item in items
+            if item["overlap"] >= min_overlap
+            and item["consistent"] is not False
+            and (item["consistent"] or not consistent)
+            and {item["from"], item["to"]} <= stops.keys()
+        ]
+        graph = pose_graph(runs, chosen, result["joins"], odometry=odometry)
+        return graph_text(graph, kind)
+
+
+def _apply(task: LongJob, joins: list[ParentJoin], connection: Connection) -> list[str]:
+    """Join parent frames in the commit that ends an association; no blob is of no use after it.
+
+    Raises
+    ------
+    Swept : another association joined one of them meanwhile, and the end is concluded again.
+    """
+    for one in joins:
+        if not join_parent(connection, task.of_map.number, one, task.job.id):
+            raise Swept(f"Another association has joined {one.parent} or {one.root} meanwhile.")
+    return []
+
+
+def _item(number: int, match: PairMatch) -> dict[str, Any]:
+    """An edge as it is kept."""
+    v = match.validation
+    T = np.eye(4) if v.T_match_query is None else v.T_match_query  # an accepted one has one
+    return {
+        "from": number, "to": match.index, "T": T.ravel().tolist(),
+        "covariance": None if v.covariance is None else v.covariance.ravel().tolist(),
+        "overlap": v.overlap, "residual_m": v.residual_m,
+        "residual_deg": math.degrees(v.residual_rad), "strength": v.strength,
+        "inliers": v.inliers, "ambiguity": v.ambiguity, "similarity": match.similarity,
+    }  # fmt: skip
+
+
+def _pose(stop: PathFrame) -> Transform | None:
+    if stop.pose is None or stop.parent is None:
+        return None
+    return transform(np.array(stop.pose), stop.parent, sensor_frame(stop.id, stop.kind))
+
+
+def _edge(item: dict[str, Any], stops: dict[int, PathFrame]) -> Edge:
+    here, there = stops[item["from"]], stops[item["to"]]
+    T, information = np.array(item["T"]).reshape(4, 4), None
+    if item["covariance"] is not None:
+        whole = information_of(np.array(item["covariance"]).reshape(6, 6), T)
+        information = whole.ravel().tolist()
+    same = (
+        "overlap", "residual_m", "residual_deg", "strength", "inliers", "ambiguity",
+        "similarity", "consistent", "loops", "closed",
+    )  # fmt: skip
+    return Edge(
+        from_pose=_pose(here), to_pose=_pose(there),
+        number=item["number"], from_frame=here.id, to_frame=there.id,
+        from_session=here.session, to_session=there.session,
+        from_robot=here.robot, to_robot=there.robot, from_name=here.name, to_name=there.name,
+        transform=transform(
+            T, sensor_frame(there.id, there.kind), sensor_frame(here.id, here.kind)
+        ),
+        information=information, **{name: item[name] for name in same},
+    )  # fmt: skip

@@ -1,0 +1,399 @@
+"""Coverage of a map: its frames queried against the rest of it, one by one.
+
+    frames, in the order of runs  -->  an item each  --coverage_plans-->  plans, counts
+
+A frame that is queried finds neither itself nor, as asked, the frames taken around it or its whole
+session. The answers are those that a robot would get; none is kept.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection
+
+from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Tasks
+from sceneprint.engine.maps.map_plans import (
+    QueriedPosition,
+    coverage_plans,
+    plan_changes,
+)
+from sceneprint.engine.products.product import StepwiseProducts
+from sceneprint.engine.search.query import Queries, steadily
+from sceneprint.engine.search.retrieval import Deadline, prepare_stored
+from sceneprint.engine.search.up_vectors import parent_axes
+from sceneprint.engine.serializers import model_label
+from sceneprint.engine.signers import Signers
+from sceneprint.errors import (
+    DamagedBlob,
+    DamagedSignature,
+    InvalidRequest,
+    UnknownFrame,
+    UnreadableGeometry,
+)
+from sceneprint.geometry.rigid import difference
+from sceneprint.store import Store
+from sceneprint.store.frame_queries import (
+    PathFrame,
+    QueryOrigin,
+    numbers_of_runs,
+    positions_of_map,
+    stops_of,
+)
+from sceneprint.store.frames import count_states
+from sceneprint.store.maps import living_frame, living_map, model_names
+from sceneprint.store.queue import items_of
+from sceneprint.store.tables import JobRow, MapRow
+from sceneprint.types import Floats
+from sceneprint_client.api import Answer, Filter, Page, Query, Transform, Vector
+from sceneprint_client.api.coverage import (
+    CELL_TRENDS,
+    COVERAGE_OUTCOMES,
+    CoverageChanges,
+    CoverageFrame,
+    CoverageOutcome,
+    CoveragePlan,
+    CoverageResult,
+    MapCoverage,
+    NewMapCoverage,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """A coverage job that has succeeded."""
+
+    request: NewMapCoverage
+    result: CoverageResult
+    plans: list[CoveragePlan]
+
+
+#: Parent frames that get a plan: those of most queried frames.
+MOST_PLANS = 20
+#: Longer than any session, seconds.
+_FOREVER_S = 1e12
+#: What costs a frame, and not the job: it was deleted or edited meanwhile, or is damaged.
+_SKIPPED = (UnknownFrame, InvalidRequest, DamagedBlob, DamagedSignature, UnreadableGeometry)
+
+
+def frames_to_query(connection: Connection, row: MapRow, request: NewMapCoverage) -> list[int]:
+    """Return the numbers of the frames that a coverage job queries, in its order.
+
+    Raises
+    ------
+    InvalidRequest : there is none.
+    """
+    numbers = numbers_of_runs(connection, row.number, request.session, request.robot)[
+        :: request.every
+    ]
+    if not numbers:
+        whose = "".join(
+            f" of {what} {name!r:.80}"
+            for what, name in (("session", request.session), ("robot", request.robot))
+            if name is not None
+        )
+        raise InvalidRequest(
+            f"Map {row.name!r} has no indexed frame{whose}. See GET /v1/maps/{row.name}/sessions.",
+            (("session", "no indexed frame"),) if whose else (),
+        )
+    if len(numbers) <= request.most:
+        return numbers
+    chosen = np.arange(request.most) * len(numbers) // request.most
+    return [numbers[place] for place in chosen.tolist()]
+
+
+class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
+    """Coverage of maps."""
+
+    kind = "coverage"
+    request, record = NewMapCoverage, MapCoverage
+    item_count = "frames"
+
+    def __init__(self, store: Store, tasks: Tasks, signers: Signers, queries: Queries) -> None:
+        super().__init__(store, tasks)
+        self._signers, self._queries = signers, queries
+
+    def start(self, connection: Connection, row: MapRow, request: NewMapCoverage) -> dict[str, Any]:
+        """Choose the frames to query; raise InvalidRequest if there is none."""
+        numbers = frames_to_query(connection, row, request)
+        return {
+            "done": 0, "total": len(numbers), "skipped": 0, "frames": numbers,
+            "revision": row.revision,
+        }  # fmt: skip
+
+    def step(
+        self, task: LongJob, request: NewMapCoverage, progress: dict[str, Any]
+    ) -> list[dict[str, Any]]:
+        """Query one frame; skip it where that cannot be done."""
+        row, number = task.of_map, progress["frames"][progress["done"]]
+        with self._store.database.read() as connection:
+            stop = stops_of(connection, [number]).get(number)
+        try:
+            if stop is None:
+                raise UnknownFrame(f"Frame number {number} was deleted.")
+            answer = self._answer(row, stop, request)
+        except _SKIPPED:
+            progress["skipped"] += 1
+            return []
+        item = outcome_of(answer, stop, request)
+        with self._store.database.read() as connection:
+            found = [living_frame(connection, row.number, one) for one in item["look_alikes"]]
+        item["look_alikes"] = [frame.number for frame in found if frame is not None]
+        return [{"frame": number} | item]
+
+    def _answer(self, row: MapRow, stop: PathFrame, request: NewMapCoverage) -> Answer:
+        """Return what a robot that sees a frame would be answered without the frames that are left
+        out. The query takes one core: the others are for robots that wait.
+        """
+        plain = Query(seed=request.seed, keep=False)
+        taken = QueryOrigin(stop.robot, stop.session, stop.captured_at)
+        left_out_s = request.not_within_s
+        if request.other_sessions:  # whole sessions, also of frames without a time
+            taken, left_out_s = replace(taken, captured_at=stop.captured_at or 0.0), _FOREVER_S
+        query = plain
+        if left_out_s > 0 and taken.session is not None and taken.captured_at is not None:
+            query = plain.model_copy(update={"filter": Filter(not_within_s=left_out_s)})
+
+        def ask(rows: list[MapRow]) -> Answer:
+            self._signers(rows[0].model_id)  # while no connection is held
+            ready = prepare_stored(self._store, self._signers, row.name, stop.id, plain)
+            if ready.frame is None or ready.frame[0] != stop.number:
+                raise UnknownFrame(f"Frame {stop.id} was deleted, and a new frame has its id.")
+            ready = replace(ready, taken=taken)
+            return self._queries.answer(rows, ready, query, Deadline(None))
+
+        return steadily(self._store, [row.name], ask)
+
+    def finish(
+        self, task: LongJob, request: NewMapCoverage, progress: dict[str, Any],
+        items: list[dict[str, Any]],
+    ) -> SliceResult:  # fmt: skip
+        """Return plans and counts of all frames; the plans are items behind those of the frames."""
+        with self._store.database.read() as connection:
+            row = living_map(connection, task.of_map)
+            found = items_of(connection, task.job.number) + items
+            plans, cell_m = plans_of(connection, row, found, request.cell_m)
+            states = count_states(connection, row.number)
+            label = model_label(model_names(connection)[row.model_id], row.model_id)
+        counts = Counter(item["outcome"] for item in found)
+        result = CoverageResult(
+            **{name: counts[name] for name in COVERAGE_OUTCOMES},
+            frames=len(found), skipped=progress["skipped"],
+            model=label, revision=progress["revision"], last_revision=row.revision,
+            map_frames=states.get("indexed", 0), cell_m=cell_m,
+        )  # fmt: skip
+        return SliceResult(
+            True, progress, items + [plan.model_dump(mode="json") for plan in plans],
+            result=result.model_dump(mode="json"), event="coverage.measured",
+        )  # fmt: skip
+
+    def details(self, connection: Connection, job: JobRow) -> dict[str, Any]:
+        """Return the plans of a job that has succeeded."""
+        return {"plans": None if job.result is None else _plans(connection, job)}
+
+    def frames(
+        self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
+        outcome: CoverageOutcome | None = None,
+    ) -> Page[CoverageFrame]:  # fmt: skip
+        """Return queried frames that still exist, also while more are queried.
+
+        Parameters
+        ----------
+        map_name, job_id, cursor, limit : see `page_of_items`
+        outcome : of the frames; default: of any
+        """
+
+        def records(connection: Connection, block: list[dict[str, Any]]) -> list[CoverageFrame]:
+            named = {one for item in block for one in (item["frame"], *item["look_alikes"])}
+            stops = stops_of(connection, named)
+            return [
+                _frame_record(item, stops)
+                for item in block
+                if item["frame"] in stops and outcome in (None, item["outcome"])
+            ]
+
+        items, more = self.page_of_items(map_name, job_id, cursor, limit, records)
+        return Page[CoverageFrame](items=items, next_cursor=more)
+
+    def changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
+        """Compare a result with an earlier one of the same map and the same options.
+
+        Parameters
+        ----------
+        map_name, job_id : of the coverage job
+        since : id of the earlier one
+
+        Raises
+        ------
+        UnknownMap, UnknownJob, NotIndexed : one of them does not exist, or did not succeed.
+        InvalidRequest : they cannot be compared.
+        """
+        with self._store.database.read() as connection:
+            after = self._measured(connection, map_name, job_id)
+            before = self._measured(connection, map_name, since)
+        _require_comparable(before, after)
+        plans = plan_changes(before.plans, after.plans)
+        trends = Counter(cell.trend for plan in plans for cell in plan.cells)
+        return CoverageChanges(
+            before=since, after=job_id, cell_m=after.result.cell_m,
+            trends={name: trends[name] for name in CELL_TRENDS}, result_before=before.result,
+            result_after=after.result, plans=plans,
+        )  # fmt: skip
+
+    def _measured(self, connection: Connection, map_name: str, job_id: str) -> _Measured:
+        job = self.find(connection, map_name, job_id)
+        found = self.require_success(job, map_name, "its plans exist")
+        request = NewMapCoverage.model_validate(job.data or {})
+        result = CoverageResult.model_validate(found)
+        return _Measured(request, result, _plans(connection, job))
+
+
+def _require_comparable(before: _Measured, after: _Measured) -> None:
+    """Raise InvalidRequest where two results say different things about the same place."""
+    names = [
+        name
+        for name in NewMapCoverage.model_fields
+        if name != "cell_m" and getattr(before.request, name) != getattr(after.request, name)
+    ]
+    if names:
+        raise InvalidRequest(
+            f"The two results cannot be compared: {', '.join(names)} of their requests differ. "
+            "Measure again with the same options.",
+            (("since", "other options"),),
+        )
+    if before.result.cell_m != after.result.cell_m:
+        raise InvalidRequest(
+            f"The two results cannot be compared: their cells are {before.result.cell_m:g} m and "
+            f"{after.result.cell_m:g} m wide. Measure again with `cell_m` = "
+            f"{before.result.cell_m:g}.",
+            (("since", "cells of another width"),),
+        )
+    axes = {plan.parent_frame: [*plan.x_axis, *plan.y_axis] for plan in before.plans}
+    for plan in after.plans:
+        own = [*plan.x_axis, *plan.y_axis]
+        if not np.allclose(axes.get(plan.parent_frame, own), own, atol=1e-3):
+            raise InvalidRequest(
+                f"The two results cannot be compared: the vertical of parent frame "
+                f"{plan.parent_frame!r:.80} was another. Give the map its `up`, and measure both "
+                "again.",
+                (("since", "another vertical"),),
+            )
+
+
+def _plans(connection: Connection, job: JobRow) -> list[CoveragePlan]:
+    """Return the plans of a job that has succeeded: the items behind those of its frames."""
+    found = items_of(connection, job.number, (job.result or {})["frames"])
+    return [CoveragePlan.model_validate(one) for one in found]
+
+
+def _frame_record(item: dict[str, Any], stops: dict[int, PathFrame]) -> CoverageFrame:
+    stop = stops[item["frame"]]
+    at = item["at"]
+    same = ("number", "outcome", "reason", "cause", "error_m", "error_deg")
+    return CoverageFrame(
+        frame_id=stop.id, robot=stop.robot, session=stop.session,
+        parent_frame=item["parent"],
+        position=None if at is None else Vector(x=at[0], y=at[1], z=at[2]),
+        look_alikes=[stops[one].id for one in item["look_alikes"] if one in stops],
+        **{name: item[name] for name in same},
+    )  # fmt: skip
+
+
+# One answer judged.
+
+
+def outcome_of(answer: Answer, stop: PathFrame, request: NewMapCoverage) -> dict[str, Any]:
+    """What became of a queried frame, as an item; its look-alikes by id.
+
+    Parameters
+    ----------
+    answer : to the frame, without those that are left out
+    stop : the frame, with its own pose where that is known
+    request : with what counts as right
+    """
+    own = None if stop.pose is None else np.array(stop.pose)
+    there = None if answer.location is None else answer.location.pose
+    off = _difference(there, own, stop.parent)
+    outcome: CoverageOutcome = "not_found"
+    if answer.status == "found":
+        outcome = "unchecked" if off is None else "found" if _is_within(off, request) else "wrong"
+    elif answer.status == "ambiguous":
+        outcome = "ambiguous"
+    poses = [one.pose for one in answer.alternatives]
+    if outcome == "wrong" and there is not None:
+        poses = [there]
+    elsewhere = [
+        pose
+        for pose in poses
+        if (apart := _difference(pose, own, stop.parent)) is None or not _is_within(apart, request)
+    ]
+    return {
+        "outcome": outcome, "reason": answer.reason, "cause": answer.cause,
+        "parent": stop.parent if own is not None else None,
+        "at": None if own is None else own[:3, 3].tolist(),
+        "error_m": None if off is None else off[0],
+        "error_deg": None if off is None else math.degrees(off[1]),
+        "look_alikes": _look_alikes(answer, elsewhere),
+    }  # fmt: skip
+
+
+def _difference(
+    pose: Transform | None, own: Floats | None, parent: str | None
+) -> tuple[float, float] | None:
+    """Metres and radians between a found pose and a frame's own, if they can be compared."""
+    if pose is None or own is None or pose.parent_frame != parent:
+        return None
+    return difference(np.array(pose.matrix), own)
+
+
+def _is_within(off: tuple[float, float], request: NewMapCoverage) -> bool:
+    return off[0] <= request.tolerance_m and math.degrees(off[1]) <= request.tolerance_deg
+
+
+#: How far the pose that a match suggests may be from one that an answer names, metres.
+_SAME_POSE_M = 1.0
+
+
+def _look_alikes(answer: Answer, poses: Sequence[Transform]) -> list[str]:
+    """Of each pose the match that suggests it: ids, each once."""
+    found: list[str] = []
+    for pose in poses:
+        near = [
+            (off[0], one.frame_id)
+            for one in answer.matches
+            if one.pose_in_map is not None
+            and (off := _difference(pose, np.array(one.pose_in_map.matrix),
+                                    one.pose_in_map.parent_frame)) is not None
+            and off[0] <= _SAME_POSE_M
+        ]  # fmt: skip
+        if near:
+            found.append(min(near)[1])
+    return list(dict.fromkeys(found))
+
+
+# All items together: plans.
+
+
+def plans_of(
+    connection: Connection, row: MapRow, items: Sequence[dict[str, Any]], cell_m: float | None
+) -> tuple[list[CoveragePlan], float]:
+    """Plans of the queried frames that have poses, and the width of their cells, metres."""
+    by_parent: dict[str, list[dict[str, Any]]] = {}
+    for item in items:
+        if item["at"] is not None:
+            by_parent.setdefault(item["parent"], []).append(item)
+    names = sorted(by_parent, key=lambda name: (-len(by_parent[name]), name))[:MOST_PLANS]
+    queried = {
+        name: [QueriedPosition(np.array(one["at"]), one["outcome"]) for one in by_parent[name]]
+        for name in names
+    }
+    axes = {
+        name: parent_axes(connection, row, [item["frame"] for item in by_parent[name]])
+        for name in names
+    }
+    return coverage_plans(queried, positions_of_map(connection, row.number), axes, cell_m)

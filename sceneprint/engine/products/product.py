@@ -1,0 +1,307 @@
+"""One mechanism for what jobs compute from a map.
+
+    request  --begin-->  queued job  --slices-->  items, files, result  --get | list_all-->  record
+
+A product adds its parameters, its steps and its result. Its job runs in slices; see `tasks`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+from sqlalchemy import Connection
+
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Tasks, ends_within
+from sceneprint.engine.serializers import job_progress, when
+from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
+from sceneprint.errors import DamagedBlob, NotIndexed, UnknownJob, UnknownMap
+from sceneprint.store import Store, queue
+from sceneprint.store.audit_log import record_change
+from sceneprint.store.maps import find_map, living_map, map_of
+from sceneprint.store.opaque_ids import row_of
+from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
+from sceneprint.store.tables import JobRow, MapRow
+from sceneprint_client.api import JobState, Page, Progress
+from sceneprint_client.api.admin import Product
+from sceneprint_client.api.base import Given
+
+Request = TypeVar("Request", bound=Given)
+Record = TypeVar("Record", bound=Product)
+
+
+class Numbered(Protocol):
+    """The record of an item, which knows its place among the items of its job."""
+
+    number: int
+
+
+Item = TypeVar("Item", bound=Numbered)
+
+#: Below uploads and re-encodings: a worker does a slice when nothing else waits.
+BACKGROUND = REENCODING_PRIORITY - 1
+#: Longest slice in seconds: an upload that arrives meanwhile waits for it.
+SLICE_S = 3.0
+#: Items that are read at once.
+_BLOCK = 500
+
+
+class Products(ABC, Generic[Request, Record]):
+    """The products of a kind in all maps.
+
+    Attributes
+    ----------
+    kind : of the jobs, such as coverage
+    request, record : of the API
+    priority : of the jobs
+    item_count : field of a result that counts the items; what concludes a job follows them
+    """
+
+    kind: ClassVar[str]
+    request: type[Request]
+    record: type[Record]
+    priority: ClassVar[int] = BACKGROUND
+    item_count: ClassVar[str] = ""
+
+    def __init__(self, store: Store, tasks: Tasks) -> None:
+        self._store, self._tasks = store, tasks
+        tasks.register(self.kind, self.run_slice)
+
+    # what each product adds
+
+    @abstractmethod
+    def start(self, connection: Connection, row: MapRow, request: Request) -> dict[str, Any]:
+        """Return the progress of a job that has done nothing yet, with `done` and `total`.
+
+        Raises
+        ------
+        InvalidRequest : the map does not have what the request names.
+        """
+
+    @abstractmethod
+    def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
+        """Do a slice of a job: some of its work, or the conclusion."""
+
+    def details(self, connection: Connection, job: JobRow) -> dict[str, Any]:
+        """Return fields of a record that lists leave out."""
+        del connection, job
+        return {}
+
+    def check_removal(self, connection: Connection, job: JobRow) -> None:
+        """Raise Conflict where a map depends on a job."""
+
+    def shows_deleted(self, connection: Connection, job: JobRow) -> bool:
+        """Return whether files of a job show a frame that was deleted."""
+        del connection, job
+        return False
+
+    # the mechanism
+
+    def begin(self, map_name: str, request: Request) -> Record:
+        """Queue a job.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : see `start`.
+        """
+        with self._store.database.read() as connection:
+            progress = self.start(connection, find_map(connection, map_name), request)
+        data = request.model_dump(mode="json", exclude_unset=True)
+        job, _ = self._tasks.begin(self.kind, map_name, data, self.priority)
+        begun = self.get(map_name, job.job_id)
+        if begun.progress is None:
+            total = Progress(done=0, total=progress["total"])
+            begun = begun.model_copy(update={"progress": total})
+        return begun
+
+    def restart(self, row: MapRow, request: Request) -> dict[str, Any]:
+        """Return what `start` returns for a map as it is now."""
+        with self._store.database.read() as connection:
+            return self.start(connection, living_map(connection, row), request)
+
+    def list_all(self, map_name: str, cursor: str | None = None, limit: int = 100) -> Page[Record]:
+        """Return the jobs of a map, the newest first.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : the service did not issue the cursor.
+        """
+        seals = self._store.seals
+        before = seals.row("job", cursor)
+        with self._store.database.read() as connection:
+            find_map(connection, map_name)
+            found = queue.list_jobs(connection, before, limit + 1, None, self.kind, [map_name])
+        more = seals.next_cursor("job", [one.job.number for one in found], limit)
+        items = [self.record_of(one.job, map_name) for one in found[:limit]]
+        return Page[self.record](items=items, next_cursor=more)  # type: ignore[name-defined]
+
+    def get(self, map_name: str, job_id: str) -> Record:
+        """Return a job with its details; raise UnknownMap or UnknownJob if it does not exist."""
+        with self._store.database.read() as connection:
+            job = self.find(connection, map_name, job_id)
+            return self.record_of(job, map_name, **self.details(connection, job))
+
+    def remove(self, map_name: str, job_id: str) -> None:
+        """Delete a job with its results, also while a worker runs it.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : it does not exist.
+        Conflict : the map depends on it; see `check_removal`.
+        """
+        with self._store.database.write() as connection:
+            job = self.find(connection, map_name, job_id)
+            self.check_removal(connection, job)
+            blobs = queue.remove_job(connection, job)
+            record_change(connection, "job.removed", map_name, job_id, kind=self.kind)
+        collect_deleted_blobs(self._store, blobs)
+
+    def forget(self) -> int:
+        """Delete the jobs whose files show deleted frames; return how many."""
+        with self._store.database.read() as connection:
+            gone = [
+                (map_of(connection, job.map_number).name, job.id)
+                for job in queue.jobs_with_files(connection, self.kind)
+                if job.map_number is not None and self.shows_deleted(connection, job)
+            ]
+        for name, job_id in gone:
+            with suppress(UnknownMap, UnknownJob):  # somebody else has deleted it
+                self.remove(name, job_id)
+        return len(gone)
+
+    def find(self, connection: Connection, map_name: str, job_id: str) -> JobRow:
+        """Return the row of a job of a map.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        UnknownJob : the map has no job of this kind and id.
+        """
+        row = find_map(connection, map_name)
+        message = (
+            f"There is no {self.record.noun} {job_id!r:.80} in map {row.name!r}. List them with "
+            f"GET /v1/maps/{row.name}/{self.record.collection}."
+        )
+        try:
+            job = queue.find_job(connection, job_id)
+        except UnknownJob:
+            raise UnknownJob(message) from None
+        if job.kind != self.kind or job.map_number != row.number:
+            raise UnknownJob(message)
+        return job
+
+    def record_of(self, job: JobRow, map_name: str, **details: Any) -> Record:
+        """Return a job as the API describes it."""
+        return self.record.model_validate(
+            {
+                "job_id": job.id, "map": map_name, "request": job.data or {}, "state": job.state,
+                "progress": job_progress(job), "result": job.result, "error": job.error,
+                "created_at": when(job.created_at), "finished_at": when(job.finished_at),
+                **details,
+            }
+        )  # fmt: skip
+
+    def require_success(self, job: JobRow, map_name: str, what: str) -> dict[str, Any]:
+        """Return the result of a job; raise NotIndexed until it has succeeded.
+
+        Parameters
+        ----------
+        job, map_name : see `find`
+        what : exists once the job has succeeded, such as "its graph exists"
+        """
+        if job.state != JobState.SUCCEEDED or job.result is None:
+            raise NotIndexed(
+                f"{self.record.noun.capitalize()} {job.id} is {job.state}; {what} once it has "
+                f"succeeded. See GET /v1/maps/{map_name}/{self.record.collection}/{job.id}."
+            )
+        return job.result
+
+    def file(self, map_name: str, job_id: str, name: str) -> queue.JobFile:
+        """Return a file that a job has made.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : the job does not exist.
+        NotIndexed : it did not succeed.
+        DamagedBlob : the file is lost.
+        """
+        with self._store.database.read() as connection:
+            job = self.find(connection, map_name, job_id)
+            self.require_success(job, map_name, f"its {name} exist")
+            found = queue.files_of(connection, job.number).get(name)
+        if found is None:
+            raise DamagedBlob(
+                f"The {name} of {self.record.noun} {job_id} are lost. Delete it and begin it again."
+            )
+        return found
+
+    def items(
+        self, connection: Connection, job: JobRow, first: int, limit: int
+    ) -> list[dict[str, Any]]:
+        """Return items of a job with their numbers, also while more are found."""
+        if job.result is not None:
+            limit = max(min(limit, job.result[self.item_count] - first), 0)
+        found = queue.items_of(connection, job.number, first, limit)
+        return [item | {"number": first + i} for i, item in enumerate(found)]
+
+    def page_of_items(
+        self, map_name: str, job_id: str, cursor: str | None, limit: int,
+        records: Callable[[Connection, list[dict[str, Any]]], list[Item]],
+    ) -> tuple[list[Item], str | None]:  # fmt: skip
+        """Return a page of the items of a job, and the cursor of the next page.
+
+        Parameters
+        ----------
+        records : returns the records of those items that pass a filter
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : the job does not exist.
+        InvalidRequest : the service did not issue the cursor.
+        """
+        after = row_of(cursor)
+        at = 0 if after is None else after + 1
+        found: list[Item] = []
+        with self._store.database.read() as connection:
+            job = self.find(connection, map_name, job_id)
+            while len(found) <= limit:
+                block = self.items(connection, job, at, _BLOCK)
+                found += records(connection, block)
+                at += len(block)
+                if len(block) < _BLOCK:
+                    break
+        return found[:limit], str(found[limit - 1].number) if len(found) > limit else None
+
+
+class StepwiseProducts(Products[Request, Record]):
+    """Products whose jobs take one equal step after another, such as one for each frame."""
+
+    @abstractmethod
+    def step(
+        self, task: LongJob, request: Request, progress: dict[str, Any]
+    ) -> Sequence[dict[str, Any]]:
+        """Do one step, count in `progress` what it skipped, and return the items it found."""
+
+    @abstractmethod
+    def finish(
+        self, task: LongJob, request: Request, progress: dict[str, Any],
+        items: list[dict[str, Any]],
+    ) -> SliceResult:  # fmt: skip
+        """Conclude a job whose steps are done; `items` are those of the last slice."""
+
+    def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
+        """Do at least one step, and as many as time allows; after the last one, conclude."""
+        request = self.request.model_validate(task.data)
+        is_over = ends_within(is_over, SLICE_S)
+        progress = dict(task.progress) or self.restart(task.of_map, request)
+        items: list[dict[str, Any]] = []
+        while progress["done"] < progress["total"]:
+            items += self.step(task, request, progress)
+            progress["done"] += 1
+            if is_over():
+                return SliceResult(False, progress, items)
+        return self.finish(task, request, progress, items)

@@ -1,1 +1,0 @@
-"""Sessions of robots associated with each other."""

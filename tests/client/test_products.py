@@ -1,0 +1,85 @@
+"""What all products of maps share, by client and raw HTTP: begin, wait, list, read, delete."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import httpx
+import pytest
+
+from benchmarks.waiting import PATIENCE_S
+from sceneprint.errors import UnknownJob, UnknownMap
+from sceneprint_client import Client
+from sceneprint_client.api import FrameMeta, JobState
+from sceneprint_client.api.admin import Product
+from sceneprint_client.api.coverage import MapCoverage
+from sceneprint_client.api.sessions import Association, Difference
+
+MAP = "produced"
+
+
+@pytest.fixture(scope="module")
+def client(
+    service_url: str, walk: Callable[..., list[tuple[bytes, FrameMeta]]]
+) -> Iterator[Client]:
+    """A client of a map with sessions a and b, of two frames each in one parent frame."""
+    with Client(service_url) as client:
+        client.create_map(MAP, model="depth")
+        frames = walk(sessions="ab", parent="room")
+        jobs = [client.upload(MAP, *frame).job_id for frame in frames]
+        assert {job.state for job in client.wait(jobs)} == {JobState.SUCCEEDED}
+        yield client
+
+
+@pytest.mark.parametrize(
+    ("kind", "job_kind", "request_", "bad", "steps"),
+    [
+        (MapCoverage, "coverage", {"not_within_s": 0}, {"every": 0}, 4),
+        (Association, "associate", {"sessions": ["a", "b"]}, {"sessions": ["a", "b", "c"]}, 2),
+        (Difference, "difference", {"before": "a", "after": "b"}, {"before": "a"}, 8),
+    ],
+)
+def test_a_product_from_request_to_deletion(
+    client: Client, service_url: str, kind: type[Product], job_kind: str,
+    request_: dict[str, Any], bad: dict[str, Any], steps: int,
+) -> None:  # fmt: skip
+    root = f"/v1/maps/{MAP}/{kind.collection}"
+    with httpx.Client(base_url=service_url, trust_env=False, timeout=PATIENCE_S) as http:
+        first, second = (http.post(root, json=request_) for _ in range(2))
+        assert (first.status_code, first.json()["progress"]["total"]) == (202, steps)
+        seen: list[tuple[int, int]] = []
+        done = client.wait_for_product(
+            kind.model_validate(first.json()), progress=lambda *step: seen.append(step)
+        )
+        assert (done.state, seen[-1]) == (JobState.SUCCEEDED, (steps, steps))
+        assert client.product(kind, MAP, done.job_id) == done
+        place = first.headers["Location"]
+        assert place == f"{root}/{done.job_id}"
+        assert http.get(f"/v1/jobs/{done.job_id}").json()["kind"] == job_kind
+        ids = [second.json()["job_id"], done.job_id]
+        assert [one.job_id for one in client.products(kind, MAP)] == ids
+        page = http.get(root, params={"limit": 1}).json()
+        rest = http.get(root, params={"cursor": page["next_cursor"]}).json()
+        assert [one["job_id"] for one in page["items"] + rest["items"]] == ids
+        for status, method, path, more in (
+            (404, "GET", f"{root}/{'0' * 32}", {}),
+            (404, "GET", f"/v1/maps/nowhere/{kind.collection}/{done.job_id}", {}),
+            (404, "DELETE", f"{root}/nothing", {}),
+            (422, "GET", root, {"params": {"cursor": "x"}}),
+            (422, "POST", root, {"json": bad}),
+            (422, "POST", root, {"json": []}),
+            (415, "POST", root, {"content": b"every=5"}),
+            (400, "POST", root, {"content": b"{", "headers": {"Content-Type": "application/json"}}),
+        ):
+            refused = http.request(method, path, **more)
+            assert refused.status_code == status, (method, path, refused.text)
+            assert refused.headers["Content-Type"] == "application/problem+json"
+        client.delete_product(kind, MAP, ids[0])
+        assert [one.job_id for one in client.products(kind, MAP)] == ids[1:]
+        assert http.delete(place).status_code == 204
+    for name in (done.job_id, "../jobs"):
+        with pytest.raises(UnknownJob, match=f"no {kind.noun} "):
+            client.product(kind, MAP, name)
+    with pytest.raises(UnknownMap):
+        next(client.products(kind, "nowhere"))
