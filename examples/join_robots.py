@@ -19,7 +19,7 @@ from sceneprint.errors import MapExists
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.types import Floats
 from sceneprint_client import Client
-from sceneprint_client.api.sessions import Join
+from sceneprint_client.api.sessions import Association, Join
 from sceneprint_client.frame_files import meta_of
 
 MAP = "two-robots"
@@ -44,7 +44,7 @@ def join(client: Client, bags: tuple[Path, Path]) -> Floats | None:
     except MapExists:
         print(f"map {MAP} is there already, and is used")
     first, second = (upload(client, bag) for bag in bags)
-    found = client.associate(MAP, second, first)
+    found = client.compute(Association, MAP, sessions=[second, first])
     if found.result is None:
         print(f"the association is {found.state}: {found.error}")
         return None

@@ -5,7 +5,7 @@ reconstructions.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeVar, get_args
 
@@ -13,12 +13,10 @@ import httpx
 
 from sceneprint_client.api import (
     Answer,
-    Filter,
     Job,
     JobState,
     Page,
     Progress,
-    ValidationOptions,
 )
 from sceneprint_client.api.admin import Product, RetriedJobs
 from sceneprint_client.api.base import checked
@@ -27,7 +25,6 @@ from sceneprint_client.api.coverage import (
     CoverageFrame,
     CoverageOutcome,
     MapCoverage,
-    NewMapCoverage,
 )
 from sceneprint_client.api.frames import ImportItem, ImportOptions
 from sceneprint_client.api.sessions import (
@@ -35,8 +32,6 @@ from sceneprint_client.api.sessions import (
     Difference,
     Edge,
     GraphFormat,
-    NewAssociation,
-    NewDifference,
 )
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
 from sceneprint_client.errors import InvalidRequest, UnreadableArchive, UnreadableCloud
@@ -278,6 +273,34 @@ class JobMethods(ServiceConnection):
 
     # products of maps: coverage, associations and differences of sessions
 
+    def compute(
+        self, kind: type[_Product], map_name: str, *, timeout_s: float = 3600.0,
+        progress: Callable[[int, int], None] | None = None, **request: Any,
+    ) -> _Product:  # fmt: skip
+        """Compute a product of a map: measure its coverage, find where two of its sessions see the
+        same places or one returns to a place, or compare two sessions.
+
+        Parameters
+        ----------
+        kind : MapCoverage, Association or Difference
+        map_name : of the map
+        timeout_s : seconds to wait; 0 returns at once. The job continues in any case
+        progress : called with the number of finished steps and the total
+        request : fields of NewMapCoverage, NewAssociation or NewDifference
+
+        Returns
+        -------
+        product : `product.state.over` is False if the time ran out
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : the map has no such frames, or a field is out of range.
+        """
+        wanted = checked(kind.request_type, f"The {kind.noun}", **request)
+        begun = self._begin(kind, f"{map_path(map_name)}/{kind.collection}", wanted)
+        return self.wait_for_product(begun, timeout_s=timeout_s, progress=progress)
+
     def product(self, kind: type[_Product], map_name: str, job_id: str) -> _Product:
         """A product of a map as it is now; UnknownMap or UnknownJob if it does not exist.
 
@@ -324,53 +347,6 @@ class JobMethods(ServiceConnection):
         return self._until_over(product, lambda: self.product(kind, *of), timeout_s, progress)
 
     # associations
-
-    def associate(
-        self, map_name: str, session: str, other: str | None = None, *,
-        robots: Sequence[str] | None = None, filter: Filter | Mapping[str, Any] | None = None,  # noqa: A002
-        apart: int | None = None, not_within_s: float | None = None, k: int = 3,
-        candidates: int = 10, seed: int = 0, min_overlap: float = 0.0, join: bool = True,
-        validation: ValidationOptions | Mapping[str, Any] | None = None, timeout_s: float = 3600.0,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> Association:  # fmt: skip
-        """Find where two sessions see the same places, or where one session returns to a place.
-
-        Parameters
-        ----------
-        map_name : of the map
-        session : each of its frames is a query
-        other : the session to search; default: earlier frames of the same session
-        robots : of each session; required if several robots have sessions of that name
-        filter : use only frames that pass it
-        apart, not_within_s : within one session, least number of frames or seconds between two
-        k, candidates, seed : accepted edges wanted for each frame, candidates to try, random seed
-        min_overlap : least overlap of an edge to keep
-        join : where the join of two sessions is strong, let their poses lead to one parent frame
-        validation : when an edge is accepted
-        timeout_s : seconds to wait; 0 returns at once. The job continues in any case
-        progress : called with the number of finished frames and the total
-
-        Returns
-        -------
-        association : `association.state.over` is False if the time ran out
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        InvalidRequest : a session has no frames, several robots, or too many frames; or
-            an option is out of range.
-        """
-        sessions = [session] if other is None else [session, other]
-        fields = given(
-            robots=robots, filter=filter, apart=apart, not_within_s=not_within_s,
-            validation=validation,
-        )  # fmt: skip
-        wanted = checked(
-            NewAssociation, "The association", sessions=sessions, k=k, candidates=candidates,
-            seed=seed, min_overlap=min_overlap, join=join, **fields,
-        )  # fmt: skip
-        begun = self._begin(Association, f"{map_path(map_name)}/associations", wanted)
-        return self.wait_for_product(begun, timeout_s=timeout_s, progress=progress)
 
     def undo_join(self, map_name: str, job_id: str) -> Association:
         """Undo the join of an association: poses are again as they were sent, or in the parent
@@ -445,51 +421,6 @@ class JobMethods(ServiceConnection):
 
     # coverage
 
-    def coverage(
-        self, map_name: str, *, session: str | None = None, robot: str | None = None,
-        every: int = 1, most: int = 1000, not_within_s: float | None = None,
-        other_sessions: bool = False, tolerance_m: float = 0.5, tolerance_deg: float = 15.0,
-        cell_m: float | None = None, seed: int = 0, like: MapCoverage | None = None,
-        timeout_s: float = 3600.0, progress: Callable[[int, int], None] | None = None,
-    ) -> MapCoverage:  # fmt: skip
-        """Measure where in a map a robot would be found: query its frames against the rest.
-
-        Parameters
-        ----------
-        map_name : of the map
-        session, robot : query only frames of these
-        every, most : query every n-th frame, and at most this many
-        not_within_s : leave out frames of the queried frame's session taken within this many
-            seconds; default: 10
-        other_sessions : leave out its whole session
-        tolerance_m, tolerance_deg : a pose within both is right
-        cell_m : width of a plan's cells; default: from the map's size
-        seed : of the queries
-        like : an earlier result, whose options and width of cells replace all of the above:
-            `coverage_changes` can then compare the two
-        timeout_s : seconds to wait; 0 returns at once. The job continues in any case
-        progress : called with the number of finished frames and the total
-
-        Returns
-        -------
-        coverage : `coverage.state.over` is False if the time ran out
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        InvalidRequest : it has no such frames, or an option is out of range.
-        """
-        wanted = checked(
-            NewMapCoverage, "The coverage", every=every, most=most, tolerance_m=tolerance_m,
-            tolerance_deg=tolerance_deg, seed=seed, other_sessions=other_sessions,
-            **given(session=session, robot=robot, not_within_s=not_within_s, cell_m=cell_m),
-        )  # fmt: skip
-        if like is not None:
-            width = None if like.result is None else like.result.cell_m
-            wanted = like.request.model_copy(update=given(cell_m=width))
-        begun = self._begin(MapCoverage, f"{map_path(map_name)}/coverage", wanted)
-        return self.wait_for_product(begun, timeout_s=timeout_s, progress=progress)
-
     def coverage_frames(
         self, map_name: str, job_id: str, outcome: CoverageOutcome | None = None
     ) -> Iterator[CoverageFrame]:
@@ -515,37 +446,6 @@ class JobMethods(ServiceConnection):
         return self._ask(CoverageChanges, "GET", path, params={"since": since})
 
     # differences of sessions
-
-    def compare_sessions(
-        self, map_name: str, before: str, after: str, *, parent_frame: str | None = None,
-        timeout_s: float = 3600.0, progress: Callable[[int, int], None] | None = None,
-    ) -> Difference:  # fmt: skip
-        """Compare two sessions of a map: which surfaces are gone, and which are new.
-
-        Parameters
-        ----------
-        map_name : of the map
-        before, after : the earlier and the later session
-        parent_frame : of the poses; default: the one that most frames of both share
-        timeout_s : seconds to wait; 0 returns at once. The job continues in any case
-        progress : called with the number of finished steps and the total
-
-        Returns
-        -------
-        difference : `difference.state.over` is False if the time ran out
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        InvalidRequest : both are the same, one does not exist, or they share no parent
-            frame.
-        """
-        wanted = checked(
-            NewDifference, "The difference", before=before, after=after,
-            **given(parent_frame=parent_frame),
-        )  # fmt: skip
-        begun = self._begin(Difference, f"{map_path(map_name)}/differences", wanted)
-        return self.wait_for_product(begun, timeout_s=timeout_s, progress=progress)
 
     def difference_points(self, map_name: str, job_id: str) -> SurfacePoints:
         """Cells of both sessions as points. `patches` gives the kind of each: SAME, GONE, NEW,

@@ -253,6 +253,8 @@ def add_associate(commands: Any) -> None:
 
 def run_associate(options: argparse.Namespace) -> int:
     """Associate, and wait, or undo a join; returns 2 where it did not succeed."""
+    from sceneprint_client.api.sessions import Association
+
     if options.undo is not None:
         with open_client(options) as client:
             undone = client.undo_join(options.map, options.undo)
@@ -273,6 +275,12 @@ def run_associate(options: argparse.Namespace) -> int:
     check_scene(options)
     times = {"captured_after": options.after, "captured_before": options.before}
     wanted = {name: value for name, value in times.items() if value is not None}
+    fields = {
+        "sessions": options.session, "robots": options.robot, "filter": wanted or None,
+        "apart": options.apart, "not_within_s": options.not_within, "k": options.k,
+        "candidates": options.candidates, "seed": options.seed,
+        "min_overlap": options.min_overlap, "join": options.join,
+    }  # fmt: skip
     with (
         open_client(options) as client,
         open_scene(options, client) as scene,
@@ -283,12 +291,7 @@ def run_associate(options: argparse.Namespace) -> int:
             bar.total = total
             bar.update(done - bar.n)
 
-        told = client.associate(
-            options.map, *options.session, robots=options.robot, filter=wanted or None,
-            apart=options.apart, not_within_s=options.not_within, k=options.k,
-            candidates=options.candidates, seed=options.seed, min_overlap=options.min_overlap,
-            join=options.join, progress=progress,
-        )  # fmt: skip
+        told = client.compute(Association, options.map, progress=progress, **fields)
         if kind is not None and told.state is JobState.SUCCEEDED:
             graph = client.graph(options.map, told.job_id, kind, odometry=options.odometry)
             write_whole(options.out, graph.encode())

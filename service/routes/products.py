@@ -15,13 +15,11 @@ from sceneprint.engine.products.session_differences import POINTS
 from sceneprint.formats.export import MEDIA_TYPE
 from sceneprint_client.api import Page
 from sceneprint_client.api.admin import Product
-from sceneprint_client.api.base import Given
 from sceneprint_client.api.coverage import (
     CoverageChanges,
     CoverageFrame,
     CoverageOutcome,
     MapCoverage,
-    NewMapCoverage,
 )
 from sceneprint_client.api.sessions import (
     Association,
@@ -29,8 +27,6 @@ from sceneprint_client.api.sessions import (
     Edge,
     Graph,
     GraphFormat,
-    NewAssociation,
-    NewDifference,
 )
 from service.auth import Here, may_read, may_write, v1_router
 from service.bodies import json_body, read_record
@@ -42,19 +38,19 @@ Limit = Annotated[int, Query(ge=1, le=1000)]
 
 
 def product_router(
-    products_of: Callable[[Engine], Products[Any, Any]], request_type: type[Given],
-    record: type[Product], about: str, *, optional: bool = False,
+    products_of: Callable[[Engine], Products[Any, Any]], record: type[Product], about: str, *,
+    optional: bool = False,
 ) -> APIRouter:  # fmt: skip
     """Return the routes that all products have: begin, list, get and delete.
 
     Parameters
     ----------
     products_of : returns the products of an engine
-    request_type, record : of the API
+    record : of the API
     about : what the job does, for the OpenAPI document
     optional : whether a request may come without a body
     """
-    noun, path = record.noun, record.collection
+    noun, path, request_type = record.noun, record.collection, record.request_type
     router = v1_router(f"/maps/{{map_name}}/{path}", path, may_read)
 
     async def begin(map_name: str, request: Request, here: Here, response: Response) -> Any:
@@ -102,7 +98,7 @@ def product_router(
 # Coverage.
 
 coverage_router = product_router(
-    lambda engine: engine.coverage, NewMapCoverage, MapCoverage,
+    lambda engine: engine.coverage, MapCoverage,
     "Measure where in the map a robot would be found. A job queries each frame, or every n-th, "
     "against the rest of the map, and counts by cell of a plan how many are found, found in a "
     "wrong place, ambiguous and not found. It runs when nothing else waits for a worker, and takes "
@@ -146,7 +142,7 @@ def get_coverage_changes(
 # Differences of sessions.
 
 differences_router = product_router(
-    lambda engine: engine.differences, NewDifference, Difference,
+    lambda engine: engine.differences, Difference,
     "Compare two sessions whose frames have poses in one parent frame. A job fuses at most 500 "
     "frames of each session to cells, and asks the frames of the other session about each cell. It "
     "runs when nothing else waits for a worker.",
@@ -173,7 +169,7 @@ def get_difference_points(map_name: str, job_id: str, request: Request, here: He
 # Associations: sessions joined, loops closed.
 
 associations_router = product_router(
-    lambda engine: engine.associations, NewAssociation, Association,
+    lambda engine: engine.associations, Association,
     "Find where sessions see the same places: two of them, which joins their maps, or one, which "
     "closes its loops. Every frame of the first session is looked up among those of the second; "
     "what validation accepts is an edge. Edges near each other must agree with how the robots "

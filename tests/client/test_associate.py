@@ -42,7 +42,9 @@ def associated(
 
 def test_edges_and_graphs(associated: Filled) -> None:
     client, steps = associated.client, []
-    found = client.associate(MAP, "a", "b", k=2, seed=3, progress=lambda *n: steps.append(n))
+    found = client.compute(
+        Association, MAP, sessions=["a", "b"], k=2, seed=3, progress=lambda *n: steps.append(n)
+    )
     assert found.state is JobState.SUCCEEDED
     name = found.job_id
     edges = list(client.edges(MAP, name))
@@ -61,7 +63,7 @@ def test_edges_and_graphs(associated: Filled) -> None:
 
 def test_refusals(associated: Filled) -> None:
     client = associated.client
-    found = client.associate(MAP, "a", apart=2)
+    found = client.compute(Association, MAP, sessions=["a"], apart=2)
     assert found.result is not None
     assert found.result.frames == 3
     of = MAP, found.job_id
@@ -74,16 +76,16 @@ def test_refusals(associated: Filled) -> None:
             ask()
         assert [name for name, _ in caught.value.fields] == [field]
     with pytest.raises(UnknownMap):
-        client.associate("nowhere", "a")
+        client.compute(Association, "nowhere", sessions=["a"])
     with pytest.raises(InvalidRequest):
-        client.associate(MAP, "a", "nobody")
+        client.compute(Association, MAP, sessions=["a", "nobody"])
     with pytest.raises(InvalidRequest):
-        client.associate(MAP, "a", "a")
+        client.compute(Association, MAP, sessions=["a", "a"])
 
 
 def test_graphs_and_edges_over_http(associated: Filled) -> None:
     client = associated.client
-    found, http = client.associate(MAP, "a", "b"), client._http
+    found, http = client.compute(Association, MAP, sessions=["a", "b"]), client._http
     place = f"/v1/maps/{MAP}/associations/{found.job_id}"
     for kind, media in (
         ("g2o", "text/x-g2o"), ("tum", "text/plain; charset=utf-8"), ("json", "application/json"),

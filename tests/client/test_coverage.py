@@ -29,7 +29,9 @@ def covered(
 @pytest.fixture(scope="module")
 def whole(covered: Client) -> MapCoverage:
     steps: list[tuple[int, int]] = []
-    told = covered.coverage(MAP, not_within_s=0.0, cell_m=0.5, progress=lambda *n: steps.append(n))
+    told = covered.compute(
+        MapCoverage, MAP, not_within_s=0.0, cell_m=0.5, progress=lambda *n: steps.append(n)
+    )
     assert told.state is JobState.SUCCEEDED
     assert steps[-1] == (4, 4)
     return told
@@ -42,7 +44,7 @@ def test_a_result_with_its_frames_plan_and_changes(covered: Client, whole: MapCo
     frames = list(covered.coverage_frames(*of))
     assert {frame.frame_id for frame in frames} == {one.frame_id for one in covered.frames(MAP)}
     assert list(covered.coverage_frames(*of, "not_found")) == []
-    again = covered.coverage(MAP, like=whole)
+    again = covered.compute(MapCoverage, MAP, not_within_s=0.0, cell_m=0.5)
     assert (again.result, again.plans) == (whole.result, whole.plans)
     told = covered.coverage_changes(MAP, again.job_id, whole.job_id)
     assert set(told.trends) - {"same"} == {"better", "worse", "new", "gone"}
@@ -58,12 +60,12 @@ def test_a_result_with_its_frames_plan_and_changes(covered: Client, whole: MapCo
 
 def test_refusals(covered: Client, whole: MapCoverage) -> None:
     with pytest.raises(UnknownMap):
-        covered.coverage("nowhere")
+        covered.compute(MapCoverage, "nowhere")
     with pytest.raises(InvalidRequest, match="no indexed frame"):
-        covered.coverage(MAP, session="nobody")
+        covered.compute(MapCoverage, MAP, session="nobody")
     with pytest.raises(InvalidRequest, match="every"):
-        covered.coverage(MAP, every=0)
-    near = covered.coverage(MAP)  # by default it leaves out frames within ten seconds
+        covered.compute(MapCoverage, MAP, every=0)
+    near = covered.compute(MapCoverage, MAP)  # by default it leaves out frames within ten seconds
     assert near.result is not None
     assert near.result.not_found == 4
     with pytest.raises(InvalidRequest, match="not_within_s of their requests differ"):
@@ -79,7 +81,7 @@ def test_a_request_without_a_body_takes_the_defaults(covered: Client) -> None:
     begun = covered._http.post(f"/v1/maps/{MAP}/coverage")
     assert begun.json()["request"] == NewMapCoverage().model_dump(mode="json")
     for _ in range(20):
-        queued = covered.coverage(MAP, timeout_s=0)
+        queued = covered.compute(MapCoverage, MAP, timeout_s=0)
         try:
             covered.cancel_job(queued.job_id)
             break

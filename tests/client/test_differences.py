@@ -11,7 +11,7 @@ import pytest
 from sceneprint.errors import InvalidRequest
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
-from sceneprint_client.api.sessions import SAME
+from sceneprint_client.api.sessions import SAME, Difference
 
 MAP = "changed"
 
@@ -30,7 +30,7 @@ def changed(
 
 
 def test_the_cells_of_a_difference_are_sent(changed: Client, service_url: str) -> None:
-    told = changed.compare_sessions(MAP, "a", "b")
+    told = changed.compute(Difference, MAP, before="a", after="b")
     result = told.result
     assert result is not None
     assert result.same > 500
@@ -49,6 +49,6 @@ def test_the_cells_of_a_difference_are_sent(changed: Client, service_url: str) -
 
 def test_what_cannot_be_compared_is_refused(changed: Client) -> None:
     with pytest.raises(InvalidRequest, match="Name two sessions"):
-        changed.compare_sessions(MAP, "a", "a")
+        changed.compute(Difference, MAP, before="a", after="a")
     with pytest.raises(InvalidRequest, match="no indexed frame with a pose of session 'z'"):
-        changed.compare_sessions(MAP, "a", "z")
+        changed.compute(Difference, MAP, before="a", after="z")

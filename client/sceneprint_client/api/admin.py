@@ -330,9 +330,10 @@ class Progress(ApiRecord):
 class Product(ApiRecord):
     """What a job computes from a map."""
 
-    #: What it is called, and the end of the path that lists it.
+    #: What it is called, the end of the path that lists it, and the record that asks for it.
     noun: ClassVar[str]
     collection: ClassVar[str]
+    request_type: ClassVar[type[Given]]
 
     job_id: str = Field(description="Also the id of its job: GET /v1/jobs/{job_id}.")
     map: str

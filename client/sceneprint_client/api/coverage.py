@@ -144,7 +144,7 @@ class CoveragePlan(ApiRecord):
 class MapCoverage(Product):
     """A coverage job of a map and its result. Its steps are queried frames."""
 
-    noun = collection = "coverage"
+    noun, collection, request_type = "coverage", "coverage", NewMapCoverage
 
     request: NewMapCoverage
     result: CoverageResult | None = Field(description="When it has succeeded.")

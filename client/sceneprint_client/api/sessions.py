@@ -186,7 +186,7 @@ class AssociationResult(ApiRecord):
 class Association(Product):
     """An association of sessions: a job and what it came to. Its steps are frames."""
 
-    noun, collection = "association", "associations"
+    noun, collection, request_type = "association", "associations", NewAssociation
 
     request: NewAssociation
     result: AssociationResult | None = Field(description="When it has succeeded.")
@@ -278,7 +278,7 @@ class DifferenceResult(ApiRecord):
 class Difference(Product):
     """A comparison of two sessions and its result. Its steps are frames; each is used twice."""
 
-    noun, collection = "difference", "differences"
+    noun, collection, request_type = "difference", "differences", NewDifference
 
     request: NewDifference
     result: DifferenceResult | None = Field(description="When it has succeeded.")

@@ -140,7 +140,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
     """Associations of the sessions of maps."""
 
     kind = "associate"
-    request, record = NewAssociation, Association
+    record = Association
     priority = 0
     item_count = "edges"
 

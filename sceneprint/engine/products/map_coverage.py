@@ -111,7 +111,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
     """Coverage of maps."""
 
     kind = "coverage"
-    request, record = NewMapCoverage, MapCoverage
+    record = MapCoverage
     item_count = "frames"
 
     def __init__(self, store: Store, tasks: Tasks, signers: Signers, queries: Queries) -> None:

@@ -54,13 +54,12 @@ class Products(ABC, Generic[Request, Record]):
     Attributes
     ----------
     kind : of the jobs, such as coverage
-    request, record : of the API
+    record : of the API
     priority : of the jobs
     item_count : field of a result that counts the items; what concludes a job follows them
     """
 
     kind: ClassVar[str]
-    request: type[Request]
     record: type[Record]
     priority: ClassVar[int] = BACKGROUND
     item_count: ClassVar[str] = ""
@@ -295,7 +294,7 @@ class StepwiseProducts(Products[Request, Record]):
 
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
         """Do at least one step, and as many as time allows; after the last one, conclude."""
-        request = self.request.model_validate(task.data)
+        request: Request = self.record.request_type.model_validate(task.data)  # type: ignore[assignment]
         is_over = ends_within(is_over, SLICE_S)
         progress = dict(task.progress) or self.restart(task.of_map, request)
         items: list[dict[str, Any]] = []

@@ -111,7 +111,7 @@ class Differences(Products[NewDifference, Difference]):
     """Differences of sessions."""
 
     kind = "difference"
-    request, record = NewDifference, Difference
+    record = Difference
 
     def __init__(self, store: Store, tasks: Tasks, signers: Signers) -> None:
         super().__init__(store, tasks)
