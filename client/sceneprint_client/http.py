@@ -127,11 +127,6 @@ def query_path(query_id: str) -> str:
     return f"/v1/queries/{_part(query_id, 'query', UnknownQuery)}"
 
 
-def reconstruction_path(job_id: str) -> str:
-    """Path of a reconstruction; UnknownJob where none can have that id."""
-    return f"/v1/reconstructions/{_part(job_id, 'reconstruction', UnknownJob)}"
-
-
 def match_path(query_id: str, frame_id: str) -> str:
     """Path of a match of a past query; UnknownQuery or UnknownFrame as `query_path`."""
     return f"{query_path(query_id)}/matches/{_part(frame_id, 'frame', UnknownFrame)}"
@@ -152,9 +147,10 @@ def job_path(job_id: str) -> str:
     return f"/v1/jobs/{_part(job_id, 'job', UnknownJob)}"
 
 
-def product_path(kind: type[Product], map_name: str, job_id: str) -> str:
+def product_path(kind: type[Product], map_name: str | None, job_id: str) -> str:
     """Path of a product; UnknownMap or UnknownJob as `map_path`."""
-    return f"{map_path(map_name)}/{kind.collection}/{_part(job_id, kind.noun, UnknownJob)}"
+    root = "/v1" if map_name is None else map_path(map_name)
+    return f"{root}/{kind.collection}/{_part(job_id, kind.noun, UnknownJob)}"
 
 
 def surface_path(map_name: str) -> str:

@@ -16,7 +16,6 @@ from sceneprint_client.api import (
     Job,
     JobState,
     Page,
-    Progress,
 )
 from sceneprint_client.api.admin import Product, RetriedJobs
 from sceneprint_client.api.base import checked
@@ -45,15 +44,12 @@ from sceneprint_client.http import (
     product_path,
     query_path,
     read_record,
-    reconstruction_path,
 )
 
 if TYPE_CHECKING:
     from sceneprint_client.surface_encoding import SurfacePoints
 
 
-#: A record of what a job does, with its `state`.
-_Begun = TypeVar("_Begun", bound=Product | Reconstruction)
 _Product = TypeVar("_Product", bound=Product)
 #: Jobs that are looked at in one round; workers take them in about this order.
 _WINDOW = 8
@@ -153,30 +149,6 @@ class JobMethods(ServiceConnection):
                 break
             self._let_work(pause)
         return [known[job_id] if job_id in known else self.job(job_id) for job_id in order]
-
-    def _until_over(
-        self, begun: _Begun, look: Callable[[], _Begun], timeout_s: float,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> _Begun:  # fmt: skip
-        """What a job does, once it is over, or as it is when the time has come.
-
-        Parameters
-        ----------
-        begun : as it is known
-        look : asks for it once more
-        timeout_s : for its end
-        progress : called with the steps that are done, and of how many, where it tells them
-        """
-        pauses = growing_pauses(time.monotonic() + timeout_s)
-        while True:
-            done: Progress | None = getattr(begun, "progress", None)
-            if progress is not None and done is not None and done.total is not None:
-                progress(done.done, done.total)
-            pause = next(pauses, None)
-            if begun.state.over or pause is None:
-                return begun
-            self._let_work(pause)
-            begun = look()
 
     # archives and whole maps: imports are jobs
 
@@ -301,13 +273,13 @@ class JobMethods(ServiceConnection):
         begun = self._begin(kind, f"{map_path(map_name)}/{kind.collection}", wanted)
         return self.wait_for_product(begun, timeout_s=timeout_s, progress=progress)
 
-    def product(self, kind: type[_Product], map_name: str, job_id: str) -> _Product:
-        """A product of a map as it is now; UnknownMap or UnknownJob if it does not exist.
+    def product(self, kind: type[_Product], map_name: str | None, job_id: str) -> _Product:
+        """A product as it is now; UnknownMap or UnknownJob if it does not exist.
 
         Parameters
         ----------
-        kind : MapCoverage, Association or Difference
-        map_name, job_id : of the product
+        kind : MapCoverage, Association, Difference or Reconstruction
+        map_name, job_id : of the product; a Reconstruction has no map
         """
         return self._ask(kind, "GET", product_path(kind, map_name, job_id))
 
@@ -321,7 +293,7 @@ class JobMethods(ServiceConnection):
         page: type[Page[_Product]] = Page[kind]  # type: ignore[valid-type]
         return self._items(page, f"{map_path(map_name)}/{kind.collection}")
 
-    def delete_product(self, kind: type[Product], map_name: str, job_id: str) -> None:
+    def delete_product(self, kind: type[Product], map_name: str | None, job_id: str) -> None:
         """Delete a product with its results, also while a worker computes it; see `product`.
 
         Raises
@@ -343,8 +315,16 @@ class JobMethods(ServiceConnection):
         timeout_s : seconds to wait
         progress : called with the number of finished steps and the total
         """
-        kind, of = type(product), (product.map, product.job_id)
-        return self._until_over(product, lambda: self.product(kind, *of), timeout_s, progress)
+        pauses = growing_pauses(time.monotonic() + timeout_s)
+        while True:
+            done = product.progress
+            if progress is not None and done is not None and done.total is not None:
+                progress(done.done, done.total)
+            pause = next(pauses, None)
+            if product.state.over or pause is None:
+                return product
+            self._let_work(pause)
+            product = self.product(type(product), product.map, product.job_id)
 
     # associations
 
@@ -479,7 +459,7 @@ class JobMethods(ServiceConnection):
 
         Returns
         -------
-        reconstruction : has `coverage` when its state is `succeeded`; else `error` says why
+        reconstruction : has a `result` when its state is `succeeded`; else `error` says why
 
         Raises
         ------
@@ -493,13 +473,7 @@ class JobMethods(ServiceConnection):
         )  # fmt: skip
         query_id = query if isinstance(query, str) else query.query_id
         begun = self._begin(Reconstruction, f"{query_path(query_id)}/reconstruction", wanted)
-        if wait_s is None:
-            return begun
-        return self._until_over(begun, lambda: self.reconstruction(begun.job_id), wait_s)
-
-    def reconstruction(self, job_id: str) -> Reconstruction:
-        """A reconstruction as it is now; UnknownJob if it does not exist."""
-        return self._ask(Reconstruction, "GET", reconstruction_path(job_id))
+        return begun if wait_s is None else self.wait_for_product(begun, timeout_s=wait_s)
 
     def reconstruction_mesh(self, job_id: str) -> bytes:
         """The surface of a reconstruction as a PLY file.
@@ -509,11 +483,7 @@ class JobMethods(ServiceConnection):
         UnknownJob : it does not exist.
         NotIndexed : it has not ended, or failed.
         """
-        return self._bytes(f"{reconstruction_path(job_id)}/mesh.ply")
-
-    def delete_reconstruction(self, job_id: str) -> None:
-        """Delete a reconstruction with its files; UnknownJob if it does not exist."""
-        self._delete(reconstruction_path(job_id))
+        return self._bytes(f"{product_path(Reconstruction, None, job_id)}/mesh.ply")
 
 
 def _import_path(map_name: str, job_id: str) -> str:

@@ -7,8 +7,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tqdm import tqdm
-
 from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli import positive
 from sceneprint.cli.options import (
@@ -25,7 +23,7 @@ from sceneprint.formats.dataset import find_sequences
 if TYPE_CHECKING:
     from sceneprint_client import Client
     from sceneprint_client.api import Answer
-    from sceneprint_client.api.surface import Coverage, Reconstruction
+    from sceneprint_client.api.surface import Coverage
 
 #: Longest wait for a worker, seconds.
 _TIMEOUT_S = 600.0
@@ -89,13 +87,13 @@ def run_reconstruct(options: argparse.Namespace) -> int:
             voxel_m=options.voxel,
             output="cloud" if options.cloud else "mesh",
         )
-        job = _waited(client, job, answer.counts.accepted)
-        if job.coverage is None:
+        job = client.wait_for_product(job, timeout_s=_TIMEOUT_S)
+        if job.result is None:
             why = one_line(job.error or "no worker has finished it yet; see `sceneprint jobs`")
             print(f"sceneprint reconstruct: job {job.job_id} is {job.state}: {why}",
                   file=sys.stderr)  # fmt: skip
             return 2
-        print("\n".join([f"{name}:", *coverage_lines(job.coverage)]))
+        print("\n".join([f"{name}:", *coverage_lines(job.result)]))
         write_whole(options.out, client.reconstruction_mesh(job.job_id))
         print(f"wrote {one_line(str(options.out))}")
     return 0
@@ -130,14 +128,3 @@ def _query(client: Client, options: argparse.Namespace) -> Answer:
     if len(frames) != 1:
         raise DatasetError(f"{path}: {len(frames)} frames found. Name a single frame file.")
     return client.query(options.map, frames[0], k=options.k, seed=options.seed, filter=wanted)
-
-
-def _waited(client: Client, job: Reconstruction, views: int) -> Reconstruction:
-    """Wait for the job, or until the timeout, and return its reconstruction."""
-    with tqdm(total=1, desc=f"fuse {views} views", unit="job", disable=None) as bar:
-
-        def progress(done: int, _: int) -> None:
-            bar.update(done - bar.n)
-
-        client.wait([job.job_id], timeout_s=_TIMEOUT_S, progress=progress)
-    return client.reconstruction(job.job_id)

@@ -226,7 +226,7 @@ def run_purge(options: argparse.Namespace) -> int:
         found = engine.purging.now()
         print(
             f"purged {found.blobs} blobs, {found.answers} stored answers, "
-            f"{found.reconstructions} reconstructions; rebuilt {found.indexes} indexes"
+            f"{found.products} products; rebuilt {found.indexes} indexes"
         )
         if not engine.store.database.shrink_log():
             print("the database log is in use: run this again when nothing reads the database")

@@ -30,7 +30,7 @@ from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.engine.products.associations import Associations
 from sceneprint.engine.products.join_upkeep import JoinUpkeep
 from sceneprint.engine.products.map_coverage import Coverages
-from sceneprint.engine.products.reconstruction import ReconstructionJobs
+from sceneprint.engine.products.reconstruction import Reconstructions
 from sceneprint.engine.products.session_differences import Differences
 from sceneprint.engine.results.query_entry import SentQuery
 from sceneprint.engine.results.query_log import QueryLog
@@ -139,12 +139,12 @@ class Engine:
         self.outputs = FrameFiles(self.store, self.signers)
         self.copies = MapCopies(self.store)
         self.points = PointClouds(self.store, self.signers, self.inspection.pairs, self.query_log)
-        self.reconstructions = ReconstructionJobs(self.store, self.tasks)
+        self.reconstructions = Reconstructions(self.store, self.tasks)
         self.retiring = Retention(self.store, settings.deleted_rows_days)
         self.tombstones = Tombstones(self.store, settings.undo_s, self.bell.ring)
         self.purging = Purging(
-            self.store, self._upkeep, self.query_log, self.tombstones, self.reconstructions,
-            self.differences, settings.purge_s, settings.quarantine_dir,
+            self.store, self._upkeep, self.query_log, self.tombstones,
+            (self.reconstructions, self.differences), settings.purge_s, settings.quarantine_dir,
         )  # fmt: skip
         self._purged = time.monotonic()
         self.operations = OperatorTasks(self.store, settings, self.bell)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from functools import partial
 
 from fastapi import Request, Response
 
 from sceneprint.engine.products.reconstruction import MEDIA_TYPE, MESH
 from sceneprint.engine.results.query_entry import StoredAnswer, unknown_query
-from sceneprint.errors import DamagedBlob
 from sceneprint.store.queue import unknown_job
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
 from service.auth import Asking, Caller, Context, Here, v1_router
 from service.bodies import json_body, read_record
 from service.problems import declared
-from service.responses import files, is_known, send_file
+from service.responses import files, send_product_file
 
 router = v1_router(tag="reconstructions")
 
@@ -35,7 +34,7 @@ async def reconstruct(
     """
     stored = await here.run(lambda: _stored_answer(here, asking, query_id))
     wanted = await read_record(request, NewReconstruction, "The reconstruction", optional=True)
-    made = await here.run(lambda: here.engine.reconstructions.begin(stored, wanted))
+    made = await here.run(lambda: here.engine.reconstructions.begin_for(stored, wanted))
     response.headers["Location"] = f"/v1/reconstructions/{made.job_id}"
     return made
 
@@ -60,7 +59,9 @@ async def get_mesh(job_id: str, request: Request, here: Here, asking: Asking) ->
     """The surface, in the query's camera frame; 409 until the job has succeeded."""
     await here.run(_find_reconstruction, here, asking, job_id)
     async with here.gate.place():  # it is read whole: when it is its turn
-        return await here.gate.run(lambda: _mesh(request, here, job_id))
+        find = partial(here.engine.reconstructions.file, None, job_id, MESH)
+        name = f"{job_id[:12]}-{MESH}"
+        return await here.gate.run(partial(send_product_file, request, here, find, name))
 
 
 @router.delete("/reconstructions/{job_id}", status_code=204, responses=declared(404))
@@ -68,7 +69,7 @@ def delete_reconstruction(job_id: str, here: Here, asking: Asking) -> None:
     """Remove a reconstruction with its files; one that is under way is given up."""
     for name in _find_reconstruction(here, asking, job_id).maps:
         asking.require(name, "write")
-    here.engine.reconstructions.delete(job_id)
+    here.engine.reconstructions.remove(None, job_id)
 
 
 def _stored_answer(here: Context, asking: Caller, query_id: str) -> StoredAnswer:
@@ -85,21 +86,7 @@ def _stored_answer(here: Context, asking: Caller, query_id: str) -> StoredAnswer
 
 
 def _find_reconstruction(here: Context, asking: Caller, job_id: str) -> Reconstruction:
-    found = here.engine.reconstructions.find(job_id)
+    found = here.engine.reconstructions.get(None, job_id)
     if not all(asking.may("read", name) for name in found.maps):
         raise unknown_job(job_id)
     return found
-
-
-def _mesh(request: Request, here: Context, job_id: str) -> Response:
-    file, blobs = here.engine.reconstructions.mesh(job_id), here.engine.store.blobs
-    if is_known(request, file.blob) or blobs.condition(file.blob) == "sound":
-        with suppress(FileNotFoundError):
-            return send_file(
-                request, lambda: blobs.open(file.blob), file.media_type, file.blob,
-                f"{job_id[:12]}-{MESH}",
-            )  # fmt: skip
-    here.engine.reconstructions.mesh(job_id)  # UnknownJob where it was deleted meanwhile
-    raise DamagedBlob(
-        f"{MESH} of reconstruction {job_id} is damaged. Start the reconstruction again."
-    )

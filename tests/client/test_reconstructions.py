@@ -19,6 +19,7 @@ from sceneprint.formats.dataset import (
 )
 from sceneprint_client import Client
 from sceneprint_client.api import Answer, JobState
+from sceneprint_client.api.surface import Reconstruction
 from sceneprint_lab.synth import synthesise_room
 
 NAME = "rebuilt"
@@ -66,14 +67,13 @@ def ply(data: bytes) -> tuple[int, int, str]:
 def test_a_surface_and_its_figures(client: Client, answered: Answer) -> None:
     made = client.reconstruct(answered, voxel_m=0.04)
     assert made.state == JobState.QUEUED
-    assert (made.query_id, made.maps, made.coverage) == (answered.query_id, [NAME], None)
+    assert (made.query_id, made.maps, made.result) == (answered.query_id, [NAME], None)
     [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
     assert (job.state, job.kind, job.map) == ("succeeded", "reconstruct", NAME), job.error
-    done = client.reconstruction(made.job_id)
-    coverage = done.coverage
+    done = client.product(Reconstruction, None, made.job_id)
+    coverage = done.result
     assert coverage is not None
     mesh = client.reconstruction_mesh(made.job_id)
-    assert [(one.name, one.bytes) for one in done.files] == [("mesh.ply", len(mesh))]
     points, triangles, comment = ply(mesh)
     assert (points, triangles) == (coverage.points, coverage.triangles)
     assert comment == "comment frame query.optical: x right, y down, z forward, metres"
@@ -98,12 +98,12 @@ def test_what_is_wanted_is_what_is_fused(client: Client, answered: Answer) -> No
         answer.query_id, frames=[first.frame_id], include_query=False, voxel_m=0.05,
         output="cloud", wait_s=PATIENCE_S,
     )  # fmt: skip
-    assert made.coverage is not None, made.error
-    assert [one.frame_id for one in made.coverage.views] == [first.frame_id]
-    assert (made.coverage.triangles, made.coverage.voxel_m) == (0, 0.05)
-    assert made.coverage.area_m2 > 1.0  # also of a cloud: it is that of the surface
+    assert made.result is not None, made.error
+    assert [one.frame_id for one in made.result.views] == [first.frame_id]
+    assert (made.result.triangles, made.result.voxel_m) == (0, 0.05)
+    assert made.result.area_m2 > 1.0  # also of a cloud: it is that of the surface
     points, triangles, _ = ply(client.reconstruction_mesh(made.job_id))
-    assert (points, triangles) == (made.coverage.points, 0)
+    assert (points, triangles) == (made.result.points, 0)
 
 
 def test_the_surface_lies_where_the_query_saw_it(
@@ -112,8 +112,8 @@ def test_the_surface_lies_where_the_query_saw_it(
     """Matches alone, in the query's camera: their points project onto the query's depth."""
     made = client.reconstruct(answered, include_query=False, strength="strong", wait_s=PATIENCE_S)
     data = client.reconstruction_mesh(made.job_id).partition(b"end_header\n")[2]
-    assert made.coverage is not None
-    rows = np.frombuffer(data[: 27 * made.coverage.points], np.uint8).reshape(-1, 27)
+    assert made.result is not None
+    rows = np.frombuffer(data[: 27 * made.result.points], np.uint8).reshape(-1, 27)
     points = rows[:, :12].copy().view("<f4").astype(float)
     query = views[0].read()
     k = query.intrinsics
@@ -135,19 +135,19 @@ def test_refusals(client: Client, answered: Answer) -> None:
         client.reconstruct(answered, frames=["nobody"])
     with pytest.raises(InvalidRequest, match="voxel_m"):
         client.reconstruct(answered, voxel_m=0.0001)
-    with pytest.raises(UnknownJob, match="no job"):
-        client.reconstruction("nothing")
+    with pytest.raises(UnknownJob, match="no reconstruction"):
+        client.product(Reconstruction, None, "nothing")
     made = client.reconstruct(answered, voxel_m=0.002)  # finer than memory allows for a room
     [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
     assert (job.state, job.attempts) == ("failed", 1)
     assert "Ask for" in str(job.error)
-    with pytest.raises(NotIndexed, match=r"is failed, and mesh\.ply exists once it has succeeded"):
+    with pytest.raises(NotIndexed, match=r"is failed \(.*It has its mesh\.ply once"):
         client.reconstruction_mesh(made.job_id)
-    client.delete_reconstruction(made.job_id)
+    client.delete_product(Reconstruction, None, made.job_id)
     with pytest.raises(UnknownJob):
         client.job(made.job_id)
     with pytest.raises(UnknownJob):
-        client.delete_reconstruction(made.job_id)
+        client.delete_product(Reconstruction, None, made.job_id)
     unvalidated = client.query(NAME, frame_id=answered.matches[0].frame_id, stages=["retrieve"])
     with pytest.raises(InvalidRequest, match="no accepted match, so"):
         client.reconstruct(unvalidated)
@@ -173,7 +173,7 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
         client.put_frame(NAME, deleted, views[0])  # another frame, which nobody has matched
         [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
         assert job.state == "succeeded", job.error
-        coverage = client.reconstruction(made.job_id).coverage
+        coverage = client.product(Reconstruction, None, made.job_id).result
         assert coverage is not None
         sources = {one.frame_id: one.source for one in coverage.views}
         assert sources[lost] == "geometry"
@@ -181,7 +181,7 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
         assert "a new frame has its id" in coverage.left_out[0].reason
         # what the query saw is not kept beyond the job, and all goes with it
         before = files(tmp_path)
-        client.delete_reconstruction(made.job_id)
+        client.delete_product(Reconstruction, None, made.job_id)
         assert len(before - files(tmp_path)) == 1
 
 

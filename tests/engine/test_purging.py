@@ -118,7 +118,9 @@ def asked(engine: Engine, frame_id: str, uploads) -> tuple[str, str, str]:
     own = engine.query_frame("hall", frame_id, options)
     other = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, options)
     assert frame_id in {match.frame_id for match in other.matches}
-    fused = engine.reconstructions.begin(engine.query_log.find(own.query_id), NewReconstruction())
+    fused = engine.reconstructions.begin_for(
+        engine.query_log.find(own.query_id), NewReconstruction()
+    )
     return own.query_id, other.query_id, fused.job_id
 
 
@@ -146,13 +148,13 @@ def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
         engine.inspection.answer(own)
     assert engine.inspection.answer(shows).query_id == shows
     purged = engine.purging.now()
-    assert (purged.answers, purged.reconstructions, purged.indexes) == (3, 1, 1)
+    assert (purged.answers, purged.products, purged.indexes) == (3, 1, 1)
     for what, wanted in secret.items():
         assert places(engine, tmp_path, wanted) == set(), what
     with pytest.raises(UnknownQuery):
         engine.inspection.answer(shows)
     with pytest.raises(UnknownJob):
-        engine.reconstructions.find(fused)
+        engine.reconstructions.get(None, fused)
     # the others are found as before
     told = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, Query(seed=1))
     assert told.matches[0].frame_id == ids(engine)[3]
@@ -244,8 +246,8 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
     second = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2, purge_s=1)
     workers = [
         Purging(
-            one.store, one._upkeep, one.query_log, one.tombstones, one.reconstructions,
-            one.differences, 0.0, one.settings.quarantine_dir,
+            one.store, one._upkeep, one.query_log, one.tombstones,
+            (one.reconstructions, one.differences), 0.0, one.settings.quarantine_dir,
         )
         for one in (second, second)
     ]  # fmt: skip

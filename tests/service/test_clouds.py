@@ -266,9 +266,9 @@ def test_a_reconstruction_leaves_clouds_out_and_says_so(served, hall, shots, clo
     until(lambda: http.get(job).json()["state"] in ("succeeded", "failed"))
     told = http.get(job).json()
     assert told["parent_frame"] == "query.sensor"
-    assert ids[0] in [one["frame_id"] for one in told["coverage"]["views"]]
-    assert None not in [one["frame_id"] for one in told["coverage"]["views"]]  # nor the query
-    assert told["coverage"]["query_explained"] > 0.9
+    assert ids[0] in [one["frame_id"] for one in told["result"]["views"]]
+    assert None not in [one["frame_id"] for one in told["result"]["views"]]  # nor the query
+    assert told["result"]["query_explained"] > 0.9
 
     answer = found(http.post(f"{path}/queries", **shots[1].form()))
     begun = http.post(f"/v1/queries/{answer['query_id']}/reconstruction", json={"frames": [ids[1]]})

@@ -328,7 +328,7 @@ class Progress(ApiRecord):
 
 
 class Product(ApiRecord):
-    """What a job computes from a map."""
+    """What a job computes from a map, or from an answer."""
 
     #: What it is called, the end of the path that lists it, and the record that asks for it.
     noun: ClassVar[str]
@@ -336,7 +336,7 @@ class Product(ApiRecord):
     request_type: ClassVar[type[Given]]
 
     job_id: str = Field(description="Also the id of its job: GET /v1/jobs/{job_id}.")
-    map: str
+    map: str | None = Field(description="Null where frames of several maps may be in it.")
     state: JobState
     progress: Progress | None = Field(description="Null until it has begun.")
     error: str | None

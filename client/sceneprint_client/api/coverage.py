@@ -146,6 +146,7 @@ class MapCoverage(Product):
 
     noun, collection, request_type = "coverage", "coverage", NewMapCoverage
 
+    map: str
     request: NewMapCoverage
     result: CoverageResult | None = Field(description="When it has succeeded.")
     plans: list[CoveragePlan] | None = Field(

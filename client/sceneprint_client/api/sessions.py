@@ -188,6 +188,7 @@ class Association(Product):
 
     noun, collection, request_type = "association", "associations", NewAssociation
 
+    map: str
     request: NewAssociation
     result: AssociationResult | None = Field(description="When it has succeeded.")
 
@@ -280,5 +281,6 @@ class Difference(Product):
 
     noun, collection, request_type = "difference", "differences", NewDifference
 
+    map: str
     request: NewDifference
     result: DifferenceResult | None = Field(description="When it has succeeded.")

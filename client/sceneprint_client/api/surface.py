@@ -7,7 +7,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from sceneprint_client.api.base import ApiRecord, Given, JobState, Vector
+from sceneprint_client.api.admin import Product
+from sceneprint_client.api.base import ApiRecord, Given, Vector
 from sceneprint_client.api.coverage import UpSource
 from sceneprint_client.api.frames import Kind
 from sceneprint_client.api.query import Named
@@ -197,30 +198,18 @@ class Coverage(ApiRecord):
     triangles: int = Field(description="0 where a cloud was asked for.")
 
 
-class ReconstructionFile(ApiRecord):
-    """What a reconstruction made."""
-
-    name: Literal["mesh.ply"]
-    media_type: str
-    bytes: int
-
-
-class Reconstruction(ApiRecord):
+class Reconstruction(Product):
     """Views of an answer, fused by a worker."""
 
-    job_id: str = Field(description="Its own id too; /v1/jobs tells more, and cancels it.")
+    noun, collection, request_type = "reconstruction", "reconstructions", NewReconstruction
+
     query_id: str
     maps: list[str] = Field(description="Whose frames are fused.")
-    state: JobState
-    error: str | None
-    created_at: datetime
-    finished_at: datetime | None
     request: NewReconstruction
     parent_frame: str = Field(
         description="Coordinates of mesh.ply: those of the query's sensor, metres; of a camera "
         "x right, y down, z forward."
     )
-    coverage: Coverage | None = Field(default=None, description="When it has succeeded.")
-    files: list[ReconstructionFile] = Field(
-        default=[], description="GET /v1/reconstructions/{job_id}/{name}."
+    result: Coverage | None = Field(
+        description="When it has succeeded; GET /v1/reconstructions/{job_id}/mesh.ply then."
     )

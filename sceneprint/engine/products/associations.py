@@ -286,7 +286,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         """
         with self._store.database.write() as connection:
             job = self.find(connection, map_name, job_id)
-            result = self.require_success(job, map_name, "its join can be undone")
+            result = self.require_success(job, "join")
             if job.map_number is not None and undo_joins(connection, job.map_number, job.id):
                 joins = [
                     one if one["root"] is None else one | {"root": None, "undone": True}
@@ -356,9 +356,8 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         UnknownMap, UnknownJob, NotIndexed : it does not exist, or did not succeed.
         """
         with self._store.database.read() as connection:
-            row = find_map(connection, map_name)
             job = self.find(connection, map_name, job_id)
-            result = self.require_success(job, row.name, "its graph exists")
+            result = self.require_success(job, "graph")
             items = self.items(connection, job, 0, result["edges"])
             progress = job.progress or {}
             numbers = [progress["source"], progress["target"]]

@@ -247,7 +247,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
 
     def _measured(self, connection: Connection, map_name: str, job_id: str) -> _Measured:
         job = self.find(connection, map_name, job_id)
-        found = self.require_success(job, map_name, "its plans exist")
+        found = self.require_success(job, "plans")
         request = NewMapCoverage.model_validate(job.data or {})
         result = CoverageResult.model_validate(found)
         return _Measured(request, result, _plans(connection, job))

@@ -17,7 +17,7 @@ from sqlalchemy import Connection
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Tasks, ends_within
 from sceneprint.engine.serializers import job_progress, when
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
-from sceneprint.errors import DamagedBlob, NotIndexed, UnknownJob, UnknownMap
+from sceneprint.errors import DamagedBlob, NotIndexed, UnknownJob
 from sceneprint.store import Store, queue
 from sceneprint.store.audit_log import record_change
 from sceneprint.store.maps import find_map, living_map, map_of
@@ -70,7 +70,6 @@ class Products(ABC, Generic[Request, Record]):
 
     # what each product adds
 
-    @abstractmethod
     def start(self, connection: Connection, row: MapRow, request: Request) -> dict[str, Any]:
         """Return the progress of a job that has done nothing yet, with `done` and `total`.
 
@@ -78,10 +77,15 @@ class Products(ABC, Generic[Request, Record]):
         ------
         InvalidRequest : the map does not have what the request names.
         """
+        raise NotImplementedError
 
     @abstractmethod
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
         """Do a slice of a job: some of its work, or the conclusion."""
+
+    def fields(self, job: JobRow) -> dict[str, Any]:
+        """Return the fields of a record that the request of a job fills."""
+        return {"request": job.data or {}}
 
     def details(self, connection: Connection, job: JobRow) -> dict[str, Any]:
         """Return fields of a record that lists leave out."""
@@ -138,13 +142,13 @@ class Products(ABC, Generic[Request, Record]):
         items = [self.record_of(one.job, map_name) for one in found[:limit]]
         return Page[self.record](items=items, next_cursor=more)  # type: ignore[name-defined]
 
-    def get(self, map_name: str, job_id: str) -> Record:
+    def get(self, map_name: str | None, job_id: str) -> Record:
         """Return a job with its details; raise UnknownMap or UnknownJob if it does not exist."""
         with self._store.database.read() as connection:
             job = self.find(connection, map_name, job_id)
             return self.record_of(job, map_name, **self.details(connection, job))
 
-    def remove(self, map_name: str, job_id: str) -> None:
+    def remove(self, map_name: str | None, job_id: str) -> None:
         """Delete a job with its results, also while a worker runs it.
 
         Raises
@@ -156,70 +160,70 @@ class Products(ABC, Generic[Request, Record]):
             job = self.find(connection, map_name, job_id)
             self.check_removal(connection, job)
             blobs = queue.remove_job(connection, job)
-            record_change(connection, "job.removed", map_name, job_id, kind=self.kind)
+            name = None if job.map_number is None else map_of(connection, job.map_number).name
+            record_change(connection, "job.removed", name, job_id, kind=self.kind)
         collect_deleted_blobs(self._store, blobs)
 
     def forget(self) -> int:
         """Delete the jobs whose files show deleted frames; return how many."""
         with self._store.database.read() as connection:
-            gone = [
-                (map_of(connection, job.map_number).name, job.id)
-                for job in queue.jobs_with_files(connection, self.kind)
-                if job.map_number is not None and self.shows_deleted(connection, job)
-            ]
-        for name, job_id in gone:
-            with suppress(UnknownMap, UnknownJob):  # somebody else has deleted it
-                self.remove(name, job_id)
+            jobs = queue.jobs_with_files(connection, self.kind)
+            gone = [job.id for job in jobs if self.shows_deleted(connection, job)]
+        for job_id in gone:
+            with suppress(UnknownJob):  # somebody else has deleted it
+                self.remove(None, job_id)
         return len(gone)
 
-    def find(self, connection: Connection, map_name: str, job_id: str) -> JobRow:
-        """Return the row of a job of a map.
+    def find(self, connection: Connection, map_name: str | None, job_id: str) -> JobRow:
+        """Return the row of a job.
+
+        Parameters
+        ----------
+        map_name : of its map; None for any
 
         Raises
         ------
         UnknownMap : no such map.
         UnknownJob : the map has no job of this kind and id.
         """
-        row = find_map(connection, map_name)
-        message = (
-            f"There is no {self.record.noun} {job_id!r:.80} in map {row.name!r}. List them with "
-            f"GET /v1/maps/{row.name}/{self.record.collection}."
-        )
-        try:
+        row = None if map_name is None else find_map(connection, map_name)
+        with suppress(UnknownJob):
             job = queue.find_job(connection, job_id)
-        except UnknownJob:
-            raise UnknownJob(message) from None
-        if job.kind != self.kind or job.map_number != row.number:
-            raise UnknownJob(message)
-        return job
+            if job.kind == self.kind and (row is None or job.map_number == row.number):
+                return job
+        where = "" if row is None else f" in map {row.name!r}"
+        raise UnknownJob(
+            f"There is no {self.record.noun} {job_id!r:.80}{where}. See GET /v1/jobs for the jobs "
+            "that exist."
+        )
 
-    def record_of(self, job: JobRow, map_name: str, **details: Any) -> Record:
+    def record_of(self, job: JobRow, map_name: str | None, **details: Any) -> Record:
         """Return a job as the API describes it."""
         return self.record.model_validate(
             {
-                "job_id": job.id, "map": map_name, "request": job.data or {}, "state": job.state,
+                "job_id": job.id, "map": map_name, "state": job.state,
                 "progress": job_progress(job), "result": job.result, "error": job.error,
                 "created_at": when(job.created_at), "finished_at": when(job.finished_at),
-                **details,
+                **self.fields(job), **details,
             }
         )  # fmt: skip
 
-    def require_success(self, job: JobRow, map_name: str, what: str) -> dict[str, Any]:
+    def require_success(self, job: JobRow, what: str) -> dict[str, Any]:
         """Return the result of a job; raise NotIndexed until it has succeeded.
 
         Parameters
         ----------
-        job, map_name : see `find`
-        what : exists once the job has succeeded, such as "its graph exists"
+        what : part of the result, such as graph
         """
         if job.state != JobState.SUCCEEDED or job.result is None:
+            why = "" if job.error is None else f" ({job.error})"
             raise NotIndexed(
-                f"{self.record.noun.capitalize()} {job.id} is {job.state}; {what} once it has "
-                f"succeeded. See GET /v1/maps/{map_name}/{self.record.collection}/{job.id}."
+                f"{self.record.noun.capitalize()} {job.id} is {job.state}{why}. It has its {what} "
+                "once it has succeeded."
             )
         return job.result
 
-    def file(self, map_name: str, job_id: str, name: str) -> queue.JobFile:
+    def file(self, map_name: str | None, job_id: str, name: str) -> queue.JobFile:
         """Return a file that a job has made.
 
         Raises
@@ -230,7 +234,7 @@ class Products(ABC, Generic[Request, Record]):
         """
         with self._store.database.read() as connection:
             job = self.find(connection, map_name, job_id)
-            self.require_success(job, map_name, f"its {name} exist")
+            self.require_success(job, name)
             found = queue.files_of(connection, job.number).get(name)
         if found is None:
             raise DamagedBlob(

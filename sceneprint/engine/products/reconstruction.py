@@ -9,25 +9,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from sqlalchemy import Connection, select
 
 from sceneprint.engine.ingest.frame_decoder import read_stored
-from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept, Tasks
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept
 from sceneprint.engine.maps.map_frames import living
+from sceneprint.engine.products.product import Products
 from sceneprint.engine.results.query_entry import StoredAnswer
-from sceneprint.engine.serializers import when
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import (
     DamagedBlob,
     FrameError,
     InvalidRequest,
     NotFound,
-    NotIndexed,
     UnknownFrame,
-    UnknownJob,
     UnreadableGeometry,
     UselessFrame,
 )
@@ -45,12 +43,11 @@ from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.surface.coverage import added_areas, observed_volume, of_views, share_seen
 from sceneprint.geometry.surface.depth_image import doubled
 from sceneprint.store import Store, queue
-from sceneprint.store.audit_log import record_change
 from sceneprint.store.frames import not_purged
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.store.tables import JobRow, frames, maps
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics
-from sceneprint_client.api import JobState, Match
+from sceneprint_client.api import Match
 from sceneprint_client.api.surface import (
     MOST_VIEWS,
     Coverage,
@@ -58,7 +55,6 @@ from sceneprint_client.api.surface import (
     LeftOut,
     NewReconstruction,
     Reconstruction,
-    ReconstructionFile,
 )
 
 # Views of an answer fused: their depth out of the store, the surface, its figures, its files.
@@ -233,7 +229,6 @@ def _fused_view(view: JobView | None, frame: DepthFrame, source: Source) -> Fuse
     )
 
 
-KIND = "reconstruct"
 #: Files of such a job: what the query saw, until it is fused; and the surface.
 QUERY, MESH = "query.geometry", "mesh.ply"
 MEDIA_TYPE = "application/ply"
@@ -241,14 +236,13 @@ MEDIA_TYPE = "application/ply"
 _STILL = np.eye(4).tolist()
 
 
-class ReconstructionJobs:
-    """Begins reconstructions, does them, and hands out what they made."""
+class Reconstructions(Products[NewReconstruction, Reconstruction]):
+    """Reconstructions of answers."""
 
-    def __init__(self, store: Store, tasks: Tasks) -> None:
-        self._store, self._tasks = store, tasks
-        tasks.register(KIND, self._fuse)
+    kind = "reconstruct"
+    record = Reconstruction
 
-    def begin(self, stored: StoredAnswer, wanted: NewReconstruction) -> Reconstruction:
+    def begin_for(self, stored: StoredAnswer, wanted: NewReconstruction) -> Reconstruction:
         """Queue a reconstruction. All that it needs of the answer is copied: that may expire.
 
         Parameters
@@ -284,58 +278,25 @@ class ReconstructionJobs:
                 blob, size = self._store.blobs.put(data_of_query), len(data_of_query)
                 files = [queue.JobFile(QUERY, blob, size, "application/octet-stream")]
             try:
-                job, _ = self._tasks.begin(KIND, of, data, files=files)
+                job, _ = self._tasks.begin(self.kind, of, data, files=files)
             except Swept:
                 continue
             except BaseException:
                 collect_deleted_blobs(self._store, [one.blob for one in files])
                 raise
-            return self.find(job.job_id)
+            return self.get(None, job.job_id)
 
-    def find(self, job_id: str) -> Reconstruction:
-        """A reconstruction; UnknownJob where there is none."""
-        with self._store.database.read() as connection:
-            job = _find(connection, job_id)
-            return _reconstruction_record(job, queue.files_of(connection, job.number))
+    def fields(self, job: JobRow) -> dict[str, Any]:
+        """Return the fields of a record that the request of a job fills."""
+        data = job.data or {}
+        return {name: data[name] for name in ("request", "query_id", "maps", "parent_frame")}
 
-    def mesh(self, job_id: str) -> queue.JobFile:
-        """Return the file of the surface.
+    def shows_deleted(self, connection: Connection, job: JobRow) -> bool:
+        """Return whether a view of a job was deleted, and cannot be restored."""
+        return not _is_current(connection, job)
 
-        Raises
-        ------
-        UnknownJob : there is no such reconstruction.
-        NotIndexed : it has not made it.
-        """
-        with self._store.database.read() as connection:
-            job = _find(connection, job_id)
-            found = queue.files_of(connection, job.number).get(MESH)
-        if found is None:
-            why = f": {job.error}" if job.error else "."
-            raise NotIndexed(
-                f"Reconstruction {job_id} is {job.state}, and {MESH} exists once it has "
-                f"succeeded{why}"
-            )
-        return found
-
-    def delete(self, job_id: str) -> None:
-        """Remove a reconstruction, whatever has become of it; UnknownJob where there is none."""
-        with self._store.database.write() as connection:
-            blobs = queue.remove_job(connection, _find(connection, job_id))
-            record_change(connection, "job.removed", None, job_id, kind=KIND)
-        collect_deleted_blobs(self._store, blobs)
-
-    def forget(self) -> int:
-        """Remove those of which any view was deleted since: they show it; returns how many."""
-        with self._store.database.read() as connection:
-            found = queue.jobs_with_files(connection, KIND)
-            gone = [job for job in found if not _is_current(connection, job)]
-        for job in gone:
-            with suppress(UnknownJob):  # somebody else has
-                self.delete(job.id)
-        return len(gone)
-
-    def _fuse(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Do it, in one slice: at most 32 views of bounded size take seconds."""
+    def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
+        """Fuse the views, in one slice: at most 32 views of bounded size take seconds."""
         del is_over
         data = task.data
         wanted = NewReconstruction.model_validate(data["request"])
@@ -415,28 +376,3 @@ def _is_current(connection: Connection, job: JobRow) -> bool:
         )
     )
     return places <= {(row.name, row.id) for row in connection.execute(there)}
-
-
-def _find(connection: Connection, job_id: str) -> JobRow:
-    job = queue.find_job(connection, job_id)
-    if job.kind != KIND:
-        raise queue.unknown_job(job_id)
-    return job
-
-
-def _reconstruction_record(job: JobRow, files: dict[str, queue.JobFile]) -> Reconstruction:
-    data, done = job.data or {}, job.state == JobState.SUCCEEDED
-    made = [files[MESH]] if MESH in files else []
-    return Reconstruction(
-        job_id=job.id,
-        query_id=data["query_id"],
-        maps=data["maps"],
-        state=job.state,
-        error=job.error,
-        created_at=when(job.created_at),
-        finished_at=when(job.finished_at),
-        request=NewReconstruction.model_validate(data["request"]),
-        parent_frame=data["parent_frame"],
-        coverage=Coverage.model_validate(job.result) if done else None,
-        files=[ReconstructionFile.model_validate(asdict(one)) for one in made],
-    )

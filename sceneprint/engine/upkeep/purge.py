@@ -14,16 +14,16 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 from sqlalchemy import Connection
 
 from sceneprint.engine.maps.tombstones import Tombstones
-from sceneprint.engine.products.reconstruction import ReconstructionJobs
-from sceneprint.engine.products.session_differences import Differences
+from sceneprint.engine.products.product import Products
 from sceneprint.engine.results.query_log import QueryLog
 from sceneprint.engine.upkeep.garbage_collection import (
     collect_deleted_blobs,
@@ -155,14 +155,13 @@ class Purged:
     Parameters
     ----------
     blobs : that were doomed, and left behind; with files in quarantine
-    answers, reconstructions, differences : that showed what is gone
+    answers, products : that showed what is gone
     indexes : that were made anew or removed
     """
 
     blobs: int
     answers: int
-    reconstructions: int
-    differences: int
+    products: int
     indexes: int
 
 
@@ -177,12 +176,11 @@ class Purging:
 
     def __init__(
         self, store: Store, upkeep: Upkeep, query_log: QueryLog, tombstones: Tombstones,
-        reconstructions: ReconstructionJobs, differences: Differences, purge_s: float,
-        quarantine: Path,
+        products: Sequence[Products[Any, Any]], purge_s: float, quarantine: Path,
     ) -> None:  # fmt: skip
         self._store, self._upkeep, self._log = store, upkeep, query_log
         self._tombstones, self._quarantine = tombstones, quarantine
-        self._reconstructions, self._differences = reconstructions, differences
+        self._products = products
         self._every_s = purge_s / 2  # what is deleted just after a look is gone in time too
         self._next = time.monotonic() + self._every_s
 
@@ -231,8 +229,7 @@ class Purging:
         found = Purged(
             blobs=tried(lambda: collect_doomed_blobs(self._store, before, seconds))
             + tried(lambda: collect_quarantined(self._store, self._quarantine)),
-            reconstructions=tried(self._reconstructions.forget),
-            differences=tried(self._differences.forget),
+            products=sum(tried(one.forget) for one in self._products),
             answers=tried(self._log.purge),
             indexes=tried(lambda: self._swept(now=before is None))
             + sum(tried(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]

@@ -46,7 +46,7 @@ export function reconstructionPanel(answer, signal) {
   }
 
   function show(told) {
-    const { coverage } = told;
+    const { result: coverage } = told;
     const path = at("reconstructions", told.job_id);
     put(said, "The reconstruction is there.");
     put(body, h("p", { class: "muted" }, `${count(coverage.views.length)} views show ${coverage.area_m2.toFixed(1)} m² together; `,
