@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 #: What was looked at, in the order in which it is told.
 _COUNTED = (
-    "models", "frames", "signatures", "blobs", "files", "generations",
+    "models", "frames", "signatures", "blobs", "files", "indexes",
 )  # fmt: skip
 
 

@@ -1,9 +1,9 @@
 """Reading all stored bytes at a low rate, to find damage before a query or a restore does.
 
-frames of the store  --Scrub.run, a slice each 4 s-->  damage told, derived data signed again
+frames of the store  --Scrub.run, a slice each 4 s-->  damage reported, derived data signed again
 
-It looks as `sceneprint fsck` does at uploads, artifacts and signatures. What is made of an upload
-is made again; a damaged upload is only told: nothing is moved while nobody looks.
+It checks frames by the function that `sceneprint fsck` uses. What is made of an upload is made
+again; anything else is only reported: nothing is moved while nobody looks.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import replace
 
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import NotFound, SceneprintError
-from sceneprint.maintenance.fsck.check import check_bytes
+from sceneprint.maintenance.fsck.check import check_frames
 from sceneprint.maintenance.fsck.findings import Finding, Folder
 from sceneprint.settings import Settings
 from sceneprint.store import Store
@@ -66,9 +66,8 @@ class Scrub:
         -------
         where the scrub stands; None: nothing was read
         """
-        if self._budget <= 0 or self._store.database.read_only:
-            return None
-        if not now and time.monotonic() < self._next:
+        rested = now or time.monotonic() >= self._next
+        if self._budget <= 0 or self._store.database.read_only or not rested:
             return None
         self._next = time.monotonic() + SLICE_S
         try:
@@ -92,7 +91,7 @@ class Scrub:
             if not numbers:
                 finished = True
                 break
-            for finding in check_bytes(folder, numbers):
+            for finding in check_frames(folder, numbers):
                 if finding.severity == "damage":
                     damaged += 1
                     self._report(finding)
@@ -122,8 +121,8 @@ class Scrub:
                 frame = find_frame(connection, row, finding.frame_id)
         except NotFound:  # deleted meanwhile
             return
-        if not finding.kind.endswith("-upload"):
+        if finding.kind.endswith("-upload"):
+            with self._store.database.write() as connection:
+                record_event(connection, "frame.damaged", row.name, frame.id, upload=True)
+        elif finding.kind.endswith(("-artifact", "-signature")):
             resign_frames(self._store, row, [frame.number], row.model_id)
-            return
-        with self._store.database.write() as connection:
-            record_event(connection, "frame.damaged", row.name, frame.id, upload=True)

@@ -32,25 +32,18 @@ class ScrubRow:
     damaged: int
 
     def is_due(self, now: float) -> bool:
-        """Whether somebody may go on; what is due later than any pass was written by a clock that
-        has been set back since.
-        """
+        """Return whether somebody may go on, or the clock has been set back by more than a pass."""
         return not now < self.next_at <= now + PASS_S
 
 
 def read_scrub(connection: Connection) -> ScrubRow | None:
-    """Where the scrub stands; None: none has begun."""
+    """Return where the scrub stands; None: none has begun."""
     row = connection.execute(select(scrubs)).mappings().first()
     return None if row is None else ScrubRow(**row)
 
 
 def claim_slice(connection: Connection) -> ScrubRow | None:
-    """Take the next slice; None where it is not due.
-
-    Parameters
-    ----------
-    connection : of a writing transaction
-    """
+    """Take the next slice, in a writing transaction; None where it is not due."""
     now, row = read_clock(connection), read_scrub(connection)
     if row is None:
         row = ScrubRow(1, 0, now + SLICE_S, now, None, 0, 0, 0)
@@ -66,23 +59,21 @@ def claim_slice(connection: Connection) -> ScrubRow | None:
 
 
 def frames_behind(connection: Connection, position: int, count: int) -> list[int]:
-    """Numbers of the next frames, at most so many."""
+    """Return the numbers of the next frames, at most so many."""
     asked = select(frames.c.number).where(frames.c.number > position)
     return list(connection.execute(asked.order_by(frames.c.number).limit(count)).scalars())
 
 
 def record_slice(connection: Connection, row: ScrubRow, *, finished: bool) -> None:
-    """Note what came of a slice; a pass that is finished is begun anew when its time has come.
+    """Note what came of a slice, in a writing transaction.
 
     Parameters
     ----------
-    connection : of a writing transaction
     row : of `claim_slice`, with the position and the counts after the slice
-    finished : whether there are no more frames
+    finished : whether there are no more frames: the next pass begins when its time has come
     """
     if finished:
         now = read_clock(connection)
-        row = replace(
-            row, position=0, finished_at=now, next_at=max(now + SLICE_S, row.began_at + PASS_S)
-        )
+        next_at = max(now + SLICE_S, row.began_at + PASS_S)
+        row = replace(row, position=0, finished_at=now, next_at=next_at)
     connection.execute(update(scrubs).values(**asdict(row)))

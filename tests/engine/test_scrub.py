@@ -115,9 +115,10 @@ def test_damage_is_told_and_what_can_be_made_again_is(
             .where(signatures.c.frame_number == number)
             .values(vector=b"\7" * size)
         )
+        connection.execute(update(frames).where(frames.c.id == ids[5]).values(pose_x=7.0))
     row = _scrub(full).run(now=True)
     assert row is not None
-    assert row.damaged == 4
+    assert row.damaged == 5
     wanted = full.operations.wanted("hall", ["frame.damaged"])
     found = full.operations.events(wanted).items
     assert {(one.frame_id, one.data.get("upload", False)) for one in found} == {
@@ -130,7 +131,7 @@ def test_damage_is_told_and_what_can_be_made_again_is(
     _due(full)
     again = _scrub(full).run(now=True)
     assert again is not None
-    assert again.damaged == 1  # the upload, until it is sent again
+    assert again.damaged == 2  # the upload, until it is sent again, and the position
 
 
 def test_a_slice_is_as_large_as_the_rate_and_goes_on_where_the_last_one_ended(

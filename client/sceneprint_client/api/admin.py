@@ -223,8 +223,8 @@ class ScrubSeen(ApiRecord):
     blobs: int = Field(description="Uploads and artifacts that this pass has read.")
     bytes: int = Field(description="Of these.")
     damaged: int = Field(
-        description="Uploads, artifacts and signatures that it found lost or damaged; events "
-        "`frame.damaged` name their frames, and `sceneprint fsck` all of them."
+        description="Rows, signatures, uploads and artifacts that it found lost or damaged. Events "
+        "`frame.damaged` name the frames of lost bytes, and `sceneprint fsck` all of them."
     )
 
 

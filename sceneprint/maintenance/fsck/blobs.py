@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from sqlalchemy import Connection, select, update
+from sqlalchemy import Column, Connection, Select, Table, Text, cast, literal, select, update
 
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.engine.upkeep.repair import PRIORITY, is_known_loss, reason_of_loss, without_loss
@@ -41,8 +42,8 @@ class BlobReference:
     Parameters
     ----------
     number : of the row
-    digest, name : of the blob, and which one of the row it is
-    what : the row, for people
+    name : which blob of the row it is: an artifact's model, a file's name, a tile's place
+    owner : id of the frame or job
     state, reason : of the frame, where it is one's
     on_its_way : whether a job is to make the blob again
     """
@@ -50,79 +51,65 @@ class BlobReference:
     kind: str
     number: int
     digest: str
-    name: str
-    what: str
     map: str | None
-    frame_id: str | None = None
+    name: str = ""
+    owner: str | None = None
     state: str | None = None
     reason: str | None = None
     on_its_way: bool = False
 
+    @property
+    def frame_id(self) -> str | None:
+        """The frame, where it is one's."""
+        return None if self.state is None else self.owner
 
-def _uploads(connection: Connection, numbers: list[int]) -> list[BlobReference]:
+    @property
+    def what(self) -> str:
+        """The blob, for people."""
+        if self.state is not None:
+            return f"the {self.kind} of frame {self.owner} of map {self.map}"
+        of = f"of map {self.map}" if self.owner is None else f"of job {self.owner}"
+        return f"{self.kind} {self.name} {of}"
+
+
+def _uploads() -> Select[Any]:
     c = frames.c
-    found = connection.execute(
-        select(c.number, c.blob, maps.c.name, c.id, c.state, c.reason)
+    return (
+        select(c.number, c.blob, maps.c.name, literal(""), c.id, c.state, c.reason)
         .join(maps, maps.c.number == c.map_number)
-        .where(c.number.in_(numbers), _KEPT)
-        .order_by(c.number)
+        .where(_KEPT)
     )
-    return [
-        BlobReference("upload", number, blob, "", f"the upload of frame {own} of map {name}",
-                      name, own, state, reason)
-        for number, blob, name, own, state, reason in found
-    ]  # fmt: skip
 
 
-def _artifacts(connection: Connection, numbers: list[int]) -> list[BlobReference]:
+def _artifacts() -> Select[Any]:
     c, signed = frames.c, signatures.c
-    job = jobs.c.frame_number == c.number
-    job &= (jobs.c.kind == REENCODE) & (jobs.c.model_id == signed.model_id)
-    on_its_way = select(jobs.c.number).where(job, jobs.c.state.in_(PENDING)).exists()
-    found = connection.execute(
-        select(c.number, signed.geometry, signed.model_id, maps.c.name, c.id, c.state, c.reason,
-               on_its_way)
+    job = (jobs.c.frame_number == c.number) & (jobs.c.model_id == signed.model_id)
+    job &= (jobs.c.kind == REENCODE) & jobs.c.state.in_(PENDING)
+    return (
+        select(c.number, signed.geometry, maps.c.name, signed.model_id, c.id, c.state, c.reason,
+               select(jobs.c.number).where(job).exists())
         .join(maps, maps.c.number == c.map_number)
         .join(signatures, signed.frame_number == c.number)
-        .where(c.number.in_(numbers), c.state == FrameState.INDEXED)
-        .order_by(c.number)
+        .where(c.state == FrameState.INDEXED)
     )  # fmt: skip
-    return [
-        BlobReference("artifact", number, blob, model_id,
-                      f"the artifact of frame {own} of map {name}", name, own, *rest)
-        for number, blob, model_id, name, own, *rest in found
-    ]  # fmt: skip
 
 
-def _job_files(connection: Connection, numbers: list[int]) -> list[BlobReference]:
-    c = job_files.c
-    found = connection.execute(
-        select(c.job_number, c.blob, c.name, jobs.c.id, jobs.c.kind, maps.c.name)
-        .join(jobs, jobs.c.number == c.job_number)
+def _job_files() -> Select[Any]:
+    return (
+        select(jobs.c.number, job_files.c.blob, maps.c.name, job_files.c.name, jobs.c.id)
+        .join(job_files, job_files.c.job_number == jobs.c.number)
         .join(maps, maps.c.number == jobs.c.map_number, isouter=True)
-        .where(c.job_number.in_(numbers))
-        .order_by(c.job_number, c.name)
     )
-    return [
-        BlobReference("job-file", number, blob, own, f"{own} of job {job} ({kind})", name)
-        for number, blob, own, job, kind, name in found
-    ]
 
 
-def _tiles(connection: Connection, numbers: list[int]) -> list[BlobReference]:
+def _tiles(blob: Column[str]) -> Select[Any]:
     c = surface_tiles.c
-    found = connection.execute(
-        select(c.number, c.blob, c.draft, maps.c.name, c.level, c.tile_x, c.tile_y, c.tile_z)
+    x, y, z, level = (cast(one, Text) for one in (c.tile_x, c.tile_y, c.tile_z, c.level))
+    return (
+        select(c.number, blob, maps.c.name, x + "," + y + "," + z + " of level " + level)
         .join(maps, maps.c.number == c.map_number)
-        .where(c.number.in_(numbers))
-        .order_by(c.number)
+        .where(blob.is_not(None))
     )
-    return [
-        BlobReference("tile", number, digest, "", f"tile {tuple(place)} of level {level} of map "
-                      f"{name}", name)
-        for number, blob, draft, name, level, *place in found
-        for digest in (blob, draft) if digest is not None
-    ]  # fmt: skip
 
 
 # What a repair does about a blob that is lost or damaged, and moved away.
@@ -140,6 +127,15 @@ def _note_loss(connection: Connection, one: BlobReference, condition: Condition)
         cancel_jobs(connection, jobs.c.frame_number == one.number)
         record_event(connection, "frame.failed", str(one.map), one.frame_id)
     return f"the frame is {state}, and says so in its reason"
+
+
+def _clear_loss(connection: Connection, one: BlobReference) -> str:
+    own = update(frames).where(frames.c.number == one.number)
+    if one.state != FrameState.FAILED:
+        connection.execute(own.values(reason=without_loss(one.reason)))
+        return "cleared"
+    connection.execute(own.values(state=FrameState.RECEIVED, reason=None))
+    return f"job {enqueue(connection, 'sign', one.number).id} is queued"
 
 
 def _make_artifact(connection: Connection, one: BlobReference, _: Condition) -> str:
@@ -166,7 +162,8 @@ def _make_tile(connection: Connection, one: BlobReference, _: Condition) -> str:
 class _Kind:
     """A kind of blob: who refers to one, what its loss means, and how it is repaired."""
 
-    read: Callable[[Connection, list[int]], list[BlobReference]]
+    table: Table
+    asked: tuple[Select[Any], ...]
     means: str
     would: str
     repair: Callable[[Connection, BlobReference, Condition], str]
@@ -174,35 +171,45 @@ class _Kind:
 
 _KINDS = {
     "upload": _Kind(
-        _uploads, "the frame cannot be signed again; upload it again to heal",
+        frames, (_uploads(),), "the frame cannot be signed again; upload it again to heal",
         "say so in the frame's reason; one that is not signed yet fails", _note_loss,
     ),
     "artifact": _Kind(
-        _artifacts, "the frame is found, and cannot be validated",
+        frames, (_artifacts(),), "the frame is found, and cannot be validated",
         "have it made again from the upload", _make_artifact,
     ),
     "job-file": _Kind(
-        _job_files, "it cannot be given out, nor gone on with",
+        jobs, (_job_files(),), "it cannot be given out, nor gone on with",
         "forget it: begin the job anew", _forget_file,
     ),
     "tile": _Kind(
-        _tiles, "that part of the surface cannot be shown",
+        surface_tiles, (_tiles(surface_tiles.c.blob), _tiles(surface_tiles.c.draft)),
+        "that part of the surface cannot be shown",
         "have it made again from the frames", _make_tile,
     ),
 }  # fmt: skip
 
 
+def _read(kind: str, connection: Connection, numbers: list[int]) -> list[BlobReference]:
+    """Read the references of some rows, in their order."""
+    number = _KINDS[kind].table.c.number
+    return [
+        BlobReference(kind, *row)
+        for asked in _KINDS[kind].asked
+        for row in connection.execute(asked.where(number.in_(numbers)).order_by(number))
+    ]
+
+
 def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Finding]:
     """Check the blobs of a kind that some rows refer to, each against its digest."""
     blobs = folder.store.blobs
-    for one in read_rows(folder, numbers, _KINDS[kind].read):
+    for one in read_rows(folder, numbers, partial(_read, kind)):
         if isinstance(one, tuple):
             continue  # found when rows were looked at
         folder.counts["blobs"] += 1
         folder.counts["bytes"] += 0 if folder.quick else blobs.size(one.digest) or 0
         condition = blobs.condition(one.digest, quick=folder.quick)
-        known = is_known_loss(one.reason)
-        found = condition == "sound" and known and kind == "upload" and not folder.quick
+        found = _is_found(one, condition) and not folder.quick
         if condition == "sound" and not found:
             continue
         with folder.store.database.read() as connection:
@@ -218,9 +225,9 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
                 kind="found-upload", severity="leftover",
                 means="the frame's reason says that it is lost, and it is there",
                 would="clear the reason, and sign a frame that had failed for that",
-                repair=partial(_clear_loss, folder, one),
+                repair=partial(_repair, folder, one),
             )  # fmt: skip
-        elif condition == "missing" and (known or one.on_its_way):
+        elif condition == "missing" and (one.on_its_way or is_known_loss(one.reason)):
             yield finding(kind=f"missing-{kind}", severity="note", means=f"{means}; this is known")
         else:
             move = "move it to the quarantine, and " if condition == "damaged" else ""
@@ -228,6 +235,11 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
                 kind=f"{condition}-{kind}", severity="damage", means=means,
                 would=move + _KINDS[kind].would, repair=partial(_repair, folder, one),
             )  # fmt: skip
+
+
+def _is_found(one: BlobReference, condition: Condition) -> bool:
+    """Return whether an upload is there that its frame calls lost."""
+    return one.kind == "upload" and condition == "sound" and is_known_loss(one.reason)
 
 
 def check_products(folder: Folder) -> Iterator[Finding]:
@@ -241,7 +253,7 @@ def check_products(folder: Folder) -> Iterator[Finding]:
 
 def _now(connection: Connection, one: BlobReference) -> BlobReference | None:
     """Return the reference as it is now; None where the row refers to the blob no more."""
-    found = _KINDS[one.kind].read(connection, [one.number])
+    found = _read(one.kind, connection, [one.number])
     return next((o for o in found if (o.digest, o.name) == (one.digest, one.name)), None)
 
 
@@ -249,23 +261,12 @@ def _repair(folder: Folder, one: BlobReference) -> str:
     # in one transaction: an upload of the same bytes may come, and what it put must stay
     with folder.store.database.write() as connection:
         now, condition = _now(connection, one), folder.store.blobs.condition(one.digest)
+        if now is not None and _is_found(now, condition):
+            return _clear_loss(connection, now)
         if now is None or condition == "sound":
             return GONE
         moved = quarantine_blob(folder, one.digest) if condition == "damaged" else ""
         return moved + _KINDS[one.kind].repair(connection, now, condition)
-
-
-def _clear_loss(folder: Folder, one: BlobReference) -> str:
-    with folder.store.database.write() as connection:
-        now, condition = _now(connection, one), folder.store.blobs.condition(one.digest)
-        if now is None or condition != "sound" or not is_known_loss(now.reason):
-            return GONE
-        own = update(frames).where(frames.c.number == one.number)
-        if now.state != FrameState.FAILED:
-            connection.execute(own.values(reason=without_loss(now.reason)))
-            return "cleared"
-        connection.execute(own.values(state=FrameState.RECEIVED, reason=None))
-        return f"job {enqueue(connection, 'sign', one.number).id} is queued"
 
 
 # What lies where blobs are kept and nothing refers to, or is none of ours.
@@ -305,17 +306,12 @@ def _unreferenced(folder: Folder, entries: list[BlobEntry]) -> Iterator[Finding]
     for entry in entries:
         if entry.digest in kept:
             continue
-        if not known:  # more likely another database's than nobody's
-            yield Finding(
-                "unreferenced-file", entry.place, "note",
-                "the database has never held a frame: is it the one of these blobs?",
-                path=entry.place,
-            )  # fmt: skip
-            continue
         yield Finding(
-            "unreferenced-file", entry.place, "leftover",
-            "no row refers to it: its writer was killed half way, or its frame was deleted",
-            "remove it", path=entry.place, repair=partial(_remove, folder, entry),
+            "unreferenced-file", entry.place, "leftover" if known else "note",
+            "no row refers to it: its writer was killed half way, or its frame was deleted"
+            if known else "the database has never held a frame: is it the one of these blobs?",
+            "remove it" if known else None, path=entry.place,
+            repair=partial(_remove, folder, entry) if known else None,
         )  # fmt: skip
 
 

@@ -24,7 +24,6 @@ from sceneprint.maintenance.fsck.database_checks import (
     check_database,
     check_models,
     check_rows,
-    check_signatures,
     damaged_database,
 )
 from sceneprint.maintenance.fsck.findings import (
@@ -43,23 +42,21 @@ from sceneprint.store.tables import frames
 from sceneprint_client.api import FrameState
 
 
-def check_bytes(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
-    """Check all stored bytes of some frames: signatures, uploads and artifacts."""
-    if not folder.quick:
-        yield from check_signatures(folder, numbers)
+def check_frames(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
+    """Check some frames: their rows, signatures, uploads and artifacts."""
+    yield from check_rows(folder, numbers)
     yield from check_blobs(folder, "upload", numbers)
     yield from check_blobs(folder, "artifact", numbers)
 
 
-def _check_frames(folder: Folder) -> Iterator[Finding]:
+def _check_all_frames(folder: Folder) -> Iterator[Finding]:
     for numbers in folder.numbers("frames"):
-        yield from check_rows(folder, numbers)
-        yield from check_bytes(folder, numbers)
+        yield from check_frames(folder, numbers)
 
 
 #: Files before frames: what a repair of a frame dooms is no leftover.
 _CHECKS: tuple[Callable[[Folder], Iterator[Finding]], ...] = (
-    check_database, check_models, check_counts, check_files, _check_frames, check_products,
+    check_database, check_models, check_counts, check_files, _check_all_frames, check_products,
     check_indexes,
 )  # fmt: skip
 

@@ -6,8 +6,9 @@ be relied upon, and a repair by them might remove what is sound.
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -16,14 +17,17 @@ from zlib import crc32
 from sqlalchemy import (
     Connection,
     ForeignKeyConstraint,
+    LargeBinary,
+    Select,
+    Text,
     and_,
+    cast,
     delete,
     insert,
     select,
     text,
     update,
 )
-from sqlalchemy.exc import DBAPIError
 
 from sceneprint.engine.upkeep.repair import PRIORITY
 from sceneprint.maintenance.fsck.findings import (
@@ -33,12 +37,13 @@ from sceneprint.maintenance.fsck.findings import (
     read_rows,
     sign_from_upload,
 )
-from sceneprint.models import PRESETS, read_model, write_model
+from sceneprint.models import PRESETS, Model, read_model, write_model
 from sceneprint.store.deletion import doom
 from sceneprint.store.maps import counted_usage, list_maps, next_revision, use_of
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.queue import PENDING, enqueue
 from sceneprint.store.reencoding_rows import REENCODE
+from sceneprint.store.signatures import remove_signature
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
@@ -46,6 +51,7 @@ from sceneprint.store.tables import (
     frame_tags,
     frames,
     jobs,
+    map_row,
     maps,
     metadata,
     models,
@@ -70,14 +76,13 @@ def check_database(folder: Folder) -> Iterator[Finding]:
     are the concern of its own pg_amcheck.
     """
     database = folder.store.database
+    folder.progress("database", 0, 1)
     if database.is_sqlite:
         # it alone reads all indexes: where one differs from its table, no row is relied upon
         pragma = "quick_check" if folder.quick else "integrity_check"
         with database.read() as connection:
             lines = connection.execute(text(f"PRAGMA {pragma}({_MOST})")).scalars().all()
-        for line in lines:
-            if line != "ok":
-                yield damaged_database(" ".join(line.split()))
+        yield from (damaged_database(" ".join(one.split())) for one in lines if one != "ok")
     keys = [] if folder.quick else [
         key for table in metadata.sorted_tables
         for key in sorted(table.foreign_key_constraints, key=lambda one: str(one.name))
@@ -176,7 +181,7 @@ class _Known:
     frame: FrameRow
     map: MapRow
     tags: frozenset[str]
-    signed: frozenset[str]  # models that it is signed with
+    signed: dict[str, bool]  # models that it is signed with, and whether that signature is sound
     busy: bool  # whether a job is to sign it
 
 
@@ -191,8 +196,8 @@ class _Fault:
 
 
 def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
-    """Find frames whose rows contradict each other, or cannot be read."""
-    for one in read_rows(folder, numbers, _known_frames):
+    """Find frames whose rows contradict each other, are damaged, or cannot be read."""
+    for one in read_rows(folder, numbers, partial(_known_frames, folder)):
         folder.counts["frames"] += 1
         if isinstance(one, tuple):
             number, error = one
@@ -215,35 +220,56 @@ def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
 
 def _repair_row(folder: Folder, number: int, kind: str) -> str:
     with folder.store.database.write() as connection:
-        for one in _known_frames(connection, [number]):  # somebody may have been at it since
+        for one in _known_frames(folder, connection, [number]):  # somebody may have been at it
             for fault in _faults(one):
                 if fault.kind == kind:
                     return fault.fix(folder, connection, one)
     return GONE
 
 
-def _known_frames(connection: Connection, numbers: list[int]) -> list[_Known]:
+def _known_frames(folder: Folder, connection: Connection, numbers: list[int]) -> list[_Known]:
     """Read all that is looked at of some frames, as one transaction sees it."""
-    known = {row.number: row for row in list_maps(connection)}
-
-    def of_frames(owner: Any, value: Any) -> dict[int, set[str]]:
-        found = defaultdict[int, set[str]](set)
-        for number, one in connection.execute(select(owner, value).where(owner.in_(numbers))):
-            found[number].add(one)
-        return found
-
-    tags = of_frames(frame_tags.c.frame_number, frame_tags.c.tag)
-    signed = of_frames(signatures.c.frame_number, signatures.c.model_id)
+    here = frames.c.number.in_(numbers)
+    own = select(maps).where(maps.c.number.in_(select(frames.c.map_number).where(here)))
+    known = {row["number"]: map_row(row) for row in connection.execute(own).mappings()}
+    tags, signed = defaultdict[int, set[str]](set), defaultdict[int, dict[str, bool]](dict)
+    c = frame_tags.c
+    for number, tag in connection.execute(
+        select(c.frame_number, c.tag).where(c.frame_number.in_(numbers))
+    ):
+        tags[number].add(tag)
+    for number, model_id, *stored in connection.execute(_signatures(folder, numbers)):
+        signed[number][model_id] = folder.quick or _is_sound(folder.model(model_id), *stored)
     waiting = select(jobs.c.frame_number).where(
         jobs.c.frame_number.in_(numbers), jobs.c.kind == "sign", jobs.c.state.in_(PENDING)
     )
     busy = set(connection.execute(waiting).scalars())
-    found = connection.execute(select(frames).where(frames.c.number.in_(numbers))).mappings().all()
     return [
         _Known(frame_row(row), known[row["map_number"]], frozenset(tags[row["number"]]),
-               frozenset(signed[row["number"]]), row["number"] in busy)
-        for row in found
+               signed[row["number"]], row["number"] in busy)
+        for row in connection.execute(select(frames).where(here)).mappings().all()
     ]  # fmt: skip
+
+
+def _signatures(folder: Folder, numbers: list[int]) -> Select[Any]:
+    c = signatures.c
+    asked = select(c.frame_number, c.model_id).where(c.frame_number.in_(numbers))
+    if folder.quick:
+        return asked
+    # SQLite holds any bytes as text, and cannot read them as such
+    raw = LargeBinary if folder.store.database.is_sqlite else Text
+    counts = (cast(one, raw) for one in (c.n_patches, c.n_pairs))
+    return asked.add_columns(cast(c.vector, LargeBinary), c.checksum, *counts)
+
+
+def _is_sound(model: Model | None, vector: bytes, checksum: int, *counts: str | bytes) -> bool:
+    """Return whether a signature is what was stored, and as long as its model makes them."""
+    try:
+        readable = all(isinstance(json.loads(one), list) for one in counts)
+        fits = model is None or len(vector) == model.signature_bytes
+        return readable and fits and crc32(vector) == checksum
+    except (ValueError, TypeError):
+        return False
 
 
 def _faults(one: _Known) -> Iterator[_Fault]:
@@ -256,8 +282,12 @@ def _faults(one: _Known) -> Iterator[_Fault]:
     if frame.state == FrameState.INDEXED and row.model_id not in one.signed:
         yield _Fault(
             "frame-without-signature", "it is indexed, and has no signature: it is not found",
-            "have it signed again from its upload",
-            lambda folder, connection, one: sign_from_upload(folder, connection, one.frame.number),
+            "have it signed again from its upload", _sign,
+        )  # fmt: skip
+    if frame.state == FrameState.INDEXED and _damaged(one):
+        yield _Fault(
+            "damaged-signature", "the bytes of its signature are not those that were stored: "
+            "queries pass it over", "remove it, and sign the frame again from its upload", _sign,
         )  # fmt: skip
     if _stray(one):
         yield _Fault(
@@ -277,15 +307,21 @@ def _faults(one: _Known) -> Iterator[_Fault]:
         )  # fmt: skip
 
 
-def _stray(one: _Known) -> frozenset[str]:
+def _damaged(one: _Known) -> set[str]:
+    """Return the models whose signature of a frame is damaged: others than these are strays."""
+    own = (one.map.model_id, one.map.next_model_id)
+    return {model_id for model_id, sound in one.signed.items() if not sound and model_id in own}
+
+
+def _stray(one: _Known) -> set[str]:
     """Return the models that a frame should have no signature of."""
     if one.frame.deletion is not None:
-        return frozenset()  # it may be restored
+        return set()  # it may be restored
     if one.frame.state in _GONE:
-        return one.signed
+        return set(one.signed)
     # another's signature would keep the frame from being signed
     own = {one.map.model_id} if one.frame.state == FrameState.INDEXED else set[str]()
-    return one.signed - own - {one.map.next_model_id or ""}
+    return one.signed.keys() - own - {one.map.next_model_id or ""}
 
 
 def _place(frame: FrameRow) -> tuple[float | None, ...]:
@@ -298,9 +334,24 @@ def _queue(_: Folder, connection: Connection, one: _Known) -> str:
     return f"job {enqueue(connection, 'sign', one.frame.number).id} is queued"
 
 
+def _sign(folder: Folder, connection: Connection, one: _Known) -> str:
+    damaged = _damaged(one)
+    _remove_signatures(connection, one.frame.number, damaged)
+    if one.map.model_id not in one.signed or one.map.model_id in damaged:
+        return sign_from_upload(folder, connection, one.frame.number)
+    for model_id in damaged:  # meanwhile the frame is found by its other signature
+        enqueue(connection, REENCODE, one.frame.number, PRIORITY, model_id)
+    return "a worker makes it again from the upload"
+
+
 def _remove_stray(_: Folder, connection: Connection, one: _Known) -> str:
     _remove_signatures(connection, one.frame.number, _stray(one))
     return f"{len(_stray(one))} removed"
+
+
+def _remove_signatures(connection: Connection, number: int, models: set[str]) -> None:
+    for model_id in models:
+        doom(connection, remove_signature(connection, number, model_id))
 
 
 def _write_derived(_: Folder, connection: Connection, one: _Known) -> str:
@@ -320,91 +371,3 @@ def _take_revision(_: Folder, connection: Connection, one: _Known) -> str:
     own = update(frames).where(frames.c.number == one.frame.number)
     connection.execute(own.values(revision=revision))
     return f"it is at revision {revision}"
-
-
-# Signatures whose bytes are not those that were stored.
-
-#: Signatures that are read in one transaction; one may have 125,000 bytes.
-_BLOCK = 32
-
-
-@dataclass(frozen=True)
-class _Stored:
-    """A signature as it lies in the database: of its map's model, or of the one to come."""
-
-    number: int
-    frame_id: str | None
-    map: str | None
-    model_id: str
-    searched: bool  # whether it is of its map's model
-    sound: bool
-
-
-def check_signatures(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
-    """Check the signatures of indexed frames, each against its checksum and its model."""
-    read = partial(_signatures, folder)
-    for start in range(0, len(numbers), _BLOCK):
-        for one in read_rows(folder, numbers[start : start + _BLOCK], read):
-            if isinstance(one, tuple):  # its columns cannot even be read
-                one = _Stored(one[0], None, None, "", True, False)
-            if one.sound:
-                continue
-            frame = f"{one.frame_id} of map {one.map}" if one.map else f"number {one.number}"
-            yield Finding(
-                "damaged-signature", f"the signature of frame {frame}", "damage",
-                "its bytes are not those that were stored: queries pass it over",
-                "remove it, and have the frame signed again from its upload",
-                map=one.map, frame_id=one.frame_id,
-                repair=partial(_repair_signature, folder, one.number),
-            )  # fmt: skip
-
-
-def _signatures(folder: Folder, connection: Connection, numbers: list[int]) -> list[_Stored]:
-    """Read the signatures that are searched, or will be: others are strays."""
-    c = signatures.c
-    found = connection.execute(
-        select(c.frame_number, frames.c.id, maps.c.name, c.model_id, c.model_id == maps.c.model_id,
-               c.vector, c.checksum, c.n_patches, c.n_pairs)
-        .join(frames, frames.c.number == c.frame_number)
-        .join(maps, maps.c.number == frames.c.map_number)
-        .where(
-            c.frame_number.in_(numbers), frames.c.state == FrameState.INDEXED,
-            c.model_id.in_((maps.c.model_id, maps.c.next_model_id)),
-        )
-    ).all()  # fmt: skip
-    stored = []
-    for number, frame_id, name, model_id, searched, vector, checksum, *_ in found:
-        model = folder.model(model_id)
-        fits = model is None or len(vector) == model.signature_bytes
-        sound = fits and crc32(vector) == checksum
-        stored.append(_Stored(number, frame_id, name, model_id, bool(searched), sound))
-    return stored
-
-
-def _repair_signature(folder: Folder, number: int) -> str:
-    with folder.store.database.write() as connection:
-        try:
-            damaged = [one for one in _signatures(folder, connection, [number]) if not one.sound]
-        except (ValueError, TypeError, DBAPIError):  # not even its columns can be read
-            _remove_signatures(connection, number)
-            return sign_from_upload(folder, connection, number)
-        done = GONE
-        for one in damaged:
-            _remove_signatures(connection, number, {one.model_id})
-            if one.searched:
-                done = sign_from_upload(folder, connection, number)
-            else:  # meanwhile the frame is found by its other signature
-                enqueue(connection, REENCODE, number, PRIORITY, one.model_id)
-                done = "a worker makes it again from the upload"
-        return done
-
-
-def _remove_signatures(
-    connection: Connection, number: int, of: Collection[str] | None = None
-) -> None:
-    """Remove the signatures of a frame, of all models or some, and doom what they refer to."""
-    own = [signatures.c.frame_number == number]
-    if of is not None:
-        own.append(signatures.c.model_id.in_(of))
-    removed = connection.execute(delete(signatures).where(*own).returning(signatures.c.geometry))
-    doom(connection, removed.scalars())

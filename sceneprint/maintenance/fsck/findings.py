@@ -33,7 +33,7 @@ _DAMAGED = ("XX001", "XX002")
 #: Seconds in which a file that nothing refers to may be part of an upload that goes on.
 GRACE_S = 3600.0
 #: Rows that are read in one transaction.
-BLOCK = 256
+BLOCK = 64
 #: What a repair says that finds nothing to do.
 GONE = "nothing: it was well again, or gone, when it was to be repaired"
 #: Why a blob stays where it is.

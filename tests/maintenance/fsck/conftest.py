@@ -78,6 +78,14 @@ class House:
     def blob(self, digest: str) -> Path:
         return self.data / "blobs" / digest[:2] / digest
 
+    def index_files(self, kind: str) -> list[Path]:
+        """The files of a kind of the newest generation of `hall`, or its manifest."""
+        manifest = max((self.data / "index").glob("hall*/*.json"))
+        if kind == "json":
+            return [manifest]
+        named = manifest.read_text()
+        return [path for path in manifest.parent.glob(f"*.{kind}") if path.name in named]
+
     def damage(self, path: Path, condition: str = "damaged", at: int = 7, bit: int = 0) -> bytes:
         """Flip a bit of a file, or remove it; return the bytes that are left."""
         data = bytearray(path.read_bytes())

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.maintenance.fsck.findings import Finding
+from sceneprint.maintenance.fsck.check import check_frames
+from sceneprint.maintenance.fsck.findings import GONE, Finding, Folder
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import JobFile, add_files, files_of, find_job
 from sceneprint.store.surface_rows import add_surface, find_surface, tiles_to_rebuild, write_tile
@@ -54,8 +55,8 @@ def lost(house: Any) -> Callable[[str], tuple[Path, str]]:
                 values = {"blob": blobs[2], "digest": "d", "cells": 1, "scale": 0}
                 write_tile(connection, row.number, "room", 0, (0, -1, 2), values)
         if kind == "job-file":
-            return house.blob(blobs[1]), f"mesh.ply of job {job.job_id} (reconstruct)"
-        return house.blob(blobs[2]), "tile (0, -1, 2) of level 0 of map hall"
+            return house.blob(blobs[1]), f"job-file mesh.ply of job {job.job_id}"
+        return house.blob(blobs[2]), "tile 0,-1,2 of level 0 of map hall"
 
     return place
 
@@ -92,7 +93,7 @@ def test_a_lost_blob_is_named_and_repaired(
     assert known == ([(f"missing-{kind}", "note")] if kind in ("upload", "artifact") else [])
     with Engine(house.settings) as engine, engine.store.database.read() as connection:
         if kind == "job-file":
-            job = find_job(connection, what.split()[3])
+            job = find_job(connection, what.split()[-1])
             assert list(files_of(connection, job.number)) == ["picture.png"]
         if kind == "tile":
             row = find_map(connection, "hall")
@@ -101,6 +102,25 @@ def test_a_lost_blob_is_named_and_repaired(
             surface = find_surface(connection, row.number)
             assert surface is not None
             assert surface.edits < surface.pose_edits  # so that workers look at it
+
+
+def test_a_repair_looks_again_before_it_writes(house: Any, lost: Any) -> None:
+    """Of a frame that was healed, and of one that was deleted, since they were looked at."""
+    path, _ = lost("upload")
+    path.rename(house.place / "away")
+    house.sql("UPDATE frames SET pose_x = pose_x + 1 WHERE number = 1")
+    house.damage(house.blob(house.sql("SELECT blob FROM frames WHERE number = 2")[0][0]))
+    with Engine(house.settings) as engine:
+        found = list(check_frames(Folder(house.settings, engine.store), [1, 2]))
+        assert [one.kind for one in found] == ["stale-value", "missing-upload", "damaged-upload"]
+        (house.place / "away").rename(path)
+        house.sql("UPDATE frames SET pose_x = pose_x - 1 WHERE number = 1")
+        engine.delete_frame("hall", str(found[2].frame_id))
+        engine.purging.now()
+        before = house.sql("SELECT * FROM frames ORDER BY number")
+        assert [one.repair and one.repair() for one in found] == [GONE] * 3
+    assert house.sql("SELECT * FROM frames ORDER BY number") == before
+    assert house.quarantined() == []
 
 
 def test_a_lost_artifact_is_made_again_and_nobody_has_to_learn_of_it(
@@ -217,6 +237,7 @@ def test_old_leftovers_are_removed_and_other_files_are_not(house: Any) -> None:
 
     before = house.files()
     assert look(repair=True) == notes
+    assert look(grace_s=0) == [*notes, left[1]]  # the other is written for a minute yet
     for path in (*unneeded, *foreign):
         age(path, 3700)
     assert look() == [*notes, *left]

@@ -45,7 +45,7 @@ def test_it_says_what_it_would_do_and_what_it_did(
     house: Any, fsck: Callable[..., str], tmp_path: Any
 ) -> None:
     assert fsck(expect=0).splitlines() == [
-        "checked 1 models, 15 frames, 13 signatures, 27 blobs, 27 files, 2 generations",
+        "checked 1 models, 15 frames, 13 signatures, 27 blobs, 27 files, 1 indexes",
         "no problems found",
     ]
     house.sql("INSERT INTO frame_tags VALUES (1, 'other')")

@@ -174,6 +174,7 @@ def test_a_damaged_signature_is_made_again(house: Any, truth: Any, uploads: Any)
         ("damaged-signature", "a worker signs it again from its upload")
     ] * len(numbers)
     assert house.look() == []
+    assert house.sql("SELECT COUNT(*) FROM doomed") == [(len(numbers),)]  # their artifacts
     rows = house.sql(f"SELECT id FROM frames WHERE number IN {tuple(numbers)}")
     others = {frame_id for each in house.answers(uploads[:12]) for frame_id, _ in each}
     assert others
@@ -208,8 +209,7 @@ def test_a_flipped_bit_is_named_and_nothing_else_is(house: Any, kind: str, times
             vector, what = whole[rng.integers(len(whole))]
             path, at = database, data.index(vector) + int(rng.integers(len(vector)))
         else:
-            files = sorted((house.data / "index").rglob(f"*.{kind}"))
-            some = places.get(kind) or [(one, str(one)) for one in files]
+            some = places.get(kind) or [(one, str(one.parent)) for one in house.index_files(kind)]
             path, what = some[rng.integers(len(some))]
             at = int(rng.integers(path.stat().st_size))
         bit = int(rng.integers(8))
