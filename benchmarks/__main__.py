@@ -1,194 +1,130 @@
-"""`make bench`: what every stage costs, as tables, as JSON, and in docs/performance.md."""
+"""Measure what each part costs beside references in the same run, and print tables.
+
+`make bench` measures all parts, and rewrites its section of docs/performance.md.
+`python -m benchmarks --only service --map-frames 10000` measures one part.
+"""
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
-import tempfile
-from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from tqdm import tqdm
 
-from benchmarks import dashboard, disk, readiness, registration, scan, search, service, summary
-from benchmarks.encode import EncodeFigures, measure
+from benchmarks import dashboard, encode, readiness, registration, scan, search, service
 from benchmarks.machine import (
-    Machine,
     describe_machine,
-    peak_megabytes_of_signing,
+    measured_on,
     pin_to_one_processor,
     seconds_to_import,
 )
+from benchmarks.pages import put_between
 from benchmarks.pairs import real_pairs, synthetic_pairs
-from sceneprint.formats.dataset import Camera, find_sequences, write_depth_png, write_intrinsics
+from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.models import PRESETS
 from sceneprint.pipeline import open_signer
 from sceneprint.types import DepthFrame
+from sceneprint_lab.cli.demo import write_building
 from sceneprint_lab.synth import synthesise_room
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Frames of the maps that are searched, and whether by sketches.
-SEARCHED = (
-    (10_000, search.FLAT), (100_000, search.FLAT), (1_000_000, search.FLAT),
-    (100_000, search.SKETCHES), (1_000_000, search.SKETCHES),
-)  # fmt: skip
+#: Folder of real recordings, which need not be there.
+RECORDINGS = Path(os.environ.get("SCENEPRINT_DATA", ROOT.parent / "shared" / "data"))
 BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
 
 
-def recordings() -> Path:
-    """Folder of real recordings, which need not be there."""
-    return Path(os.environ.get("SCENEPRINT_DATA", ROOT.parent / "shared" / "data"))
-
-
-def real_frames(n: int) -> list[DepthFrame]:
-    """`n` frames spread over the recordings at SCENEPRINT_DATA; none where there are none."""
-    root = recordings()
-    scenes = [root / "7scenes", root / "tum", root / "sun3d"]
+def frames_to_sign(n: int) -> list[DepthFrame]:
+    """Return `n` frames spread over the recordings, or of synthetic rooms."""
+    scenes = [RECORDINGS / name for name in ("7scenes", "tum", "sun3d")]
     found = [
-        reference
+        frame
         for scene in scenes
         if scene.is_dir()
         for sequence in find_sequences(scene)
-        for reference in sequence.frames
+        for frame in sequence.frames
     ]
-    step = max(len(found) // n, 1)
-    return [reference.read_depth() for reference in found[::step][:n]]
-
-
-def synthetic_frames(n: int) -> list[DepthFrame]:
-    """`n` frames of synthetic rooms, five of each."""
+    if found:
+        return [frame.read_depth() for frame in found[:: max(len(found) // n, 1)][:n]]
     rooms = tqdm(range((n + 4) // 5), desc="synthetic rooms", disable=None)
     return [frame for i in rooms for frame in synthesise_room(3, i, 5).frames][:n]
 
 
-def peak_memory(frames: list[DepthFrame], preset: str) -> float:
-    """Peak memory of `sceneprint sign` over ten of the frames, MB."""
-    with tempfile.TemporaryDirectory() as folder:
-        for i, frame in enumerate(frames[:10]):
-            own = Path(folder) / f"{i:02d}"
-            own.mkdir()
-            write_intrinsics(own, Camera(frame.intrinsics, 1000.0, along_ray=False))
-            write_depth_png(own / "frame.png", frame.depth, 1000.0)
-        return peak_megabytes_of_signing(Path(folder), preset)
+@contextmanager
+def frames_to_serve(dataset: Path, most: int = 320) -> Iterator[list[FrameReference]]:
+    """Yield frames of a data set, evenly thinned, or of a synthetic building."""
+    with TemporaryDirectory(prefix="sceneprint-bench-") as temporary:
+        if not dataset.is_dir():
+            dataset = Path(temporary) / "building"
+            for _ in tqdm(write_building(dataset, 6), "synthetic rooms", 6, disable=None):
+                pass
+        found = [frame for sequence in find_sequences(dataset) for frame in sequence.frames]
+        yield found[:: max(len(found) // most, 1)][:most]
 
 
-def table(preset: str, f: EncodeFigures, peak: float) -> list[str]:
-    """The figures of one preset as lines of Markdown."""
-    lines = [
-        f"### Signing, `{preset}`: median of {f.frames} frames, one thread, warm",
-        "",
-        "| stage | ms |",
-        "|---|--:|",
-    ]
-    lines += [f"| {stage} | {ms:.1f} |" for stage, ms in f.stages.items()]
-    lines += [f"| **signing, sum** | **{f.signing:.1f}** |"]
-    lines += [f"| {stage} | {ms:.1f} |" for stage, ms in f.artifact_stages.items()]
-    lines += [f"| {stage} | {ms:.1f} |" for stage, ms in f.fpfh_stages.items()]
-    if f.fpfh is not None and f.ratio is not None and f.ratio_with_artifact is not None:
-        lines += [f"| **FPFH, sum** | **{f.fpfh:.1f}** |"]
-        lines += [f"| **signing / FPFH** | **{f.ratio:.2f}** |"]
-        lines += [f"| **signing and geometry artifact / FPFH** | **{f.ratio_with_artifact:.2f}** |"]
-    else:
-        lines += [f"| FPFH | not measured: {f.note} |"]
-    sizes = f"Geometry artifact: {f.artifact_bytes:,} bytes. Peak memory of a process that signs: "
-    return [*lines, "", f"{sizes}{peak:.0f} MB.", ""]
+def parts(options: argparse.Namespace) -> dict[str, Callable[[], list[str]]]:
+    """Return what measures each part. Those behind `service` run on one processor."""
 
+    def served(measure: Callable[[list[FrameReference]], list[str]]) -> list[str]:
+        with frames_to_serve(options.dataset) as frames:
+            return measure(frames)
 
-@dataclass(frozen=True)
-class Rows:
-    """All that one run measured; `encode`: figures and peak memory (MB) of each preset."""
+    def registered() -> list[str]:
+        pairs = real_pairs(RECORDINGS, options.pairs) or synthetic_pairs(options.pairs)
+        return registration.measure(pairs, open_signer(PRESETS[0]).model)
 
-    encode: dict[str, tuple[EncodeFigures, float]]
-    scan: list[scan.ScanFigures]
-    registration: registration.RegistrationFigures
-    search: list[search.SearchFigures]
-    service: service.ServiceFigures
-    readiness: readiness.ReadinessFigures | None = None
-    disk: list[disk.DiskFigures] | None = None
-    dashboard: dashboard.DashboardFigures | None = None
+    def encoded() -> list[str]:
+        frames = frames_to_sign(options.frames)
+        return [line for one in PRESETS for line in encode.measure(frames, one)]
 
-
-def page(machine: Machine, rows: Rows, start: float) -> str:
-    """The section of docs/performance.md that `make bench` owns."""
-    packages = ", ".join(f"{name} {number}" for name, number in machine.packages.items())
-    lines = [
-        BEGIN,
-        f"Measured {datetime.now(UTC):%Y-%m-%d} on: {machine.processor}, {machine.cores} cores, "
-        f"{machine.memory_gib} GiB; Python {machine.python}, {packages}. The machine is shared: "
-        "compare ratios, not milliseconds.",
-        "",
-    ]
-    of_depth = rows.encode.get(PRESETS[0])
-    if of_depth is not None:
-        lines += summary.table(of_depth[0], rows.search[0], rows.service)
-    for preset, (figures, peak) in rows.encode.items():
-        lines += table(preset, figures, peak)
-    lines += service.table(rows.service)
-    lines += readiness.table(rows.readiness) if rows.readiness is not None else []
-    lines += dashboard.table(rows.dashboard)
-    lines += [line for one in rows.scan for line in scan.table(one)] + search.table(rows.search)
-    lines += registration.table(rows.registration)
-    lines += disk.table(rows.disk) if rows.disk is not None else []
-    return "\n".join([*lines, f"`import sceneprint`: {start:.2f} s.", END])
-
-
-def measure_all(n_frames: int, n_pairs: int) -> Rows:
-    """Every row, one after the other."""
-    frames = real_frames(n_frames) or synthetic_frames(n_frames)
-    pairs = real_pairs(recordings(), n_pairs) or synthetic_pairs(n_pairs)
-    recording = recordings() / "7scenes" / "redkitchen"
-    with service.frames_of(recording if recording.is_dir() else None) as served_frames:
-        served = service.measure(served_frames)
-        started = readiness.measure(served_frames[0], list(served_frames[1:201]))
-        stored = [disk.measure_new(served_frames[:40], preset) for preset in ("depth", "paper")]
-    looked = dashboard.measure()
-    pin_to_one_processor()  # the service above has all processors, as it would
-    signers = {preset: open_signer(preset) for preset in PRESETS}
-    return Rows(
-        encode={p: (measure(frames, s), peak_memory(frames, p)) for p, s in signers.items()},
-        scan=[scan.measure(*size) for size in scan.SCANNED],
-        registration=registration.measure(pairs, signers[PRESETS[0]].model),
-        search=[search.measure(n, flat_bytes=kind) for n, kind in SEARCHED],
-        service=served,
-        readiness=started,
-        disk=stored,
-        dashboard=looked,
-    )
+    return {
+        "dashboard": dashboard.measure,
+        "readiness": lambda: served(lambda some: readiness.measure(some[0], some[1:201])),
+        "disk": lambda: served(lambda some: readiness.measure_disk(some[:40])),
+        "service": lambda: served(lambda some: service.measure(some, options.map_frames)),
+        "signing": encoded,
+        "registration": registered,
+        "scan": lambda: [line for size in scan.SCANNED for line in scan.measure(*size)],
+        "search": search.table,
+    }
 
 
 def main() -> int:
-    """Measure, print, and write what was asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=50)
-    parser.add_argument("--pairs", type=int, default=20)
-    parser.add_argument("--json", type=Path, default=ROOT / "out" / "bench.json")
+    """Measure, print, and rewrite the page that is named."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", nargs="+", metavar="PART", help="parts to measure")
+    parser.add_argument("--dataset", type=Path, default=RECORDINGS / "7scenes" / "redkitchen",
+                        help="of what a service is asked")  # fmt: skip
+    parser.add_argument("--frames", type=int, default=50, help="that are signed")
+    parser.add_argument("--pairs", type=int, default=20, help="that are registered")
+    parser.add_argument("--map-frames", type=int, default=0, help="of the served map, with random")
     parser.add_argument("--page", type=Path, help="Markdown file whose marked section is replaced")
     options = parser.parse_args()
-    start = seconds_to_import()
-    rows = measure_all(options.frames, options.pairs)
+    every = parts(options)
+    if unknown := set(options.only or ()) - set(every):
+        parser.error(f"--only {min(unknown)}: choose from {', '.join(every)}")
     machine = describe_machine()
-    section = page(machine, rows, start)
-    print(section)
-    options.json.parent.mkdir(parents=True, exist_ok=True)
-    result = {
-        "machine": asdict(machine),
-        "import_seconds": start,
-        "encode": {p: asdict(f) | {"peak_megabytes": m} for p, (f, m) in rows.encode.items()},
-        "scan": [asdict(one) for one in rows.scan],
-        "registration": asdict(rows.registration),
-        "search": [asdict(one) for one in rows.search],
-        "service": asdict(rows.service),
-        "readiness": None if rows.readiness is None else asdict(rows.readiness),
-        "disk": None if rows.disk is None else [asdict(one) for one in rows.disk],
-        "dashboard": None if rows.dashboard is None else asdict(rows.dashboard),
-    }
-    options.json.write_text(json.dumps(result, indent=1) + "\n")
+    packages = ", ".join(f"{name} {number}" for name, number in machine.packages.items())
+    lines = [
+        f"{measured_on('`make bench`')} {machine.memory_gib} GiB; Python {machine.python}, "
+        f"{packages}. The machine is shared: compare ratios, not milliseconds.",
+        "",
+    ]
+    for name, measure in every.items():
+        if name == "signing":
+            pin_to_one_processor()
+        if options.only is None or name in options.only:
+            lines += measure()
+    lines.append(f"`import sceneprint`: {seconds_to_import():.2f} s.")
+    print("\n".join(lines))
     if options.page is not None:
-        before, rest = options.page.read_text().split(BEGIN)
-        options.page.write_text(before + section + rest.split(END)[1])
+        put_between(options.page, BEGIN, END, lines)
     return 0
 
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.machine import peak_megabytes_of_signing
 from sceneprint.errors import MissingDependency
 from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics
 from sceneprint.fusion import open3d
 from sceneprint.geometry.signature.fisher_vector import quantise, statistics_of_counts, whiten
 from sceneprint.geometry.signature.pair_features import count_pairs
 from sceneprint.geometry.signature.segmentation import hierarchy, patch_weights, segment
 from sceneprint.geometry.surface.depth_image import inverse_depth, surface
-from sceneprint.pipeline import Signer, geometry_of, sign
+from sceneprint.pipeline import Signer, geometry_of, open_signer, sign
 from sceneprint.signing import float_signature, see
 from sceneprint.types import DepthFrame, Floats
 from sceneprint_lab.evaluation.pair_run import FEATURES, NORMALS, VOXEL, Clock, points_of
@@ -23,7 +27,7 @@ __all__ = ["Clock", "measure", "open3d", "points_of", "signing_stages"]
 
 
 def signing_stages(frame: DepthFrame, signer: Signer) -> dict[str, float]:
-    """Milliseconds of each stage of `sign`; their sum is the time of `sign` itself."""
+    """Return milliseconds of each stage of `sign`; their sum is the time of `sign` itself."""
     model, p, clock = signer.model, signer.model.parameters, Clock()
     q, camera = clock.run("inverse depth", lambda: inverse_depth(frame, p.depth))
     seen = clock.run("points and normals", lambda: surface(q, camera, p.normals))
@@ -50,7 +54,7 @@ def signing_stages(frame: DepthFrame, signer: Signer) -> dict[str, float]:
 
 
 def artifact_stages(frame: DepthFrame, signer: Signer) -> tuple[dict[str, float], int]:
-    """Milliseconds of each stage of the geometry artifact beside `sign`, and its bytes."""
+    """Return milliseconds of each stage of the geometry artifact beside `sign`, and its bytes."""
     clock, model = Clock(), signer.model
     seen = see(frame, model.parameters)
     geometry = clock.run("patches and descriptors", lambda: geometry_of(seen, model))
@@ -60,7 +64,7 @@ def artifact_stages(frame: DepthFrame, signer: Signer) -> tuple[dict[str, float]
 
 
 def fpfh_stages(points: Floats, o3d: Any) -> dict[str, float]:
-    """Milliseconds of each stage of FPFH."""
+    """Return milliseconds of each stage of FPFH."""
     clock, search = Clock(), o3d.geometry.KDTreeSearchParamHybrid
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     thin = clock.run("FPFH voxel grid", lambda: cloud.voxel_down_sample(VOXEL))
@@ -72,28 +76,17 @@ def fpfh_stages(points: Floats, o3d: Any) -> dict[str, float]:
     return clock.stages
 
 
-@dataclass(frozen=True)
-class EncodeFigures:
-    """Medians over all frames, milliseconds; `ratio` is the median of each frame's own.
+def measure(frames: Sequence[DepthFrame], preset: str, warm_up: int = 3) -> list[str]:
+    """Sign every frame and, in turn, compute its FPFH; return the table.
 
-    `ratio_with_artifact` has the geometry artifact made and written beside the signature.
+    Parameters
+    ----------
+    frames : of a depth camera
+    preset : of the model
+    warm_up : frames that are also signed before the clock runs
     """
-
-    frames: int
-    stages: dict[str, float]
-    signing: float
-    artifact_stages: dict[str, float]
-    artifact_bytes: int
-    fpfh_stages: dict[str, float]
-    fpfh: float | None
-    ratio: float | None
-    ratio_with_artifact: float | None
-    note: str
-
-
-def measure(frames: list[DepthFrame], signer: Signer, warm_up: int = 3) -> EncodeFigures:
-    """Sign every frame and, in turn, compute its FPFH, on the processor we are pinned to."""
-    p, note, o3d = signer.model.parameters.depth, "", None
+    signer, note, o3d = open_signer(preset), "", None
+    p = signer.model.parameters.depth
     try:
         o3d = open3d("FPFH")
     except MissingDependency as error:
@@ -107,23 +100,48 @@ def measure(frames: list[DepthFrame], signer: Signer, warm_up: int = 3) -> Encod
         artifacts.append(artifact_stages(frame, signer))
         if o3d is not None:
             theirs.append(fpfh_stages(points_of(frame, p.minimum_depth, p.maximum_depth), o3d))
-    sums, other = [sum(s.values()) for s in ours], [sum(s.values()) for s in theirs]
-    made = [sum(s.values()) - s["artifact from bytes"] for s, _ in artifacts]
-    ratios = [a / b for a, b in zip(sums, other, strict=False)]
-    with_artifact = [(a + m) / b for a, m, b in zip(sums, made, other, strict=False)]
-    return EncodeFigures(
-        frames=len(frames),
-        stages=_medians(ours),
-        signing=float(np.median(sums)),
-        artifact_stages=_medians([stages for stages, _ in artifacts]),
-        artifact_bytes=int(np.median([size for _, size in artifacts])),
-        fpfh_stages=_medians(theirs),
-        fpfh=float(np.median(other)) if other else None,
-        ratio=float(np.median(ratios)) if ratios else None,
-        ratio_with_artifact=float(np.median(with_artifact)) if with_artifact else None,
-        note=note,
-    )
+    sums, other = [sum(row.values()) for row in ours], [sum(row.values()) for row in theirs]
+    made = [sum(row.values()) - row["artifact from bytes"] for row, _ in artifacts]
+    lines = [
+        f"### Signing, `{preset}`: median of {len(frames)} frames, one thread, warm",
+        "",
+        "| stage | ms |",
+        "|---|--:|",
+        *stage_rows(ours),
+        f"| **signing, sum** | **{np.median(sums):.1f}** |",
+        *stage_rows([row for row, _ in artifacts]),
+        *stage_rows(theirs),
+    ]
+    if other:
+        whole = np.add(sums, made)
+        lines += [
+            f"| **FPFH, sum** | **{np.median(other):.1f}** |",
+            f"| **signing / FPFH** | **{np.median(np.divide(sums, other)):.2f}** |",
+            f"| **signing and geometry artifact / FPFH** | "
+            f"**{np.median(np.divide(whole, other)):.2f}** |",
+        ]
+    else:
+        lines.append(f"| FPFH | not measured: {note} |")
+    size = int(np.median([size for _, size in artifacts]))
+    return [
+        *lines, "",
+        f"Geometry artifact: {size:,} bytes. Peak memory of a process that signs: "
+        f"{_peak_memory(frames, preset):.0f} MB.", "",
+    ]  # fmt: skip
 
 
-def _medians(rows: list[dict[str, float]]) -> dict[str, float]:
-    return {s: float(np.median([row[s] for row in rows])) for s in rows[0]} if rows else {}
+def stage_rows(rows: Sequence[Mapping[str, float]], prefix: str = "") -> Iterable[str]:
+    """Yield a row of a table for each stage: its median."""
+    for stage in rows[0] if rows else ():
+        yield f"| {prefix}{stage} | {np.median([row[stage] for row in rows]):.1f} |"
+
+
+def _peak_memory(frames: Sequence[DepthFrame], preset: str) -> float:
+    """Return the peak memory of `sceneprint sign` over ten of the frames, MB."""
+    with tempfile.TemporaryDirectory() as folder:
+        for i, frame in enumerate(frames[:10]):
+            own = Path(folder) / f"{i:02d}"
+            own.mkdir()
+            write_intrinsics(own, Camera(frame.intrinsics, 1000.0, along_ray=False))
+            write_depth_png(own / "frame.png", frame.depth, 1000.0)
+        return peak_megabytes_of_signing(Path(folder), preset)

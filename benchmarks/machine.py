@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 
@@ -47,6 +48,15 @@ def describe_machine() -> Machine:
         memory_gib=round(pages / 2**30, 1),
         python=platform.python_version(),
         packages=packages,
+    )
+
+
+def measured_on(command: str) -> str:
+    """Return a sentence that says when, where and by which command figures were measured."""
+    machine = describe_machine()
+    return (
+        f"Measured {datetime.now(UTC):%Y-%m-%d} on {machine.processor}, {machine.cores} "
+        f"processors; {command}."
     )
 
 

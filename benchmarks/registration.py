@@ -1,20 +1,17 @@
 """Two frames to a transform: our validation beside Open3D's FPFH + RANSAC + ICP.
 
-FramePair of `benchmarks.pairs`  --measure-->  RegistrationFigures
-
-Ours works in both directions, tells whether to believe the result, and looks for rivals; Open3D's
-works in one direction and always answers. Features are counted on both frames, for both.
+Ours works in both directions, says whether to believe the result, and looks for rivals. Open3D's
+works in one direction and always answers. Features of both frames count, for both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.encode import Clock, points_of
+from benchmarks.encode import Clock, points_of, stage_rows
 from benchmarks.pairs import FramePair
 from sceneprint.errors import MissingDependency
 from sceneprint.fusion import open3d
@@ -31,32 +28,10 @@ METHOD = METHODS[0]
 RIGHT = (0.10, float(np.radians(10.0)))
 
 
-@dataclass(frozen=True)
-class RegistrationFigures:
-    """Medians over all pairs, milliseconds; shares are medians of each pair's own.
-
-    `share` compares all of ours with all of Open3D's; `share_of_stored` validation alone, as of
-    frames whose geometry is stored, with all of Open3D's. `right` and `open3d_right`: share of
-    pairs within 10 cm and 10 degrees of the truth, ours only where accepted.
-    """
-
-    pairs: int
-    mean_overlap: float
-    stages: dict[str, float]
-    ours: float
-    right: float
-    open3d_stages: dict[str, float]
-    open3d: float | None
-    open3d_right: float | None
-    share: float | None
-    share_of_stored: float | None
-    note: str
-
-
 def register_by_us(
     query: DepthFrame, match: DepthFrame, model: Model, clock: Clock
 ) -> Floats | None:
-    """Validation of two frames: T_match_query (4, 4) where it is accepted, else None."""
+    """Validate two frames: T_match_query (4, 4) where it is accepted, else None."""
     of_query, of_match = clock.run(
         "geometry of both frames",
         lambda: [geometry_of(see(frame, model.parameters), model) for frame in (query, match)],
@@ -66,21 +41,21 @@ def register_by_us(
 
 
 def is_right(T_match_query: Floats | None, truth: Floats) -> bool:
-    """Within 10 cm and 10 degrees of the truth."""
+    """Return whether a transform is within 10 cm and 10 degrees of the truth."""
     if T_match_query is None:
         return False
     metres, radians = difference(T_match_query, truth)
     return metres <= RIGHT[0] and radians <= RIGHT[1]
 
 
-def measure(pairs: Sequence[FramePair], model: Model, warm_up: int = 1) -> RegistrationFigures:
-    """Validate every pair and, in turn, register it by Open3D, on the processor we are pinned to.
+def measure(pairs: Sequence[FramePair], model: Model, warm_up: int = 1) -> list[str]:
+    """Validate every pair and, in turn, register it by Open3D; return the table.
 
     Parameters
     ----------
     pairs : at least one
     model : with the parameters of our validation
-    warm_up : pairs that are also done before the clock runs
+    warm_up : pairs that are also validated before the clock runs
     """
     p, note, o3d = model.parameters.depth, "", None
     try:
@@ -107,51 +82,27 @@ def measure(pairs: Sequence[FramePair], model: Model, warm_up: int = 1) -> Regis
             theirs.append(attempt.stages)
             open3d_right.append(is_right(attempt.refined, pair.T_match_query))
     sums, other = [sum(row.values()) for row in ours], [sum(row.values()) for row in theirs]
-    alone = [row["validation"] for row in ours]
-    return RegistrationFigures(
-        pairs=len(pairs),
-        mean_overlap=float(np.mean([pair.overlap for pair in pairs])),
-        stages=_medians(ours),
-        ours=float(np.median(sums)),
-        right=float(np.mean(right)),
-        open3d_stages=_medians(theirs),
-        open3d=_median(other),
-        open3d_right=float(np.mean(open3d_right)) if open3d_right else None,
-        share=_median(a / b for a, b in zip(sums, other, strict=False)),
-        share_of_stored=_median(a / b for a, b in zip(alone, other, strict=False)),
-        note=note,
-    )
-
-
-def table(f: RegistrationFigures) -> list[str]:
-    """The figures as lines of Markdown."""
+    stored = [row["validation"] for row in ours]
     lines = [
-        f"### Registration: median of {f.pairs} pairs of frames (mean overlap "
-        f"{f.mean_overlap:.2f}), one thread, warm",
+        f"### Registration: median of {len(pairs)} pairs of frames (mean overlap "
+        f"{np.mean([pair.overlap for pair in pairs]):.2f}), one thread, warm",
         "",
         "| stage | ms |",
         "|---|--:|",
-        *(f"| {stage} | {ms:.1f} |" for stage, ms in f.stages.items()),
-        f"| **ours, sum** | **{f.ours:.1f}** |",
-        *(f"| Open3D {stage} | {ms:.1f} |" for stage, ms in f.open3d_stages.items()),
+        *stage_rows(ours),
+        f"| **ours, sum** | **{np.median(sums):.1f}** |",
+        *stage_rows(theirs, "Open3D "),
     ]
-    if f.open3d is None or f.share is None or f.share_of_stored is None:
-        lines += [f"| Open3D | not measured: {f.note} |"]
-    else:
+    text = (
+        f"Accepted and within 10 cm and 10 degrees of the truth: {np.mean(right):.2f} of the pairs"
+    )
+    if other:
+        text += f"; Open3D's within it: {np.mean(open3d_right):.2f}"
         lines += [
-            f"| **Open3D, sum** | **{f.open3d:.1f}** |",
-            f"| **ours / Open3D** | **{f.share:.3f}** |",
-            f"| validation of stored frames / Open3D | {f.share_of_stored:.3f} |",
+            f"| **Open3D, sum** | **{np.median(other):.1f}** |",
+            f"| **ours / Open3D** | **{np.median(np.divide(sums, other)):.3f}** |",
+            f"| validation of stored frames / Open3D | {np.median(np.divide(stored, other)):.3f} |",
         ]
-    right = f"Accepted and within 10 cm and 10 degrees of the truth: {f.right:.2f} of the pairs"
-    theirs = "" if f.open3d_right is None else f"; Open3D's within it: {f.open3d_right:.2f}"
-    return [*lines, "", f"{right}{theirs}.", ""]
-
-
-def _median(values: Iterable[float]) -> float | None:
-    listed = list(values)
-    return float(np.median(listed)) if listed else None
-
-
-def _medians(rows: list[dict[str, float]]) -> dict[str, float]:
-    return {s: float(np.median([row[s] for row in rows])) for s in rows[0]} if rows else {}
+    else:
+        lines.append(f"| Open3D | not measured: {note} |")
+    return [*lines, "", f"{text}.", ""]

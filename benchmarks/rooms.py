@@ -17,20 +17,19 @@ import numpy as np
 from PIL import Image
 from sqlalchemy import insert, select
 
+from benchmarks.indexed_frames import fill
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.formats.export import write_ply
+from sceneprint.models import read_model
 from sceneprint.settings import Settings
 from sceneprint.store.maps import find_map
-from sceneprint.store.tables import frames as frame_table
-from sceneprint.store.tables import jobs, signatures
+from sceneprint.store.tables import frames, jobs, signatures
 from sceneprint_client.api import NewMap
 from sceneprint_lab.synth import KINECT, symmetric_box, synthesise_room, synthesise_survey, take
 from sceneprint_lab.synth.trajectories import pose
 
 SEED = 21
-#: Frames that are written in one commit.
-_BLOCK = 5_000
 
 
 @dataclass(frozen=True)
@@ -160,37 +159,31 @@ def multiply(data: Path, source: str, name: str, count: int) -> None:
     """
     rng = np.random.default_rng(SEED)
     with Engine(Settings(data_dir=data)) as engine:
+        database = engine.store.database
         engine.create_map(NewMap(name=name, title=f"{count:,} frames", model="depth"))
-        with engine.store.database.read() as connection:
+        with database.read() as connection:
             row, other = find_map(connection, name), find_map(connection, source)
-            of_other = frame_table.c.map_number == other.number
-            asked = select(frame_table).where(of_other, frame_table.c.revision > 0)
-            asked = asked.order_by(frame_table.c.number).limit(1)
-            frame = dict(connection.execute(asked).mappings().one())
-            of_it = signatures.c.frame_number == frame.pop("number")
-            signed = dict(connection.execute(select(signatures).where(of_it)).mappings().one())
-            by = select(jobs).where(jobs.c.frame_number == signed["frame_number"])
-            job = dict(connection.execute(by).mappings().one())
+            first = select(frames).where(frames.c.map_number == other.number)
+            first = first.where(frames.c.revision > 0).order_by(frames.c.number).limit(1)
+            frame = dict(connection.execute(first).mappings().one())
+            number = frame.pop("number")
+            of_it = select(signatures).where(signatures.c.frame_number == number)
+            signed = dict(connection.execute(of_it).mappings().one())
+            of_it = select(jobs).where(jobs.c.frame_number == number)
+            job = dict(connection.execute(of_it).mappings().one())
             del job["number"]
-        for start in range(0, count, _BLOCK):
-            block = range(start, min(start + _BLOCK, count))
-            names = rng.bytes(16 * len(block)).hex()
-            own = {"map_number": row.number, "received_at": time.time(), "indexed_at": time.time()}
-            made = [
-                {**frame, **own, "id": names[32 * i : 32 * i + 32], "content_id": f"{place:064x}",
-                 "session": f"run-{place // 1000:03d}", "captured_at": 1.7e9 + place,
-                 "revision": place + 1}
-                for i, place in enumerate(block)
-            ]  # fmt: skip
-            with engine.store.database.write() as connection:
-                connection.execute(insert(frame_table), made)
-                where = frame_table.c.map_number == row.number
-                added = select(frame_table.c.number).where(
-                    where, frame_table.c.revision > start, frame_table.c.revision <= block.stop
-                )
-                numbers = connection.execute(added).scalars().all()
-                vectors = [{**signed, "frame_number": n, "vector": b"\0"} for n in numbers]
-                connection.execute(insert(signatures), vectors)
-                about = {"map_number": row.number}
-                done = [{**job, **about, "id": f"{n:032x}", "frame_number": n} for n in numbers]
-                connection.execute(insert(jobs), done)
+        names = rng.bytes(16 * count).hex()
+        own = {"map_number": row.number, "received_at": time.time(), "indexed_at": time.time()}
+        columns = [
+            {**frame, **own, "id": names[32 * i : 32 * i + 32], "content_id": f"{i:064x}",
+             "session": f"run-{i // 1000:03d}", "captured_at": 1.7e9 + i}
+            for i in range(count)
+        ]  # fmt: skip
+        vectors = np.zeros((count, 1), np.uint8)
+        fill(database, name, read_model("depth"), vectors, columns=columns, signed=signed)
+        with database.write() as connection:
+            added = select(frames.c.number).where(frames.c.map_number == row.number)
+            numbers = connection.execute(added).scalars().all()
+            about = {"map_number": row.number}
+            done = [{**job, **about, "id": f"{n:032x}", "frame_number": n} for n in numbers]
+            connection.execute(insert(jobs), done)

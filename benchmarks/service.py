@@ -1,110 +1,54 @@
-"""What HTTP and the store add to a query, and whether the service stays awake under load.
-
-`python -m benchmarks.service [DATASET]` measures this row alone.
-"""
+"""What HTTP and the store add to a query, and whether the service answers many at once."""
 
 from __future__ import annotations
 
-import argparse
 import statistics
-import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from multiprocessing import get_context
-from multiprocessing.context import SpawnProcess
-from multiprocessing.queues import Queue
-from multiprocessing.sharedctypes import Synchronized
 from multiprocessing.synchronize import Barrier
-from multiprocessing.synchronize import Event as EventType
 from pathlib import Path
-from queue import Empty
 from tempfile import TemporaryDirectory
 
 import httpx
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.encode import stage_rows
 from benchmarks.library import Library, accepted, are_same
 from benchmarks.machine import processor_seconds
 from benchmarks.readiness import MAP, fill_map
-from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client
-from sceneprint_lab.cli.demo import serving, write_building
+from sceneprint_lab.cli.demo import serving
 
-#: Processes that query at once, for their throughput beside that of one.
-CROWD = 8
-#: Processes that query at once while a worker signs, and for how long.
-CLIENTS, SECONDS = 4, 20.0
-#: Requests a second to /healthz.
-RATE = 50.0
-#: Seconds that a process of the load may take to end.
-END_S = 60.0
-
-
-@dataclass(frozen=True)
-class Throughput:
-    """Queries of some clients at once.
-
-    `per_second`: of all together. `p50`, `p99`: milliseconds to an answer. `least`: answers that
-    the slowest client got, over those of the mean client.
-    """
-
-    per_second: float
-    p50: float
-    p99: float
-    least: float
-
-
-@dataclass(frozen=True)
-class ServiceFigures:
-    """Medians in milliseconds; `ratio` is the median of the ratios of single queries.
-
-    `stages`: of the library, one after the other. `http`, `cpu`: lower quartile, median and upper
-    quartile, until the answer and of the service's processors. `idle`, `loaded`: p50 and p99 of
-    /healthz. `throughput`: by number of clients.
-    """
-
-    frames: int
-    queries: int
-    stages: dict[str, float]
-    library: float
-    http: tuple[float, float, float]
-    cpu: tuple[float, float, float]
-    ratio: float
-    idle: tuple[float, float]
-    loaded: tuple[float, float]
-    queries_per_second: float
-    throughput: dict[int, Throughput]
-
-    @property
-    def gain(self) -> float:
-        """Queries a second of a crowd over those of one client."""
-        return self.throughput[CROWD].per_second / self.throughput[1].per_second
+#: Processes that query at once, for their throughput beside that of one; seconds of each load.
+CROWD, SECONDS = 8, 20.0
+#: Processes that query at once while a worker signs; requests a second to /healthz.
+CLIENTS, RATE = 4, 50.0
 
 
 def measure(
-    frames: Sequence[FrameReference], n_queries: int = 20, seconds: float = SECONDS,
-    map_frames: int = 0,
-) -> ServiceFigures:  # fmt: skip
-    """Fill a map with all but a few frames, and look those up over HTTP and with the library.
+    frames: Sequence[FrameReference], map_frames: int = 0, n_queries: int = 20
+) -> list[str]:
+    """Look up some frames among the others over HTTP and with the library; return the tables.
 
     Parameters
     ----------
     frames : of a data set
-    n_queries : how many are looked up, spread among the others
-    seconds : how long the service is kept under load
     map_frames : of the map, if `frames` are fewer: the rest is random. As R grows with the map,
         answers are then not compared with the library's
+    n_queries : how many are looked up
 
     Raises
     ------
     AssertionError : service and library answer differently, and so do not do the same work.
     """
-    asked = {int(i) for i in np.linspace(1, len(frames) - 2, n_queries)}
-    database = [frame for i, frame in enumerate(frames) if i not in asked]
-    queries = [frames[i] for i in sorted(asked)]
+    places = {int(i) for i in np.linspace(1, len(frames) - 2, n_queries)}
+    database = [frame for i, frame in enumerate(frames) if i not in places]
+    queries = [frames[i] for i in sorted(places)]
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         fill_map(folder, max(map_frames - len(database), 0), "depth")
@@ -125,80 +69,105 @@ def measure(
             spent, expected = library.ask(frame)
             stages.append(spent)
             assert map_frames > len(database) or are_same(accepted(answer, names), expected)
-        idle = _healthz(url, min(seconds, 3.0))
-        throughput = {n: _throughput(url, queries, n, seconds) for n in (1, CROWD)}
-        loaded, rate = _loaded(url, queries, seconds)
+        idle = _healthz(url, 3.0)
+        crowds = {n: _load(url, queries, n, uploads=False)[0] for n in (1, CROWD)}
+        meanwhile, loaded = _load(url, queries, CLIENTS, uploads=True)
     sums = [sum(one.values()) for one in stages]
-    return ServiceFigures(
-        frames=max(map_frames, len(database)),
-        queries=len(queries),
-        stages={name: statistics.median(one[name] for one in stages) for name in stages[0]},
-        library=statistics.median(sums),
-        http=_quartiles(http),
-        cpu=_quartiles(cpu),
-        ratio=statistics.median(h / s for h, s in zip(http, sums, strict=True)),
-        idle=idle,
-        loaded=loaded,
-        queries_per_second=rate,
-        throughput=throughput,
-    )
+    ratio = statistics.median(h / s for h, s in zip(http, sums, strict=True))
+    rates = {n: sum(map(len, crowd)) / SECONDS for n, crowd in crowds.items()}
+    return [
+        f"### A query over HTTP, {max(map_frames, len(database)):,} frames in the map, k = 5, all "
+        f"stages, warm: median of {len(queries)}",
+        "",
+        "| | ms |",
+        "|---|--:|",
+        *stage_rows(stages),
+        f"| **library, sum** | **{statistics.median(sums):.1f}** |",
+        f"| **over HTTP** | **{_spread(http)}** |",
+        f"| **processor time of the service** | **{_spread(cpu)}** |",
+        f"| **HTTP / library** | **{ratio:.2f}** |",
+        f"| /healthz, idle: p50, p99 | {idle[0]:.1f}, {idle[1]:.1f} |",
+        f"| /healthz while {CLIENTS} clients query and a worker signs: p50, p99 | "
+        f"{loaded[0]:.1f}, {loaded[1]:.1f} |",
+        "",
+        f"Queries answered meanwhile: {sum(map(len, meanwhile)) / SECONDS:.1f} a second.",
+        "",
+        "| clients at once | queries a second | p50, ms | p99, ms | slowest client / mean |",
+        "|--:|--:|--:|--:|--:|",
+        *(_row(n, crowd) for n, crowd in crowds.items()),
+        "",
+        f"{CROWD} clients are answered **{rates[CROWD] / rates[1]:.2f}** times as often as one.",
+        "",
+    ]
 
 
-def _quartiles(values: Sequence[float]) -> tuple[float, float, float]:
-    lower, median, upper = np.percentile(values, (25, 50, 75)).tolist()
-    return lower, median, upper
+def _row(n: int, crowd: Sequence[Sequence[float]]) -> str:
+    counts = [len(own) for own in crowd]
+    p50, p99 = np.percentile([ms for own in crowd for ms in own], (50, 99))
+    least = min(counts) / (sum(counts) / n)
+    return f"| {n} | {sum(counts) / SECONDS:.1f} | {p50:.0f} | {p99:.0f} | {least:.2f} |"
 
 
-def _throughput(
-    url: str, frames: Sequence[FrameReference], clients: int, seconds: float
-) -> Throughput:
-    """Queries of some clients, each of which asks again when it is answered.
+def _spread(values: Sequence[float]) -> str:
+    lower, median, upper = np.percentile(values, (25, 50, 75))
+    return f"{median:.1f} ({lower:.1f} to {upper:.1f})"
 
-    Raises
-    ------
-    RuntimeError : a client died, and the figures would be of fewer.
+
+def _load(
+    url: str, frames: Sequence[FrameReference], clients: int, *, uploads: bool
+) -> tuple[list[list[float]], tuple[float, float]]:
+    """Let clients query at once, and a worker sign if `uploads`.
+
+    Returns
+    -------
+    answers : milliseconds of each, by client
+    healthz : p50 and p99 of /healthz meanwhile
     """
     context = get_context("spawn")
-    ready, answers = context.Barrier(clients), context.Queue()
-    crowd = [
-        context.Process(target=_time_queries, args=(url, list(frames), seconds, ready, answers, i))
-        for i in range(clients)
-    ]
-    try:
-        for one in crowd:
-            one.start()
-        taken: list[list[float]] = []
-        while len(taken) < clients:
-            _see_alive([one for one in crowd if one.exitcode])
-            with suppress(Empty):
-                taken.append(answers.get(timeout=1.0))
-    finally:
-        for one in crowd:
-            one.join(END_S)
-            one.terminate()
-    counts = [len(own) for own in taken]
-    p50, p99 = np.percentile([ms for own in taken for ms in own], (50, 99)).tolist()
-    return Throughput(sum(counts) / seconds, p50, p99, min(counts) / (sum(counts) / clients))
+    n = clients + uploads
+    barrier = context.Barrier(n + 1)
+    with ProcessPoolExecutor(n, context, _barriers.append, (barrier,)) as pool:
+        work = [pool.submit(_time_queries, url, list(frames), i) for i in range(clients)]
+        if uploads:
+            uploading = pool.submit(_upload, url, list(frames))
+        barrier.wait()
+        healthz = _healthz(url, SECONDS)
+        answers = [one.result() for one in work]
+        if uploads:
+            uploading.result()
+    return answers, healthz
 
 
-def _time_queries(
-    url: str, frames: Sequence[FrameReference], seconds: float, ready: Barrier,
-    answers: Queue[list[float]], place: int,
-) -> None:  # fmt: skip
-    """Ask for frames in turn, beginning with one of its own; milliseconds of each answer."""
+#: Of a process of the load: passed when all of them have loaded their code.
+_barriers: list[Barrier] = []
+
+
+def _time_queries(url: str, frames: Sequence[FrameReference], place: int) -> list[float]:
+    """Query frames in turn, each after the answer to the last; return milliseconds of each."""
     taken: list[float] = []
     with Client(url) as client:
         client.query(MAP, frames[place % len(frames)])
-        ready.wait()
-        until = time.perf_counter() + seconds
+        _barriers[0].wait()
+        until = time.perf_counter() + SECONDS
         while (start := time.perf_counter()) < until:
             client.query(MAP, frames[(place + len(taken)) % len(frames)])
             taken.append(1e3 * (time.perf_counter() - start))
-    answers.put(taken)
+    return taken
+
+
+def _upload(url: str, frames: Sequence[FrameReference]) -> None:
+    """Keep the worker busy: the same frames in one map after another."""
+    with Client(url) as client:
+        _barriers[0].wait()
+        until, number = time.perf_counter() + SECONDS, 0
+        while time.perf_counter() < until:
+            client.create_map(f"load-{number}")
+            client.wait([client.upload(f"load-{number}", frame).job_id for frame in frames])
+            number += 1
 
 
 def _healthz(url: str, seconds: float) -> tuple[float, float]:
-    """p50 and p99 of /healthz, asked at a steady rate, milliseconds."""
+    """Return p50 and p99 of /healthz at a steady rate, milliseconds."""
     taken = []
     with httpx.Client(base_url=url) as client:
         until = time.perf_counter() + seconds
@@ -208,142 +177,3 @@ def _healthz(url: str, seconds: float) -> tuple[float, float]:
             time.sleep(max(1 / RATE - (time.perf_counter() - start), 0.0))
     p50, p99 = np.percentile(taken, (50, 99)).tolist()
     return p50, p99
-
-
-def _loaded(
-    url: str, queries: Sequence[FrameReference], seconds: float
-) -> tuple[tuple[float, float], float]:
-    """/healthz while clients query and a worker signs, and queries answered a second.
-
-    Raises
-    ------
-    RuntimeError : a process of the load died, and the figures would be of less.
-    """
-    context = get_context("spawn")
-    stop, done = context.Event(), context.Value("i", 0)
-    begun = [context.Event() for _ in range(CLIENTS)]
-    load = [
-        context.Process(target=_query_on, args=(url, list(queries), stop, done, one))
-        for one in begun
-    ]
-    load.append(context.Process(target=_upload_on, args=(url, list(queries), stop)))
-    try:
-        for one in load:
-            one.start()
-        for event in begun:  # until all are at work
-            while not event.wait(0.1):
-                _see_alive(load)
-        begin, counted = time.perf_counter(), done.value
-        figures = _healthz(url, seconds)
-        rate = (done.value - counted) / (time.perf_counter() - begin)
-        _see_alive(load)
-    finally:
-        _end(load, stop)
-    return figures, rate
-
-
-def _see_alive(load: Sequence[SpawnProcess]) -> None:
-    codes = [one.exitcode for one in load if not one.is_alive()]
-    if codes:
-        raise RuntimeError(f"{len(codes)} of {len(load)} processes of the load died: {codes}")
-
-
-def _end(load: Sequence[SpawnProcess], stop: EventType) -> None:
-    """Let all end, and end those that do not."""
-    stop.set()
-    until = time.monotonic() + END_S
-    for one in load:
-        if one.pid is not None:  # it was started
-            one.join(max(until - time.monotonic(), 0.0))
-            if one.is_alive():
-                one.terminate()
-                one.join()
-
-
-def _query_on(
-    url: str, frames: Sequence[FrameReference], stop: EventType, done: Synchronized[int],
-    begun: EventType,
-) -> None:  # fmt: skip
-    with Client(url) as client:
-        while not stop.is_set():
-            for frame in frames:
-                if stop.is_set():
-                    return
-                client.query(MAP, frame)
-                with done.get_lock():
-                    done.value += 1
-                begun.set()
-
-
-def _upload_on(url: str, frames: Sequence[FrameReference], stop: EventType) -> None:
-    """Keep the worker busy: the same frames in one map after another."""
-    with Client(url) as client:
-        for number in range(10_000):
-            client.create_map(f"load-{number}")
-            jobs = [client.upload(f"load-{number}", frame).job_id for frame in frames]
-            client.wait(jobs)
-            if stop.is_set():
-                return
-
-
-def table(f: ServiceFigures) -> list[str]:
-    """The figures as lines of Markdown."""
-    return [
-        f"### A query over HTTP, {f.frames:,} frames in the map, k = 5, all stages, warm: "
-        f"median of {f.queries}",
-        "",
-        "| | ms |",
-        "|---|--:|",
-        *(f"| {stage} | {ms:.1f} |" for stage, ms in f.stages.items()),
-        f"| **library, sum** | **{f.library:.1f}** |",
-        f"| **over HTTP** | **{_spread(f.http)}** |",
-        f"| **processor time of the service** | **{_spread(f.cpu)}** |",
-        f"| **HTTP / library** | **{f.ratio:.2f}** |",
-        f"| /healthz, idle: p50, p99 | {f.idle[0]:.1f}, {f.idle[1]:.1f} |",
-        f"| /healthz while {CLIENTS} clients query and a worker signs: p50, p99 | "
-        f"{f.loaded[0]:.1f}, {f.loaded[1]:.1f} |",
-        "",
-        f"Queries answered meanwhile: {f.queries_per_second:.1f} a second.",
-        "",
-        "| clients at once | queries a second | p50, ms | p99, ms | slowest client / mean |",
-        "|--:|--:|--:|--:|--:|",
-        *(
-            f"| {n} | {one.per_second:.1f} | {one.p50:.0f} | {one.p99:.0f} | {one.least:.2f} |"
-            for n, one in f.throughput.items()
-        ),
-        "",
-        f"{CROWD} clients are answered **{f.gain:.2f}** times as often as one.",
-        "",
-    ]
-
-
-def _spread(quartiles: tuple[float, float, float]) -> str:
-    return "{1:.1f} ({0:.1f} to {2:.1f})".format(*quartiles)
-
-
-@contextmanager
-def frames_of(dataset: Path | None, most: int = 320) -> Iterator[list[FrameReference]]:
-    """Frames of a data set, or of a synthetic building that is gone afterwards, evenly thinned."""
-    with TemporaryDirectory(prefix="sceneprint-bench-") as temporary:
-        if dataset is None:
-            dataset = Path(temporary) / "building"
-            for _ in tqdm(write_building(dataset, 6), "synthetic rooms", 6, disable=None):
-                pass
-        found = [frame for sequence in find_sequences(dataset) for frame in sequence.frames]
-        yield found[:: max(len(found) // most, 1)][:most]
-
-
-def main() -> int:
-    """Measure this row alone."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("dataset", type=Path, nargs="?")
-    parser.add_argument("--frames", type=int, default=320)
-    parser.add_argument("--map-frames", type=int, default=0, help="of the map, random ones too")
-    options = parser.parse_args()
-    with frames_of(options.dataset, options.frames) as frames:
-        print(*table(measure(frames, map_frames=options.map_frames)), sep="\n")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -31,17 +31,17 @@ def pair_of(frames: tuple[DepthFrame, ...]) -> FramePair:
 
 
 def test_scan_compares_a_read_and_four_scans() -> None:
-    found = scan.measure(signatures=5, length=64, runs=3)
-    assert list(found.milliseconds) == list(found.shares)
-    assert len(found.milliseconds) == 4
-    assert found.read > 0
-    assert all(value > 0 for value in (*found.milliseconds.values(), *found.shares.values()))
-    assert list(found.spread) == list(found.shares)
-    for name, (low, high) in found.spread.items():
-        assert low <= found.shares[name] <= high
-    text = "\n".join(scan.table(found))
-    assert "5 signatures of 64 bytes" in text
-    assert all(f"| {name} | " in text for name in found.milliseconds)
+    lines = scan.measure(signatures=5, length=64, runs=3)
+    assert "5 signatures of 64 bytes (0.0 MB)" in lines[0]
+    rows = [line.strip("| ").split(" | ") for line in lines if line.startswith("| L")]
+    assert [row[0] for row in rows] == [
+        f"{norm}, {queries}" for norm in ("L1", "L2")
+        for queries in ("one query", f"{scan.TOGETHER} queries at once")
+    ]  # fmt: skip
+    for _, ms, share, quartiles in rows:
+        low, high = map(float, quartiles.split(" to "))
+        assert float(ms) >= 0
+        assert 0 <= low <= float(share) <= high
 
 
 def test_pairs_by_hand() -> None:
@@ -65,12 +65,13 @@ def test_without_open3d_the_row_says_so(
     small_model: Model, room_frames: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
-    figures = registration.measure([pair_of(room_frames)], small_model, warm_up=0)
-    assert (figures.open3d, figures.open3d_right, figures.share) == (None, None, None)
-    assert list(figures.stages) == ["geometry of both frames", "validation"]
-    assert figures.ours == pytest.approx(sum(figures.stages.values()))
-    text = "\n".join(registration.table(figures))
-    assert "Open3D | not measured: FPFH needs Open3D, which cannot be imported" in text
+    lines = registration.measure([pair_of(room_frames)], small_model, warm_up=0)
+    rows = dict(line.strip("| ").split(" | ", 1) for line in lines if line.startswith("| "))
+    stages = [float(rows[name]) for name in ("geometry of both frames", "validation")]
+    assert float(rows["**ours, sum**"].strip("*")) == pytest.approx(sum(stages), abs=0.11)
+    assert rows["Open3D"].startswith("not measured: FPFH needs Open3D, which cannot be imported")
+    assert not any("ours / Open3D" in line or "Open3D's" in line for line in lines)
+    assert "truth: 1.00 of the pairs." in "\n".join(lines)
 
 
 @pytest.mark.parametrize("preset", ["paper", "depth"])

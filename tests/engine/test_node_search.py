@@ -7,9 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from benchmarks.fleet.bulk_load import fill, walk
+from benchmarks.indexed_frames import fill
 from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index
 from sceneprint.geometry.retrieval.ranking import distances
@@ -45,8 +46,13 @@ def node(store_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ite
 
 @pytest.fixture(scope="module")
 def places() -> dict[str, Bytes]:
-    """Signatures of both maps: two walks in each."""
-    return {name: walk(n, LENGTH, seed=i, walks=2) for i, (name, n) in enumerate(SIZES.items())}
+    """Signatures of both maps."""
+    return {name: drawn(n, LENGTH, seed=i) for i, (name, n) in enumerate(SIZES.items())}
+
+
+def drawn(n: int, length: int, seed: int) -> Bytes:
+    found: Bytes = np.random.default_rng(seed).integers(0, 256, (n, length), np.uint8)
+    return found
 
 
 def ask(engine: Engine, frame: str, maps: list[str]) -> Answer:
@@ -132,7 +138,7 @@ def test_maps_of_psi_are_compared_whole_by_l1_without_an_index(
     node: Node, small_model: Model
 ) -> None:
     engine = node("alone")
-    made = walk(100, small_model.signature_bytes, seed=4)
+    made = drawn(100, small_model.signature_bytes, seed=4)
     fill(engine.store.database, "old", small_model, made)
     assert engine.publish_due() == 0
     answer = ask(engine, "old-8", ["old"])
