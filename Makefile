@@ -33,9 +33,9 @@ help:
 	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
 	@echo "make docs    the documentation as a site, into out/site; a dead link is an error"
 	@echo "make docs-serve  the same at http://127.0.0.1:8009, made anew when a page changes"
-	@echo "make soak    200 kills [KILLS=n], and a crowd of writers and readers; rewrites its part of docs/reliability.md"
-	@echo "make siege   broken uploads, fuzzing, ten times too many requests, noisy neighbours; likewise"
-	@echo "make fleet   robots, services, workers and PostgreSQL with a standby, parts killed; likewise"
+	@echo "make soak    robots on SQLite, 100 kills, a full disk; rewrites its part of docs/reliability.md"
+	@echo "make siege   broken uploads, every operation, tenants that attack; likewise"
+	@echo "make fleet   robots on PostgreSQL with a standby, parts killed; likewise"
 	@echo "make models  train the presets that ship with the package (minutes)"
 	@echo "make lock    write requirements*.lock anew from pyproject.toml [UPGRADE=1 for the newest]"
 	@echo "make sbom    the packages of the service and its image, as CycloneDX, into out/"
@@ -119,19 +119,16 @@ docs-serve: export NO_MKDOCS_2_WARNING = 1
 docs-serve: $(STAMP)
 	$(BIN)/python -m mkdocs serve --dev-addr 127.0.0.1:8009 --watch tools/site
 
-soak: $(STAMP)
-	$(BIN)/python -m benchmarks.soak --page docs/reliability.md $(if $(KILLS),--kills $(KILLS))
+SOAK = $(BIN)/python -m benchmarks.soak --page docs/reliability.md
 
-siege: $(STAMP)
-	$(BIN)/python -m benchmarks.siege --page docs/reliability.md
+soak: $(STAMP) kernels
+	$(SOAK) soak soak-crowd
+
+siege: $(STAMP) kernels
+	$(SOAK) siege
 
 fleet: $(STAMP) kernels
-	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md
-	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --asynchronous
-	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --objects --delays --freezes 2
-	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --objects --delays \
-		--robots 1000 --rate 0.003 --seconds 200 --kills 12 --promotions 1 --freezes 1 \
-		--partitions 2 --retention-s 40 --offline 360
+	$(SOAK) fleet fleet-asynchronous fleet-delays fleet-crowd
 
 models: $(STAMP)
 	$(BIN)/sceneprint train --preset depth --out sceneprint/presets/depth.safetensors

@@ -27,8 +27,8 @@ import pytest
 from sqlalchemy import Connection, NullPool, create_engine
 from xdist.scheduler import LoadFileScheduling
 
-from benchmarks.fleet.postgres import NoServer, Server
-from benchmarks.fleet.s3 import ObjectServer
+from benchmarks.postgres import NoServer, Server
+from benchmarks.s3 import ObjectServer
 from benchmarks.waiting import until as wait_until
 from sceneprint.cli import main
 from sceneprint.formats.dataset import write_depth_png
@@ -70,13 +70,13 @@ LONG = (
     "test_lookalikes.py", "test_lifecycle.py",
     "test_hostile.py", "test_pulled_copies.py", "test_fleets.py", "test_fuzz.py",
     "test_training.py", "test_survival.py", "test_work.py",
-    "test_recovery.py", "test_siege.py", "test_cli.py", "test_map_copy.py", "test_failover.py",
+    "test_recovery.py", "test_cli.py", "test_map_copy.py", "test_failover.py",
     "test_connections.py", "test_kill.py", "test_tracker.py", "test_purging.py",
     "test_associations.py", "test_evaluate.py", "test_equal_rooms.py",
     "test_sequences.py", "test_inspecting.py",
     "test_reencoding_switch.py", "test_decoders.py", "test_tenancy.py",
     "test_bench_rows.py", "test_same_as_evaluate.py", "test_soak.py", "test_tour.py",
-    "test_docs.py", "test_examples.py", "test_limits.py", "test_fleet.py",
+    "test_docs.py", "test_examples.py", "test_limits.py",
 )  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent

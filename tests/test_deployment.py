@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fleet.postgres import Server, binaries, of_nobody
+from benchmarks.postgres import Server, binaries, of_nobody
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import list_keys

@@ -1,1 +1,1 @@
-"""`make soak`: the service killed and crowded for as long as it takes, and what was lost."""
+"""`make soak`, `fleet`, `siege`: robots on a service that is disturbed, and what was lost."""

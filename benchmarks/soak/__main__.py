@@ -1,143 +1,222 @@
-"""`make soak`: kill and crowd the service, shift its clocks, and print what was lost.
+"""Disturb a service while robots use it, and count what was lost.
 
-`python -m benchmarks.soak --page docs/reliability.md` puts the figures into the page.
+`python -m benchmarks.soak soak --page docs/reliability.md` runs a plan and puts its figures into
+the page. `--store`, `--faults` and the other options change the plan:
+`python -m benchmarks.soak fleet --faults kill=50 failover=5 --seconds 300`.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
-from datetime import UTC, datetime
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 
-from benchmarks.machine import describe_machine
+from benchmarks.machine import measured_on
 from benchmarks.pages import put_between
-from benchmarks.soak.clocks import ClockFigures, find_library, jump_clocks
-from benchmarks.soak.crowd import STABLE, crowd
-from benchmarks.soak.crowd_audit import CrowdFigures
-from benchmarks.soak.kills import KillFigures, kill
-from benchmarks.soak.load import Shot, shots
+from benchmarks.soak.attacks import attack_table
+from benchmarks.soak.broken_uploads import broken_table
+from benchmarks.soak.faults import CUT_OFF, CUT_OFF_S, FROZEN, FROZEN_S, FULL, FULL_S
+from benchmarks.soak.operations import operation_table
+from benchmarks.soak.plan import FAULTS, PLANS, Plan
+from benchmarks.soak.processes import DATABASE_S, STORE_S
+from benchmarks.soak.run import SoakFigures, drive
+from sceneprint.cli.options import ended_by_signals
 
-BEGIN, END = "<!-- soak:begin -->", "<!-- soak:end -->"
-
-
-def table(kills: KillFigures, crowded: CrowdFigures) -> list[str]:
-    """The figures as lines of Markdown."""
-    victims = ", ".join(f"{n} of {name}" for name, n in sorted(kills.kills.items()))
-    return [
-        f"### {sum(kills.kills.values())} kills within {kills.seconds:.0f} s",
-        "",
-        f"SIGKILL of {victims}, under load.",
-        "",
-        "| | |",
-        "|---|--:|",
-        f"| uploads acknowledged, of them deleted again | {kills.acknowledged}, {kills.deleted} |",
-        f"| **lost** | **{kills.lost}** |",
-        f"| **signed or stored twice with effect** | **{kills.doubled}** |",
-        f"| **changes without their event or audit line** | **{kills.separated}** |",
-        f"| **half-written, by `sceneprint fsck`** | **{kills.half_written}** |",
-        f"| files that nothing refers to (fsck removes them) | {kills.leftovers} |",
-        f"| signatures other than those of the undisturbed run | {kills.differing} |",
-        f"| answers other than those of the undisturbed run, of {kills.queries} | {kills.wrong} |",
-        f"| uploads and deletions that had to be sent again | {kills.retries} |",
-        f"| most tries of a job | {kills.tries} |",
-        "",
-        f"### {crowded.writers} writers and {crowded.readers} readers for {crowded.seconds:.0f} s",
-        "",
-        "| | |",
-        "|---|--:|",
-        f"| uploads, deletions, answers | {crowded.uploads}, {crowded.deletions}, "
-        f"{crowded.answers} |",
-        f'| **"database is locked"** | **{crowded.locked}** |',
-        f"| **errors of any process** | **{len(crowded.errors)}** |",
-        f"| **wrong answers** | **{len(crowded.wrong)}** |",
-        "",
-    ]
+_TIMES = {1: "once", 2: "twice"}
 
 
-def clock_table(clocks: ClockFigures | None) -> list[str]:
-    """The figures of clocks as lines of Markdown; None: not tried."""
-    if clocks is None:
-        return ["### Clocks that jump", "", "Not tried: libfaketime is not installed.", ""]
-    held = clocks.held
-    return [
-        f"### {clocks.jumps} jumps of all clocks, by one or two years",
-        "",
-        "| | |",
-        "|---|--:|",
-        f"| uploads acknowledged, of them deleted again | {held.acknowledged}, {held.deleted} |",
-        f"| jobs that waited or ran at a jump | {clocks.waiting} |",
-        f"| longest from a jump until no job waited | {clocks.longest_s:.0f} s |",
-        f"| **lost** | **{held.lost}** |",
-        f"| **signed or stored twice with effect** | **{held.doubled}** |",
-        f"| **half-written, by `sceneprint fsck`** | **{held.half_written}** |",
-        f"| signatures, answers other than those of the undisturbed run | {held.differing}, "
-        f"{held.wrong} of {held.queries} |",
-        f"| **removed before their `retention_days` were over by any clock** | "
-        f"**{clocks.removed}** |",
-        f"| of 3 kept for 30 days, removed once the clock was a year ahead | {clocks.due} |",
-        "",
-    ]
+def title(plan: Plan) -> str:
+    """Return what a plan runs, in a few words."""
+    store = "SQLite"
+    if plan.store == "postgresql":
+        standby = "an asynchronous" if plan.asynchronous else "a synchronous"
+        store = f"PostgreSQL with {standby} standby"
+    return f"{plan.robots:,} robots for {plan.seconds:.0f} s, {store}"
 
 
-def main() -> int:
-    """Run all of it; exit code 1 where anything was lost, doubled, locked or wrong."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=200)
-    parser.add_argument("--frames", type=int, default=800, help="that are uploaded meanwhile")
-    parser.add_argument("--seconds", type=float, default=120, help="of writers and readers")
-    parser.add_argument("--crowd", type=int, default=8, help="writers, and as many readers")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--clock-frames", type=int, default=147, help="uploaded while clocks jump")
-    parser.add_argument(
-        "--faketime", type=Path, default=find_library(), help="libfaketimeMT.so.1, where not found"
+def description(figures: SoakFigures) -> Iterator[str]:
+    """Yield sentences about a run."""
+    plan, kills = figures.plan, figures.kills
+    blobs = "an object store" if plan.objects else "a shared folder"
+    delayed = ""
+    if plan.delays:
+        delayed = (
+            f" (a message to the database takes {1e3 * DATABASE_S:g} ms, one to the store "
+            f"{1e3 * STORE_S:g} ms)"
+        )
+    yield (
+        f"{plan.services} services, {plan.workers} workers, blobs in {blobs}{delayed}; each robot "
+        f"sends {plan.rate:g} frames a second, and {plan.readers} readers search."
     )
-    parser.add_argument("--only-clocks", action="store_true", help="print their table alone")
-    parser.add_argument("--page", type=Path, help="whose figures to replace")
-    options = parser.parse_args()
-    every = shots(max(options.frames, STABLE + 40 * options.crowd, options.clock_frames))
-    if options.only_clocks:
-        of_clocks = _clocks(every[: options.clock_frames], options.faketime)
-        print("\n".join(clock_table(of_clocks)))
-        return int(of_clocks is None or not of_clocks.sound)
-    of_clocks = _clocks(every[: options.clock_frames], options.faketime)
-    with tempfile.TemporaryDirectory(prefix="sceneprint-soak-") as folder:
-        kills, crowded = Path(folder) / "kills", Path(folder) / "crowd"
-        kills.mkdir()
-        crowded.mkdir()
-        of_kills = kill(kills, every[: options.frames], options.kills, options.seed)
-        print(of_kills)
-        of_crowd = crowd(
-            crowded, every[: STABLE + 40 * options.crowd], options.crowd, options.crowd,
-            options.seconds, options.seed,
-        )  # fmt: skip
-    for line in (*of_crowd.errors[:20], *of_crowd.wrong[:20]):
-        print(line, file=sys.stderr)
-    machine = describe_machine()
-    when = (
-        f"Measured {datetime.now(UTC):%Y-%m-%d} on {machine.processor}, "
-        f"{machine.cores} processors; `make soak`."
-    )
-    lines = ["", when, "", *table(of_kills, of_crowd), *clock_table(of_clocks)]
-    print("\n".join(lines))
-    if options.page is not None:
-        put_between(options.page, BEGIN, END, lines)
-    lost = of_kills.lost + of_kills.doubled + of_kills.separated + of_kills.half_written
-    wrong = of_kills.differing + of_kills.wrong + len(of_crowd.wrong) + len(of_crowd.errors)
-    wrong += of_clocks is not None and not of_clocks.sound
-    idle = 0 in (of_crowd.uploads, of_crowd.deletions, of_crowd.answers)  # nothing was tried
-    return int(bool(lost + wrong + of_crowd.locked) or idle)
+    killed = sorted((name, n) for name, n in kills.items() if name not in _UNKILLED)
+    if killed:
+        yield "SIGKILL of " + ", ".join(f"{n} of {name}" for name, n in killed) + "."
+    for victim, sentence in _UNKILLED.items():
+        if kills[victim]:
+            yield sentence.format(_TIMES.get(kills[victim], f"{kills[victim]} times"))
+    if plan.retention_s is not None:
+        yield (
+            f"Three of four robots have maps that keep a frame for {plan.retention_s:g} s, so that "
+            "frames go as fast as they come."
+        )
+    if plan.count("offline-hour"):
+        yield (
+            "One more robot was offline for a simulated hour, at one frame every ten seconds; its "
+            f"{figures.spooled} frames were spooled at once."
+        )
 
 
-def _clocks(shots: list[Shot], library: Path | None) -> ClockFigures | None:
-    if library is None:
-        print("clocks are not shifted: install libfaketime, or name it by --faketime")
-        return None
-    with tempfile.TemporaryDirectory(prefix="sceneprint-soak-") as folder:
-        found = jump_clocks(Path(folder), shots, library)
-    print(found)
+#: Faults that end no process, as sentences.
+_UNKILLED = {
+    FROZEN: f"The primary was frozen {{}} for {FROZEN_S:g} s (SIGSTOP).",
+    CUT_OFF: f"A host was cut off {{}} from its servers for {CUT_OFF_S:g} s.",
+    FULL: f"The disk was full {{}} for {FULL_S:g} s.",
+}
+
+
+def rows(figures: SoakFigures) -> dict[str, str]:
+    """Return the rows of the table: what, and how much."""
+    plan, found = figures.plan, figures.found
+    known = {
+        "frames acknowledged, and those that robots deleted again":
+            f"{found.acknowledged + figures.deleted}, {figures.deleted}",
+        "of the rest indexed, or in a state that says why not": f"{found.indexed}, {found.stated}",
+        "of the indexed, looked up by a query of themselves, found":
+            f"{found.looked_up}, {found.found}",
+        "**lost**": f"**{figures.lost}**",
+    }  # fmt: skip
+    if plan.retention_s is not None:
+        known["deleted by retention, with an event"] = f"{found.aged}"
+    if plan.count("offline-hour"):
+        sent = f"{figures.spooled}, {figures.spooled_twice}"
+        known["frames of the robot that was offline, and those sent again"] = sent
+    if plan.asynchronous:
+        known[
+            "acknowledged, and not received by the standby when its primary died: missing, of "
+            "those that only the dead primary has"
+        ] = f"{len(found.missing)}, {figures.window}"
+    known |= {
+        "**stored twice; stored, and not acknowledged; back after a deletion**":
+            f"**{found.doubled}, {found.strangers}, {found.returned}**",
+        "**changes without their event or line of the audit log**": f"**{found.separated}**",
+        "**half-written, by `sceneprint fsck`**": f"**{figures.damaged}**",
+        "files that nothing refers to (fsck removes them)": f"{figures.leftovers}",
+        "events of frames that were not heard, or heard twice":
+            f"{found.unheard}, {found.heard_twice}",
+        "answers and lists that differ between the services": f"{found.disagreeing}",
+        "**searches with a wrong distance, order or match**, of":
+            f"**{len(found.wrong)}**, {found.searches:,}",
+        "queries answered, requests sent again, errors":
+            f"{figures.queries}, {figures.repeated}, {len(figures.faults)}",
+    }  # fmt: skip
+    for kind, (p50, p99) in figures.waits_ms.items():
+        known[f"{kind}: median, p99"] = f"{p50:,.0f}, {p99:,.0f} ms"
+    if plan.store == "postgresql":
+        turns = "{:.1f}, {:.1f} ms".format(*figures.turn_ms)
+        known["of a frame, all writers wait for one; those of its map do"] = turns
+    else:
+        known['**"database is locked"**'] = f"**{figures.locked}**"
+    service, worker = (one / 1e6 for one in figures.memory)
+    known["most memory of a service's process, of a worker's"] = f"{service:,.0f}, {worker:,.0f} MB"
+    return known
+
+
+def table(figures: SoakFigures) -> list[str]:
+    """Return the figures as lines of Markdown."""
+    lines = [f"### {title(figures.plan)}", "", *description(figures), "", "| | |", "|---|--:|"]
+    lines += [f"| {what} | {value} |" for what, value in rows(figures).items()]
+    if figures.outages:
+        lines += ["", "| fault | longest that a client had no answer, s |", "|---|--:|"]
+    for victim, waits in sorted(figures.outages.items()):
+        waited = [f"{one:.1f}" for one in sorted(waits) if one >= 0.05]
+        lines.append(f"| {victim}, {len(waits)} | {', '.join(waited) or '0.0'} |")
+    lines.append("")
+    for one in figures.promotions:
+        back = ", ".join(f"{seconds:.1f}" for seconds in one.resumed.values())
+        lines.append(
+            f"Primary dead for {one.promoted - one.killed:.1f} s until the standby was promoted; "
+            f"each service answered {back} s after that."
+        )
+    if figures.broken is not None:
+        lines += broken_table(figures.broken)
+    if figures.operations:
+        lines += operation_table(figures.operations)
+    if figures.attacks:
+        lines += ["### One tenant attacks while others work", "", *attack_table(figures.attacks)]
+    return [*lines, ""]
+
+
+def parse_faults(texts: Sequence[str]) -> dict[str, int]:
+    """Return the faults that the command line names."""
+    found = {}
+    for text in texts:
+        name, _, count = text.partition("=")
+        if name not in FAULTS or not count.isdigit():
+            raise argparse.ArgumentTypeError(f"{text}: write FAULT=N; faults: {', '.join(FAULTS)}")
+        found[name] = int(count)
     return found
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run plans; exit code 1 where anything was lost, doubled, half stored or wrong."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("plans", nargs="+", choices=list(PLANS), metavar="PLAN",
+                        help=", ".join(PLANS))  # fmt: skip
+    parser.add_argument("--store", choices=("sqlite", "postgresql"))
+    parser.add_argument("--faults", nargs="*", metavar="FAULT=N", help=", ".join(FAULTS))
+    for name in ("seconds", "rate", "retention_s", "most_turn_ms", "most_query_ms"):
+        parser.add_argument(f"--{name.replace('_', '-')}", type=float)
+    for name in ("robots", "readers", "services", "workers", "seed"):
+        parser.add_argument(f"--{name}", type=int)
+    for name in ("asynchronous", "objects", "delays", "signed"):
+        parser.add_argument(f"--{name}", action="store_true", default=None)
+    parser.add_argument("--data", type=Path, help="folder of recordings; default: synthetic rooms")
+    parser.add_argument("--page", type=Path, help="whose figures to replace")
+    parser.add_argument("--keep", type=Path, help="new folder for data and logs, left there")
+    options = parser.parse_args(arguments)
+    changed = {one.name: getattr(options, one.name) for one in fields(Plan)
+               if getattr(options, one.name, None) is not None}  # fmt: skip
+    if options.faults is not None:
+        try:
+            changed["faults"] = parse_faults(options.faults)
+        except argparse.ArgumentTypeError as error:
+            parser.error(str(error))
+    return max(
+        _run(name, replace(PLANS[name], **changed), options.page, options.keep)
+        for name in options.plans
+    )
+
+
+def _run(name: str, plan: Plan, page: Path | None, keep: Path | None) -> int:
+    """Run a plan, print its figures, and return the exit code."""
+    if plan.count("full-disk") and os.geteuid() != 0:
+        print("the disk is not filled: only root may mount one")
+        plan = replace(plan, faults={**plan.faults, "full-disk": 0})
+    with (
+        ended_by_signals(),
+        tempfile.TemporaryDirectory(prefix="sceneprint-soak-", ignore_cleanup_errors=True) as new,
+    ):
+        folder = Path(new) if keep is None else keep / name
+        folder.mkdir(parents=True, exist_ok=True)
+        figures = drive(folder, plan)
+    reports = [one.report for one in figures.operations if not one.sound]
+    broken = [] if figures.broken is None else figures.broken.failed
+    for line in (
+        *figures.faults[:20], *figures.found.wrong[:20], *broken[:20], *reports, *figures.exceeded
+    ):  # fmt: skip
+        print(line, file=sys.stderr)
+    command = f"`python -m benchmarks.soak {name}`, within {figures.seconds:.0f} s"
+    lines = ["", measured_on(command), "", *table(figures)]
+    print("\n".join(lines))
+    if page is not None:
+        put_between(page, f"<!-- {name}:begin -->", f"<!-- {name}:end -->", lines)
+    return 0 if figures.sound else 1
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from pydantic import SecretStr
 
-from benchmarks.fleet.postgres import Server
+from benchmarks.postgres import Server
 from sceneprint.cli.checks import Check, store_check
 from sceneprint.cli.doctor import database, object_stores, server
 from sceneprint.engine import Engine

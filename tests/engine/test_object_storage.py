@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.fleet.s3 import ObjectServer
+from benchmarks.s3 import ObjectServer
 from sceneprint.engine import Engine
 from sceneprint.engine.admin import statistics as measuring
 from sceneprint.engine.engine import open_engine

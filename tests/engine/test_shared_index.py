@@ -17,7 +17,7 @@ import pytest
 from pydantic import ValidationError
 from sqlalchemy import select
 
-from benchmarks.fleet.s3 import ObjectServer
+from benchmarks.s3 import ObjectServer
 from sceneprint.atomic_files import folder_turn
 from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index, shared_index

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from benchmarks.fleet.postgres import Server
+from benchmarks.postgres import Server
 from sceneprint.store import Store, open_store
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import FrameMeta

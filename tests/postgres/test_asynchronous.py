@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.fleet.postgres import Server
+from benchmarks.postgres import Server
 from sceneprint.engine import Engine
 from sceneprint.errors import StoreAway, UnknownFrame
 from sceneprint.settings import Settings

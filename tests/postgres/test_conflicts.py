@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection
 
-from benchmarks.fleet.postgres import Server
+from benchmarks.postgres import Server
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.errors import StoreLocked

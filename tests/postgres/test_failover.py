@@ -19,7 +19,7 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from benchmarks.fleet.postgres import Server
+from benchmarks.postgres import Server
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.settings import Settings
 from service.app import create_app

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from benchmarks.fleet.postgres import OPTIONS, Server, binaries, of_nobody
+from benchmarks.postgres import OPTIONS, Server, binaries, of_nobody
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.errors import UnknownFrame

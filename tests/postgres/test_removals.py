@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 from sqlalchemy import select, text, update
 
-from benchmarks.fleet.postgres import Server
-from benchmarks.fleet.s3 import ObjectServer
+from benchmarks.postgres import Server
+from benchmarks.s3 import ObjectServer
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload

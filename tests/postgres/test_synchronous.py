@@ -10,7 +10,7 @@ import psycopg
 import pytest
 from sqlalchemy import text
 
-from benchmarks.fleet.postgres import Server
+from benchmarks.postgres import Server
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import StoreAway
 from sceneprint.store import Store

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from sqlalchemy import text
 
-from benchmarks.fleet.postgres import Server
+from benchmarks.postgres import Server
 from sceneprint.store import Store, wakeup
 from sceneprint.store.database import Database, reach_database
 from sceneprint.store.wakeup import Notices, process_name

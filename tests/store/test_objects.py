@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fleet.s3 import ObjectServer
+from benchmarks.s3 import ObjectServer
 from sceneprint.errors import StoreAway, UnusableStore
 from sceneprint.store.blobs import object_client
 from sceneprint.store.blobs import object_client as module

@@ -14,7 +14,7 @@ import pytest
 from sqlalchemy import text
 
 import migrations
-from benchmarks.fleet.postgres import Server
+from benchmarks.postgres import Server
 from sceneprint.cli import main
 from sceneprint.errors import NewerSchema
 from sceneprint.store import Store, database, open_database

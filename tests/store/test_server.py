@@ -16,7 +16,7 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from sqlalchemy import insert, select, text
 
-from benchmarks.fleet.postgres import Server
+from benchmarks.postgres import Server
 from sceneprint.errors import StoreAway, StoreLocked, UnusableStore
 from sceneprint.store import Database, Store, database, open_database, open_store
 from sceneprint.store.database import is_there, known_revisions, reach_database

@@ -8,7 +8,7 @@ import pytest
 from sqlalchemy import Connection, select, text
 from sqlalchemy.exc import DBAPIError
 
-from benchmarks.fleet.postgres import Server
+from benchmarks.postgres import Server
 from sceneprint import errors
 from sceneprint.store import Database, open_database
 from sceneprint.store.database import is_there, reach_database

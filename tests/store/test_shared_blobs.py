@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from sqlalchemy import text
 
-from benchmarks.fleet.postgres import Server
+from benchmarks.postgres import Server
 from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store import Store, open_blobs, open_database, open_store
 from sceneprint.store.blobs.folder import MARK

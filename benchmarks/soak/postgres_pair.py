@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
 
-from benchmarks.fleet.postgres import Server
+from benchmarks.postgres import Server
 
 DATABASE = "fleet"
 
@@ -34,7 +34,7 @@ class Pair:
         self._standby: Server | None = None
         self._dead: Server | None = None
 
-    def begin(self) -> None:
+    def start(self) -> None:
         """Start the primary with its database, and a standby that follows it."""
         self.primary.start()
         self.primary.create(DATABASE)

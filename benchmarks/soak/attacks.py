@@ -1,7 +1,7 @@
-"""What one tenant does to the others: attacks, run in a process of their own.
+"""Attacks of one tenant, and how long others wait meanwhile.
 
-The process stands for other machines: within the victim's, attacks would take its turns at the
-interpreter, and its times would tell of that.
+Attacks run in a process of their own, which stands for other machines: within the process of the
+other clients they would take turns at its interpreter.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import time
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from multiprocessing.synchronize import Event
-from typing import Any, NamedTuple
+from typing import Any
 
 import httpx
+import numpy as np
 
-from benchmarks.soak.load import Shot
+from benchmarks.soak.failover_client import LATER, Exchange, RequestLog, bearer
+from benchmarks.soak.recordings import Shot
 
-#: Statuses with which a request is sent away.
-AWAY = (429, 503, 507)
 #: Seconds that a request may take.
 PATIENCE_S = 60.0
 #: Session of the frames of `noisy` that have poses.
@@ -38,8 +38,9 @@ _NICENESS = 5
 _PNG = {"Content-Type": "image/png"}
 
 
-class Order(NamedTuple):
-    """An attack to run.
+@dataclass
+class Attack:
+    """An attack of one tenant.
 
     Parameters
     ----------
@@ -53,59 +54,119 @@ class Order(NamedTuple):
     url: str
     secrets: Sequence[str]
     shots: list[Shot]
-
-
-@dataclass
-class Attack:
-    """An attack in hand.
-
-    Parameters
-    ----------
-    order : what is done
-    stop : set when it is to end
-    sent, refused : requests, and those of them that were sent away
-    """
-
-    order: Order
-    stop: Event
     sent: int = 0
     refused: int = 0
 
     def count(self, status: int) -> None:
         """Count an answer."""
         self.sent += 1
-        self.refused += status in AWAY
+        self.refused += status in LATER
 
     def shot(self, number: int) -> Shot:
-        """A frame to send."""
-        return self.order.shots[number % len(self.order.shots)]
+        """Return a frame to send."""
+        return self.shots[number % len(self.shots)]
 
 
-@contextmanager
-def attacker() -> Iterator[tuple[Callable[[Order], Any], Event]]:
-    """A process that attacks: begins an order, whose future gives the counts when the event was
-    set.
+@dataclass(frozen=True)
+class AttackFigures:
+    """The other tenants just before an attack, and during it.
+
+    Parameters
+    ----------
+    name : of the attack
+    calm_s, under_s : 99th percentiles of requests, and of frames until they are signed, seconds
+    victim_refused : requests of the other tenants that had to be repeated
+    sent, refused : requests of the attacker, and those that were sent away
     """
-    spawn = multiprocessing.get_context("spawn")
-    stop = spawn.Event()
-    with ProcessPoolExecutor(1, spawn, _begin, (stop,)) as pool:
-        pool.submit(os.getpid).result()  # it has begun
-        yield (lambda order: pool.submit(_attack, order)), stop
+
+    name: str
+    calm_s: tuple[float, float]
+    under_s: tuple[float, float]
+    victim_refused: int
+    sent: int
+    refused: int
 
 
+#: Set when the attack is to end.
 _stop: list[Event] = []
 
 
-def _begin(stop: Event) -> None:
+def _prepare(stop: Event) -> None:
     _stop.append(stop)
     os.nice(_NICENESS)
 
 
-def _attack(order: Order) -> tuple[int, int]:
-    """Attack until told to stop; requests sent, and refused."""
-    attack = Attack(order, _stop[0])
-    ATTACKS[order.name](attack)
+def _attack(attack: Attack) -> tuple[int, int]:
+    """Attack until the event is set; return the requests sent and refused."""
+    ATTACKS[attack.name](attack)
     return attack.sent, attack.refused
+
+
+def run_attacks(
+    url: str, secrets: Sequence[str], shots: list[Shot], seconds: float, log: RequestLog,
+    drain: Callable[[], None],
+) -> Iterator[AttackFigures]:  # fmt: skip
+    """Run every attack while others work, after as long a time without it.
+
+    Parameters
+    ----------
+    url, secrets, shots : see Attack
+    seconds : of each attack
+    log : of the other tenants
+    drain : removes what an attack leaves in the queue
+    """
+    spawn = multiprocessing.get_context("spawn")
+    stop = spawn.Event()
+    with ProcessPoolExecutor(1, spawn, _prepare, (stop,)) as pool:
+        pool.submit(os.getpid).result()  # its code is loaded
+        for name in ATTACKS:
+            stop.clear()
+            begun = time.monotonic()
+            time.sleep(seconds)
+            running = pool.submit(_attack, Attack(name, url, secrets, shots))
+            time.sleep(min(seconds / 4, 1.0))  # so that it has begun
+            middle = time.monotonic()
+            time.sleep(seconds)
+            stop.set()
+            sent, refused = running.result()
+            drain()  # what others sent meanwhile is answered then
+            calm, under = (_percentiles(log, one, one + seconds) for one in (begun, middle))
+            repeated = sum(one.tries - 1 for one in _between(log, middle, middle + seconds))
+            yield AttackFigures(name, calm, under, repeated, sent, refused)
+
+
+def _between(log: RequestLog, first: float, last: float) -> list[Exchange]:
+    """Return the requests that were on their way at some time."""
+    with log.lock:
+        return [one for one in log.exchanges if one.begun <= last and one.answered >= first]
+
+
+def _percentiles(log: RequestLog, first: float, last: float) -> tuple[float, float]:
+    """Return 99th percentiles of requests, and of uploads until their frames were signed."""
+    own = _between(log, first, last)
+    signed = [one.answered - one.begun for one in own if one.kind == "upload"]
+    other = [one.answered - one.begun for one in own if one.kind != "upload"]
+    if not signed or not other:
+        raise RuntimeError("no other tenant was answered")
+    return float(np.percentile(other, 99)), float(np.percentile(signed, 99))
+
+
+def attack_table(found: Sequence[AttackFigures]) -> list[str]:
+    """Return the figures as lines of Markdown."""
+    lines = [
+        "| attack | request p99, calm | under attack | ratio | frame signed p99, calm "
+        "| under attack | ratio | victim refused | attacker sent | refused |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
+    ]
+    for one in found:
+        times = " | ".join(
+            f"{1e3 * calm:.0f} ms | {1e3 * under:.0f} ms | {under / calm:.1f}"
+            for calm, under in zip(one.calm_s, one.under_s, strict=True)
+        )
+        lines.append(
+            f"| {one.name} | {times} | **{one.victim_refused}** | {one.sent} | {one.refused} |"
+        )
+    return lines
 
 
 # Connections that are held.
@@ -159,8 +220,8 @@ def _archive(attack: Attack, client: httpx.Client, number: int) -> httpx.Respons
         assert camera is not None
         archive.writestr("run/intrinsics.json", json.dumps(camera.model_dump(mode="json")))
         archive.writestr("run/note.bin", f"{time.monotonic_ns()}-{number}".encode() * 100_000)
-        for shot in attack.order.shots:
-            archive.writestr(f"run/{shot.number}.png", shot.png)
+        for i, shot in enumerate(attack.shots):
+            archive.writestr(f"run/{i}.png", shot.png)
     return client.post(
         "/v1/maps/noisy/imports", content=made.getvalue(),
         headers={"Content-Type": "application/zip"},
@@ -213,12 +274,15 @@ def _repeated(send: Send, connections: int = _CONNECTIONS) -> Callable[[Attack],
     """Requests on some connections, each after the answer to the last."""
 
     def repeat(attack: Attack) -> None:
-        secrets = attack.order.secrets
+        secrets = attack.secrets
 
         def go_on(first: int) -> None:
             number = first
-            with client_of(attack.order.url, secrets[first % len(secrets)]) as client:
-                while not attack.stop.is_set():
+            headers = bearer(secrets[first % len(secrets)])
+            with httpx.Client(
+                base_url=attack.url, headers=headers, timeout=PATIENCE_S, trust_env=False
+            ) as client:
+                while not _stop[0].is_set():
                     try:
                         attack.count(send(attack, client, number // connections).status_code)
                     except httpx.HTTPError:
@@ -274,9 +338,9 @@ def _hold(
     count: int = _CONNECTIONS,
 ) -> None:  # fmt: skip
     """Connections that are begun and held, again and again where they are closed."""
-    url, secrets = httpx.URL(attack.order.url), attack.order.secrets
+    url, secrets = httpx.URL(attack.url), attack.secrets
     with ExitStack() as stack:
-        while not attack.stop.is_set():
+        while not _stop[0].is_set():
             for number in range(count):
                 secret = secrets[number % len(secrets)]
                 again = f"Authorization: Bearer made-up-{number}\r\n" if two else ""
@@ -291,13 +355,7 @@ def _hold(
                     attack.count(0)  # it is held
                 except OSError:
                     attack.count(503)
-                if attack.stop.is_set():
+                if _stop[0].is_set():
                     return
-            attack.stop.wait(2.0)
+            _stop[0].wait(2.0)
             stack.close()
-
-
-def client_of(url: str, secret: str) -> httpx.Client:
-    """A client with a key."""
-    headers = {"Authorization": f"Bearer {secret}"}
-    return httpx.Client(base_url=url, headers=headers, timeout=PATIENCE_S, trust_env=False)

@@ -28,7 +28,7 @@ STRIDE = 4
 ROOM_FRAMES, GRIDS = 30, STRIDE**2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shot:
     """A frame as a robot sends it.
 

@@ -1,1 +1,0 @@
-"""`make fleet`: real PostgreSQL, service processes and workers, and what breaks among them."""

@@ -1,1 +1,0 @@
-"""What strangers may send, and more than the service can do: it answers all, and loses nothing."""

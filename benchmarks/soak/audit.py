@@ -1,0 +1,275 @@
+"""What a store holds and answers in the end, compared with what was acknowledged to clients."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Container, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import cache
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, select
+
+from benchmarks.soak.plan import MODEL
+from benchmarks.soak.recordings import Shot
+from benchmarks.soak.robots import Acknowledged, K, Ledger, Listener, Search
+from benchmarks.waiting import until
+from sceneprint.decoders import LocalDecoders
+from sceneprint.engine.ingest.frame_decoder import read_upload
+from sceneprint.errors import SceneprintError
+from sceneprint.pipeline import Signer, open_signer, sign
+from sceneprint.store.tables import audit, events
+from sceneprint_client import Client
+from sceneprint_client.api import Frame, FrameState
+
+#: Seconds for the workers to finish the queue, and for events to arrive.
+PATIENCE_S, EVENTS_S = 600.0, 20.0
+#: Frames whose neighbours every service lists; most that are looked up by a query.
+COMPARED, LOOKED_UP = 20, 1_000
+#: States in which a frame is stored, is not searched, and says why.
+STATED = (FrameState.REJECTED, FrameState.FAILED, FrameState.REDUNDANT)
+#: Changes that clients make, each of which has an event and a line of the audit log.
+CHANGES = ("map.created", "frame.received")
+
+
+@dataclass
+class Found:
+    """The state of the store in the end.
+
+    Parameters
+    ----------
+    acknowledged : frames, but for those that were deleted
+    indexed, stated : of them, those that queries find, and those whose state says why they do not
+    aged : frames that retention deleted when it was due, with an event
+    looked_up, found : indexed frames that a query searched, and those that it found at distance 0
+    missing : ids of acknowledged frames that are not stored
+    returned : deleted frames that are stored
+    stuck : frames that wait to be signed
+    doubled : frames beyond one of a content in a map
+    strangers : frames that are stored, and were not acknowledged
+    unheard, heard_twice : events of acknowledged frames that came never, or more than once
+    disagreeing : answers and lists that are not the same at every address
+    separated : changes whose event or line of the audit log is missing
+    searches, wrong : of readers and of this check, and what is wrong with them
+    """
+
+    acknowledged: int = 0
+    indexed: int = 0
+    stated: int = 0
+    aged: int = 0
+    looked_up: int = 0
+    found: int = 0
+    missing: set[str] = field(default_factory=set)
+    returned: int = 0
+    stuck: int = 0
+    doubled: int = 0
+    strangers: int = 0
+    unheard: int = 0
+    heard_twice: int = 0
+    disagreeing: int = 0
+    separated: int = 0
+    searches: int = 0
+    wrong: list[str] = field(default_factory=list)
+
+
+def is_idle(client: Client) -> bool:
+    """Return whether a service answers, and no job waits or runs."""
+    try:
+        jobs = client.status().jobs or {}
+    except SceneprintError:
+        return False
+    return not jobs.get("queued", 0) and not jobs.get("running", 0)
+
+
+def await_idle(client: Client) -> None:
+    """Return once no job waits or runs."""
+    until(lambda: is_idle(client), PATIENCE_S, 0.5)
+
+
+def check(
+    ledger: Ledger, stable: Sequence[str], clients: Sequence[Client],
+    listeners: Sequence[Listener], aging: Mapping[str, float] = MappingProxyType({}),
+) -> Found:  # fmt: skip
+    """Look up every acknowledged frame at every address.
+
+    Parameters
+    ----------
+    ledger : of what was acknowledged
+    stable : ids of the frames that readers searched
+    clients : one for each service
+    listeners : one for each map
+    aging : seconds for which some maps keep a frame
+    """
+    known = {one.frame_id: one for one in ledger.frames if one.frame_id not in ledger.deleted}
+    maps = sorted({one.map_name for one in ledger.frames})
+    lists = [{name: list(client.frames(name)) for name in maps} for client in clients]
+    stored = {frame.frame_id: frame for frames in lists[0].values() for frame in frames}
+    present = {name: frame for name, frame in stored.items() if name in known}
+    indexed = {name for name, one in present.items() if one.state == FrameState.INDEXED}
+    stated = sum(one.state in STATED for one in present.values())
+    contents = Counter((one.map, one.content_id) for one in stored.values())
+    # frames of maps that age may go while they are looked up
+    lasting = [
+        one for one in known.values() if one.frame_id in indexed and one.map_name not in aging
+    ]
+    looked_up = lasting[:: -(-len(lasting) // LOOKED_UP) or 1]
+    with ThreadPoolExecutor(len(clients)) as pool:
+        parts = [looked_up[i :: len(clients)] for i in range(len(clients))]
+        found = sum(pool.map(_count_found, clients, parts))
+    gone = set(known) - set(stored)
+    aged = {
+        str(name)
+        for one in listeners
+        for name, at in one.retired.items()
+        if name in gone
+        and at - known[name].begun >= aging.get(known[name].map_name, math.inf)
+    }  # fmt: skip
+    result = Found(
+        acknowledged=len(known),
+        indexed=len(indexed),
+        stated=stated,
+        aged=len(aged),
+        looked_up=len(looked_up),
+        found=found,
+        missing=gone - aged,
+        returned=len(stored.keys() & ledger.deleted.keys()),
+        stuck=len(present) - len(indexed) - stated,
+        doubled=sum(contents.values()) - len(contents),
+        strangers=len(stored.keys() - known.keys() - ledger.deleted.keys()),
+        disagreeing=sum(_plain(one, aging) != _plain(lists[0], aging) for one in lists[1:]),
+    )
+    some = sorted(lasting, key=lambda one: one.frame_id)[:: max(len(lasting) // COMPARED, 1)]
+    _compare_searches(result, ledger, stable, clients, some)
+    _compare_events(result, [known[name] for name in (*present, *sorted(aged))], listeners)
+    return result
+
+
+def _plain(lists: dict[str, list[Frame]], aging: Container[str]) -> dict[str, dict[str, str]]:
+    return {
+        name: {one.frame_id: one.state for one in frames}
+        for name, frames in lists.items()
+        if name not in aging
+    }
+
+
+def _search(client: Client, one: Acknowledged, k: int) -> list[tuple[str, int]]:
+    answer = client.query(
+        one.map_name, one.shot.png, one.shot.meta, stages=("retrieve",), k=k, exact=True, keep=False
+    )
+    return [(match.frame_id, int(match.distance)) for match in answer.matches]
+
+
+def _count_found(client: Client, frames: Sequence[Acknowledged]) -> int:
+    """Return how many frames a query of their own content finds at distance 0."""
+    return sum((one.frame_id, 0) in _search(client, one, 2) for one in frames)
+
+
+def _compare_searches(
+    result: Found, ledger: Ledger, stable: Sequence[str], clients: Sequence[Client],
+    some: Sequence[Acknowledged],
+) -> None:  # fmt: skip
+    """Compare searches with each other, and with signatures that the library alone computes."""
+    known = {one.frame_id: one for one in ledger.frames}
+    searches = list(ledger.searches)
+    for one in some:
+        begun = time.monotonic()
+        answers = [_search(client, one, K) for client in clients]
+        result.disagreeing += any(answer != answers[0] for answer in answers[1:])
+        searches.append(Search(one.frame_id, answers[0], begun, time.monotonic()))
+    result.searches = len(searches)
+    vectors = {name: signature(known[name].shot) for name in _named(searches, stable, known)}
+    for search in searches:
+        own = stable if known[search.frame_id].map_name == known[stable[0]].map_name else ()
+        result.wrong += wrong_matches(search, ledger.deleted, own, vectors)
+
+
+def _named(
+    searches: Sequence[Search], stable: Sequence[str], known: Container[str]
+) -> set[str]:  # fmt: skip
+    """Return the ids of all frames of some searches, and of those that stay."""
+    found = {name for one in searches for name, _ in one.matches} | {*stable}
+    return {name for name in found | {one.frame_id for one in searches} if name in known}
+
+
+@cache
+def signature(shot: Shot) -> NDArray[np.int64]:
+    """Return the signature of a frame, as the library alone computes it."""
+    signer, decoders = _signer()
+    vector = sign(read_upload(shot.png, shot.meta, decoders).frame, signer).vector
+    return vector.astype(np.int64)
+
+
+@cache
+def _signer() -> tuple[Signer, LocalDecoders]:
+    return open_signer(MODEL), LocalDecoders(1)
+
+
+def wrong_matches(
+    search: Search, deleted: Mapping[str, tuple[float, float]], stable: Sequence[str],
+    vectors: Mapping[str, NDArray[np.int64]],
+) -> list[str]:  # fmt: skip
+    """Return what is wrong with the matches of an exact search.
+
+    Parameters
+    ----------
+    search : for frames near a stored one
+    deleted : when the deletion of a frame was sent and acknowledged
+    stable : ids of frames that are in the map all the time
+    vectors : signatures by frame; the matches may have frames that are not known
+    """
+
+    def distance(name: str) -> int:
+        return int(((vectors[search.frame_id] - vectors[name]) ** 2).sum())
+
+    wrong = []
+    for name, far in search.matches:
+        if name in vectors and far != distance(name):
+            wrong.append(f"{name} at {far}, which is not its distance")
+        if name in deleted and deleted[name][1] < search.begun:
+            wrong.append(f"{name} is found, and was deleted before")
+    names, distances = {name for name, _ in search.matches}, [far for _, far in search.matches]
+    if distances != sorted(distances) or len(names) != len(distances):
+        wrong.append("the matches are not in their order, or one is there twice")
+    # a frame that is deleted during the search is left out, and none takes its place
+    meanwhile = sum(
+        begun <= search.answered and done >= search.begun for begun, done in deleted.values()
+    )
+    if stable and len(names) + meanwhile < min(K, len(stable) - 1):
+        wrong.append(f"{len(names)} matches, where {meanwhile} can have been deleted meanwhile")
+    return wrong + [
+        f"{name} at {distance(name)} is missing"
+        for name in stable
+        if name not in (*names, search.frame_id) and distance(name) < max(distances, default=-1)
+    ]
+
+
+def count_separated(connection: Connection) -> int:
+    """Return how many changes of clients lack their event or their line of the audit log."""
+    by_event, by_line = (
+        Counter(tuple(row) for row in connection.execute(
+            select(kind, name, target).where(kind.in_(CHANGES))
+        ))
+        for kind, name, target in (
+            (events.c.kind, events.c.map, events.c.frame_id),
+            (audit.c.action, audit.c.map, audit.c.target),
+        )
+    )  # fmt: skip
+    return (by_event - by_line).total() + (by_line - by_event).total()
+
+
+def _compare_events(
+    result: Found, stored: Sequence[Acknowledged], listeners: Sequence[Listener]
+) -> None:
+    """Count the events of stored frames that were not heard, and those that were heard twice."""
+    heard = {one.map_name: one.heard for one in listeners}
+    wanted = [(one.map_name, ("frame.received", one.frame_id)) for one in stored]
+    end = time.monotonic() + EVENTS_S
+    while time.monotonic() < end and not all(heard[name][event] for name, event in wanted):
+        time.sleep(0.2)
+    result.unheard = sum(heard[name][event] == 0 for name, event in wanted)
+    result.heard_twice = sum(heard[name][event] > 1 for name, event in wanted)

@@ -1,0 +1,276 @@
+"""Uploads that are broken: none may crash a process, fail with 5xx, or cost much memory."""
+
+from __future__ import annotations
+
+import io
+import json
+import random
+import struct
+import tarfile
+import threading
+import time
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import httpx
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.soak.failover_client import bearer
+from benchmarks.soak.processes import Part, ended, peak_bytes
+from benchmarks.soak.recordings import Shot
+from sceneprint.formats.depth_file import encode_npy
+from sceneprint.formats.export import write_ply
+
+#: Bytes that parsers of binary formats stumble over.
+_WORDS = (
+    b"\x00" * 4, b"\xff" * 4, b"\x7f\xff\xff\xff", b"\x80\x00\x00\x00", b"\xff\xff\xff\x7f",
+    b"\x00\x00\x00\x01", b"IDAT", b"IEND", b"IHDR", b"PK\x03\x04", b"\x93NUMPY",
+)  # fmt: skip
+_TEXTS = (
+    "null", "-1", "1e999", "NaN", "[]", "{}", '""', '"\\ud800"', "18446744073709551616", "true",
+    "[" * 500, '{"a":' * 200, '"' + "x" * 5000 + '"',
+)  # fmt: skip
+#: Points of a cloud: few, so that the bytes of headers are often hit.
+_POINTS = np.random.default_rng(0).uniform(-3, 3, (200, 3)).astype(np.float32)
+
+
+def _npy(shot: Shot) -> bytes:
+    k = shot.meta.intrinsics
+    assert k is not None  # these are depth images
+    return encode_npy(np.linspace(1, 3, k.width * k.height, dtype=np.float32).reshape(k.height, -1))
+
+
+def _members(shot: Shot) -> dict[str, bytes]:
+    k = shot.meta.intrinsics
+    camera = {name: getattr(k, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    return {
+        "room/seq-01/intrinsics.json": json.dumps(camera).encode(),
+        "room/seq-01/frame-000000.depth.png": shot.png,
+        "room/seq-02/000000.ply": write_ply(_POINTS),
+    }
+
+
+def _zip(shot: Shot) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name, data in _members(shot).items():
+            archive.writestr(zipfile.ZipInfo(name), data)  # the present time would be other bytes
+    return out.getvalue()
+
+
+def _tar(shot: Shot) -> bytes:
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w") as archive:
+        for name, data in _members(shot).items():
+            member = tarfile.TarInfo(name)
+            member.size = len(data)
+            archive.addfile(member, io.BytesIO(data))
+    return out.getvalue()
+
+
+#: By kind, a sound file; the tests of the formats break files of all others.
+CLOUDS: dict[str, Callable[[Shot], bytes]] = {
+    "ply": lambda _: write_ply(_POINTS),
+    "kitti": lambda _: np.column_stack([_POINTS, np.ones(200, np.float32)]).tobytes(),
+    "npy cloud": lambda _: encode_npy(_POINTS),
+}
+ARCHIVES: dict[str, Callable[[Shot], bytes]] = {"zip": _zip, "tar": _tar}
+FILES: dict[str, Callable[[Shot], bytes]] = {
+    "png": lambda shot: shot.png,
+    "npy": _npy,
+    "compressedDepth": lambda shot: struct.pack("<iff", 0, 0.0, 0.0) + shot.png,
+    **CLOUDS,
+    **ARCHIVES,
+}
+#: How often each kind is broken.
+_WEIGHTS = {**dict.fromkeys(FILES, 2.0), "json": 5.0, "png": 5.0}
+
+
+@dataclass(frozen=True)
+class BrokenUpload:
+    """What is sent.
+
+    Parameters
+    ----------
+    kind : of the file, or json: its metadata is broken
+    data : the file
+    meta : JSON text, or something like it
+    """
+
+    kind: str
+    data: bytes
+    meta: str
+
+
+@dataclass(frozen=True)
+class BrokenFigures:
+    """The answers to broken uploads.
+
+    Parameters
+    ----------
+    sent : by kind of file
+    statuses : answers by status
+    failed : answers with 5xx other than 503, and requests without an answer
+    crashed : processes of services and workers that ended
+    peak_bytes : most memory that a process took, decoders too
+    seconds : in all
+    """
+
+    sent: dict[str, int]
+    statuses: dict[int, int]
+    failed: list[str]
+    crashed: int
+    peak_bytes: int
+    seconds: float
+
+
+def mutated(shots: list[Shot], seed: int, number: int) -> BrokenUpload:
+    """The upload of a number: a sound one, broken in one to four places; the same each time."""
+    rng = random.Random(f"{seed} {number}")
+    shot = rng.choice(shots)
+    kind = rng.choices(list(_WEIGHTS), list(_WEIGHTS.values()))[0]
+    meta = shot.meta.model_dump_json()
+    if kind == "json":
+        return BrokenUpload(kind, shot.png, _broken_text(meta, rng))
+    data = FILES[kind](shot)
+    if kind in CLOUDS:
+        meta = json.dumps({"format": "kitti"} if kind == "kitti" else {})
+    for _ in range(rng.randint(1, 4)):
+        data = _broken(data, rng)
+    if rng.random() < 0.5:
+        data = _sealed(data)
+    return BrokenUpload(kind, data, meta)
+
+
+def _sealed(data: bytes) -> bytes:
+    """A broken PNG with the right check sums, so that what comes after them is reached."""
+    at = data.find(b"\x89PNG") + 8
+    out = bytearray(data)
+    while 8 <= at <= len(data) - 12:
+        (length,) = struct.unpack_from(">I", data, at)
+        end = at + 8 + length
+        if end + 4 > len(data):
+            break
+        struct.pack_into(">I", out, end, zlib.crc32(data[at + 4 : end]))
+        at = end + 4
+    return bytes(out)
+
+
+def _broken(data: bytes, rng: random.Random) -> bytes:
+    """Bytes with one thing wrong."""
+    if not data:
+        return rng.choice(_WORDS)
+    at = rng.randrange(len(data)) if rng.random() < 0.5 else rng.randrange(min(len(data), 64))
+    how = rng.randrange(7)
+    if how == 0:
+        return data[:at]
+    if how == 1:
+        return data[:at] + bytes([data[at] ^ (1 << rng.randrange(8))]) + data[at + 1 :]
+    if how == 2:
+        word = rng.choice(_WORDS)
+        return data[:at] + word + data[at + len(word) :]
+    if how == 3:
+        return data[:at] + rng.randbytes(rng.randint(1, 64)) + data[at:]
+    if how == 4:
+        return data[:at] + data[at + rng.randint(1, 256) :]
+    if how == 5:
+        end = at + rng.randint(1, 512)
+        return data[:end] + data[at:]
+    return data + rng.randbytes(rng.randint(1, 64))
+
+
+def _broken_text(text: str, rng: random.Random) -> str:
+    """JSON with a value, or a character, that is not what is expected."""
+    if rng.random() < 0.5:
+        known: dict[str, Any] = json.loads(text)
+        place = known if rng.random() < 0.5 else known["intrinsics"]
+        name = rng.choice([*place, "pose", "tags", "captured_at", "strange"])
+        marked = {**place, name: "@@"}
+        whole = marked if place is known else {**known, "intrinsics": marked}
+        return json.dumps(whole).replace('"@@"', rng.choice(_TEXTS))
+    return _broken(text.encode(), rng).decode("utf-8", "replace")
+
+
+def send_broken(
+    url: str, key: str, parts: Sequence[Part], shots: list[Shot], n: int, seed: int,
+    threads: int = 4,
+) -> BrokenFigures:  # fmt: skip
+    """Send broken uploads to a service with the map `siege`, and watch the processes.
+
+    Parameters
+    ----------
+    url, key : of the service
+    parts : services and workers
+    shots : to break
+    n : how many are sent
+    seed : of the breaking
+    threads : that send
+    """
+    before = [pid for part in parts for pid in [part.pid, *part.children()]]
+    statuses: Counter[int] = Counter()
+    sent: Counter[str] = Counter()
+    failed: list[str] = []
+    lock, start = threading.Lock(), time.perf_counter()
+
+    def send(number: int) -> None:
+        upload = mutated(shots, seed, number)
+        try:
+            status, text = _send(client, upload, number)
+        except httpx.HTTPError as error:
+            status, text = 0, repr(error)
+        with lock:
+            bar.update()
+            sent[upload.kind] += 1
+            statuses[status] += 1
+            if status == 0 or (status >= 500 and status != 503):
+                failed.append(f"upload {number} of {upload.kind}: {status} {text[-2000:]}")
+
+    bar = tqdm(total=n, desc="broken uploads", disable=None, leave=False)
+    client = httpx.Client(base_url=url, timeout=60, trust_env=False, headers=bearer(key))
+    with bar, client, ThreadPoolExecutor(threads) as pool:  # all threads may use the client
+        list(pool.map(send, range(n)))
+    peak = max(peak_bytes(pid) for part in parts for pid in part.members())
+    return BrokenFigures(
+        dict(sent), dict(sorted(statuses.items())), failed, ended(before), peak,
+        time.perf_counter() - start,
+    )  # fmt: skip
+
+
+def _send(client: httpx.Client, upload: BrokenUpload, number: int) -> tuple[int, str]:
+    if upload.kind in ARCHIVES:
+        kind = "application/zip" if upload.kind == "zip" else "application/gzip"
+        answer = client.post(
+            "/v1/maps/siege/imports", content=upload.data, headers={"Content-Type": kind}
+        )
+        return answer.status_code, answer.text
+    # both uploads and queries read the file
+    answer = client.post(
+        f"/v1/maps/siege/{'frames' if number % 2 else 'queries'}",
+        files={"frame": ("frame", upload.data, "application/octet-stream")},
+        data={"meta": upload.meta},
+    )
+    return answer.status_code, answer.text
+
+
+def broken_table(found: BrokenFigures) -> list[str]:
+    """Return the figures as lines of Markdown."""
+    kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(found.sent.items()))
+    answers = ", ".join(f"{n} of {status}" for status, n in found.statuses.items())
+    return [
+        f"### {sum(found.sent.values())} broken uploads within {found.seconds:.0f} s",
+        "",
+        "| | |",
+        "|---|--:|",
+        f"| files | {kinds} |",
+        f"| answers | {answers} |",
+        f"| **5xx, or no answer** | **{len(found.failed)}** |",
+        f"| **processes that ended** | **{found.crashed}** |",
+        f"| most memory of a process, decoders too | {found.peak_bytes / 2**20:.0f} MiB |",
+        "",
+    ]

@@ -1,0 +1,183 @@
+"""Injected faults: what is killed, frozen, cut off or filled at random, and when."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import httpx
+
+from benchmarks.soak.plan import Plan
+from benchmarks.soak.processes import Fleet, Part, await_service
+
+#: How often a kill hits each, in proportion: the process that signs, and its supervisor.
+VICTIMS = {"service": 3, "worker": 2, "signing process": 2}
+PRIMARY, FROZEN, CUT_OFF = "primary", "frozen primary", "network of a host"
+FULL = "full disk"
+#: The faults of a plan that come at random moments, by the name that a schedule gives them.
+AT_RANDOM = {"freeze": FROZEN, "partition": CUT_OFF, "full-disk": FULL}
+#: Seconds for which a primary is frozen: less than a connection is believed to live.
+FROZEN_S = 5.0
+#: Seconds for which a host does not reach the servers: longer than a worker has a job for.
+CUT_OFF_S = 12.0
+#: Seconds for which the disk is full.
+FULL_S = 6.0
+#: Part of the time before the first and after the last fault.
+CALM = 0.1
+#: Seconds until a killed part starts again, and until the standby is promoted.
+AWAY_S, UNNOTICED_S = (0.0, 3.0), 1.0
+#: Seconds for which an asynchronous standby receives nothing before its primary dies.
+STALL_S = 2.0
+
+
+@dataclass(frozen=True)
+class Kill:
+    """A fault; its time is of `time.monotonic`."""
+
+    victim: str
+    at: float
+
+
+@dataclass(frozen=True)
+class Promotion:
+    """A standby took the place of its primary.
+
+    Parameters
+    ----------
+    killed, promoted : when
+    resumed : by address of a service, seconds until it answered a query again
+    unreceived : ids of the frames that the standby had not received
+    """
+
+    killed: float
+    promoted: float
+    resumed: dict[str, float]
+    unreceived: frozenset[str]
+
+
+def schedule(
+    seconds: float, faults: Mapping[str, int], rng: random.Random
+) -> list[tuple[float, str]]:
+    """Return the seconds from the beginning, and what is hit then."""
+    first, last = CALM * seconds, (1 - CALM) * seconds
+    victims = rng.choices(list(VICTIMS), list(VICTIMS.values()), k=faults.get("kill", 0))
+    due = [(rng.uniform(first, last), victim) for victim in victims]
+    promotions = faults.get("failover", 0)
+    part = (last - first) / max(promotions, 1)
+    due += [(first + part * (i + rng.random()), PRIMARY) for i in range(promotions)]
+    for fault, name in AT_RANDOM.items():
+        due += [(rng.uniform(first, last), name) for _ in range(faults.get(fault, 0))]
+    return sorted(due)
+
+
+@dataclass
+class FaultInjector:
+    """Works through a schedule.
+
+    Parameters
+    ----------
+    fleet, plan : whose parts are hit
+    answers : whether a service answers a query
+    rng : of the victims
+    """
+
+    fleet: Fleet
+    plan: Plan
+    answers: Callable[[str], bool]
+    rng: random.Random
+    kills: list[Kill] = field(default_factory=list)
+    promotions: list[Promotion] = field(default_factory=list)
+
+    def run(self, due: list[tuple[float, str]], show: Callable[[str], None]) -> None:
+        """Inject each fault when it is due, or as soon as the one before it is over."""
+        begun = time.monotonic()
+        inject = {
+            PRIMARY: self._promote, FROZEN: self._freeze, CUT_OFF: self._cut_off,
+            FULL: self._fill_disk,
+        }  # fmt: skip
+        for at, victim in due:
+            time.sleep(max(begun + at - time.monotonic(), 0.0))
+            show(victim)
+            if victim in inject:
+                self.kills.append(Kill(victim, time.monotonic()))
+                inject[victim]()
+            else:
+                self._kill(victim)
+
+    def _kill(self, victim: str) -> None:
+        part = self.rng.choice(self.fleet.services if victim == "service" else self.fleet.workers)
+        signing = part.children() if victim == "signing process" else []
+        if not signing:
+            self._restart(part, "service" if victim == "service" else "worker")
+            return
+        self.kills.append(Kill(victim, time.monotonic()))
+        with suppress(ProcessLookupError):
+            os.kill(signing[0], signal.SIGKILL)
+
+    def _restart(self, part: Part, victim: str) -> None:
+        self.kills.append(Kill(victim, time.monotonic()))
+        part.kill()
+        time.sleep(self.rng.uniform(*AWAY_S))
+        part.start()
+
+    def _freeze(self) -> None:
+        assert self.fleet.pair is not None
+        with self.fleet.pair.frozen():
+            time.sleep(FROZEN_S)
+
+    def _cut_off(self) -> None:
+        with self.fleet.partitioned(self.rng.randrange(len(self.fleet.services))):
+            time.sleep(CUT_OFF_S)
+
+    def _fill_disk(self) -> None:
+        """Fill the disk once all services are ready: none can start while it is full."""
+        for url in self.fleet.urls:
+            await_service(url)
+        with self.fleet.full_disk():
+            time.sleep(FULL_S)
+        for part in (*self.fleet.services, *self.fleet.workers):
+            if not part.is_running:  # a worker that was about to start
+                part.start()
+
+    def _promote(self) -> None:
+        """Kill the primary, promote its standby, and note how soon queries are answered."""
+        pair, urls = self.fleet.pair, self.fleet.urls
+        assert pair is not None
+        for url in urls:
+            await_service(url)
+        if self.plan.asynchronous:
+            pair.stall()
+            time.sleep(STALL_S)
+        killed = time.monotonic()
+        self.kills[-1] = Kill(PRIMARY, killed)
+        pair.kill_primary()
+        time.sleep(UNNOTICED_S)
+        pair.promote()
+        promoted = time.monotonic()
+        resumed: dict[str, float] = {}
+        watching = [
+            threading.Thread(target=self._watch, args=(url, promoted, resumed)) for url in urls
+        ]
+        for one in watching:
+            one.start()
+        unreceived = pair.unreceived()
+        for one in watching:
+            one.join()
+        self.promotions.append(Promotion(killed, promoted, resumed, frozenset(unreceived)))
+        pair.renew()
+
+    def _watch(self, url: str, promoted: float, resumed: dict[str, float]) -> None:
+        """Note when a service answers a query again."""
+        resumed[url] = float("inf")
+        while time.monotonic() < promoted + 120:
+            with suppress(httpx.TransportError):
+                if self.answers(url):
+                    resumed[url] = time.monotonic() - promoted
+                    return
+            time.sleep(0.1)

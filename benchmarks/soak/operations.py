@@ -1,0 +1,168 @@
+"""Every operation of the OpenAPI document, called in allowed and in forbidden ways.
+
+schemathesis generates the requests. No answer may be 5xx, or other than the document declares.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.soak.plan import MODEL, Plan
+from benchmarks.soak.processes import Fleet
+from benchmarks.soak.recordings import Shot
+from sceneprint_client import Client
+
+CHECKS = (
+    "not_a_server_error", "status_code_conformance", "content_type_conformance",
+    "response_schema_conformance", "response_headers_conformance",
+)  # fmt: skip
+#: Of schemathesis.
+PHASES = "examples,coverage,fuzzing,stateful"
+#: Streams of events have no end: so many are read.
+_EVENTS = 2
+_COUNTED = re.compile(r"(\d+) generated(?:, (\d+) found \d+ unique failures?)?(?:, (\d+) passed)?")
+
+
+@dataclass(frozen=True)
+class OperationFigures:
+    """The answers to generated requests.
+
+    Parameters
+    ----------
+    caller : whose key was shown, and what it named
+    operations : that were called
+    requests, passed : sent, and answered as the document says
+    report : of schemathesis
+    """
+
+    caller: str
+    operations: int
+    requests: int
+    passed: int
+    report: str
+
+    @property
+    def sound(self) -> bool:
+        """Return whether something was called, and nothing failed."""
+        return self.requests > 0 and self.requests == self.passed
+
+
+def call_operations(
+    caller: str, url: str, folder: Path, *, key: str | None = None,
+    known: Mapping[str, str] | None = None,
+    examples: int = 20, seed: int = 1, phases: str = PHASES,
+) -> OperationFigures:  # fmt: skip
+    """Call every operation of a service.
+
+    Parameters
+    ----------
+    caller, url : see OperationFigures, and of the service
+    folder : for the configuration
+    key : to show
+    known : parameters of paths and queries, such as map_name: what is there, so that more than
+        404 comes back. Nothing is deleted then
+    examples : requests of each operation, besides those of the edges of its schema
+    seed : of what is generated
+    phases : of schemathesis
+    """
+    lines = [f"max-stream-events = {_EVENTS}", "request-timeout = 30.0"]
+    if known:
+        lines += ["[parameters]", *(f"{json.dumps(n)} = {json.dumps(v)}" for n, v in known.items())]
+    config = folder / "schemathesis.toml"
+    config.write_text("\n".join(lines) + "\n")
+    command = [
+        str(Path(sys.executable).parent / "schemathesis"), "--config-file", str(config),
+        "run", f"{url}/openapi.json", "--checks", ",".join(CHECKS), "--phases", phases,
+        "--max-examples", str(examples), "--seed", str(seed), "--generation-database", "none",
+        "--suppress-health-check", "all", "--no-color", "--warnings", "off", "--workers", "1",
+        "--continue-on-failure", "--no-shrink",
+    ]  # fmt: skip
+    if key is not None:
+        command += ["--header", f"Authorization: Bearer {key}"]
+    if known:
+        command += ["--exclude-method", "DELETE"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    return read_report(caller, done.stdout + done.stderr, done.returncode)
+
+
+def read_report(caller: str, report: str, code: int) -> OperationFigures:
+    """Return what schemathesis counted; an exit code that it does not explain is a failure."""
+    counted, tested = _COUNTED.search(report), re.search(r"Tested: (\d+)", report)
+    if counted is None or tested is None:
+        return OperationFigures(caller, 0, 0, 0, report)
+    requests, failed, passed = (int(one or 0) for one in counted.groups())
+    if failed:
+        passed = requests - failed
+    elif code != 0:
+        passed = 0
+    return OperationFigures(caller, int(tested[1]), requests, passed, report)
+
+
+def call_as_everybody(
+    folder: Path, frames: Sequence[Shot], examples: int, phases: str = PHASES
+) -> list[OperationFigures]:
+    """Call every operation with all rights, with those of one map, and without a key.
+
+    Parameters
+    ----------
+    folder : empty; of data and configuration
+    frames : that each map holds
+    examples, phases : see `call_operations`
+    """
+    found = []
+    plan = Plan("sqlite", services=1, workers=1)
+    for caller in ("an operator", "an operator, of what is stored", "its own map", "another map"):
+        own = folder / caller
+        own.mkdir()
+        with Fleet(own, plan) as fleet:
+            operator = fleet.start()
+            url = fleet.urls[0]
+            with Client(url, operator) as client:
+                for name in ("siege", "other"):
+                    client.create_map(name, model=MODEL)
+                    for one in frames:
+                        client.upload(name, one.png, one.meta, wait_s=60)
+                map_name = "other" if caller == "another map" else "siege"
+                frame = next(iter(client.frames(map_name)))
+                query = client.query(map_name, frame_id=frame.frame_id)
+                known = {
+                    "path.map_name": map_name, "path.frame_id": frame.frame_id,
+                    "path.job_id": frame.job_id, "path.query_id": query.query_id,
+                }  # fmt: skip
+                key = operator
+                if caller.endswith("map"):
+                    key = client.create_key("fuzzer", {"siege": "write"}).secret
+            named = None if caller == "an operator" else known
+            found.append(
+                call_operations(
+                    caller, url, own, key=key, known=named, examples=examples, phases=phases
+                )
+            )
+            if (
+                caller == "another map"
+            ):  # all are refused, and the edges of schemas would take hours
+                few = max(examples // 5, 1)
+                found.append(
+                    call_operations(
+                        "nothing, without a key", url, own, examples=few, phases="fuzzing"
+                    )
+                )
+    return found
+
+
+def operation_table(found: Sequence[OperationFigures]) -> list[str]:
+    """Return the figures as lines of Markdown."""
+    return [
+        f"### Every operation of the OpenAPI document ({found[0].operations})",
+        "",
+        "| called by, or for | answered as declared, none with 5xx |",
+        "|---|--:|",
+        *(f"| {one.caller} | {one.passed} of {one.requests} |" for one in found),
+        "",
+    ]

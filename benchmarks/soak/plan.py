@@ -1,0 +1,105 @@
+"""What a soak runs: a store, robots, and the faults that are injected; and the plans of `make`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from benchmarks.soak.failover_client import SILENCE_S
+
+#: Faults by their names on the command line. A kill hits a service, a worker or a process that
+#: signs; the numbers of `operation` and `attack` are requests of each, and seconds of each.
+FAULTS = (
+    "kill", "failover", "freeze", "partition", "full-disk", "offline-hour",
+    "broken-upload", "attack", "operation",
+)  # fmt: skip
+#: The map that most robots share; every so many robots have one of their own, of so many.
+MAP, MODEL, OWN, OWN_MAPS = "fleet", "depth", 4, 19
+#: Robots that are so many that no surfaces are built for their maps.
+CROWD = 100
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run.
+
+    Parameters
+    ----------
+    store : what holds the rows
+    faults : how often each is injected; of the offline hour, frames that a robot spools in it
+    seconds : for which the robots walk
+    robots, rate : how many, and frames a second of each
+    signed : whether robots wait until their frame is signed
+    readers : clients that repeat exact searches all the time
+    services, workers : processes
+    asynchronous : whether the standby may lack what is acknowledged
+    objects, delays : whether blobs are in an object store, and whether messages take their time
+    retention_s : for which maps of single robots keep a frame, while the shared one keeps all
+    most_turn_ms : of a frame, for which all writers may have to wait for one, beside the time for
+        which hosts are cut off
+    most_query_ms : 99 of 100 queries are answered within it
+    most_bytes : of a process
+    seed : of victims and moments
+    data : folder of recordings; default: synthetic rooms
+    """
+
+    store: Literal["sqlite", "postgresql"] = "postgresql"
+    faults: Mapping[str, int] = field(default_factory=dict)
+    seconds: float = 120.0
+    robots: int = 8
+    rate: float = 1.0
+    signed: bool = False
+    readers: int = 2
+    services: int = 2
+    workers: int = 4
+    asynchronous: bool = False
+    objects: bool = False
+    delays: bool = False
+    retention_s: float | None = None
+    most_turn_ms: float = 25.0
+    most_query_ms: float = 1e3 * (SILENCE_S + 5)
+    most_bytes: int = 1 << 30
+    seed: int = 0
+    data: Path | None = None
+
+    def count(self, fault: str) -> int:
+        """Return how often a fault is injected."""
+        return self.faults.get(fault, 0)
+
+    @property
+    def is_crowd(self) -> bool:
+        """Return whether there are too many robots for their maps to have surfaces."""
+        return self.robots >= CROWD
+
+    @property
+    def frames(self) -> int:
+        """Return the most frames that a robot sends."""
+        return int(self.seconds * self.rate) + 1
+
+    def map_of(self, robot: int) -> str:
+        """Return the map that a robot sends to."""
+        own = robot % OWN == OWN - 1
+        if self.retention_s is not None:  # as many frames are to go as come, but for a few
+            own = not own
+        return f"{MAP}-{robot % (OWN * OWN_MAPS)}" if own else MAP
+
+
+_FLEET = {"kill": 20, "failover": 2}
+#: By the marks of their tables in docs/reliability.md.
+PLANS = {
+    "soak": Plan("sqlite", {"kill": 100, "full-disk": 3}, seconds=400, workers=2, rate=0.5),
+    "soak-crowd": Plan("sqlite", workers=2, rate=2.0, readers=8),
+    "siege": Plan(
+        "sqlite", {"broken-upload": 20_000, "attack": 5, "operation": 20}, robots=2, rate=2.0,
+        seconds=400, signed=True, services=1, workers=1,
+    ),
+    "fleet": Plan(faults=_FLEET),
+    "fleet-asynchronous": Plan(faults=_FLEET, asynchronous=True),
+    "fleet-delays": Plan(faults={**_FLEET, "freeze": 2}, objects=True, delays=True),
+    "fleet-crowd": Plan(
+        faults={"kill": 12, "failover": 1, "freeze": 1, "partition": 2, "offline-hour": 360},
+        robots=1000, rate=0.003, seconds=200, objects=True, delays=True, retention_s=40,
+    ),
+}  # fmt: skip

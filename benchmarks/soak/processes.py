@@ -1,0 +1,338 @@
+"""The processes of a run on one machine: services, workers, and servers of their data."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import httpx
+
+from benchmarks.s3 import ObjectServer
+from benchmarks.soak.delay_proxy import DelayProxy
+from benchmarks.soak.plan import Plan
+from benchmarks.soak.postgres_pair import Pair
+from benchmarks.waiting import until
+from sceneprint.maintenance.fsck.check import fsck
+from sceneprint.settings import Settings
+from sceneprint.store import Store, open_store
+
+#: Settings of every process. Another worker soon takes what a killed one held, and indexes are
+#: published early.
+SETTINGS = {
+    "SCENEPRINT_REQUIRE_KEYS": "1", "SCENEPRINT_LEASE_S": "5", "SCENEPRINT_TAIL_FRAMES": "100",
+    "SCENEPRINT_REQUESTS_PER_S": "0",
+}  # fmt: skip
+#: Seconds that a message to the database takes, and one to the object store, in a slow network.
+DATABASE_S, STORE_S = 0.0005, 0.01
+#: Bytes of the disk that is filled, a file system in memory.
+DISK_BYTES = 384 << 20
+#: Creates a key that may do everything.
+_CREATE_KEY = """
+import sys
+from sceneprint.engine import Engine
+from sceneprint.settings import Settings
+
+with Engine(Settings(data_dir=sys.argv[1])) as engine:
+    print(engine.create_key("operator").secret)
+"""
+
+
+class Part:
+    """A command of ours in a process group of its own.
+
+    Parameters
+    ----------
+    arguments : of `sceneprint`
+    log : file that its standard error is appended to
+    environment : of the process
+    """
+
+    def __init__(self, arguments: list[str], log: Path, environment: Mapping[str, str]) -> None:
+        self._arguments, self._log, self._environment = arguments, log, environment
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start the command."""
+        with self._log.open("ab") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "sceneprint", *self._arguments], env=self._environment,
+                stdout=subprocess.DEVNULL, stderr=log, start_new_session=True,
+            )  # fmt: skip
+
+    @property
+    def pid(self) -> int:
+        """Return the process that leads the group."""
+        assert self._process is not None
+        return self._process.pid
+
+    @property
+    def is_running(self) -> bool:
+        """Return whether the command has not ended."""
+        return self._process is not None and self._process.poll() is None
+
+    def members(self) -> list[int]:
+        """Return the processes of the group that run."""
+        return [pid for pid, group, _ in _processes() if group == self.pid]
+
+    def children(self) -> list[int]:
+        """Return the workers that the command has started."""
+        return [
+            pid for pid, _, parent in _processes()
+            if parent == self.pid and b"spawn_main" in _read(pid, "cmdline")
+        ]  # fmt: skip
+
+    def kill(self) -> None:
+        """End the whole group at once, as a power cut would."""
+        if self._process is not None:
+            os.killpg(self.pid, signal.SIGKILL)
+            self._process.wait()
+            self._process = None
+
+    def end(self) -> None:
+        """Ask the command to end, and kill it if it does not."""
+        if self._process is not None:
+            self._process.terminate()
+            try:
+                self._process.wait(60)
+            except subprocess.TimeoutExpired:
+                self.kill()
+            self._process = None
+
+
+def _read(pid: int, name: str) -> bytes:
+    """Return a file of a process, which is empty once the process has ended."""
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/{name}").read_bytes()
+    return b""
+
+
+def _processes() -> Iterator[tuple[int, int, int]]:
+    """Yield the number, group and parent of each process that runs."""
+    for path in Path("/proc").glob("[0-9]*"):
+        fields = _read(int(path.name), "stat").rpartition(b")")[2].split()
+        if fields and fields[0] != b"Z":
+            yield int(path.name), int(fields[2]), int(fields[1])
+
+
+def peak_bytes(pid: int) -> int:
+    """Return the most memory that a process ever had."""
+    found = re.search(rb"^VmHWM:\s+(\d+) kB", _read(pid, "status"), re.MULTILINE)
+    return 1024 * int(found[1]) if found else 0
+
+
+class Fleet:
+    """All processes of a plan, from `start` until the context ends.
+
+    On PostgreSQL each service is a host of its own, and workers are spread over the hosts. On
+    SQLite they share a data folder.
+
+    Parameters
+    ----------
+    folder : of data and logs
+    plan : of the run
+    """
+
+    def __init__(self, folder: Path, plan: Plan) -> None:
+        self.folder, self._plan = folder, plan
+        self.services: list[Part] = []
+        self.workers: list[Part] = []
+        self.urls: list[str] = []
+        self.pair: Pair | None = None
+        #: The disk of uploads, where it is one of its own.
+        self._disk: Path | None = None
+        #: By which each host reaches the servers, where it does not reach them itself.
+        self._networks: list[list[DelayProxy]] = []
+        self._objects = ObjectServer() if plan.objects else None
+        self._shared = dict(SETTINGS)
+        if plan.is_crowd:
+            self._shared["SCENEPRINT_SURFACES"] = "asked"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:  # fmt: skip
+        for part in (*self.workers, *self.services):
+            part.kill()
+        if self.pair is not None:
+            self.pair.end()
+        for proxy in chain.from_iterable(self._networks):
+            proxy.end()
+        if self._objects is not None:
+            self._objects.kill()
+        if self._disk is not None:
+            subprocess.run(["umount", str(self._disk)], check=True)
+
+    def start(self) -> str:
+        """Start all processes, and return a key that may do everything."""
+        plan = self._plan
+        if plan.count("full-disk"):
+            disk = self.folder / ("host-1" if plan.store == "sqlite" else "blobs")
+            disk.mkdir()
+            size = f"size={DISK_BYTES}"
+            subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", str(disk)], check=True)
+            self._disk = disk
+        if plan.store == "postgresql":
+            (self.folder / "database").mkdir()
+            self.pair = Pair(self.folder / "database", synchronous=not plan.asynchronous)
+            self.pair.start()
+            blobs = f"file://{self.folder / 'blobs'}"
+            if self._objects is not None:
+                self._objects.start()
+                blobs = f"{self._objects.bucket('fleet')}/blobs"
+                self._shared |= self._objects.env
+            self._shared |= {
+                "SCENEPRINT_DATABASE_URL": self.pair.url, "SCENEPRINT_BLOB_URL": blobs
+            }  # fmt: skip
+        secret = subprocess.run(
+            [sys.executable, "-c", _CREATE_KEY, str(self.folder / "host-1")], check=True, text=True,
+            env=os.environ | self._shared, stdout=subprocess.PIPE,
+        ).stdout.strip()  # fmt: skip
+        hosts = [self._host_environment() for _ in range(plan.services)]
+        for number in range(plan.services):
+            port = free_port()
+            self.urls.append(f"http://127.0.0.1:{port}")
+            command = ["serve", "--workers", "0", "--port", str(port)]
+            self.services.append(self._part(f"service-{number + 1}", command, number, hosts))
+        for number in range(plan.workers):
+            command = ["work", "--workers", "1"]
+            self.workers.append(self._part(f"worker-{number + 1}", command, number, hosts))
+        for part in (*self.services, *self.workers):
+            part.start()
+        for url in self.urls:
+            await_service(url)
+        return secret
+
+    def _part(
+        self, name: str, command: list[str], number: int, hosts: list[dict[str, str]]
+    ) -> Part:
+        host = number % len(hosts)
+        data = self.folder / f"host-{1 if self.pair is None else host + 1}"
+        log = self.folder / f"{name}.log"
+        return Part([*command, "--data", str(data)], log, os.environ | hosts[host])
+
+    def _host_environment(self) -> dict[str, str]:
+        """Return the environment of a host, with a network of its own where the plan needs one."""
+        self._networks.append([])
+        if self.pair is None or not (self._plan.delays or self._plan.count("partition")):
+            return self._shared
+        database = [self._reached(port, DATABASE_S) for port in self.pair.ports]
+        own = self._shared | {"SCENEPRINT_DATABASE_URL": self.pair.url_at(database)}
+        if self._objects is not None:
+            port = self._reached(self._objects.port, STORE_S)
+            own["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{port}"
+        return own
+
+    def _reached(self, port: int, delay_s: float) -> int:
+        """Return the port by which the newest host reaches a server."""
+        proxy = DelayProxy(port, delay_s if self._plan.delays else 0.0)
+        self._networks[-1].append(proxy)
+        return proxy.port
+
+    @contextmanager
+    def partitioned(self, host: int) -> Iterator[None]:
+        """Cut a host off from the database and the object store; whoever calls it reaches it."""
+        for proxy in self._networks[host]:
+            proxy.freeze()
+        try:
+            yield
+        finally:
+            for proxy in self._networks[host]:
+                proxy.thaw()
+
+    @contextmanager
+    def full_disk(self) -> Iterator[None]:
+        """Leave no room on the disk of uploads for a while."""
+        assert self._disk is not None
+        ballast = self._disk / "ballast"
+        with ballast.open("wb", buffering=0) as file:
+            for block in (1 << 20, 1 << 12, 1):
+                with suppress(OSError):
+                    while True:
+                        file.write(bytes(block))
+        try:
+            yield
+        finally:
+            ballast.unlink()
+
+    def memory(self) -> tuple[int, int]:
+        """Return the most bytes that a process of services, and one of workers, ever had."""
+        found = [
+            max(peak_bytes(pid) for part in parts for pid in part.members())
+            for parts in (self.services, self.workers)
+        ]
+        return found[0], found[1]
+
+    def log_lines(self) -> list[str]:
+        """Return the lines of all logs."""
+        logs = sorted(self.folder.glob("*.log"))
+        return [line for log in logs for line in log.read_text(errors="replace").splitlines()]
+
+    def fsck(self) -> tuple[int, int]:
+        """Return how many files nothing refers to, and how many damages `sceneprint fsck` finds."""
+        with self.settings() as settings:
+            found = Counter(one.severity for one in fsck(settings, grace_s=0.0))
+        return found["leftover"], found["damage"]
+
+    @contextmanager
+    def store(self) -> Iterator[Store]:
+        """Open the store in this process."""
+        with (
+            self.settings() as settings,
+            closing(open_store(settings.database, settings.blobs)) as store,
+        ):
+            yield store
+
+    def stop(self) -> None:
+        """Ask services and workers to end."""
+        for part in (*self.workers, *self.services):
+            part.end()
+
+    @contextmanager
+    def settings(self) -> Iterator[Settings]:
+        """Let this process be one of the first host for a while."""
+        before = dict(os.environ)
+        os.environ.update(self._shared)
+        try:
+            yield Settings(data_dir=self.folder / "host-1")
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
+
+
+def free_port() -> int:
+    """Return a port that nobody listens on now."""
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+def await_service(url: str) -> None:
+    """Return once a service can work."""
+    until(partial(_is_ready, url), pause_s=0.1)
+
+
+def _is_ready(url: str) -> bool:
+    try:
+        return httpx.get(f"{url}/readyz", trust_env=False, timeout=5).is_success
+    except httpx.TransportError:
+        return False
+
+
+def ended(before: Sequence[int]) -> int:
+    """Return how many of some processes have ended."""
+    return len(set(before) - {pid for pid, _, _ in _processes()})

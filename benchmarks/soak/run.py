@@ -1,0 +1,421 @@
+"""One run: clients, injected faults, and what came of it."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import httpx
+import numpy as np
+from sqlalchemy import select
+from tqdm import tqdm
+
+from benchmarks.soak.attacks import SESSION, AttackFigures, run_attacks
+from benchmarks.soak.audit import Found, await_idle, check, count_separated
+from benchmarks.soak.broken_uploads import BrokenFigures, send_broken
+from benchmarks.soak.failover_client import Exchange, FailoverClient, RequestLog, bearer
+from benchmarks.soak.faults import CUT_OFF_S, FaultInjector, Kill, Promotion, schedule
+from benchmarks.soak.lock_samples import LockSampler, LockShares
+from benchmarks.soak.operations import OperationFigures, call_as_everybody
+from benchmarks.soak.plan import MAP, MODEL, Plan
+from benchmarks.soak.postgres_pair import DATABASE
+from benchmarks.soak.processes import Fleet, await_service
+from benchmarks.soak.recordings import Shot, recordings, walks
+from benchmarks.soak.robots import (
+    OFFLINE_PATIENCE_S,
+    Acknowledged,
+    Ledger,
+    Listener,
+    OfflineRobot,
+    Reader,
+    Robot,
+    RobotCrowd,
+    image_query,
+)
+from sceneprint.store import queue
+from sceneprint.store.deletion import DAY_S
+from sceneprint.store.tables import jobs, maps
+from sceneprint_client import Client
+from sceneprint_client.api import FrameMeta
+from sceneprint_client.api.admin import Scope
+
+#: Map of the robot that is offline at first, and the part of the time for which it is.
+OFFLINE_MAP, OFFLINE = "fleet-offline", 0.4
+#: Frames that are in the shared map all the time.
+STABLE = 24
+#: Seconds that a robot may take to have its last frame acknowledged.
+PATIENCE_S = 240.0
+#: Least part of the time for which locks have to be sampled.
+SAMPLED = 0.5
+#: Threads that drive the robots; keys of an attacker, frames of its map, and those with poses.
+DRIVERS, KEYS, ROWS, POSED = 32, 10, 1_000, 16
+#: How SQLite says that a writer gave up waiting, and how we do.
+LOCKED = ("database is locked", "have waited for long", "has been writing for long")
+
+
+@dataclass
+class SoakFigures:
+    """What came of a run.
+
+    Parameters
+    ----------
+    plan, found : that was run, and the state of the store in the end
+    kills : by victim
+    outages : see `outages`
+    promotions : of the standby
+    waits_ms : median and 99th percentile of each kind of request
+    memory : most bytes of a service's process, and of a worker's
+    deleted, queries, repeated : frames that robots deleted, queries that were answered, and
+        requests that were sent again
+    faults : answers that must not be
+    locked : lines of logs in which a writer gave up waiting
+    damaged, leftovers : findings of `sceneprint fsck`
+    lost : acknowledged frames that are missing, beyond those that a standby had not received
+    window : acknowledged frames that the standbys had not received
+    locks : see LockShares
+    spooled, spooled_twice : frames of the robot that was offline, and those that were sent again
+    attacks, broken, operations : see there
+    seconds : of all
+    """
+
+    plan: Plan
+    found: Found
+    kills: Counter[str] = field(default_factory=Counter)
+    outages: dict[str, list[float]] = field(default_factory=dict)
+    promotions: Sequence[Promotion] = ()
+    waits_ms: dict[str, tuple[float, float]] = field(default_factory=dict)
+    memory: tuple[int, int] = (0, 0)
+    deleted: int = 0
+    queries: int = 0
+    repeated: int = 0
+    faults: list[str] = field(default_factory=list)
+    locked: int = 0
+    damaged: int = 0
+    leftovers: int = 0
+    lost: int = 0
+    window: int = 0
+    locks: LockShares = field(default_factory=LockShares)
+    spooled: int = 0
+    spooled_twice: int = 0
+    attacks: list[AttackFigures] = field(default_factory=list)
+    broken: BrokenFigures | None = None
+    operations: list[OperationFigures] = field(default_factory=list)
+    seconds: float = 0.0
+
+    @property
+    def turn_ms(self) -> tuple[float, float]:
+        """Return for how long all writers, and those of its map, wait for a frame; milliseconds."""
+        each = 1e3 / max(self.found.acknowledged, 1)
+        return self.locks.everybody * each, self.locks.one_map * each
+
+    @property
+    def exceeded(self) -> list[str]:
+        """Return the bounds of the plan that do not hold."""
+        plan, (_, query_ms) = self.plan, self.waits_ms.get("query", (0.0, 0.0))
+        # a host that is cut off may have the turn for as long
+        cut_off_s = plan.count("partition") * CUT_OFF_S
+        most_turn_ms = plan.most_turn_ms + 1e3 * cut_off_s / max(self.found.acknowledged, 1)
+        found = {
+            "the turn of all writers takes": (self.turn_ms[0], most_turn_ms, "ms a frame"),
+            "the 99th percentile of queries is": (query_ms, plan.most_query_ms, "ms"),
+            "a process had": (max(self.memory) / 1e6, plan.most_bytes / 1e6, "MB"),
+        }
+        return [
+            f"{what} {value:,.1f} {unit}, above {most:,.0f}"
+            for what, (value, most, unit) in found.items()
+            if value > most
+        ]
+
+    @property
+    def sound(self) -> bool:
+        """Return whether nothing was lost, doubled, half stored or wrong, and the bounds hold."""
+        found, plan = self.found, self.plan
+        stored = found.acknowledged - len(found.missing) - found.aged
+        wrong = (
+            self.lost, found.returned, found.stuck, found.doubled, found.strangers,
+            found.heard_twice, found.disagreeing, found.separated, len(found.wrong), self.damaged,
+            len(self.faults), found.looked_up - found.found, stored - found.indexed - found.stated,
+            len(self.exceeded), self.locked, sum(one.victim_refused for one in self.attacks),
+            sum(not one.sound for one in self.operations),
+            0 if self.broken is None else len(self.broken.failed) + self.broken.crashed,
+        )  # fmt: skip
+        tried = found.acknowledged > 0 and self.window == len(found.missing)
+        if plan.store == "postgresql":  # a server that fell, or was frozen, is not sampled
+            tried &= self.locks.seconds >= SAMPLED * plan.seconds
+        tried &= self.spooled == plan.count("offline-hour")
+        return tried and not any(wrong) and (plan.asynchronous or not found.unheard)
+
+
+def drive(folder: Path, plan: Plan) -> SoakFigures:
+    """Run a plan in an empty folder; nothing of it runs afterwards."""
+    begun = time.monotonic()
+    more = -(-plan.count("offline-hour") // plan.frames)  # walks, of the robot that is offline
+    more_stable = -(-STABLE // plan.frames)
+    n = plan.robots + more + more_stable
+    with recordings(plan.data, n * plan.frames) as data:
+        walked = walks(data, n, plan.frames)
+    shots = [shot for walk in walked[plan.robots :] for shot in walk]
+    stable, spooled = shots[:STABLE], shots[STABLE:][: plan.count("offline-hour")]
+    with Fleet(folder, plan) as fleet:
+        figures = _Run(fleet, plan, walked[: plan.robots], stable, spooled).figures()
+    if plan.count("operation"):
+        figures.operations = call_as_everybody(folder, stable[:4], plan.count("operation"))
+    figures.seconds = time.monotonic() - begun
+    return figures
+
+
+class _Run:
+    """A run in progress; see `drive`."""
+
+    def __init__(
+        self, fleet: Fleet, plan: Plan, walked: list[list[Shot]], stable: list[Shot],
+        spooled: list[Shot],
+    ) -> None:  # fmt: skip
+        self._fleet, self._plan = fleet, plan
+        self._walked, self._stable, self._spooled = walked, stable, spooled
+        self._ledger, self._log, self._stop = Ledger(), RequestLog(), threading.Event()
+        self._rng = random.Random(plan.seed)
+        self._figures = SoakFigures(plan, Found(), faults=self._log.faults)
+
+    def figures(self) -> SoakFigures:
+        """Run it to its end."""
+        fleet, plan, log, figures = self._fleet, self._plan, self._log, self._figures
+        key = fleet.start()
+        locks = LockSampler(self._primary)
+        with ExitStack() as opened:
+            clients = [opened.enter_context(Client(url, key)) for url in fleet.urls]
+            names = self._create_maps(clients[0])
+            ids = self._upload_stable(clients[0])
+            listeners = [self._listener(clients[0], name) for name in names]
+            offline = self._offline_robot(clients[0])
+            readers = self._readers(clients[0], ids)
+            others: list[threading.Thread] = [*listeners, *offline, *readers]
+            injector = FaultInjector(
+                fleet, plan, partial(_answers, key=key, shot=self._stable[0]), self._rng
+            )  # fmt: skip
+            if plan.store == "postgresql":
+                others.append(locks)
+            self._walk(clients[0], key, others, injector)
+            for one in (*offline, *readers):
+                one.join(OFFLINE_PATIENCE_S)
+                if one.is_alive():
+                    log.fault(f"{one.name} does not end")
+            for url in fleet.urls:
+                await_service(url)
+            await_idle(clients[0])
+            if plan.store == "postgresql":
+                locks.stop()
+            figures.found = check(self._ledger, ids, clients, listeners, self._aging)
+            for listener in listeners:
+                listener.stop()
+            figures.memory = fleet.memory()
+            fleet.stop()
+            figures.leftovers, figures.damaged = fleet.fsck()
+            with fleet.store() as store, store.database.read() as connection:
+                figures.found.separated = count_separated(connection)
+        figures.locks, figures.spooled_twice = locks.shares, sum(one.repeated for one in offline)
+        self._count(injector)
+        return figures
+
+    def _count(self, injector: FaultInjector) -> None:
+        """Add up what the injector, the ledger and the log have."""
+        figures, log, ledger = self._figures, self._log, self._ledger
+        unreceived = {name for one in injector.promotions for name in one.unreceived}
+        window = {one.frame_id for one in ledger.frames} & unreceived
+        figures.kills = Counter(one.victim for one in injector.kills)
+        figures.outages = outages(injector.kills, log.exchanges)
+        figures.promotions = injector.promotions
+        for kind in sorted({one.kind for one in log.exchanges}):
+            taken = [1e3 * (one.answered - one.begun) for one in log.exchanges if one.kind == kind]
+            p50, p99 = np.quantile(taken, (0.5, 0.99)).tolist()
+            figures.waits_ms[kind] = p50, p99
+        figures.repeated = sum(one.tries - 1 for one in log.exchanges)
+        figures.deleted, figures.queries = len(ledger.deleted), ledger.queries
+        figures.lost, figures.window = len(figures.found.missing - window), len(window)
+        figures.spooled = sum(one.map_name == OFFLINE_MAP for one in ledger.frames)
+        if self._plan.store == "sqlite":
+            figures.locked = sum(
+                sign in line for line in self._fleet.log_lines() for sign in LOCKED
+            )  # fmt: skip
+
+    def _primary(self) -> str:
+        assert self._fleet.pair is not None
+        return self._fleet.pair.primary.url(DATABASE).replace("+psycopg", "")
+
+    @property
+    def _aging(self) -> dict[str, float]:
+        """Return the seconds for which maps keep a frame that keep none for long."""
+        kept_s, plan = self._plan.retention_s, self._plan
+        own = {plan.map_of(i) for i in range(plan.robots)} - {MAP}
+        return {} if kept_s is None else dict.fromkeys(own, kept_s)
+
+    def _create_maps(self, client: Client) -> list[str]:
+        """Create the maps of all robots."""
+        plan = self._plan
+        names = list(dict.fromkeys([MAP, *map(plan.map_of, range(plan.robots))]))
+        if self._spooled:
+            names.append(OFFLINE_MAP)
+        for name in names:
+            days = self._aging[name] / DAY_S if name in self._aging else None
+            client.create_map(name, model=MODEL, retention_days=days)
+        return names
+
+    def _upload_stable(self, client: Client) -> list[str]:
+        """Upload the frames that stay, and return their ids."""
+        begun = time.monotonic()
+        added = [client.upload(MAP, one.png, one.meta) for one in self._stable]
+        client.wait([one.job_id for one in added])
+        ids = [one.frame_id for one in added]
+        self._ledger.frames += [
+            Acknowledged(name, MAP, shot, begun)
+            for name, shot in zip(ids, self._stable, strict=True)
+        ]
+        return ids
+
+    def _walk(
+        self, client: Client, key: str, others: Sequence[threading.Thread], injector: FaultInjector
+    ) -> None:
+        """Start all clients, inject the faults, and stop the robots when it is time."""
+        plan, stop, fleet = self._plan, self._stop, self._fleet
+        clients = [
+            FailoverClient(fleet.urls, self._log, first=i) for i in range(min(plan.robots, DRIVERS))
+        ]
+        robots = self._robots(client)
+        crowd = RobotCrowd(
+            robots, plan.rate, clients, self._ledger, self._log, stop,
+            deletes=not plan.asynchronous, signed=plan.signed,
+        )  # fmt: skip
+        noisy = self._noisy(client) if plan.count("attack") else []
+        with tqdm(total=plan.seconds, unit="s", disable=None, leave=False) as bar:
+            showing = threading.Thread(target=_show, args=(bar, self._ledger, stop), daemon=True)
+            begun = time.monotonic()
+            for one in (*others, showing):
+                one.start()
+            crowd.start()
+            try:
+                due = schedule(plan.seconds, plan.faults, self._rng)
+                injector.run(due, bar.set_postfix_str)
+                self._besiege(client, key, noisy)
+                stop.wait(max(begun + plan.seconds - time.monotonic(), 0.0))
+            finally:
+                stop.set()
+        crowd.join(PATIENCE_S)
+
+    def _besiege(self, client: Client, key: str, noisy: Sequence[str]) -> None:
+        """Send broken uploads, and let a tenant attack the others."""
+        plan, fleet, figures = self._plan, self._fleet, self._figures
+        if plan.count("attack"):
+            drain = partial(self._empty_queue, client)
+            seconds = float(plan.count("attack"))
+            for one in run_attacks(
+                fleet.urls[0], noisy, self._stable[:8], seconds, self._log, drain
+            ):
+                figures.attacks.append(one)
+        if plan.count("broken-upload"):
+            client.create_map("siege", model=MODEL)
+            figures.broken = send_broken(
+                fleet.urls[0], key, [*fleet.services, *fleet.workers], self._stable,
+                plan.count("broken-upload"), plan.seed,
+            )  # fmt: skip
+
+    def _noisy(self, client: Client) -> list[str]:
+        """Create a tenant with a map of many frames, and return its keys."""
+        client.create_map("noisy", model=MODEL)
+        grants: dict[str, Scope] = {"noisy": "admin"}
+        first = client.create_key("noisy-0", grants)
+        keys = [first.secret] + [
+            client.create_key(f"noisy-{i}", grants, tenant="noisy-0").secret for i in range(1, KEYS)
+        ]
+        few = self._stable[:8]
+        for i in range(ROWS):
+            one = few[i % len(few)]
+            client.put_frame("noisy", f"row-{i}", one.png, one.meta)
+        self._empty_queue(client)
+        for i in range(POSED):
+            one = few[i % len(few)]
+            matrix = [[1, 0, 0, 0.1 * i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+            pose = {"parent_frame": "map", "matrix": matrix}
+            meta = one.meta.model_dump() | {"session": SESSION, "sequence": i, "pose": pose}
+            posed = FrameMeta.model_validate(meta)
+            client.put_frame("noisy", f"posed-{i}", one.png, posed)
+        await_idle(client)
+        return keys
+
+    def _empty_queue(self, client: Client) -> None:
+        """Cancel what waits or runs for the attacker, and wait for the rest."""
+        with self._fleet.store() as store, store.database.write() as connection:
+            noisy = select(maps.c.number).where(maps.c.name == "noisy").scalar_subquery()
+            queue.cancel_jobs(connection, jobs.c.map_number == noisy)
+        await_idle(client)
+
+    def _robots(self, client: Client) -> list[Robot]:
+        """Return the robots, each with a key of its own; they start one after the other."""
+        plan, robots = self._plan, []
+        for i, walk in enumerate(self._walked):
+            name, map_name = f"robot-{i}", plan.map_of(i)
+            key = client.create_key(name, {map_name: "write"}).secret
+            robots.append(Robot(i, name, map_name, key, walk, i / plan.robots / plan.rate))
+        return robots
+
+    def _listener(self, client: Client, map_name: str) -> Listener:
+        secret = client.create_key(f"listener-of-{map_name}", {map_name: "read"}).secret
+        return Listener(map_name, secret, FailoverClient(self._fleet.urls, self._log))
+
+    def _readers(self, client: Client, ids: Sequence[str]) -> list[Reader]:
+        """Return the readers of the shared map."""
+        found = []
+        for i in range(self._plan.readers):
+            secret = client.create_key(f"reader-{i}", {MAP: "read"}).secret
+            failover = FailoverClient(self._fleet.urls, self._log, first=i)
+            found.append(Reader(secret, MAP, ids, failover, self._ledger, self._stop, i))
+        return found
+
+    def _offline_robot(self, client: Client) -> list[OfflineRobot]:
+        """Return the robot that is offline, if there is one."""
+        if not self._spooled:
+            return []
+        name = "robot-offline"
+        key = client.create_key(name, {OFFLINE_MAP: "write"}).secret
+        robot = Robot(self._plan.robots, name, OFFLINE_MAP, key, self._spooled, 0.0)
+        file, offline_s = self._fleet.folder / "spool.db", OFFLINE * self._plan.seconds
+        return [OfflineRobot(robot, file, offline_s, self._fleet.urls, self._ledger, self._log)]
+
+
+def _answers(url: str, *, key: str, shot: Shot) -> bool:
+    """Return whether a service answers a query."""
+    return httpx.post(
+        f"{url}/v1/maps/{MAP}/queries", headers=bearer(key), timeout=5,
+        trust_env=False, **image_query(shot, k="1", stages="retrieve", keep="false"),
+    ).is_success  # fmt: skip
+
+
+def _show(bar: tqdm[None], ledger: Ledger, stop: threading.Event) -> None:
+    while not stop.wait(1.0):
+        bar.set_description(f"{len(ledger.frames)} acknowledged")
+        bar.update(1)
+
+
+def outages(kills: Sequence[Kill], exchanges: Sequence[Exchange]) -> dict[str, list[float]]:
+    """Return the longest that a robot had no answer because of each kill, by victim, in seconds.
+
+    A wait counts for the first kill within it, or else for the last one before: its victim was not
+    back yet.
+    """
+    longest = [0.0] * len(kills)
+    for wait in exchanges:
+        if wait.tries > 1:
+            within = [i for i, one in enumerate(kills) if wait.begun <= one.at <= wait.answered]
+            before = [i for i, one in enumerate(kills) if one.at < wait.begun]
+            for i in within[:1] or before[-1:]:
+                longest[i] = max(longest[i], wait.answered - max(wait.begun, kills[i].at))
+    found: dict[str, list[float]] = {}
+    for kill, seconds in zip(kills, longest, strict=True):
+        found.setdefault(kill.victim, []).append(seconds)
+    return found
