@@ -29,16 +29,16 @@ from sqlalchemy import (
     update,
 )
 
-from sceneprint.engine.upkeep.repair import PRIORITY
+from sceneprint.engine.upkeep.repair import PRIORITY, reason_of_loss
 from sceneprint.maintenance.fsck.findings import (
     GONE,
     Finding,
     Folder,
     read_rows,
-    sign_from_upload,
 )
 from sceneprint.models import PRESETS, Model, read_model, write_model
 from sceneprint.store.deletion import doom
+from sceneprint.store.events import record_event
 from sceneprint.store.maps import counted_usage, list_maps, next_revision, use_of
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.queue import PENDING, enqueue
@@ -185,16 +185,6 @@ class _Known:
     busy: bool  # whether a job is to sign it
 
 
-@dataclass(frozen=True)
-class _Fault:
-    """What is wrong with a frame; `fix` does what `would` says, and says what it did."""
-
-    kind: str
-    means: str
-    would: str
-    fix: Callable[[Folder, Connection, _Known], str]
-
-
 def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
     """Find frames whose rows contradict each other, are damaged, or cannot be read."""
     for one in read_rows(folder, numbers, partial(_known_frames, folder)):
@@ -209,21 +199,21 @@ def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
             )  # fmt: skip
             continue
         folder.counts["signatures"] += len(one.signed)
-        for fault in _faults(one):
-            yield Finding(
-                fault.kind, f"frame {one.frame.id} of map {one.map.name}",
-                "leftover" if fault.kind == "stray-signature" else "damage",
-                fault.means, fault.would, map=one.map.name, frame_id=one.frame.id,
-                repair=partial(_repair_row, folder, one.frame.number, fault.kind),
-            )  # fmt: skip
+        for kind, fault in _FAULTS.items():
+            if fault.is_found(one):
+                yield Finding(
+                    kind, f"frame {one.frame.id} of map {one.map.name}",
+                    "leftover" if kind == "stray-signature" else "damage",
+                    fault.means, fault.would, map=one.map.name, frame_id=one.frame.id,
+                    repair=partial(_repair_row, folder, one.frame.number, fault),
+                )  # fmt: skip
 
 
-def _repair_row(folder: Folder, number: int, kind: str) -> str:
+def _repair_row(folder: Folder, number: int, fault: _Fault) -> str:
     with folder.store.database.write() as connection:
         for one in _known_frames(folder, connection, [number]):  # somebody may have been at it
-            for fault in _faults(one):
-                if fault.kind == kind:
-                    return fault.fix(folder, connection, one)
+            if fault.is_found(one):
+                return fault.fix(folder, connection, one)
     return GONE
 
 
@@ -272,44 +262,13 @@ def _is_sound(model: Model | None, vector: bytes, checksum: int, *counts: str | 
         return False
 
 
-def _faults(one: _Known) -> Iterator[_Fault]:
-    frame, row = one.frame, one.map
-    if frame.state in _BEING_SIGNED and not one.busy:
-        yield _Fault(
-            "frame-without-job", f"it is {frame.state}, and no job is to sign it",
-            "queue a job for it", _queue,
-        )  # fmt: skip
-    if frame.state == FrameState.INDEXED and row.model_id not in one.signed:
-        yield _Fault(
-            "frame-without-signature", "it is indexed, and has no signature: it is not found",
-            "have it signed again from its upload", _sign,
-        )  # fmt: skip
-    if frame.state == FrameState.INDEXED and _damaged(one):
-        yield _Fault(
-            "damaged-signature", "the bytes of its signature are not those that were stored: "
-            "queries pass it over", "remove it, and sign the frame again from its upload", _sign,
-        )  # fmt: skip
-    if _stray(one):
-        yield _Fault(
-            "stray-signature", "it has a signature of a model, or in a state, that is not its own",
-            "remove that signature", _remove_stray,
-        )  # fmt: skip
-    placed = (frame.pose_x, frame.pose_y, frame.pose_z) == _place(frame)
-    if not placed or (frame.state != FrameState.DELETED and one.tags != frozenset(frame.tags)):
-        yield _Fault(
-            "stale-value", f"the {'tags' if placed else 'position'} by which it is searched "
-            "are not its own", "write them anew from the frame", _write_derived,
-        )  # fmt: skip
-    if frame.revision is not None and frame.revision > row.revision:
-        yield _Fault(
-            "revision-ahead", f"its revision {frame.revision} is beyond its map's {row.revision}",
-            "give it the map's next revision", _take_revision,
-        )  # fmt: skip
+def _is_indexed(one: _Known) -> bool:
+    return one.frame.state == FrameState.INDEXED
 
 
 def _damaged(one: _Known) -> set[str]:
-    """Return the models whose signature of a frame is damaged: others than these are strays."""
-    own = (one.map.model_id, one.map.next_model_id)
+    """Return the models whose signature of an indexed frame is damaged: others are strays."""
+    own = (one.map.model_id, one.map.next_model_id) if _is_indexed(one) else ()
     return {model_id for model_id, sound in one.signed.items() if not sound and model_id in own}
 
 
@@ -320,12 +279,19 @@ def _stray(one: _Known) -> set[str]:
     if one.frame.state in _GONE:
         return set(one.signed)
     # another's signature would keep the frame from being signed
-    own = {one.map.model_id} if one.frame.state == FrameState.INDEXED else set[str]()
+    own = {one.map.model_id} if _is_indexed(one) else set[str]()
     return one.signed.keys() - own - {one.map.next_model_id or ""}
 
 
 def _place(frame: FrameRow) -> tuple[float | None, ...]:
     return (None,) * 3 if frame.pose is None else tuple(row[3] for row in frame.pose[:3])
+
+
+def _is_stale(one: _Known) -> bool:
+    """Return whether the tags or the position by which a frame is searched are not its own."""
+    frame = one.frame
+    placed = (frame.pose_x, frame.pose_y, frame.pose_z) == _place(frame)
+    return not placed or (frame.state != FrameState.DELETED and one.tags != frozenset(frame.tags))
 
 
 def _queue(_: Folder, connection: Connection, one: _Known) -> str:
@@ -335,13 +301,30 @@ def _queue(_: Folder, connection: Connection, one: _Known) -> str:
 
 
 def _sign(folder: Folder, connection: Connection, one: _Known) -> str:
-    damaged = _damaged(one)
-    _remove_signatures(connection, one.frame.number, damaged)
-    if one.map.model_id not in one.signed or one.map.model_id in damaged:
-        return sign_from_upload(folder, connection, one.frame.number)
-    for model_id in damaged:  # meanwhile the frame is found by its other signature
-        enqueue(connection, REENCODE, one.frame.number, PRIORITY, model_id)
-    return "a worker makes it again from the upload"
+    """Let a frame without a sound signature be signed from its upload; failed if that is gone."""
+    frame, row, damaged = one.frame, one.map, _damaged(one)
+    _remove_signatures(connection, frame.number, damaged)
+    if row.model_id in one.signed and row.model_id not in damaged:
+        for model_id in damaged:  # meanwhile the frame is found by its other signature
+            enqueue(connection, REENCODE, frame.number, PRIORITY, model_id)
+        return "a worker makes it again from the upload"
+    condition = folder.store.blobs.condition(frame.blob)
+    loss = None if condition == "sound" else reason_of_loss(condition, found=False)
+    values = {
+        "state": FrameState.RECEIVED if loss is None else FrameState.FAILED,
+        "reason": loss,
+        "indexed_at": None,
+        "novelty": None,  # it was kept once, whatever has come since that is like it
+        # readers and indexes that hold it learn that it is found no more, until it is signed
+        "revision": next_revision(connection, row.number),
+    }
+    connection.execute(update(frames).where(frames.c.number == frame.number).values(**values))
+    if loss is not None:
+        record_event(connection, "frame.failed", row.name, frame.id)
+        return f"it is failed: {loss}"
+    job = enqueue(connection, "sign", frame.number, PRIORITY)
+    record_event(connection, "frame.received", row.name, frame.id, job.id)
+    return "a worker signs it again from its upload"
 
 
 def _remove_stray(_: Folder, connection: Connection, one: _Known) -> str:
@@ -371,3 +354,42 @@ def _take_revision(_: Folder, connection: Connection, one: _Known) -> str:
     own = update(frames).where(frames.c.number == one.frame.number)
     connection.execute(own.values(revision=revision))
     return f"it is at revision {revision}"
+
+
+@dataclass(frozen=True)
+class _Fault:
+    """What is wrong with a frame; `fix` does what `would` says, and says what it did."""
+
+    is_found: Callable[[_Known], object]
+    means: str
+    would: str
+    fix: Callable[[Folder, Connection, _Known], str]
+
+
+_FAULTS = {
+    "frame-without-job": _Fault(
+        lambda one: one.frame.state in _BEING_SIGNED and not one.busy,
+        "it waits to be signed, and no job is to sign it", "queue a job for it", _queue,
+    ),
+    "frame-without-signature": _Fault(
+        lambda one: _is_indexed(one) and one.map.model_id not in one.signed,
+        "it is indexed, and has no signature: it is not found",
+        "have it signed again from its upload", _sign,
+    ),
+    "damaged-signature": _Fault(
+        _damaged, "the bytes of its signature are not those that were stored: queries pass it over",
+        "remove the signature, and have the frame signed again from its upload", _sign,
+    ),
+    "stray-signature": _Fault(
+        _stray, "it has a signature of a model, or in a state, that is not its own",
+        "remove that signature", _remove_stray,
+    ),
+    "stale-value": _Fault(
+        _is_stale, "the tags or the position by which it is searched are not its own",
+        "write them anew from the frame", _write_derived,
+    ),
+    "revision-ahead": _Fault(
+        lambda one: (one.frame.revision or 0) > one.map.revision,
+        "its revision is beyond its map's", "give it the map's next revision", _take_revision,
+    ),
+}  # fmt: skip

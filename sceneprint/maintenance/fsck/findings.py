@@ -9,19 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from sqlalchemy import ColumnElement, Connection, Table, func, select, update
+from sqlalchemy import ColumnElement, Connection, Table, func, select
 from sqlalchemy.exc import DBAPIError
 
-from sceneprint.engine.upkeep.repair import PRIORITY, reason_of_loss
 from sceneprint.errors import StoreError, UnreadableModel, UnusableStore
 from sceneprint.models import Model, parse_model
 from sceneprint.settings import Settings
 from sceneprint.store import Store
-from sceneprint.store.events import record_event
-from sceneprint.store.maps import find_map, map_of, next_revision
-from sceneprint.store.queue import enqueue
+from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, models
-from sceneprint_client.api import FrameState
 
 #: damage: something is not as it was stored; leftover: something that nobody needs;
 #: note: known, or harmless.
@@ -166,37 +162,6 @@ def is_of_rows(error: Exception) -> bool:
     return isinstance(cause.orig, sqlite3.Error) or (
         getattr(cause.orig, "sqlstate", None) in _DAMAGED
     )
-
-
-def sign_from_upload(folder: Folder, connection: Connection, number: int) -> str:
-    """Let a frame that has no signature be signed from its upload; failed where that is gone.
-
-    Parameters
-    ----------
-    connection : of a writing transaction
-    number : of the frame
-    """
-    own = frames.c.number == number
-    columns = select(frames.c.id, frames.c.map_number, frames.c.blob)
-    frame_id, map_number, blob = connection.execute(columns.where(own)).one()
-    name = map_of(connection, map_number).name
-    condition = folder.store.blobs.condition(blob)
-    loss = None if condition == "sound" else reason_of_loss(condition, found=False)
-    values = {
-        "state": FrameState.RECEIVED if loss is None else FrameState.FAILED,
-        "reason": loss,
-        "indexed_at": None,
-        "novelty": None,  # it was kept once, whatever has come since that is like it
-        # readers and indexes that hold it learn that it is found no more, until it is signed
-        "revision": next_revision(connection, map_number),
-    }
-    connection.execute(update(frames).where(own).values(**values))
-    if loss is not None:
-        record_event(connection, "frame.failed", name, frame_id)
-        return f"it is failed: {loss}"
-    job = enqueue(connection, "sign", number, PRIORITY)
-    record_event(connection, "frame.received", name, frame_id, job.id)
-    return "a worker signs it again from its upload"
 
 
 def quarantine_blob(folder: Folder, digest: str) -> str:

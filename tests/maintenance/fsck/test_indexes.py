@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.store.tables import frames
 from sceneprint_client.api import Query
 
 
@@ -52,22 +51,3 @@ def test_an_index_that_differs_from_the_database_is_made_again(house: Any, uploa
     assert [match.distance for match in answer.matches] == [0, 0]
     assert answer.index_generation == 1
     assert house.look() == []
-
-
-def test_an_index_that_lacks_a_frame_is_removed(house: Any) -> None:
-    """As one that was published while a signature was damaged."""
-    columns = {column.name: column.name for column in frames.columns}
-    columns |= {"number": "99", "id": "'ff'", "content_id": "'ff'"}
-    house.sql(  # a frame of `hall` that its index has never heard of, though as old as others
-        f"INSERT INTO frames ({', '.join(columns)})"
-        f" SELECT {', '.join(columns.values())} FROM frames WHERE number = 1"
-    )
-    house.sql(
-        "INSERT INTO signatures SELECT 99, model_id, vector, checksum, geometry, n_patches,"
-        " n_pairs FROM signatures WHERE frame_number = 1"
-    )
-    house.sql("INSERT INTO frame_tags SELECT 99, tag FROM frame_tags WHERE frame_number = 1")
-    found = {one.kind: one for one in house.look(repair=True)}
-    assert sorted(found) == ["damaged-index", "stale-value"]  # the latter: it was not counted
-    assert found["damaged-index"].means == "has not the signatures of frames ff"
-    assert list((house.data / "index").glob("hall*/*.json")) == []

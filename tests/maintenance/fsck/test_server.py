@@ -90,17 +90,6 @@ def test_rows_and_blobs_are_checked_and_mended(fleet):
     assert fleet.kinds() == []
 
 
-def test_rows_that_refer_to_none_are_fatal(fleet):
-    fleet.sql(f"INSERT INTO frame_tags VALUES ({WAITING} + 7, 'x')", "DELETE FROM maps "
-              "WHERE name = 'attic'")  # fmt: skip
-    found = fleet.look(repair=True)
-    assert ("dangling-row", "row 22, 'x' of table frame_tags") in [
-        (one.kind, one.what) for one in found
-    ]
-    assert all(one.done is None for one in found)
-    assert any("refers to a row of maps" in one.means for one in found)
-
-
 def test_a_server_that_is_away_is_no_damage(fleet, postgres):
     fleet.sql("UPDATE maps SET used_bytes = used_bytes - 1 WHERE name = 'hall'")
     seen = fsck(fleet.settings)
