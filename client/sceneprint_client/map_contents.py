@@ -12,7 +12,7 @@ from pydantic_core import to_json
 
 from sceneprint_client.api import Frame, FrameState, Map, NewMap, Page
 from sceneprint_client.api.base import checked
-from sceneprint_client.api.copies import MOST_LISTED, FrameRowRecord, FrameRows, MapListing
+from sceneprint_client.api.copies import CopyRequest, MapCopy
 from sceneprint_client.api.listing import (
     Clock,
     FrameDeletion,
@@ -492,19 +492,25 @@ class MapMethods(ServiceConnection):
         """
         return self._bytes(f"{frame_path(map_name, frame_id)}/upload")
 
-    # a copy of a map, row by row
+    # a copy of a map, part by part
 
-    def map_listing(
-        self, map_name: str, cursor: str | None = None, limit: int = MOST_LISTED
-    ) -> MapListing:
-        """A map, and a part of the list of its indexed frames; UnknownMap if there is none."""
-        params = given(cursor=cursor, limit=limit)
-        return self._ask(MapListing, "GET", f"{map_path(map_name)}/copy", params=params)
+    def map_copy(self, map_name: str, have: Sequence[str] = ()) -> tuple[MapCopy, dict[str, bytes]]:
+        """A map at one moment, and those parts of its rows that you lack, as many as fit.
 
-    def copied_rows(self, map_name: str, frame_ids: Sequence[str]) -> list[FrameRowRecord]:
-        """All that the service knows of at most 50 indexed frames, but for their uploads."""
-        path = f"{map_path(map_name)}/copy/frames"
-        return self._ask(FrameRows, "GET", path, params={"frame_id": list(frame_ids)}).items
+        Raises
+        ------
+        UnknownMap : there is no such map.
+        ValueError : the service sent something else.
+        """
+        body = CopyRequest(have=list(have)).model_dump()
+        data = self._send("POST", f"{map_path(map_name)}/copy", json=body).content
+        line, _, rest = data.partition(b"\n")
+        head, parts, start = MapCopy.model_validate_json(line), dict[str, bytes](), 0
+        for one in head.parts:
+            if one.sent:
+                parts[one.digest] = rest[start : start + one.bytes]
+                start += one.bytes
+        return head, parts
 
     def copied_artifact(self, map_name: str, digest: str) -> bytes:
         """What validation compares of a frame; NotFound if no indexed frame has it."""

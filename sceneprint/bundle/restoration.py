@@ -137,8 +137,8 @@ class _Restoration:
         for name in _OF_ITSELF:
             connection.exec_driver_sql(f"DELETE FROM {name}")
         for table in tables():
-            columns = [one.name for one in table.columns]
-            write_rows(connection, table, decoded_rows(table, self._read(table.name, columns)))
+            read = self._read(table.name, [one.name for one in table.columns])
+            write_rows(connection, table, decoded_rows([*table.columns], read))
         count_on(connection, self.manifest.numbers)
         found, manifest = summary_of(connection), self.manifest
         if any(found[name] != getattr(manifest, name) for name in ("maps", "frames", "signatures")):
@@ -160,7 +160,7 @@ class _Restoration:
     def secrets(self) -> list[Row]:
         """Return the rows of the secrets, which give a store its name."""
         columns = [one.name for one in secrets.columns]
-        return list(decoded_rows(secrets, self._read(secrets.name, columns, told=False)))
+        return list(decoded_rows([*secrets.columns], self._read(secrets.name, columns, told=False)))
 
     def _read(self, table: str, columns: list[str], *, told: bool = True) -> Iterator[list[object]]:
         parts = [one for one in self.manifest.parts if one.kind == f"rows/{table}"]

@@ -147,21 +147,21 @@ def table_parts(connection: Connection, table: Table) -> Iterator[tuple[bytes, i
     UnusableStore : a value is not of its column's type, as after somebody has edited the database.
     """
     keys = [i for i, one in enumerate(table.columns) if one.primary_key]
-    encoders = [_encoder(one) for one in table.columns]
-
-    rows = (
-        (
-            repr([row[i] for i in keys]),
-            [x if f is None or x is None else f(x) for f, x in zip(encoders, row, strict=True)],
-        )
-        for row in read_table(connection, table)
-    )
+    rows = encoded_rows(table.columns, read_table(connection, table))
     try:
-        yield from row_parts([one.name for one in table.columns], rows)
+        keyed = ((repr([row[i] for i in keys]), row) for row in rows)
+        yield from row_parts([one.name for one in table.columns], keyed)
     except (TypeError, ValueError) as error:
         raise UnusableStore(
             f"A row of table {table.name} cannot be read ({error}). Run `sceneprint fsck`."
         ) from error
+
+
+def encoded_rows(columns: Iterable[Column[Any]], rows: Iterable[Row]) -> Iterator[Row]:
+    """Yield rows of a database as JSON has them: bytes as base64, documents as text."""
+    encoders = [_encoder(one) for one in columns]
+    for row in rows:
+        yield [x if f is None or x is None else f(x) for f, x in zip(encoders, row, strict=True)]
 
 
 def _encoder(column: Column[Any]) -> Callable[[Any], Any] | None:
@@ -171,7 +171,7 @@ def _encoder(column: Column[Any]) -> Callable[[Any], Any] | None:
     if isinstance(column.type, Boolean):
         return bool
     if isinstance(column.type, JSON):  # SQLite keeps a bare number as one
-        return lambda value: value if isinstance(value, str) else json.dumps(value)
+        return lambda value: value if isinstance(value, str) else json.dumps(value, sort_keys=True)
     return None
 
 
@@ -212,21 +212,21 @@ def read_rows(data: bytes, columns: Sequence[str]) -> Iterator[Row]:
         ) from error
 
 
-def decoded_rows(table: Table, rows: Iterable[Row]) -> Iterator[Row]:
-    """Yield rows of a part as the database takes them, each value of its column's type.
+def decoded_rows(columns: Sequence[Column[Any]], rows: Iterable[Row]) -> Iterator[Row]:
+    """Yield rows of `encoded_rows` as the database takes them, each value of its column's type.
 
     Raises
     ------
     DamagedBundle : a value is of another type.
     """
-    decoders = [_decoder(one) for one in table.columns]
+    decoders = [_decoder(one) for one in columns]
     for row in rows:
         try:
             yield [None if x is None else f(x) for f, x in zip(decoders, row, strict=True)]
         except (TypeError, ValueError, binascii.Error) as error:
             raise DamagedBundle(
-                f"A row of table {table.name} of the bundle is not one of this schema ({error}), "
-                "and nothing was restored."
+                f"A row of table {columns[0].table.name} of the bundle is not one of this schema "
+                f"({error}), and nothing was restored."
             ) from error
 
 

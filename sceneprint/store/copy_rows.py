@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Row, insert, select, update
+from sqlalchemy import Column, Connection, Row, insert, select, update
 
 from sceneprint.store.frames import write_frame
 from sceneprint.store.maps import count_on, find_map, free_id, next_revision, position
@@ -28,6 +29,8 @@ from sceneprint.store.tables import (
 )
 from sceneprint_client.api import FrameState, JobState
 
+#: Rows that are held at once.
+_BLOCK = 200
 #: Columns of a frame that are copied; the rest is the store's own.
 COPIED = (
     "content_id", "blob", "bytes", "intrinsics", "depth_scale", "depth_along_ray", "robot",
@@ -35,35 +38,20 @@ COPIED = (
     "base_frame", "base", "novelty", "received_at", "indexed_at", "cloud", "up", "name", "sequence",
     "samples",
 )  # fmt: skip
-#: Columns of a signature that tell one from another without its bytes.
-_TOLD = ("checksum", "geometry", "n_patches", "n_pairs")
+#: Columns of a copied frame: its id, those, and its signature.
+COLUMNS: tuple[Column[Any], ...] = (
+    frames.c.id, *(frames.c[name] for name in COPIED), signatures.c.vector, signatures.c.geometry,
+    signatures.c.n_patches, signatures.c.n_pairs,
+)  # fmt: skip
 
 
-def copied_values(row: Mapping[str, Any]) -> list[Any]:
-    """All of a frame that is copied, with what tells its signature."""
-    return [row[name] for name in (*COPIED, *_TOLD)]
-
-
-def indexed_rows(connection: Connection, row: MapRow, after: int, limit: int) -> Sequence[Row[Any]]:
-    """Indexed frames of a map in the order they came, without their vectors.
-
-    Parameters
-    ----------
-    after : number of the last frame before
-    limit : at most so many
-    """
-    columns = [frames.c.number, frames.c.id, *(frames.c[name] for name in COPIED)]
-    asked = select(*columns, *(signatures.c[name] for name in _TOLD))
-    asked = _signed(asked, row).where(frames.c.number > after)
-    return connection.execute(asked.order_by(frames.c.number).limit(limit)).all()
-
-
-def rows_of_ids(connection: Connection, row: MapRow, ids: Sequence[str]) -> Sequence[Row[Any]]:
-    """Indexed frames of a map with their signatures, in the order they came."""
-    columns = [frames.c.id, *(frames.c[name] for name in COPIED), signatures.c.vector]
-    asked = select(*columns, *(signatures.c[name] for name in _TOLD))
-    asked = _signed(asked, row).where(frames.c.id.in_(ids))
-    return connection.execute(asked.order_by(frames.c.number)).all()
+def copied_rows(connection: Connection, row: MapRow) -> Iterator[Row[Any]]:
+    """Yield `COLUMNS` of the indexed frames of a map, in the order they came."""
+    statement = _signed(select(*COLUMNS), row).order_by(frames.c.received_at, frames.c.number)
+    options = {"stream_results": True}
+    with closing(connection.execute(statement, execution_options=options)) as found:
+        while block := found.fetchmany(_BLOCK):
+            yield from block
 
 
 def _signed(asked: Any, row: MapRow) -> Any:

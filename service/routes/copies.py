@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import Path, Query, Response
+from fastapi import Path, Request, Response
 
-from sceneprint_client.api.copies import MOST_LISTED, MOST_ROWS, FrameRows, MapListing
+from sceneprint_client.api.copies import CopyRequest
 from service.auth import Here, may_read, v1_router
+from service.bodies import json_body, read_record
 from service.problems import declared
 
 router = v1_router("/maps/{map_name}/copy", "maps", may_read)
@@ -17,31 +18,16 @@ _BYTES: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.get("", responses=declared(404, 422))
-def get_map_listing(
-    map_name: str,
-    here: Here,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the part before.")] = None,
-    limit: Annotated[int, Query(ge=1, le=MOST_LISTED)] = 100,
-) -> MapListing:
-    """The map, and a part of the list of its indexed frames, in the order they came."""
-    return here.engine.copies.listing(map_name, cursor, limit)
-
-
-@router.get("/frames", responses=declared(404, 422))
-def get_frame_rows(
-    map_name: str,
-    here: Here,
-    frame_id: Annotated[
-        list[Annotated[str, Query(max_length=64)]],
-        Query(min_length=1, max_length=MOST_ROWS, description="Once for each frame."),
-    ],
-) -> FrameRows:
-    """All that is known of some indexed frames, with their signatures and without their uploads.
-
-    Those that are not there, or not indexed, are left out.
+@router.post(
+    "", response_class=Response, responses={**_BYTES, **declared(400, 404, 413, 415, 422)},
+    openapi_extra=json_body("CopyRequest"),
+)  # fmt: skip
+async def copy_map(map_name: str, request: Request, here: Here) -> Response:
+    """The map and its indexed frames at one moment: a line with the head, a `MapCopy` as JSON, and
+    the bytes of the parts that the caller lacks, at most some 32 MB. Ask again for the others.
     """
-    return here.engine.copies.rows(map_name, frame_id)
+    known = await read_record(request, CopyRequest, "The request")
+    return _response(await here.run(here.engine.copies.bundle, map_name, frozenset(known.have)))
 
 
 @router.get(
@@ -51,12 +37,14 @@ def get_artifact(
     map_name: str, digest: Annotated[str, Path(pattern="^[0-9a-f]{64}$")], here: Here
 ) -> Response:
     """The geometry of an indexed frame, as validation compares it."""
-    return Response(
-        here.engine.copies.artifact(map_name, digest), media_type="application/octet-stream"
-    )
+    return _response(here.engine.copies.artifact(map_name, digest))
 
 
 @router.get("/model", response_class=Response, responses={**_BYTES, **declared(404)})
 def get_map_model(map_name: str, here: Here) -> Response:
     """The file of the map's model."""
-    return Response(here.engine.copies.model(map_name), media_type="application/octet-stream")
+    return _response(here.engine.copies.model(map_name))
+
+
+def _response(data: bytes) -> Response:
+    return Response(data, media_type="application/octet-stream")

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
+from sceneprint.bundle import rows
 from sceneprint.engine.maps import map_copy
 from sceneprint.engine.maps.map_copy import PulledMap, pull_map
-from sceneprint.errors import Conflict, DamagedBlob, InvalidRequest, UnknownMap
+from sceneprint.errors import Conflict, DamagedBlob, InvalidRequest, NotFound, UnknownMap
 from sceneprint.store import open_store
 from sceneprint.types import DepthFrame
 from sceneprint_client import Client
@@ -205,39 +206,37 @@ def test_a_killed_pull_leaves_the_copy_and_goes_on(
     assert robot.answers(asked) == answers(service, asked)
 
 
-@pytest.mark.parametrize("rounds", [1, 10])
-def test_a_map_that_changes_is_listed_until_it_is_quiet(
-    robot: Robot, walk: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch, rounds: int
+def test_a_copy_is_one_state_of_a_map_that_changes(
+    robot: Robot, walk: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """But not for ever: then what was gone by the end is in the copy until the next pull."""
+    """Parts that do not fit into one answer come with the next, whatever has changed by then."""
     service = robot.service
     service.create_map(MAP, model="depth")
-    ids = upload(service, walk[:4])
-    monkeypatch.setattr(map_copy, "ROUNDS", rounds)
-    monkeypatch.setattr(map_copy, "MOST_LISTED", 2)
-    monkeypatch.setattr(map_copy, "MOST_ROWS", 1)
-    read, changes = service.map_listing, iter([ids[0], ids[3]])
+    ids = upload(service, walk[:6])
+    monkeypatch.setattr(rows, "_ROWS", 1)  # a part for each row
+    monkeypatch.setattr(map_copy, "MOST_BYTES", 1)  # and one of them in each answer
+    ask, answered = service.map_copy, list[Any]()
 
-    def changing(*given: Any, **how: Any) -> Any:
-        part = read(*given, **how)
-        if part.next_cursor is not None and (gone := next(changes, None)) is not None:
-            service.delete_frame(MAP, gone)
-        return part
+    def changing(*arguments: Any) -> Any:
+        answered.append(ask(*arguments))
+        if len(answered) == 2:
+            service.delete_frame(MAP, ids[0])
+            service.edit_frame(MAP, ids[5], {"tags": ["dark"]})
+        return answered[-1]
 
-    monkeypatch.setattr(service, "map_listing", changing)
+    monkeypatch.setattr(service, "map_copy", changing)
     found = robot.pull()
-    if rounds == 1:
-        assert (found.frames, found.written, found.revision) == (3, 3, 4)
-        monkeypatch.undo()
-        service.delete_frame(MAP, ids[3])
-        found = robot.pull()
-        assert (found.frames, found.written, found.removed) == (2, 0, 1)
-    else:
-        assert (found.frames, found.written) == (2, 2)
+    assert [len(parts) for _, parts in answered] == [1] * 6
+    assert [len(head.parts) for head, _ in answered] == [6, 6, 5, 5, 5, 5]
+    assert (found.frames, found.written) == (5, 5)
     assert found.revision == service.map(MAP).revision
     with Client.embedded(robot.folder) as client:
         living = [one for one in client.frames(MAP) if one.state == "indexed"]
-        assert {one.frame_id for one in living} == set(ids[1:3])
+        assert {one.frame_id for one in living} == set(ids[1:])
+        assert client.frame(MAP, ids[5]).tags == ["dark"]
+    again = robot.pull()
+    assert (again.written, again.removed) == (0, 0)
+    assert answered[-1][1] == {}  # the copy's own parts are those of the service
 
 
 def test_a_frame_that_goes_before_its_artifact_is_passed_over(
@@ -258,14 +257,36 @@ def test_a_frame_that_goes_before_its_artifact_is_passed_over(
     assert (found.frames, found.written, found.revision) == (1, 1, 3)
 
 
+def test_artifacts_that_are_away_end_the_pull(
+    robot: Robot, walk: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot.service.create_map(MAP, model="depth")
+    upload(robot.service, walk[:1])
+
+    def away(*_: Any) -> bytes:
+        raise NotFound("no such artifact")
+
+    monkeypatch.setattr(robot.service, "copied_artifact", away)
+    with pytest.raises(Conflict, match="lost artifacts"):
+        robot.pull()
+
+
 def test_other_bytes_than_were_named_are_refused(
     robot: Robot, walk: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot.service.create_map(MAP, model="depth")
     upload(robot.service, walk[:1])
-    monkeypatch.setattr(robot.service, "copied_artifact", lambda *_: b"other")
-    with pytest.raises(DamagedBlob, match="other bytes"):
-        robot.pull()
+    read = robot.service.map_copy
+
+    def other(*arguments: Any) -> Any:
+        head, parts = read(*arguments)
+        return head, dict.fromkeys(parts, b"other")
+
+    for name, answer in (("copied_artifact", lambda *_: b"other"), ("map_copy", other)):
+        with monkeypatch.context() as patch:
+            patch.setattr(robot.service, name, answer)
+            with pytest.raises(DamagedBlob, match="with other bytes than it has"):
+                robot.pull()
     with Client.embedded(robot.folder) as client:
         assert list(client.maps()) == []
 

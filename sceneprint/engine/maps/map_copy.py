@@ -1,69 +1,66 @@
 """One map in a robot's own store, as it is in the service: found alike, and renewed by what is new.
 
-    MapCopies.listing  -->  ids and tags of all frames
-    tags that differ  --MapCopies.rows-->  FrameRowRecord, ...  -->  artifacts that are not here
+    parts of the copy  --MapCopies.bundle-->  head of the map, and the parts that the robot lacks
+    rows of these      ------------------->  artifacts that are not here
     --pull_map-->  all of it in one transaction
 
-Whoever is killed before that transaction leaves the copy as it was, and the artifacts that it had:
-the next one goes on from there.
+A part of rows is the same bytes in the service and in the copy. Whoever is killed before that
+transaction leaves the copy as it was, and the artifacts that it had: the next one goes on from
+there.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zlib import crc32
 
-from sqlalchemy import Connection
+from sqlalchemy import JSON, Connection
 
 from sceneprint.atomic_files import make_folder, write_durable
+from sceneprint.bundle.rows import Row, decoded_rows, encoded_rows, read_rows, row_parts
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import Conflict, DamagedBlob, InvalidRequest, NotFound, UnknownMap
 from sceneprint.models import parse_model
 from sceneprint.store import Store
 from sceneprint.store.copy_rows import (
+    COLUMNS,
     COPIED,
     CopiedFrame,
     add_copied,
-    copied_values,
+    copied_rows,
     date_map,
     edit_copied,
     has_artifact,
-    indexed_rows,
     living_rows,
     model_of,
     numbers_in_blocks,
-    rows_of_ids,
 )
 from sceneprint.store.deletion import BLOCK, delete_frames, remove_map
 from sceneprint.store.frames import write_map
 from sceneprint.store.maps import add_map, find_map, keep_model, list_maps
 from sceneprint.store.signatures import StoredSignature
 from sceneprint.store.tables import FrameRow, MapRow
-from sceneprint_client.api.copies import (
-    MOST_LISTED,
-    MOST_ROWS,
-    FrameRowRecord,
-    FrameRows,
-    ListedFrame,
-    MapListing,
-)
+from sceneprint_client.api.copies import CopyPart, MapCopy
 
 if TYPE_CHECKING:
     from sceneprint_client import Client
 
-#: Times that a map is listed at most, until nothing is left to fetch: it may change meanwhile.
+#: Times that a map is asked for without any part that is new: its artifacts are away then.
 ROUNDS = 10
+#: Bytes of parts in one answer, and what one part has over it.
+MOST_BYTES = 32 << 20
+_NAMES = [one.name for one in COLUMNS]
 
 
-def copy_tag(row: Mapping[str, Any]) -> str:
-    """Stands for all that is copied of a frame."""
-    told = json.dumps(copied_values(row), sort_keys=True)
-    return hashlib.sha256(told.encode()).hexdigest()[:32]
+def copy_parts(connection: Connection, row: MapRow) -> Iterator[tuple[str, bytes, int]]:
+    """Yield digest, bytes and number of rows of each part of a map's indexed frames."""
+    rows = encoded_rows(COLUMNS, copied_rows(connection, row))
+    for data, count in row_parts(_NAMES, ((one[0], one) for one in rows)):
+        yield hashlib.sha256(data).hexdigest(), data, count
 
 
 class MapCopies:
@@ -72,49 +69,32 @@ class MapCopies:
     def __init__(self, store: Store) -> None:
         self._store = store
 
-    def listing(self, map_name: str, cursor: str | None, limit: int) -> MapListing:
-        """A map, and a part of the list of its indexed frames.
+    def bundle(self, map_name: str, have: Collection[str]) -> bytes:
+        """Return a map at one moment: a line with its `MapCopy`, and the bytes of its parts.
+
+        Parameters
+        ----------
+        have : digests of parts that the caller has; of the others some 32 MB follow the line
 
         Raises
         ------
         UnknownMap : there is none of that name.
-        InvalidRequest : a cursor that was not given out.
         """
-        after = self._store.seals.row("frame", cursor) or 0
+        parts, sent, size = list[CopyPart](), list[bytes](), 0
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
-            found = indexed_rows(connection, row, after, limit + 1)
             name, _ = model_of(connection, row.model_id)
-        numbers = [one.number for one in found]
-        return MapListing(
+            for digest, data, count in copy_parts(connection, row):
+                is_sent = digest not in have and size < MOST_BYTES
+                if is_sent:
+                    sent.append(data)
+                    size += len(data)
+                parts.append(CopyPart(digest=digest, bytes=len(data), rows=count, sent=is_sent))
+        head = MapCopy(
             name=row.name, title=row.title, up=row.up, created_at=row.created_at,
-            revision=row.revision, model_id=row.model_id, model=name,
-            items=[
-                ListedFrame(frame_id=one.id, tag=copy_tag(dict(one._mapping)))
-                for one in found[:limit]
-            ],
-            next_cursor=self._store.seals.next_cursor("frame", numbers, limit),
+            revision=row.revision, model_id=row.model_id, model=name, parts=parts,
         )  # fmt: skip
-
-    def rows(self, map_name: str, ids: Sequence[str]) -> FrameRows:
-        """Rows of some of its indexed frames; UnknownMap where there is no such map."""
-        with self._store.database.read() as connection:
-            row = find_map(connection, map_name)
-            found = rows_of_ids(connection, row, ids)
-        # as bytes, which pydantic takes for base64 when it reads them
-        return FrameRows(
-            items=[
-                FrameRowRecord.model_construct(
-                    frame_id=one.id,
-                    **{
-                        name: one._mapping[name]
-                        for name in FrameRowRecord.model_fields
-                        if name != "frame_id"
-                    },
-                )
-                for one in found
-            ]
-        )
+        return b"".join((head.model_dump_json().encode(), b"\n", *sent))
 
     def artifact(self, map_name: str, digest: str) -> bytes:
         """The artifact of one of its indexed frames.
@@ -185,57 +165,108 @@ def claim_folder(folder: Path) -> None:
     write_durable(folder / _MARK, b"{}", folder_is_new=False)
 
 
+@dataclass(frozen=True, eq=False)
+class _Pull:
+    """What is known of a map while it is pulled.
+
+    Parameters
+    ----------
+    own : rows that the copy has, as a part has them, by part and by id
+    fetched : rows that came, likewise
+    """
+
+    own: dict[str, dict[str, Row]]
+    fetched: dict[str, dict[str, Row]]
+
+    def rows(self, head: MapCopy) -> dict[str, Row]:
+        """Return the rows of all frames of the map, by id."""
+        parts = self.own | self.fetched
+        return {name: row for one in head.parts for name, row in parts[one.digest].items()}
+
+
 def pull_map(
     client: Client, store: Store, map_name: str,
     progress: Callable[[int, int], None] | None = None,
 ) -> PulledMap:  # fmt: skip
-    """Let a store have a map as a service has it now.
+    """Bring a map of a store to one state that it had in the service during this call.
 
-    Queries of the store go on meanwhile, of the map as it was. Where the map changes all the time,
-    the copy has each frame as it was at some moment of the pull.
+    Queries of the store go on meanwhile, of the map as it was.
 
     Parameters
     ----------
     client : of the service; its key may read the map
-    progress : told of frames fetched and frames to fetch
+    progress : called with the frames that were fetched, and those to fetch
 
     Raises
     ------
     UnknownMap : the service has none of that name, or the key may not read it.
-    Conflict : it became another map meanwhile, or frames were uploaded into the copy.
+    Conflict : it became another map meanwhile, or its artifacts are away; or frames were uploaded
+        into the copy.
     DamagedBlob : the service sent other bytes than it named.
     """
-    fetched: dict[str, FrameRowRecord] = {}
-    artifacts = size = 0
-    for _ in range(ROUNDS):
-        listing, listed, is_quiet = _list_all(client, map_name)
-        with store.database.read() as connection:
-            known = _tags(connection, listing)
-        told = {one: copy_tag(row_values(row)) for one, row in fetched.items()}
-        left = [
-            one.frame_id for one in listed
-            if one.tag not in (known.get(one.frame_id), told.get(one.frame_id))
-        ]  # fmt: skip
-        if not left and is_quiet:
-            break
-        for done in range(0, len(left), MOST_ROWS):
-            for row in client.copied_rows(map_name, left[done : done + MOST_ROWS]):
-                try:
-                    more = _fetch_artifact(client, store, map_name, row.geometry)
-                except UnknownMap:
-                    raise
-                except NotFound:  # the frame was deleted or signed again meanwhile
-                    continue
-                artifacts, size = artifacts + (more > 0), size + more
-                fetched[row.frame_id] = row
+    pull = _Pull(_own_parts(store, map_name), {})
+    artifacts = size = idle = 0
+    while True:
+        head, parts = client.map_copy(map_name, [*pull.own, *pull.fetched])
+        if pull.own and not _is_copy_of(store, head):
+            pull.own.clear()  # of another map: its rows are not those of this one
+            continue
+        before = len(pull.fetched)
+        for digest, data in parts.items():
+            rows = _read_part(map_name, digest, data)
+            try:
+                for row in rows.values():
+                    more = _fetch_artifact(client, store, map_name, row[_NAMES.index("geometry")])
+                    artifacts, size = artifacts + (more > 0), size + more
+            except UnknownMap:
+                raise
+            except NotFound:  # the frame was deleted or signed again meanwhile
+                continue
+            pull.fetched[digest] = rows
             if progress is not None:
-                progress(min(done + MOST_ROWS, len(left)), len(left))
+                wanted = sum(one.rows for one in head.parts if one.digest not in pull.own)
+                done = sum(one.rows for one in head.parts if one.digest in pull.fetched)
+                progress(done, wanted)
+        if all(one.digest in pull.own or one.digest in pull.fetched for one in head.parts):
+            break
+        idle = 0 if len(pull.fetched) > before else idle + 1
+        if idle >= ROUNDS:
+            raise _changed(map_name)
     model = client.copied_model(map_name)
-    if parse_model(model, map_name).id != listing.model_id:
+    if parse_model(model, map_name).id != head.model_id:
         raise _changed(map_name)
-    written, removed = _write(store, listing, listed, fetched, model)
-    there = sum(one.frame_id in known or one.frame_id in fetched for one in listed)
-    return PulledMap(listing.revision, there, written, removed, artifacts, size)
+    rows = pull.rows(head)
+    written, removed = _write(store, head, pull, rows, model)
+    return PulledMap(head.revision, len(rows), written, removed, artifacts, size)
+
+
+def _own_parts(store: Store, map_name: str) -> dict[str, dict[str, Row]]:
+    """Return the rows of a map in the store, by part and id; none where there is no such map."""
+    with store.database.read() as connection:
+        row = next((one for one in list_maps(connection) if one.name == map_name), None)
+        if row is None:
+            return {}
+        return {
+            digest: {one[0]: one for one in read_rows(data, _NAMES)}
+            for digest, data, _ in copy_parts(connection, row)
+        }
+
+
+def _is_copy_of(store: Store, head: MapCopy) -> bool:
+    with store.database.read() as connection:
+        return _here(connection, head) is not None
+
+
+def _read_part(map_name: str, digest: str, data: bytes) -> dict[str, Row]:
+    if hashlib.sha256(data).hexdigest() != digest:
+        raise DamagedBlob(
+            f"A part of map {map_name!r} came with other bytes than it has. Nothing was changed. "
+            "Pull again."
+        )
+    rows = list(read_rows(data, _NAMES))
+    for _ in decoded_rows(COLUMNS, rows):  # raises where a value is of another type
+        pass
+    return {one[0]: one for one in rows}
 
 
 def _fetch_artifact(client: Client, store: Store, map_name: str, digest: str) -> int:
@@ -256,101 +287,72 @@ def _fetch_artifact(client: Client, store: Store, map_name: str, digest: str) ->
     return len(data)
 
 
-def _list_all(client: Client, map_name: str) -> tuple[MapListing, list[ListedFrame], bool]:
-    """All indexed frames of a map, and whether it was quiet while they were listed.
-
-    Raises
-    ------
-    Conflict : it became another map meanwhile.
-    """
-    first = part = client.map_listing(map_name, limit=MOST_LISTED)
-    found, is_quiet = list(first.items), True
-    while part.next_cursor is not None:
-        part = client.map_listing(map_name, part.next_cursor, MOST_LISTED)
-        if (part.created_at, part.model_id) != (first.created_at, first.model_id):
-            raise _changed(map_name)
-        is_quiet = is_quiet and part.revision == first.revision
-        found += part.items
-    return first, found, is_quiet
-
-
 def _changed(map_name: str) -> Conflict:
     return Conflict(
-        f"Map {map_name!r} was created again, or came to another model, while it was pulled. The "
-        "copy is as it was. Pull again."
+        f"Map {map_name!r} was created again, came to another model, or lost artifacts while it "
+        "was pulled. The copy is as it was. Pull again."
     )
 
 
-def row_values(row: FrameRowRecord) -> dict[str, Any]:
-    """Columns of a frame and its signature, as the database has them."""
-    told = row.model_dump(exclude={"vector"})
-    return told | {"vector": row.vector, "checksum": crc32(row.vector)}
-
-
-def _here(connection: Connection, listing: MapListing) -> MapRow | None:
+def _here(connection: Connection, head: MapCopy) -> MapRow | None:
     """The map in the store, if it is a copy of this one, and not of one of before."""
-    row = next((one for one in list_maps(connection) if one.name == listing.name), None)
-    if row is None or (row.created_at, row.model_id) != (listing.created_at, listing.model_id):
+    row = next((one for one in list_maps(connection) if one.name == head.name), None)
+    if row is None or (row.created_at, row.model_id) != (head.created_at, head.model_id):
         return None
     return row
 
 
-def _tags(connection: Connection, listing: MapListing) -> dict[str, str]:
-    """Tags of the frames that the store has of a map."""
-    row, after = _here(connection, listing), 0
-    found: dict[str, str] = {}
-    while row is not None:
-        some = indexed_rows(connection, row, after, MOST_LISTED)
-        if not some:
-            break
-        found |= {one.id: copy_tag(dict(one._mapping)) for one in some}
-        after = some[-1].number
-    return found
-
-
 def _write(
-    store: Store, listing: MapListing, listed: Sequence[ListedFrame],
-    fetched: Mapping[str, FrameRowRecord], model: bytes,
-) -> tuple[int, int]:  # fmt: skip
-    """Bring the map in the store to what was listed, all of it or nothing."""
+    store: Store, head: MapCopy, pull: _Pull, rows: dict[str, Row], model: bytes
+) -> tuple[int, int]:
+    """Bring the map in the store to a state of the service, all of it or nothing.
+
+    Returns
+    -------
+    frames that are new or changed, and that are gone
+    """
+    before = {name: row for part in pull.own.values() for name, row in part.items()}
+    written = [_copied(head, row) for name, row in rows.items() if before.get(name) != row]
     blobs: list[str] = []
     with store.blobs.kept(), store.database.write() as connection:
-        keep_model(connection, listing.model_id, listing.model, model)
-        row = _prepared(store, connection, listing, blobs)
+        keep_model(connection, head.model_id, head.model, model)
+        row = _prepared(store, connection, head, blobs)
         there = living_rows(connection, row)
-        wanted = {one.frame_id for one in listed}
-        gone = [one for name, one in there.items() if name not in wanted]
+        gone = [one for name, one in there.items() if name not in rows]
         renewed = [
-            there[name] for name, one in fetched.items()
-            if name in there and there[name].content_id != one.content_id
+            there[one.id] for one in written
+            if one.id in there and there[one.id].content_id != one.values["content_id"]
         ]  # fmt: skip
         for some in numbers_in_blocks([*gone, *renewed]):
             blobs += delete_frames(connection, row, some)
         kept = there.keys() - {one.id for one in renewed}
-        written = [fetched[one.frame_id] for one in listed if one.frame_id in fetched]
         for one in written:
-            if not store.blobs.holds(one.geometry):
+            if not store.blobs.holds(one.made.geometry):
                 raise DamagedBlob(
-                    f"The artifact {one.geometry[:12]} was removed meanwhile. Pull again."
+                    f"The artifact {one.made.geometry[:12]} was removed meanwhile. Pull again."
                 )
-            if one.frame_id in kept:
-                edit_copied(connection, row, there[one.frame_id], _copied(one, listing))
-        new = [_copied(one, listing) for one in written if one.frame_id not in kept]
+            if one.id in kept:
+                edit_copied(connection, row, there[one.id], one)
+        new = [one for one in written if one.id not in kept]
         for first in range(0, len(new), BLOCK):
             add_copied(connection, row, new[first : first + BLOCK])
     collect_deleted_blobs(store, blobs)
     return len(written), len(gone)
 
 
-def _copied(one: FrameRowRecord, listing: MapListing) -> CopiedFrame:
-    values = row_values(one)
-    made = StoredSignature(listing.model_id, one.vector, one.geometry, one.n_patches, one.n_pairs)
-    return CopiedFrame(one.frame_id, {name: values[name] for name in COPIED}, made)
+def _copied(head: MapCopy, row: Row) -> CopiedFrame:
+    """A frame from its row in a part."""
+    ((name, *found),) = decoded_rows(COLUMNS, [row])
+    values: dict[str, Any] = {
+        column.name: json.loads(x) if isinstance(column.type, JSON) and x is not None else x
+        for column, x in zip(COLUMNS[1:], found, strict=True)
+    }
+    own = (values[one] for one in ("vector", "geometry", "n_patches", "n_pairs"))
+    made = StoredSignature(head.model_id, *own)
+    return CopiedFrame(name, {one: values[one] for one in COPIED}, made)
 
 
-def _prepared(
-    store: Store, connection: Connection, listing: MapListing, blobs: list[str]
-) -> MapRow:
+def _prepared(store: Store, connection: Connection, head: MapCopy, blobs: list[str]) -> MapRow:
     """The map in the store, made where it is not there; one of before goes.
 
     Raises
@@ -358,15 +360,15 @@ def _prepared(
     Conflict : it has frames that were uploaded here, and are nowhere else.
     """
     rows = {one.name: one for one in list_maps(connection)}
-    before, row = rows.get(listing.name), _here(connection, listing)
+    before, row = rows.get(head.name), _here(connection, head)
     if before is not None:
-        _require_copied(store, living_rows(connection, before).values(), listing.name)
+        _require_copied(store, living_rows(connection, before).values(), head.name)
     if before is not None and row is None:
         blobs += remove_map(connection, before)
     if row is None:
-        made = add_map(connection, listing.name, listing.title, listing.model_id)
-        row = date_map(connection, made, listing.created_at)
-    return write_map(connection, row, {"title": listing.title, "up": listing.up})
+        made = add_map(connection, head.name, head.title, head.model_id)
+        row = date_map(connection, made, head.created_at)
+    return write_map(connection, row, {"title": head.title, "up": head.up})
 
 
 def _require_copied(store: Store, found: Iterable[FrameRow], map_name: str) -> None:
