@@ -8,7 +8,6 @@ from fastapi import Request, Response
 
 from sceneprint.engine.products.reconstruction import MEDIA_TYPE, MESH
 from sceneprint.engine.results.query_entry import StoredAnswer, unknown_query
-from sceneprint.store.queue import unknown_job
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
 from service.auth import Asking, Caller, Context, Here, v1_router
 from service.bodies import json_body, read_record
@@ -88,5 +87,5 @@ def _stored_answer(here: Context, asking: Caller, query_id: str) -> StoredAnswer
 def _find_reconstruction(here: Context, asking: Caller, job_id: str) -> Reconstruction:
     found = here.engine.reconstructions.get(None, job_id)
     if not all(asking.may("read", name) for name in found.maps):
-        raise unknown_job(job_id)
+        raise here.engine.reconstructions.unknown(job_id)
     return found

@@ -191,8 +191,11 @@ class Products(ABC, Generic[Request, Record]):
             job = queue.find_job(connection, job_id)
             if job.kind == self.kind and (row is None or job.map_number == row.number):
                 return job
-        where = "" if row is None else f" in map {row.name!r}"
-        raise UnknownJob(
+        raise self.unknown(job_id, "" if row is None else f" in map {row.name!r}")
+
+    def unknown(self, job_id: str, where: str = "") -> UnknownJob:
+        """Return the error for a job that does not exist, or that the caller may not see."""
+        return UnknownJob(
             f"There is no {self.record.noun} {job_id!r:.80}{where}. See GET /v1/jobs for the jobs "
             "that exist."
         )
