@@ -1,7 +1,7 @@
 // Coverage is begun by a dialog, and followed until it is over.
 import { at, send } from "../lib/api.js";
-import { h, put } from "../lib/dom.js";
-import { coded } from "../lib/prose.js";
+import { h } from "../lib/dom.js";
+import { beginFrom } from "../lib/products.js";
 import { sheet } from "../lib/states.js";
 
 /**
@@ -24,9 +24,7 @@ export function beginCoverage(map, { sessions, robots }, onbegun) {
   const within = number("not_within_s", 10, { min: 0, step: "any" });
   const off = number("tolerance_m", 0.5, { min: 0.01, max: 100, step: "any" }), turned = number("tolerance_deg", 15, { min: 0.1, max: 180, step: "any" });
   const wide = number("cell_m", "", { min: 0.1, max: 1000, step: "any", placeholder: "auto" });
-  const wrong = h("p", { class: "field-error", role: "alert" });
-  const button = h("button", { class: "button primary" }, "Start");
-  const dialog = sheet({ title: "Measure coverage", buttons: button, children: [
+  const dialog = sheet({ title: "Measure coverage", buttons: h("button", { class: "button primary" }, "Start"), children: [
     h("p", { class: "muted" }, "Queries frames of the map against the rest of it. Uploads and queries go first; it takes about 0.1 s per frame."),
     field("session", "Query frames of", session),
     robots.length > 1 && field("robot", "and of", robot),
@@ -36,28 +34,14 @@ export function beginCoverage(map, { sessions, robots }, onbegun) {
     h("details", {}, h("summary", {}, "Tolerance and cells"),
       h("div", { class: "cover-pair" }, field("tolerance_m", "Right within, m", off), field("tolerance_deg", "and within, °", turned)),
       field("cell_m", "Cell width, m", wide, "Two results are compared only if their cells are equally wide.")),
-    wrong,
+    h("p", { class: "field-error", role: "alert" }),
   ] });
-  dialog.querySelector("form").addEventListener("submit", async (event) => {
-    event.preventDefault();
-    if (button.disabled) return;
-    button.disabled = true;
-    put(wrong);
+  beginFrom(dialog, at("maps", map, "coverage"), () => {
     const value = (input) => (Number.isFinite(input.valueAsNumber) ? input.valueAsNumber : undefined);
     const left = without.value === "session" ? { other_sessions: true } : { not_within_s: without.value === "itself" ? 0 : value(within) };
-    const json = { session: session.value || undefined, robot: robot.value || undefined, every: value(every), most: value(most), ...left,
+    return { session: session.value || undefined, robot: robot.value || undefined, every: value(every), most: value(most), ...left,
       tolerance_m: value(off), tolerance_deg: value(turned), cell_m: value(wide) };
-    try {
-      const { data } = await send("POST", at("maps", map, "coverage"), { json });
-      dialog.close();
-      onbegun(data);
-    } catch (error) {
-      if (error.status === undefined || error.status === 401 || !dialog.open) { dialog.close(); throw error; }
-      const told = error.errors?.length ? error.errors.map((one) => `${one.field}: ${one.reason}`).join(". ") : error.detail;
-      put(wrong, coded(told));
-      button.disabled = false;
-    }
-  });
+  }, onbegun);
 }
 
 /** @param {string} id of the job */

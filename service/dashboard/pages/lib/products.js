@@ -1,5 +1,7 @@
 // Products of a map: each is computed by a long job, which a page follows until it is over.
-import { get } from "./api.js";
+import { get, send } from "./api.js";
+import { put } from "./dom.js";
+import { coded } from "./prose.js";
 
 const POLL_MS = 700;
 const OVER = new Set(["succeeded", "failed", "dead", "cancelled"]);
@@ -28,4 +30,30 @@ export async function followJob(path, onchange, signal) {
       if (error.status !== 0 && error.status !== 503) throw error; // a service that restarts does not end it
     }
   }
+}
+
+/**
+ * Begin a product when the form of a dialog is submitted; what is wrong is said in its `.field-error`.
+ * @param {HTMLDialogElement} dialog
+ * @param {string} path of the list of such products
+ * @param {() => Object<string, any>} request what the form asks for
+ * @param {(begun: Object<string, any>) => void} onbegun
+ */
+export function beginFrom(dialog, path, request, onbegun) {
+  const wrong = /** @type {HTMLElement} */ (dialog.querySelector(".field-error")), button = /** @type {HTMLButtonElement} */ (dialog.querySelector(".primary"));
+  dialog.querySelector("form").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    if (button.disabled) return;
+    button.disabled = true;
+    put(wrong);
+    try {
+      const { data } = await send("POST", path, { json: request() });
+      dialog.close();
+      onbegun(data);
+    } catch (error) {
+      if (error.status === undefined || error.status === 401 || !dialog.open) { dialog.close(); throw error; }
+      put(wrong, coded(error.errors?.length ? error.errors.map((one) => `${one.field}: ${one.reason}`).join(". ") : error.detail));
+      button.disabled = false;
+    }
+  });
 }

@@ -1,9 +1,9 @@
 // Associations beside the picture: which one is drawn, what it came to, and how a new one is begun.
 
 import { at, send } from "../lib/api.js";
-import { h, put } from "../lib/dom.js";
+import { h } from "../lib/dom.js";
 import { count, metres, degrees } from "../lib/format.js";
-import { goesOn } from "../lib/products.js";
+import { beginFrom, goesOn } from "../lib/products.js";
 import { coded } from "../lib/prose.js";
 import { confirm, sheet } from "../lib/states.js";
 import { EDGES } from "./scene.js";
@@ -71,33 +71,20 @@ export function begin(map, runs, onbegun) {
   const options = (first) => runs.map((one, i) => h("option", { value: i, selected: i === first }, one.robot === null || one.robot === one.session ? one.session : `${one.session} (${one.robot})`));
   const from = h("select", { name: "from" }, options(0));
   const to = h("select", { name: "to" }, h("option", { value: "" }, "itself (loop closures)"), options(1));
-  const error = h("p", { class: "field-error", role: "alert" });
-  const button = h("button", { class: "button primary", type: "submit" }, "Start");
   const dialog = sheet({
     title: "New association",
     children: [
       h("p", { class: "muted" }, "Each frame of the first run is queried among the frames of the second; accepted matches become edges. This takes about 0.1 s per frame."),
       h("label", { class: "field" }, h("span", {}, "Query the frames of"), from),
-      h("label", { class: "field" }, h("span", {}, "among the frames of"), to), error,
+      h("label", { class: "field" }, h("span", {}, "among the frames of"), to), h("p", { class: "field-error", role: "alert" }),
     ],
-    buttons: button,
+    buttons: h("button", { class: "button primary", type: "submit" }, "Start"),
   });
-  dialog.querySelector("form").addEventListener("submit", async (event) => {
-    event.preventDefault();
+  beginFrom(dialog, at("maps", map, "associations"), () => {
     const chosen = [from, to].filter((one) => one.value !== "").map((one) => runs[Number(one.value)]);
-    const json = { sessions: chosen.map((one) => one.session) };
-    if (chosen.every((one) => one.robot !== null)) json.robots = chosen.map((one) => one.robot);
-    button.disabled = true;
-    put(error);
-    try {
-      const { data } = await send("POST", at("maps", map, "associations"), { json });
-      dialog.close();
-      onbegun(data);
-    } catch (problem) {
-      put(error, coded(problem.detail ?? problem.message));
-      button.disabled = false;
-    }
-  });
+    const robots = chosen.every((one) => one.robot !== null) ? chosen.map((one) => one.robot) : undefined;
+    return { sessions: chosen.map((one) => one.session), robots };
+  }, onbegun);
 }
 
 /**
