@@ -218,13 +218,10 @@ class JobMethods(ServiceConnection):
                 f"{file}: The file cannot be read ({error.strerror}). Check its name."
             ) from error
 
-    def import_job(self, map_name: str, job_id: str) -> Job:
-        """An import of a map; UnknownMap or UnknownJob if it does not exist."""
-        return self._ask(Job, "GET", _import_path(map_name, job_id))
-
     def import_items(self, map_name: str, job_id: str) -> Iterator[ImportItem]:
         """Results for the members of an archive so far, in their order."""
-        return self._items(Page[ImportItem], f"{_import_path(map_name, job_id)}/items")
+        job = job_path(job_id).rpartition("/")[2]
+        return self._items(Page[ImportItem], f"{map_path(map_name)}/imports/{job}/items")
 
     def _send_archive(self, map_name: str, archive: BinaryIO, options: ImportOptions) -> Job:
         """Send an archive, from its start at each try."""
@@ -484,10 +481,6 @@ class JobMethods(ServiceConnection):
         NotIndexed : it has not ended, or failed.
         """
         return self._bytes(f"{product_path(Reconstruction, None, job_id)}/mesh.ply")
-
-
-def _import_path(map_name: str, job_id: str) -> str:
-    return f"{map_path(map_name)}/imports/{job_path(job_id).rpartition('/')[2]}"
 
 
 def _of_map(options: ImportOptions | None, name: str | None) -> ImportOptions:

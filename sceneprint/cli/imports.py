@@ -169,7 +169,7 @@ def _waited(client: Client, options: argparse.Namespace, name: str, job: Job) ->
     with tqdm(desc=name, unit="frame", disable=None) as bar:
         while not job.state.over:
             client.wait([job.job_id], timeout_s=_PAUSE_S)
-            job = client.import_job(options.map, job.job_id)
+            job = client.job(job.job_id)
             if job.progress is not None:
                 _show(bar, name, job.progress)
             if job.progress != seen or job.state == JobState.RUNNING:

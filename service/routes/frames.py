@@ -356,14 +356,8 @@ async def add_import(
             lambda: here.engine.imports.begin(map_name, archive, options, once), patient=True
         )
     mark_replayed(response, replayed=replayed)
-    response.headers["Location"] = f"/v1/maps/{map_name}/imports/{job.job_id}"
+    response.headers["Location"] = f"/v1/jobs/{job.job_id}"
     return job
-
-
-@imports_router.get("/{job_id}", responses=declared(404), dependencies=[Depends(may_read)])
-def get_import(map_name: str, job_id: str, here: Here) -> Job:
-    """How far an import has come."""
-    return here.engine.imports.get(map_name, job_id)
 
 
 @imports_router.get(

@@ -72,7 +72,7 @@ def test_a_slice_that_was_lost_is_done_again(
     assert [one["status"] for one in again.items] == [200, 200]
     assert [one["frame_id"] for one in again.items] == [one["frame_id"] for one in lost.items]
     assert empty.run(task) == JobState.SUCCEEDED  # there is time for all now
-    told = empty.imports.get("hall", job.job_id)
+    told = empty.get_job(job.job_id)
     assert told.result is not None
     summary = UploadSummary.model_validate(told.result.pop("summary"))
     assert told.result == {

@@ -114,7 +114,7 @@ def test_an_archive_is_read_where_it_lies(
         file = receiver.end()
     job = one.imports.begin("hall", file, ImportOptions())[0]
     assert work_off(other) == ["succeeded"] * 4
-    told = one.imports.get("hall", job.job_id)
+    told = one.get_job(job.job_id)
     assert told.result is not None
     assert told.result["received"] == 3
     names = {key.rpartition("/")[2] for key in keys(open_objects(f"{bucket}/fleet"), "blobs/")}

@@ -347,7 +347,8 @@ def test_many_at_once(served, make_map, shots, clouds, until):
     zipped = {"content": packed.getvalue(), "headers": {"Content-Type": "application/zip"}}
     job = http.post(f"{path}/imports", **zipped).headers["location"]
     until(lambda: http.get(job).json()["state"] == "succeeded")
-    items = http.get(f"{job}/items").json()["items"]
+    job_id = job.rpartition("/")[2]
+    items = http.get(f"{path}/imports/{job_id}/items").json()["items"]
     assert [(one["name"], one["status"]) for one in items] \
         == [("run/0.ply", 202), ("run/1.ply", 202), ("run/2.pcd", 422)]  # fmt: skip
     until(lambda: http.get(path).json()["frames"].get("indexed") == 4)

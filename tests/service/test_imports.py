@@ -40,7 +40,7 @@ def test_an_archive_from_the_door_to_its_frames(served, yard, small_shots, until
     begun = http.post(f"{yard}/imports", **said)
     assert begun.status_code == 202, begun.text
     path = begun.headers["location"]
-    assert path == f"{yard}/imports/{begun.json()['job_id']}"
+    assert path == f"/v1/jobs/{begun.json()['job_id']}"
     again = http.post(f"{yard}/imports", **said)
     assert again.headers["idempotent-replayed"] == "true"
     assert again.json()["job_id"] == begun.json()["job_id"]
@@ -59,8 +59,9 @@ def test_an_archive_from_the_door_to_its_frames(served, yard, small_shots, until
     assert told["result"] == {
         "sequences": 1, "received": 4, "there": 0, "refused": 2, "ignored": 0,
     }  # fmt: skip
-    first = http.get(f"{path}/items", params={"limit": 4}).json()
-    rest = http.get(f"{path}/items", params={"cursor": first["next_cursor"]}).json()
+    items_of = f"{yard}/imports/{told['job_id']}/items"
+    first = http.get(items_of, params={"limit": 4}).json()
+    rest = http.get(items_of, params={"cursor": first["next_cursor"]}).json()
     assert rest["next_cursor"] is None
     items = first["items"] + rest["items"]
     assert [(one["name"], one["status"]) for one in items] == [
@@ -75,7 +76,7 @@ def test_an_archive_from_the_door_to_its_frames(served, yard, small_shots, until
     )
     jobs = http.get("/v1/jobs", params={"kind": "import", "map": "yard"}).json()["items"]
     assert [one["job_id"] for one in jobs] == [begun.json()["job_id"]]
-    refused(http.get(f"{yard}/imports/{frame['job_id']}"), 404, "unknown-job")
+    refused(http.get(f"{yard}/imports/{frame['job_id']}/items"), 404, "unknown-job")
     refused(http.get(f"{yard}/imports/{'0' * 32}/items"), 404, "unknown-job")
 
 
@@ -147,7 +148,7 @@ def test_a_map_that_is_one_file_becomes_views(
     begun = post(**options)
     assert begun.status_code == 202, begun.text
     where = begun.headers["location"]
-    assert where == f"{path}/imports/{begun.json()['job_id']}"
+    assert where == f"/v1/jobs/{begun.json()['job_id']}"
     until(lambda: http.get(where).json()["state"] not in ("queued", "running"))
     told = http.get(where).json()
     assert (told["kind"], told["state"]) == ("import-map", "succeeded"), told
@@ -161,5 +162,5 @@ def test_a_map_that_is_one_file_becomes_views(
     frames = http.get(f"{path}/frames", params={"tag": "virtual", "limit": 1}).json()["items"]
     assert frames[0]["pose"]["parent_frame"] == "room"
     assert frames[0]["intrinsics"]["width"] == 80
-    items = http.get(f"{where}/items", params={"limit": 1}).json()
+    items = http.get(f"{path}/imports/{told['job_id']}/items", params={"limit": 1}).json()
     assert items["items"][0]["name"] == "room.ply/00000"

@@ -52,7 +52,6 @@ OF_A_MAP = {
     "PUT /v1/maps/{map_name}/frames/{frame_id}": Case("write"),
     "POST /v1/maps/{map_name}/frames/batch": Case("write"),
     "POST /v1/maps/{map_name}/imports": Case("write"),
-    "GET /v1/maps/{map_name}/imports/{job_id}": Case(),
     "GET /v1/maps/{map_name}/imports/{job_id}/items": Case(),
     "GET /v1/maps/{map_name}/frames/{frame_id}": Case(),
     "PATCH /v1/maps/{map_name}/frames/{frame_id}": Case("write", body={"tags": ["x"]}),

@@ -21,7 +21,6 @@ from sqlalchemy import Connection, func, select
 from sceneprint import errors
 from sceneprint.engine.ingest.uploads import Upload, Uploads, item_of
 from sceneprint.engine.ingest.uploads import UploadResult as UploadOutcome
-from sceneprint.engine.jobs.lifecycle import get_job
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept, Tasks
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.formats.archive import BLOCK, Archive, Inflater, is_archive, open_archive
@@ -44,7 +43,7 @@ from sceneprint.store.maps import find_map, living_map, model_content
 from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.tables import ARCHIVE, JobRow, MapRow, frames
 from sceneprint.types import Intrinsics
-from sceneprint_client.api import FrameState, Job, Page
+from sceneprint_client.api import Job, Page
 from sceneprint_client.api.base import GivenDirection
 from sceneprint_client.api.frames import ImportItem, ImportOptions, UploadSummary, upload_summary
 from sceneprint_client.formats import HEAD
@@ -411,25 +410,6 @@ class Imports:
             collect_deleted_blobs(self._store, [archive.blob])
         return job, again
 
-    def get(self, map_name: str, job_id: str) -> Job:
-        """An import of a map; UnknownMap or UnknownJob where there is none.
-
-        While the views of a map are signed, its progress counts those that are by now.
-        """
-        with self._store.database.read() as connection:
-            find_map(connection, map_name)
-        job = get_job(self._store, job_id)
-        if job.kind not in (KIND, MAP_KIND) or job.map != map_name:
-            raise queue.unknown_job(job_id)
-        now = job.progress
-        if now is None or now.phase not in ("render", "sign") or now.rendered is None:
-            return job
-        with self._store.database.read() as connection:
-            states = states_of_import(connection, queue.find_job(connection, job_id))
-        signed = now.rendered - states[FrameState.RECEIVED] - states[FrameState.SIGNING]
-        progress = now.model_copy(update={"signed": signed, "done": now.rendered + signed})
-        return job.model_copy(update={"progress": progress})
-
     def items(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100
     ) -> Page[ImportItem]:
@@ -440,11 +420,12 @@ class Imports:
         UnknownMap, UnknownJob : there is none.
         InvalidRequest : a cursor that was not given out.
         """
-        self.get(map_name, job_id)
         first = row_of(cursor) or 0
         with self._store.database.read() as connection:
-            number = queue.find_job(connection, job_id).number
-            found = queue.items_of(connection, number, first, limit + 1)
+            row, job = find_map(connection, map_name), queue.find_job(connection, job_id)
+            if job.kind not in (KIND, MAP_KIND) or job.map_number != row.number:
+                raise queue.unknown_job(job_id)
+            found = queue.items_of(connection, job.number, first, limit + 1)
         more = str(first + limit) if len(found) > limit else None
         return Page[ImportItem](
             items=[ImportItem(**one) for one in found[:limit]], next_cursor=more

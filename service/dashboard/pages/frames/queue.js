@@ -186,7 +186,7 @@ export class Queue {
   }
 
   async followImport(item) {
-    const path = at("maps", this.map, "imports", item.job.job_id);
+    const path = at("jobs", item.job.job_id);
     let wait = POLL_S;
     while (item.state === "importing") {
       await new Promise((resolve) => { setTimeout(resolve, 1000 * wait); });
@@ -198,7 +198,7 @@ export class Queue {
         return;
       }
       const over = job.state !== "queued" && job.state !== "running";
-      const items = over ? await get(`${path}/items`, { params: { limit: 1000 } }).catch(() => null) : null;
+      const items = over ? await get(at("maps", this.map, "imports", item.job.job_id, "items"), { params: { limit: 1000 } }).catch(() => null) : null;
       const refused = items?.items.filter((one) => one.problem) ?? [];
       this.change(item, { job, refused, reason: job.error, state: over ? (job.state === "succeeded" ? "imported" : job.state) : "importing" });
     }
