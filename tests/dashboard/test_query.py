@@ -576,12 +576,12 @@ def test_an_answer_is_reconstructed(station, page, ask, settle, with_open3d):
     job = page.url.rpartition("reconstruction=")[2]
     told = station.client.get(f"/v1/reconstructions/{job}").json()
     assert told["query_id"] == answer["query_id"]
-    expect(card).to_contain_text(f"{len(told['coverage']['views'])} views show")
-    expect(card).to_contain_text(f"{told['coverage']['area_m2']:.1f} m²")
+    expect(card).to_contain_text(f"{len(told['result']['views'])} views show")
+    expect(card).to_contain_text(f"{told['result']['area_m2']:.1f} m²")
     with page.expect_download() as download:
         mesh.click()
-    size = next(one["bytes"] for one in told["files"] if one["name"] == "mesh.ply")
-    assert download.value.path().stat().st_size == size
+    ply = station.client.get(f"/v1/reconstructions/{job}/mesh.ply").content
+    assert download.value.path().read_bytes() == ply
     page.reload()  # the address has it
     settle(page)
     expect(mesh).to_be_visible()
