@@ -41,7 +41,7 @@ def moved(before: DepthFrame, after: DepthFrame) -> Floats:
 
 def drive(client: Client) -> None:
     """Map two rooms, then drive through both; nothing tells of the way between them."""
-    walks = [synthesise_room(5, index, 24, along_path=True).frames for index in (0, 1)]
+    walks = [synthesise_room(3, index, 24, along_path=True).frames for index in (0, 1)]
     client.create_map(MAP, "Example: two rooms", model="depth")
     cameras = [build_map(client, f"room-{i}", walk[::3]) for i, walk in enumerate(walks)]
     T_odom_camera, stamp = np.eye(4), 0.0
