@@ -276,7 +276,7 @@ def write_rows(connection: Connection, table: Table, rows: Iterator[Row]) -> Non
         raise BundleError(
             f"PostgreSQL cannot hold a row of table {table.name} "
             f"({str(error).partition(chr(10))[0]}), and nothing was restored. Restore the bundle "
-            "to a folder, mend the row there, and take another snapshot."
+            "to a folder, mend the row there, and take a snapshot of that."
         ) from error
 
 

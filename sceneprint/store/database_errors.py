@@ -171,7 +171,7 @@ _MEANT: dict[str, tuple[type[UnusableStore], str]] = {
     "42P01": (UnusableStore, "Its tables are not there, or no longer. Restore it from a copy."),
     "42501": (UnusableStore, "The user must own the database's tables: grant what is missing."),
     "58": (UnusableStore, "The server has trouble with its files. Look into its log."),
-    "XX001": (UnusableStore, "The server's files are damaged. Restore a snapshot or a backup."),
+    "XX001": (UnusableStore, "The server's files are damaged. Restore a bundle or a backup."),
     "XX002": (UnusableStore, "An index of the server is damaged. REINDEX the database."),
 }
 #: What is no good until somebody changes it, of what is said when a connection is opened.

@@ -267,7 +267,7 @@ def is_current(connection: Connection, row: QueryRow) -> bool:
 
 
 def keep_answer(connection: Connection, number: int, data: bytes, at: float) -> bool:
-    """Keep an answer in the database, as part of every snapshot; return whether it is stored."""
+    """Keep an answer in the database, as part of every backup; return whether it is stored."""
     own = update(queries).where(_c.number == number, _STORED)
     return connection.execute(own.values(answer=data, kept_at=at)).rowcount == 1
 

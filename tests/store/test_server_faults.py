@@ -40,7 +40,7 @@ def served(postgres_url: str) -> Iterator[Database]:
         ("28P01", errors.UnusableStore, "Check user and password"),
         ("42501", errors.UnusableStore, "grant what is missing"),
         ("58030", errors.UnusableStore, "trouble with its files"),
-        ("XX001", errors.UnusableStore, "Restore a snapshot"),
+        ("XX001", errors.UnusableStore, "Restore a bundle"),
     ],
 )
 def test_a_fault_is_of_its_kind_and_leaves_nothing(

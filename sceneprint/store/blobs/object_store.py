@@ -44,12 +44,10 @@ from sceneprint.store.database_errors import unusable
 # Whose a prefix of an object store is, or the folder of a fleet: two databases on one would sweep
 # each other's blobs.
 #
-#     PREFIX/sceneprint.json   {"store": name of the store, "restoring": while one is restored
-#     there}
+#     PREFIX/sceneprint.json   {"store": its name, "restoring": while one is restored there}
 #
-# The name goes with the database's secret, so a restored store has that of the one that the
-# snapshot
-# was taken of: a restore therefore takes no prefix that is in use, were it by its own name.
+# The name goes with the database's secret, so a restored store has that of the one that was backed
+# up: a restore therefore takes no prefix that is in use, even one of the same name.
 
 
 class BucketOwner:
