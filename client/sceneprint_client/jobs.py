@@ -7,7 +7,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, get_args
 
 import httpx
 
@@ -441,18 +441,15 @@ class JobMethods(ServiceConnection):
     # reconstructions
 
     def reconstruct(
-        self, query: str | Answer, *, frames: Iterable[str] | None = None,
-        strength: Literal["strong", "any"] = "any", include_query: bool = True,
-        voxel_m: float | None = None, output: Literal["mesh", "cloud"] = "mesh",
-        wait_s: float | None = None,
-    ) -> Reconstruction:  # fmt: skip
+        self, query: str | Answer, *, wait_s: float | None = None, **request: Any
+    ) -> Reconstruction:
         """Fuse the accepted matches of an answer into a surface, in the query's camera frame.
 
         Parameters
         ----------
         query : the answer, or the id of its query
-        frames, strength, include_query, voxel_m, output : see NewReconstruction
         wait_s : seconds to wait for it; default: none
+        request : fields of NewReconstruction
 
         Returns
         -------
@@ -463,11 +460,7 @@ class JobMethods(ServiceConnection):
         UnknownQuery : the answer is not stored, or no longer.
         InvalidRequest : it has no accepted match, or lacks a named one.
         """
-        chosen = None if frames is None else tuple(frames)
-        wanted = checked(
-            NewReconstruction, "The reconstruction", frames=chosen, strength=strength,
-            include_query=include_query, voxel_m=voxel_m, output=output,
-        )  # fmt: skip
+        wanted = checked(NewReconstruction, "The reconstruction", **request)
         query_id = query if isinstance(query, str) else query.query_id
         begun = self._begin(Reconstruction, f"{query_path(query_id)}/reconstruction", wanted)
         return begun if wait_s is None else self.wait_for_product(begun, timeout_s=wait_s)

@@ -15,12 +15,12 @@ from sqlalchemy import Connection
 from sceneprint.engine.maps.map_frames import Output
 from sceneprint.engine.maps.map_plans import PlanFrame, plan_frame, surface_picture
 from sceneprint.engine.maps.surface_job import (
-    PRIORITY,
     SURFACE,
     scale_of,
     surface_points,
     tile_cells,
 )
+from sceneprint.engine.products.product import BACKGROUND
 from sceneprint.engine.serializers import tag_of, when
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import (
@@ -385,7 +385,7 @@ def begin_job(connection: Connection, row: MapRow, surface: SurfaceRow) -> tuple
             return False, []
     blobs = [] if job is None else queue.remove_job(connection, job)
     data = {"revision": row.revision, "edits": surface.pose_edits}
-    new = queue.enqueue(connection, SURFACE, None, PRIORITY, map_number=row.number, data=data)
+    new = queue.enqueue(connection, SURFACE, None, BACKGROUND, map_number=row.number, data=data)
     stored.write_surface(connection, row.number, job_number=new.number)
     return True, blobs
 

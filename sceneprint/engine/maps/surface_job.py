@@ -45,7 +45,6 @@ from sceneprint.store import Store
 from sceneprint.store import surface_rows as stored
 from sceneprint.store.deletion import doom
 from sceneprint.store.maps import living_map
-from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
 from sceneprint.store.surface_rows import FusedFrame, SurfaceRow, TileRow
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats, Geometry
@@ -53,8 +52,6 @@ from sceneprint_client.surface_encoding import CELL, NO_SESSION, SIDE, STEPS
 
 #: Kind of the jobs, and of the event that tells of their end.
 SURFACE, UPDATED = "surface", "surface.updated"
-#: As of coverage: a worker does a slice when nothing else waits.
-PRIORITY = REENCODING_PRIORITY - 1
 #: Seconds that a slice fuses frames; writing its tiles takes about as long.
 SLICE_S = 1.5
 #: Levels of a surface, and the width of the finest cells in voxels of the map's model.
