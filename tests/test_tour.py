@@ -175,7 +175,7 @@ def test_queries_answer_as_the_page_says(outputs: dict[str, list[str]]) -> None:
 def test_places_are_rebuilt(outputs: dict[str, list[str]], with_open3d: None) -> None:
     rebuilt = one(outputs, "What does the place look like?")[-1]
     assert rebuilt["state"] == "succeeded"
-    assert {f["name"] for f in rebuilt["files"]} == {"mesh.ply"}
+    assert len(rebuilt["result"]["views"]) > 1
 
 
 @pytest.mark.thorough
