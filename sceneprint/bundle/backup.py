@@ -28,10 +28,10 @@ from sceneprint.errors import BundleError, DamagedBlob, UnusableStore
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database
 from sceneprint.store.blobs.folder import is_digest
-from sceneprint.store.database import current_revision, is_there, known_revisions, reach_database
+from sceneprint.store.database import is_there, known_revisions, reach_database
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint.store.postgres.connection import allow
-from sceneprint.store.read_only import opened_blobs
+from sceneprint.store.read_only import opened_blobs, require_present_schema
 from sceneprint_client.api import FrameState
 
 #: Parts and blobs that are written at once: each waits for its disk, or for the network.
@@ -138,14 +138,7 @@ def _opened(url: str) -> Iterator[Database]:
         if not is_there(url):
             shown = database.file or database.shown
             raise UnusableStore(f"{shown}: there is no database. Name its folder with --data.")
-        head, _ = known_revisions()
-        with database.read() as connection:
-            found = current_revision(connection)
-        if found != head:
-            raise UnusableStore(
-                f"{database.shown} has schema {found}, and this version works with {head}. Any "
-                "other use of it, such as `sceneprint serve`, brings it there."
-            )
+        require_present_schema(database)
         yield database
 
 

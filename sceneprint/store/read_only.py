@@ -46,14 +46,7 @@ def look_at(url: str) -> Iterator[Database]:
     before = None if path is None else _state(path)
     database = Database(engine)
     try:
-        head, _ = known_revisions()
-        with database.read() as connection:
-            found = current_revision(connection)
-        if found != head:
-            raise UnusableStore(
-                f"{database.shown} has schema {found}, and this version works with {head}. Any "
-                "other use of it, such as `sceneprint serve`, brings it there."
-            )
+        require_present_schema(database)
         yield database
     finally:
         database.close()
@@ -62,6 +55,23 @@ def look_at(url: str) -> Iterator[Database]:
                 f"{path} was written while it was looked at, which nobody did at first: what was "
                 "found may be wrong. Run it again."
             )
+
+
+def require_present_schema(database: Database) -> None:
+    """See that a database has the schema that this version works with; it is not brought there.
+
+    Raises
+    ------
+    UnusableStore, NewerSchema : it has another.
+    """
+    head, _ = known_revisions()
+    with database.read() as connection:
+        found = current_revision(connection)
+    if found != head:
+        raise UnusableStore(
+            f"{database.shown} has schema {found}, and this version works with {head}. Any "
+            "other use of it, such as `sceneprint serve`, brings it there."
+        )
 
 
 def _open_engine(url: URL, path: Path) -> tuple[Engine, bool]:
