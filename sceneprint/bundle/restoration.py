@@ -250,6 +250,8 @@ def restore_to_folder(
     with folder_turn(work) as mine:
         if not mine:
             raise BundleError(f"{folder}: another process restores to it.")
+        for half in work.glob(f"{_BLOBS}/*/.*"):  # of a restore that was killed
+            half.unlink()
         _check_room(folder, reading.manifest, work)
         with closing(FolderBlobs(work / _BLOBS)) as blobs:
             lost = reading.blobs(blobs)

@@ -23,9 +23,9 @@ from sceneprint.cli.options import (
 )
 from sceneprint.cli.scenes import Scene, add_scene_options, check_scene, open_scene
 from sceneprint.errors import InvalidRequest
-from sceneprint.models import PRESETS
 from sceneprint_client.api.base import FrameState, JobState
 from sceneprint_client.api.listing import Clock
+from sceneprint_client.api.maps import PRESETS
 from sceneprint_client.api.results import CLOUD_FRAMES, RECORD_STATUSES, VIEWS, WIDTH
 
 if TYPE_CHECKING:

@@ -105,7 +105,7 @@ def run_serve(options: argparse.Namespace) -> int:
 
     def work(read_only: bool) -> None:
         try:
-            from sceneprint.cli.options import prepare_presets
+            from sceneprint.cli.preparation import prepare_presets
             from worker.supervisor import Supervisor
 
             prepare_presets(settings, logging.getLogger(__name__).info, stop=stop)
@@ -158,7 +158,7 @@ def add_work(commands: Any) -> None:
 def run_work(options: argparse.Namespace) -> int:
     """Work until told to stop."""
     from sceneprint.atomic_files import warn_if_public
-    from sceneprint.cli.options import prepare_presets
+    from sceneprint.cli.preparation import prepare_presets
     from sceneprint.engine.engine import open_engine
     from sceneprint.process import log_as_json
     from worker.supervisor import run as work

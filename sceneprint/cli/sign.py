@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from sceneprint.atomic_files import write_whole
 from sceneprint.cli.bag import add_recording_options, sequences_at
-from sceneprint.cli.options import add_model_options, open_for
+from sceneprint.cli.preparation import add_model_options, open_for
 from sceneprint.errors import DatasetError, FrameError
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.pipeline import Signature, Signer, sign

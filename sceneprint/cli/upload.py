@@ -55,8 +55,8 @@ from sceneprint.errors import (
     UnknownMap,
 )
 from sceneprint.formats.dataset import FrameReference, FrameSequence, find_sequences
-from sceneprint.models import PRESETS
 from sceneprint_client.api.base import NOVEL
+from sceneprint_client.api.maps import PRESETS
 from sceneprint_client.sidecars import row_of
 
 if TYPE_CHECKING:

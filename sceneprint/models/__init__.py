@@ -2,7 +2,6 @@
 
 from sceneprint.models.model import SCHEMA_VERSION, Model, ModelParameters
 from sceneprint.models.model_file import (
-    PRESETS,
     build_table,
     default_cache_dir,
     open_table,
@@ -11,6 +10,7 @@ from sceneprint.models.model_file import (
     save_model,
     write_model,
 )
+from sceneprint_client.api.maps import PRESETS
 
 __all__ = [
     "PRESETS",

@@ -43,6 +43,7 @@ from sceneprint.models.model import (
     parameters_of,
 )
 from sceneprint.types import Floats32
+from sceneprint_client.api.maps import PRESETS
 
 #: Most components: the pair table names them in 16 bits.
 MAXIMUM_COMPONENTS = 2**15 - 1
@@ -178,8 +179,6 @@ def _check_cloud(p: CloudParameters) -> None:
         raise ValueError("neighbours in a cloud should be in some range of each other")
 
 
-#: Names of the models that ship with the package, the default first.
-PRESETS = ("depth", "lidar", "paper")
 #: A model of the most components fits; a larger file is refused unread.
 MAXIMUM_BYTES = 16 << 20
 

@@ -147,6 +147,22 @@ def test_somebody_else_is_faster(place, tmp_path, name):
     assert (folder / name).read_bytes() == b"somebody else's"
 
 
+def test_what_a_killed_restore_left_is_used_or_removed(place, tmp_path, content):
+    """A whole blob is not read again, and half of one is not put among the others."""
+    restore_to_folder(place, tmp_path / "sound")
+    blob = next((tmp_path / "sound" / "blobs").glob("??/*"))
+    new = tmp_path / "new" / ".restoring" / "blobs" / blob.parent.name
+    new.mkdir(parents=True)
+    (new / blob.name).write_bytes(bytes(blob.stat().st_size))  # seen by its size alone
+    (new / ".0123456789ab.part").write_bytes(b"half")
+    (new.parents[1] / "sceneprint.db").write_bytes(b"half")
+    restore_to_folder(place, tmp_path / "new")
+    found, expected = content(tmp_path / "new"), content(tmp_path / "sound")
+    name = f"blobs/{blob.parent.name}/{blob.name}"
+    assert found.pop(name) != expected.pop(name)
+    assert found == expected
+
+
 def test_two_at_once(place, tmp_path):
     inner: list[Exception] = []
 

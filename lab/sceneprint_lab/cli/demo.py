@@ -188,7 +188,7 @@ def add_demo(commands: Any) -> None:
 
 def run_demo(options: argparse.Namespace) -> int:
     """Show the whole way of a frame, over HTTP."""
-    from sceneprint.cli.options import prepare_presets
+    from sceneprint.cli.preparation import prepare_presets
     from sceneprint_client import Client
 
     options.out.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli import number_within, positive, positive_number, whole_number
 from sceneprint.cli.bag import add_recording_options, sequences_at
-from sceneprint.cli.options import add_model_options, open_for
+from sceneprint.cli.preparation import add_model_options, open_for
 from sceneprint.errors import DatasetError
 from sceneprint.settings import Settings
 from sceneprint_client.sidecars import Camera
