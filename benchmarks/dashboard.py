@@ -208,7 +208,8 @@ def _draw(browser: Browser, address: str, mark: str, canvas: str, size: str) -> 
         until(page, _MARKED.format(mark))
         settled(page)
         drawn: dict[str, Any] = page.evaluate(_DRAW, [*CANVAS, DRAWN, canvas])
-        if drawn["size"] != list(CANVAS) or not drawn["smooth"]:
+        # only clouds are antialiased
+        if drawn["size"] != list(CANVAS) or drawn["smooth"] != (mark == "overlay"):
             raise AssertionError(f"another canvas was drawn than the one that is meant: {drawn}")
         return drawn | {"size": int(page.evaluate(size))}
     finally:
