@@ -20,6 +20,7 @@ from benchmarks.encode import stage_rows
 from benchmarks.library import Library, accepted, are_same
 from benchmarks.machine import processor_seconds
 from benchmarks.readiness import MAP, fill_map
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client
 from sceneprint_lab.cli.demo import serving
@@ -126,11 +127,11 @@ def _load(
     context = get_context("spawn")
     n = clients + uploads
     barrier = context.Barrier(n + 1)
-    with ProcessPoolExecutor(n, context, _barriers.append, (barrier,)) as pool:
+    with ProcessPoolExecutor(n, context, _join, (barrier,)) as pool:
         work = [pool.submit(_time_queries, url, list(frames), i) for i in range(clients)]
         if uploads:
             uploading = pool.submit(_upload, url, list(frames))
-        barrier.wait()
+        barrier.wait(PATIENCE_S)
         healthz = _healthz(url, SECONDS)
         answers = [one.result() for one in work]
         if uploads:
@@ -142,12 +143,16 @@ def _load(
 _barriers: list[Barrier] = []
 
 
+def _join(barrier: Barrier) -> None:
+    _barriers.append(barrier)
+
+
 def _time_queries(url: str, frames: Sequence[FrameReference], place: int) -> list[float]:
     """Query frames in turn, each after the answer to the last; return milliseconds of each."""
     taken: list[float] = []
     with Client(url) as client:
         client.query(MAP, frames[place % len(frames)])
-        _barriers[0].wait()
+        _barriers[0].wait(PATIENCE_S)
         until = time.perf_counter() + SECONDS
         while (start := time.perf_counter()) < until:
             client.query(MAP, frames[(place + len(taken)) % len(frames)])
@@ -158,7 +163,7 @@ def _time_queries(url: str, frames: Sequence[FrameReference], place: int) -> lis
 def _upload(url: str, frames: Sequence[FrameReference]) -> None:
     """Keep the worker busy: the same frames in one map after another."""
     with Client(url) as client:
-        _barriers[0].wait()
+        _barriers[0].wait(PATIENCE_S)
         until, number = time.perf_counter() + SECONDS, 0
         while time.perf_counter() < until:
             client.create_map(f"load-{number}")

@@ -248,11 +248,11 @@ def wrong_matches(
     ]
 
 
-def count_separated(connection: Connection) -> int:
-    """Return how many changes of clients lack their event or their line of the audit log."""
+def count_separated(connection: Connection, map_names: Sequence[str]) -> int:
+    """Return how many changes to some maps lack their event or their line of the audit log."""
     by_event, by_line = (
         Counter(tuple(row) for row in connection.execute(
-            select(kind, name, target).where(kind.in_(CHANGES))
+            select(kind, name, target).where(kind.in_(CHANGES), name.in_(map_names))
         ))
         for kind, name, target in (
             (events.c.kind, events.c.map, events.c.frame_id),

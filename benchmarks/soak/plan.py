@@ -29,7 +29,7 @@ class Plan:
     ----------
     store : what holds the rows
     faults : how often each is injected; of the offline hour, frames that a robot spools in it
-    seconds : for which the robots walk
+    seconds : for which the robots walk; attacks may end sooner
     robots, rate : how many, and frames a second of each
     signed : whether robots wait until their frame is signed
     readers : clients that repeat exact searches all the time
@@ -93,7 +93,7 @@ PLANS = {
     "soak-crowd": Plan("sqlite", workers=2, rate=2.0, readers=8),
     "siege": Plan(
         "sqlite", {"broken-upload": 20_000, "attack": 5, "operation": 20}, robots=2, rate=2.0,
-        seconds=400, signed=True, services=1, workers=1,
+        seconds=900, signed=True, services=1, workers=1,
     ),
     "fleet": Plan(faults=_FLEET),
     "fleet-asynchronous": Plan(faults=_FLEET, asynchronous=True),

@@ -7,14 +7,13 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import httpx
 import numpy as np
-from sqlalchemy import select
 from tqdm import tqdm
 
 from benchmarks.soak.attacks import SESSION, AttackFigures, run_attacks
@@ -39,12 +38,11 @@ from benchmarks.soak.robots import (
     RobotCrowd,
     image_query,
 )
-from sceneprint.store import queue
 from sceneprint.store.deletion import DAY_S
-from sceneprint.store.tables import jobs, maps
 from sceneprint_client import Client
-from sceneprint_client.api import FrameMeta
+from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.admin import Scope
+from sceneprint_client.errors import JobOver, UnknownJob
 
 #: Map of the robot that is offline at first, and the part of the time for which it is.
 OFFLINE_MAP, OFFLINE = "fleet-offline", 0.4
@@ -219,7 +217,7 @@ class _Run:
             fleet.stop()
             figures.leftovers, figures.damaged = fleet.fsck()
             with fleet.store() as store, store.database.read() as connection:
-                figures.found.separated = count_separated(connection)
+                figures.found.separated = count_separated(connection, names)
         figures.locks, figures.spooled_twice = locks.shares, sum(one.repeated for one in offline)
         self._count(injector)
         return figures
@@ -303,7 +301,8 @@ class _Run:
                 due = schedule(plan.seconds, plan.faults, self._rng)
                 injector.run(due, bar.set_postfix_str)
                 self._besiege(client, key, noisy)
-                stop.wait(max(begun + plan.seconds - time.monotonic(), 0.0))
+                if not noisy:  # else the run ends with the attacks
+                    stop.wait(max(begun + plan.seconds - time.monotonic(), 0.0))
             finally:
                 stop.set()
         crowd.join(PATIENCE_S)
@@ -349,10 +348,11 @@ class _Run:
         return keys
 
     def _empty_queue(self, client: Client) -> None:
-        """Cancel what waits or runs for the attacker, and wait for the rest."""
-        with self._fleet.store() as store, store.database.write() as connection:
-            noisy = select(maps.c.number).where(maps.c.name == "noisy").scalar_subquery()
-            queue.cancel_jobs(connection, jobs.c.map_number == noisy)
+        """Cancel what waits for the attacker, and wait for the rest."""
+        for job in list(client.jobs(JobState.QUEUED)):
+            if job.map == "noisy":
+                with suppress(JobOver, UnknownJob):
+                    client.cancel_job(job.job_id)
         await_idle(client)
 
     def _robots(self, client: Client) -> list[Robot]:
