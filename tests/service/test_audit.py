@@ -11,7 +11,7 @@ import pytest
 
 #: Operations that store nothing but an answer.
 READING = {
-    "ask", "ask_several", "localize", "localize_sequence", "compare",
+    "ask", "ask_several", "compare", "copy_map", "localize", "localize_sequence",
 }  # fmt: skip
 
 
