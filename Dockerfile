@@ -80,7 +80,7 @@ USER 10001:10001
 # folder only where it may write, so one that root made would be passed over, and every process
 # would compile for itself. The code is for every processor from x86-64-v3 on (2013 and later); on
 # an older one the first use compiles once more, into the same folder.
-RUN python -c "from sceneprint.cli.options import prepare_presets; \
+RUN python -c "from sceneprint.cli.preparation import prepare_presets; \
     from sceneprint.settings import Settings; \
     prepare_presets(Settings(), clouds=True)"
 

@@ -65,7 +65,7 @@ lint: $(STAMP)
 
 # Compiled once here, and not by each process of the tests for itself.
 kernels: $(STAMP)
-	@$(BIN)/python -c 'from sceneprint.cli.options import prepare_presets; \
+	@$(BIN)/python -c 'from sceneprint.cli.preparation import prepare_presets; \
 		from sceneprint.settings import Settings; prepare_presets(Settings(), clouds=True)'
 
 # Nor does each compile the tests, whose assertions pytest writes anew, where nobody has yet; what

@@ -38,7 +38,7 @@ NUMPY_LOOPS = (
     "print(*(name for name in d if has[name]))"
 )
 KERNELS = (
-    "from sceneprint.cli.options import prepare_presets; from sceneprint.settings import Settings; "
+    "from sceneprint.cli.preparation import prepare_presets; from sceneprint.settings import Settings; "
     "prepare_presets(Settings(), clouds=True)"
 )
 

@@ -203,13 +203,13 @@ def test_service_and_worker_alone_do_the_job_together(begin, make_map, small_sho
 UNPREPARED = """
 import sys
 from sceneprint import cli
-from sceneprint.cli import options
+from sceneprint.cli import preparation
 from sceneprint.errors import UnusableStore
 
 def fail(*_, **__):
     raise UnusableStore("no room for tables")
 
-options.prepare_presets = fail
+preparation.prepare_presets = fail
 sys.exit(cli.main(["serve", "--port", "0", "--data", sys.argv[1]]))
 """
 
