@@ -38,8 +38,8 @@ NUMPY_LOOPS = (
     "print(*(name for name in d if has[name]))"
 )
 KERNELS = (
-    "from sceneprint.cli.preparation import prepare_presets; from sceneprint.settings import Settings; "
-    "prepare_presets(Settings(), clouds=True)"
+    "from sceneprint.cli.preparation import prepare_presets; "
+    "from sceneprint.settings import Settings; prepare_presets(Settings(), clouds=True)"
 )
 
 
