@@ -31,7 +31,7 @@ from sceneprint_client.api import (
     ValidationOptions,
 )
 from sceneprint_client.api.admin import NewKey, NewModel
-from sceneprint_client.api.copies import CopyRequest, MapCopy
+from sceneprint_client.api.copies import CopyRequest
 from sceneprint_client.api.coverage import NewMapCoverage
 from sceneprint_client.api.listing import (
     FrameEdit,
@@ -94,7 +94,6 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
                 (NewKey, "validation"),
                 (NewAssociation, "validation"),
                 (CopyRequest, "validation"),
-                (MapCopy, "serialization"),
                 (NewMapCoverage, "validation"),
                 (NewDifference, "validation"),
                 (NewModel, "validation"),
