@@ -34,7 +34,7 @@ from sceneprint.bundle.rows import row_parts
 from sceneprint.engine import Engine
 from sceneprint.errors import BundleError, UnusableStore
 from sceneprint.settings import Settings
-from sceneprint.store import FolderBlobs, open_database
+from sceneprint.store import open_database
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import refers_to
 from sceneprint.store.tables import keys
@@ -340,22 +340,6 @@ def test_a_read_only_folder_can_be_taken(master):
         assert done.stdout == "9 0\n", done.stderr
         assert names_in(data) == before
         assert verify_bundle(str(out)).manifest.blobs == 9
-
-
-@file_only
-def test_large_blobs_go_in_parts(data, tmp_path, settings, monkeypatch):
-    """The same parts."""
-    opened: list[str] = []
-    call = FolderBlobs.open
-    monkeypatch.setattr(
-        FolderBlobs, "open", lambda blobs, digest: (opened.append(digest), call(blobs, digest))[1]
-    )
-    take_backup(settings(data), str(tmp_path / "small"))
-    assert opened == []
-    monkeypatch.setattr(backup, "LARGE", 20)
-    take_backup(settings(data), str(tmp_path / "large"))
-    assert len(opened) == 9
-    assert parts_in(tmp_path / "small") == parts_in(tmp_path / "large")
 
 
 def test_interrupted_it_leaves_no_bundle(master, tmp_path, settings):

@@ -29,14 +29,11 @@ from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.blobs.object_store import BucketOwner
 from sceneprint.store.tables import metadata
 from sceneprint_client.api import Query
+from tests.bundle.test_backup import names_in
 
 SIGNED = 4
 file_only = pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 own_servers = pytest.mark.sqlite_only("these have servers of their own")
-
-
-def names_in(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
 
 
 def fleet_of(folder: Path, url: str, **other: object) -> Settings:

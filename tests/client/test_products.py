@@ -6,15 +6,16 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.errors import UnknownJob, UnknownMap
+from sceneprint.errors import InvalidRequest, UnknownJob, UnknownMap
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.admin import Product
 from sceneprint_client.api.coverage import MapCoverage
-from sceneprint_client.api.sessions import Association, Difference
+from sceneprint_client.api.sessions import SAME, Association, Difference
 
 MAP = "produced"
 
@@ -83,3 +84,28 @@ def test_a_product_from_request_to_deletion(
             client.product(kind, MAP, name)
     with pytest.raises(UnknownMap):
         next(client.products(kind, "nowhere"))
+
+
+def test_the_cells_of_a_difference_are_sent(client: Client, service_url: str) -> None:
+    told = client.compute(Difference, MAP, before="a", after="b")
+    result = told.result
+    assert result is not None
+    assert result.same > 500
+    assert (result.parent_frame, result.frames_before, result.frames_after) == ("room", 2, 2)
+    of = MAP, told.job_id
+    found = client.difference_points(*of)
+    assert found.patches is not None
+    assert (found.patches == SAME).sum() == result.same
+    assert (np.diff(found.patches) >= 0).all()
+    url = f"{service_url}/v1/maps/{MAP}/differences/{told.job_id}/points"
+    sent = httpx.get(url)
+    assert sent.headers["content-type"] == "application/vnd.sceneprint.points"
+    again = httpx.get(url, headers={"If-None-Match": sent.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+
+
+def test_what_cannot_be_compared_is_refused(client: Client) -> None:
+    with pytest.raises(InvalidRequest, match="Name two sessions"):
+        client.compute(Difference, MAP, before="a", after="a")
+    with pytest.raises(InvalidRequest, match="no indexed frame with a pose of session 'z'"):
+        client.compute(Difference, MAP, before="a", after="z")

@@ -36,6 +36,7 @@ from sceneprint.formats.dataset import (
     write_pose,
 )
 from sceneprint.types import Intrinsics
+from tests.datasets.shared import pose_at
 
 CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)
 DEPTH = np.arange(12, dtype=np.float32).reshape(3, 4) / 8
@@ -58,12 +59,6 @@ except OSError as error:
     print(error.strerror)
 print(list(folder.iterdir()))
 """
-
-
-def pose_at(x: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[0, 3] = x
-    return pose
 
 
 @pytest.fixture(scope="module")

@@ -22,18 +22,13 @@ from sceneprint.formats.dataset import (
 from sceneprint.formats.export import write_ply
 from sceneprint.types import Cloud
 from sceneprint_client.frame_files import meta_of
+from tests.datasets.shared import pose_at
 
 POINTS = np.arange(36, dtype=np.float32).reshape(12, 3) / 8
 
 
 def kitti(points: np.ndarray) -> bytes:
     return np.concatenate([points, np.zeros((len(points), 1))], axis=1).astype("<f4").tobytes()
-
-
-def pose_at(x: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[0, 3] = x
-    return pose
 
 
 def points_of(frame: FrameReference) -> np.ndarray:

@@ -2,16 +2,16 @@
 
 import io
 import struct
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.errors import FrameError, UnreadableFrame
+from sceneprint.errors import UnreadableFrame
 from sceneprint.formats.dataset import decode_npy, make_frame
-from sceneprint.types import DepthFrame, Intrinsics
+from sceneprint.types import Intrinsics
+from tests.datasets.shared import frame_or_error, mutations
 
 CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)
 METRES = np.array([[0, 0.001, 1, 0], [1.234, 65.534, 0.002, 0.003], [0.5, 0.501, 0.502, 0.503]])
@@ -125,44 +125,11 @@ def test_bad_npy(case: str) -> None:
         decode_npy(data)
 
 
-def frame_or_error(data: bytes) -> DepthFrame | None:
-    """Whatever the bytes: a frame that can be used, or a FrameError on one line."""
-    try:
-        frame = make_frame(decode_npy(data), CAMERA)
-    except FrameError as error:
-        assert "\n" not in str(error)  # noqa: PT017  (an error is a right outcome too)
-        return None
-    assert np.isfinite(frame.depth).all()
-    assert (frame.depth >= 0).all()
-    assert frame.depth.any()
-    assert frame.depth.shape == (3, 4)
-    return frame
-
-
-def mutations(data: bytes, number: int) -> Iterator[bytes]:
-    """The file with one to three bytes changed, bits flipped, pieces lost or put in."""
-    random = np.random.default_rng(7)
-    for _ in range(number):
-        mutated = bytearray(data)
-        for _ in range(int(random.integers(1, 4))):
-            place = int(random.integers(0, len(mutated)))
-            match random.integers(0, 4):
-                case 0:
-                    mutated[place] = int(random.integers(0, 256))
-                case 1:
-                    mutated[place] ^= 1 << int(random.integers(0, 8))
-                case 2:
-                    del mutated[place : place + int(random.integers(1, 9))]
-                case _:
-                    mutated[place:place] = random.bytes(int(random.integers(1, 9)))
-        yield bytes(mutated)
-
-
 def test_mutations() -> None:
     frames = errors = 0
     for data in (GOOD_NPY, npy(METRES), npy(np.asfortranarray(METRES))):
         for mutated in mutations(data, 700):
-            outcome = frame_or_error(mutated)
+            outcome = frame_or_error(decode_npy, mutated, CAMERA)
             frames += outcome is not None
             errors += outcome is None
     assert min(frames, errors) > 50  # both ends were reached
@@ -171,14 +138,14 @@ def test_mutations() -> None:
 @settings(max_examples=100)
 @given(st.binary(max_size=300), st.sampled_from([b"", GOOD_NPY[:8], GOOD_NPY[:10], GOOD_NPY[:128]]))
 def test_any_bytes(data: bytes, start: bytes) -> None:
-    frame_or_error(start + data)
+    frame_or_error(decode_npy, start + data, CAMERA)
 
 
 @settings(max_examples=100)
 @given(st.text(max_size=200), st.binary(max_size=20))
 def test_any_header(header: str, data: bytes) -> None:
-    frame_or_error(npy_with(header, data))
-    frame_or_error(npy_with("{" + header + "}", data))
+    frame_or_error(decode_npy, npy_with(header, data), CAMERA)
+    frame_or_error(decode_npy, npy_with("{" + header + "}", data), CAMERA)
 
 
 any_values = st.lists(st.floats(width=64), min_size=12, max_size=12)
@@ -189,4 +156,4 @@ any_values = st.lists(st.floats(width=64), min_size=12, max_size=12)
 def test_any_values(values: list[float], dtype: str) -> None:
     with np.errstate(all="ignore"):
         data = npy(np.array(values).reshape(3, 4).astype(dtype))
-    frame_or_error(data)
+    frame_or_error(decode_npy, data, CAMERA)

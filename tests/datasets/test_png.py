@@ -3,7 +3,6 @@
 import io
 import struct
 import zlib
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -11,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageFile
 
-from sceneprint.errors import FrameError, UnreadableFrame
-from sceneprint.formats.dataset import decode_frame, decode_png, make_frame
+from sceneprint.errors import UnreadableFrame
+from sceneprint.formats.dataset import decode_frame, decode_png
 from sceneprint.formats.depth_file import PNG_SIGNATURE, encode_png, size_of
-from sceneprint.types import MAXIMUM_SAMPLES, DepthFrame, Intrinsics
+from sceneprint.types import MAXIMUM_SAMPLES, Intrinsics
+from tests.datasets.shared import frame_or_error, mutations
 
 CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)
 SAMPLES = np.array([[0, 1, 1000, 65535], [1234, 65534, 2, 3], [500, 501, 502, 503]], np.uint16)
@@ -165,39 +165,6 @@ def test_truncated_png_whatever_the_program_told_pillow(monkeypatch) -> None:
     np.testing.assert_array_equal(decode_png(GOOD_PNG), SAMPLES)
 
 
-def frame_or_error(data: bytes) -> DepthFrame | None:
-    """Whatever the bytes: a frame that can be used, or a FrameError on one line."""
-    try:
-        frame = make_frame(decode_png(data), CAMERA)
-    except FrameError as error:
-        assert "\n" not in str(error)  # noqa: PT017  (an error is a right outcome too)
-        return None
-    assert np.isfinite(frame.depth).all()
-    assert (frame.depth >= 0).all()
-    assert frame.depth.any()
-    assert frame.depth.shape == (3, 4)
-    return frame
-
-
-def mutations(data: bytes, number: int) -> Iterator[bytes]:
-    """The file with one to three bytes changed, bits flipped, pieces lost or put in."""
-    random = np.random.default_rng(7)
-    for _ in range(number):
-        mutated = bytearray(data)
-        for _ in range(int(random.integers(1, 4))):
-            place = int(random.integers(0, len(mutated)))
-            match random.integers(0, 4):
-                case 0:
-                    mutated[place] = int(random.integers(0, 256))
-                case 1:
-                    mutated[place] ^= 1 << int(random.integers(0, 8))
-                case 2:
-                    del mutated[place : place + int(random.integers(1, 9))]
-                case _:
-                    mutated[place:place] = random.bytes(int(random.integers(1, 9)))
-        yield bytes(mutated)
-
-
 def repaired(data: bytes) -> bytes:
     """The same PNG with right check sums, so that damage reaches what lies behind them."""
     out, position = data[:8], 8
@@ -217,7 +184,7 @@ def test_mutations() -> None:
             both = [mutated]
             if mutated.startswith(PNG_SIGNATURE):
                 both.append(repaired(mutated))
-            outcomes = [frame_or_error(one) for one in both]
+            outcomes = [frame_or_error(decode_png, one, CAMERA) for one in both]
             frames += sum(one is not None for one in outcomes)
             errors += sum(one is None for one in outcomes)
     assert min(frames, errors) > 50  # both ends were reached
@@ -226,8 +193,8 @@ def test_mutations() -> None:
 @settings(max_examples=100)
 @given(st.binary(max_size=300), st.sampled_from([b"", PNG_SIGNATURE, GOOD_PNG[:33]]))
 def test_any_bytes(data: bytes, start: bytes) -> None:
-    frame_or_error(start + data)
-    frame_or_error(repaired(start + data))
+    frame_or_error(decode_png, start + data, CAMERA)
+    frame_or_error(decode_png, repaired(start + data), CAMERA)
 
 
 @settings(max_examples=150)
@@ -241,7 +208,9 @@ def test_any_bytes(data: bytes, start: bytes) -> None:
 def test_any_pixels(
     size: tuple[int, int], rows: bytes, bits: int, colour: int, interlace: int
 ) -> None:
-    frame_or_error(raw_png(*size, rows, bits=bits, colour=colour, interlace=interlace))
+    frame_or_error(
+        decode_png, raw_png(*size, rows, bits=bits, colour=colour, interlace=interlace), CAMERA
+    )
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (7, 1), (60, 80)])

@@ -15,6 +15,7 @@ from sqlalchemy import select, update
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.products.product import Products
+from sceneprint.engine.search import local_index
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.formats.dataset import decode_frame, write_depth_png
 from sceneprint.geometry.signature.fisher_vector import Whitening
@@ -37,6 +38,17 @@ class Upload:
     frame: DepthFrame
     pose: Floats
     room: str
+
+
+class Between:
+    """An end of a slice that is not reached, and what happens when it is looked for."""
+
+    def __init__(self, do: Callable[[], object]) -> None:
+        self._do = do
+
+    def __call__(self) -> bool:
+        self._do()
+        return False
 
 
 @pytest.fixture(scope="session")
@@ -138,9 +150,21 @@ def signed_folder(
 
 
 @pytest.fixture
-def full(signed_folder: Path, tmp_path: Path, make_engine: Callable[..., Engine]) -> Engine:
+def _always_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let queries look for a newer index each time."""
+    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
+
+
+@pytest.fixture
+def data(signed_folder: Path, tmp_path: Path) -> Path:
+    """A copy of `signed_folder`, to be changed."""
+    return Path(shutil.copytree(signed_folder, tmp_path / "data"))
+
+
+@pytest.fixture
+def full(data: Path, make_engine: Callable[..., Engine]) -> Engine:
     """An engine on a copy of `signed_folder`."""
-    shutil.copytree(signed_folder, tmp_path / "data")
+    del data
     return make_engine()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,6 @@ from sqlalchemy import event, insert, select, update
 
 from sceneprint.engine import Engine
 from sceneprint.engine.maps.tombstones import Tombstones
-from sceneprint.engine.search import local_index
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.upkeep.purge import Retention
 from sceneprint.errors import UnknownFrame, UnknownJob
@@ -26,17 +24,7 @@ Make = Callable[..., Engine]
 Ids = Callable[[Engine], list[str]]
 DAYS = 7.0
 ALL = Query(stages=("retrieve",), k=50)
-
-
-@pytest.fixture(autouse=True)
-def _always_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
-
-
-@pytest.fixture
-def data(signed_folder: Path, tmp_path: Path) -> Path:
-    shutil.copytree(signed_folder, tmp_path / "data")
-    return tmp_path / "data"
+pytestmark = pytest.mark.usefixtures("_always_look")
 
 
 def after(engine: Engine, days: float) -> int:

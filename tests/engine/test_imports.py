@@ -27,6 +27,7 @@ from sceneprint.store.maps import MapUsage, counted_usage, find_map
 from sceneprint.store.queue import MAXIMUM_FAILURES, files_of
 from sceneprint_client.api import Job, JobState, NewMap
 from sceneprint_client.api.frames import ImportOptions, UploadSummary, pooled_range
+from tests.engine.conftest import Between
 
 
 def packed(uploads: Any) -> bytes:
@@ -139,17 +140,6 @@ def test_nothing_is_left_of_an_archive_that_was_refused(empty: Engine, uploads: 
         raise ConnectionError("gone")
     assert sorted(empty.store.blobs.digests()) == before
     assert list(empty.settings.blob_dir.glob(".*")) == []
-
-
-class Between:
-    """An end of a slice that is not reached, and what happens when it is asked for."""
-
-    def __init__(self, do: Callable[[], object]) -> None:
-        self._do = do
-
-    def __call__(self) -> bool:
-        self._do()
-        return False
 
 
 def test_a_cancelled_import_takes_no_frame_more(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,7 @@ Make = Callable[..., Engine]
 ALL = Query(stages=("retrieve",), k=50)
 #: Bytes of a signature.
 LENGTH = read_model("depth").signature_bytes
-
-
-@pytest.fixture
-def data(signed_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
-    shutil.copytree(signed_folder, tmp_path / "data")
-    return tmp_path / "data"
+pytestmark = pytest.mark.usefixtures("_always_look")
 
 
 def ask(engine: Engine, uploads: Any) -> tuple[list[tuple[str, int]], int]:

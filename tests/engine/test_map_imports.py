@@ -27,6 +27,7 @@ from sceneprint.types import ReferenceSurface
 from sceneprint_client.api import FrameState, Job, JobState, NewMap, Query
 from sceneprint_client.api.frames import ImportOptions, MapImportResult
 from sceneprint_lab.synth.rooms import make_room
+from tests.engine.conftest import Between
 
 #: A camera of few pixels, so that views are rendered and signed quickly.
 CAMERA = {"fx": 146.0, "fy": 146.0, "cx": 79.5, "cy": 59.5, "width": 160, "height": 120}
@@ -162,17 +163,6 @@ def test_the_same_view_in_two_sessions_is_two_frames(
     added = [slice_of(chosen, one, lambda: True).items for one in (task, other)]
     assert [one["status"] for items in added for one in items] == [202] * 4
     assert len({one["frame_id"] for items in added for one in items}) == 4
-
-
-class Between:
-    """An end of a slice that is not reached, and what happens when it is looked for."""
-
-    def __init__(self, do: Callable[[], object]) -> None:
-        self._do = do
-
-    def __call__(self) -> bool:
-        self._do()
-        return False
 
 
 def test_a_cancelled_import_adds_no_view_more(

@@ -33,12 +33,6 @@ Make = Callable[..., Engine]
 
 
 @pytest.fixture
-def data(signed_folder: Path, tmp_path: Path) -> Path:
-    shutil.copytree(signed_folder, tmp_path / "data")
-    return tmp_path / "data"
-
-
-@pytest.fixture
 def noon(monkeypatch: pytest.MonkeyPatch) -> float:
     """A time that does not go on, half a minute after a full one."""
     at = 1_800_000_030.0

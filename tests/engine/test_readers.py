@@ -18,17 +18,7 @@ Make = Callable[..., Engine]
 Ids = Callable[[Engine], list[str]]
 WorkOff = Callable[[Engine], list[JobState | None]]
 ALL = Query(stages=("retrieve",), k=50)
-
-
-@pytest.fixture(autouse=True)
-def _always_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
-
-
-@pytest.fixture
-def data(signed_folder: Path, tmp_path: Path) -> Path:
-    shutil.copytree(signed_folder, tmp_path / "data")
-    return tmp_path / "data"
+pytestmark = pytest.mark.usefixtures("_always_look")
 
 
 @pytest.fixture

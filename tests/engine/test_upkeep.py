@@ -134,17 +134,16 @@ def test_a_model_that_cannot_be_read_costs_its_maps_alone(
 
 
 def test_an_index_is_published_by_what_it_lacks_however_large(
-    signed_folder: Path, tmp_path: Path, make_engine: Make, uploads: Any, work_off: Any
+    data: Path, make_engine: Make, uploads: Any, work_off: Any
 ) -> None:
     """Twelve frames, and deletions one after the other: each second one is published."""
-    shutil.copytree(signed_folder, tmp_path / "data")
-    engine = make_engine(tmp_path / "data", tail_frames=1)
+    engine = make_engine(data, tail_frames=1)
     assert engine.publish_due() == 1
     names = [one.frame_id for one in engine.list_frames("hall").items]
     due = []
     for name in names[:4]:
         engine.delete_frame("hall", name)
-        other = make_engine(tmp_path / "data", tail_frames=1)  # who knows nothing of the index
+        other = make_engine(data, tail_frames=1)  # who knows nothing of the index
         due.append((engine.publish_due(), other.publish_due()))
     assert due == [(0, 0), (1, 0), (0, 0), (1, 0)]
     answer = engine.queries.upload(["hall"], uploads[11].data, uploads[11].meta, ALL)

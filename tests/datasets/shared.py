@@ -1,0 +1,53 @@
+"""What the tests of datasets share: poses, images whose bytes were changed, what comes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from sceneprint.errors import FrameError
+from sceneprint.formats.dataset import make_frame
+from sceneprint.types import DepthFrame, Intrinsics
+
+
+def frame_or_error(
+    decode: Callable[[bytes], np.ndarray], data: bytes, camera: Intrinsics
+) -> DepthFrame | None:
+    """Whatever the bytes: a frame that can be used, or a FrameError on one line."""
+    try:
+        frame = make_frame(decode(data), camera)
+    except FrameError as error:
+        assert "\n" not in str(error)  # noqa: PT017  (an error is a right outcome too)
+        return None
+    assert np.isfinite(frame.depth).all()
+    assert (frame.depth >= 0).all()
+    assert frame.depth.any()
+    assert frame.depth.shape == (camera.height, camera.width)
+    return frame
+
+
+def mutations(data: bytes, number: int) -> Iterator[bytes]:
+    """The file with one to three bytes changed, bits flipped, pieces lost or put in."""
+    random = np.random.default_rng(7)
+    for _ in range(number):
+        mutated = bytearray(data)
+        for _ in range(int(random.integers(1, 4))):
+            place = int(random.integers(0, len(mutated)))
+            match random.integers(0, 4):
+                case 0:
+                    mutated[place] = int(random.integers(0, 256))
+                case 1:
+                    mutated[place] ^= 1 << int(random.integers(0, 8))
+                case 2:
+                    del mutated[place : place + int(random.integers(1, 9))]
+                case _:
+                    mutated[place:place] = random.bytes(int(random.integers(1, 9)))
+        yield bytes(mutated)
+
+
+def pose_at(x: float) -> np.ndarray:
+    """A pose (4, 4) that many metres along the first axis."""
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
