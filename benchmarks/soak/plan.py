@@ -58,7 +58,7 @@ class Plan:
     objects: bool = False
     delays: bool = False
     retention_s: float | None = None
-    most_turn_ms: float = 25.0
+    most_turn_ms: float = 50.0
     most_query_ms: float = 1e3 * (SILENCE_S + 5)
     most_bytes: int = 1 << 30
     seed: int = 0
