@@ -320,9 +320,9 @@ def broken(**changed: Any) -> BrokenFigures:
         ({"indexed": 7, "looked_up": 5, "found": 5, "aged": 2}, {}, True),
         ({"indexed": 7, "looked_up": 5, "found": 5, "aged": 1}, {}, False),
         ({}, {"locks": LockShares(5_000, 100.0, 0.9, 0.9)}, False),  # 100 ms a frame
-        # 12 s are a host's that was cut off, and 0.225 s those of 9 frames
-        ({}, {"plan": Plan(faults={"partition": 1}), "locks": LockShares(9, 99.0, 12.2)}, True),
-        ({}, {"plan": Plan(faults={"partition": 1}), "locks": LockShares(9, 99.0, 12.3)}, False),
+        # 12 s are a host's that was cut off, and 0.45 s those of 9 frames
+        ({}, {"plan": Plan(faults={"partition": 1}), "locks": LockShares(9, 99.0, 12.4)}, True),
+        ({}, {"plan": Plan(faults={"partition": 1}), "locks": LockShares(9, 99.0, 12.5)}, False),
         ({}, {"waits_ms": {"query": (90.0, 25_001.0)}}, False),
         ({}, {"memory": (2 << 30, 1)}, False),
         ({}, {"locks": LockShares(5_000, 59.0, 0.0, 0.0)}, False),  # half of 120 s is too few
