@@ -1,7 +1,5 @@
 """What the tests of datasets share: poses, images whose bytes were changed, what comes of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -47,7 +45,6 @@ def mutations(data: bytes, number: int) -> Iterator[bytes]:
 
 
 def pose_at(x: float) -> np.ndarray:
-    """A pose (4, 4) that many metres along the first axis."""
     pose = np.eye(4)
     pose[0, 3] = x
     return pose

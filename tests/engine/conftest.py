@@ -151,7 +151,6 @@ def signed_folder(
 
 @pytest.fixture
 def _always_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let queries look for a newer index each time."""
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
 
 
