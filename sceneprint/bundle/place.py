@@ -207,11 +207,9 @@ class BundlePlace:
         """
         names = self.names()
         if not names or name not in (None, *names):
-            shown = ", ".join(names[:3]) or "none"
-            raise BundleError(
-                f"{self.shown} holds no bundle{'' if name is None else f' {name!r:.80}'}. It holds "
-                f"{shown}."
-            )
+            shown = "" if name is None else f" {name!r:.80}"
+            then = f"The newest are: {', '.join(names[:3])}." if names else "Name another place."
+            raise BundleError(f"{self.shown} holds no bundle{shown}. {then}")
         key = f"{_BUNDLES}{name or names[0]}.json"
         found = self._objects.look(key)
         data = b"" if found is None or found.size > LONGEST else self._objects.get(key)

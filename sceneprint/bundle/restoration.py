@@ -15,6 +15,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -110,7 +111,7 @@ class _Restoration:
             condition = place.condition(digest)
             if condition != "sound":
                 raise place.damaged(digest, f"is {condition}")
-        elif blobs.size(digest) == size:
+        elif blobs.condition(digest) == "sound":
             pass  # a restore that was killed has copied it
         elif size <= LARGE:
             blobs.put(place.get(digest))
@@ -147,10 +148,9 @@ class _Restoration:
             check_sound(connection, self.place.shown)
         except UnusableStore as error:
             raise DamagedBundle(str(error)) from error
-        listed = listed_blobs(self.place, self.manifest)
-        for digest in referred(connection):
-            if next(listed, (None,))[0] != digest:
-                raise self._other("the blobs that its rows refer to")
+        listed = (digest for digest, _, _ in listed_blobs(self.place, self.manifest))
+        if any(one != other for one, other in zip_longest(listed, referred(connection))):
+            raise self._other("the blobs that its rows refer to")
         # answers in files are not in a bundle
         connection.exec_driver_sql("DELETE FROM queries WHERE NOT listed AND kept_at IS NULL")
         connection.exec_driver_sql(
@@ -160,18 +160,20 @@ class _Restoration:
     def secrets(self) -> list[Row]:
         """Return the rows of the secrets, which give a store its name."""
         columns = [one.name for one in secrets.columns]
-        return list(decoded_rows([*secrets.columns], self._read(secrets.name, columns, told=False)))
+        return list(
+            decoded_rows([*secrets.columns], self._read(secrets.name, columns, counts=False))
+        )
 
-    def _read(self, table: str, columns: list[str], *, told: bool = True) -> Iterator[list[object]]:
+    def _read(self, table: str, columns: list[str], *, counts: bool = True) -> Iterator[Row]:
         parts = [one for one in self.manifest.parts if one.kind == f"rows/{table}"]
         for part, data in zip(
             parts, in_order(lambda one: self.place.get(one.digest), parts), strict=True
         ):
-            found = [list(row) for row in read_rows(data, columns)]
+            found = list(read_rows(data, columns))
             if len(found) != part.rows:
                 raise self._other(f"its rows of table {table}")
             yield from found
-            if told:
+            if counts:
                 self._go_on(len(found))
 
     def _other(self, what: str) -> DamagedBundle:
@@ -250,6 +252,8 @@ def restore_to_folder(
     with folder_turn(work) as mine:
         if not mine:
             raise BundleError(f"{folder}: another process restores to it.")
+        if (folder / _BLOBS).exists():  # a restore was killed between two names, see `_put`
+            (folder / _BLOBS).rename(work / _BLOBS)
         for half in work.glob(f"{_BLOBS}/*/.*"):  # of a restore that was killed
             half.unlink()
         _check_room(folder, reading.manifest, work)
@@ -269,6 +273,8 @@ def _check_folder(folder: Path) -> None:
             raise BundleError(f"{folder} is no folder. Name another with --data.")
         return
     ours = {_WORK, "lost+found"} if os.path.ismount(folder) else {_WORK}
+    if (folder / _WORK / _DATABASE).exists() and not (folder / _WORK / _BLOBS).exists():
+        ours.add(_BLOBS)  # a restore was killed when its blobs had their name, and no database
     found = sorted({one.name for one in folder.iterdir()} - ours)
     if found:
         more = "" if len(found) <= 3 else f" and {len(found) - 3} more"

@@ -107,10 +107,10 @@ def last_numbers(connection: Connection) -> dict[str, int]:
     """Return the last number that each table has given out, 0 where it has given none."""
     found = {one.name: 0 for one in tables() if numbered(one)}
     if connection.dialect.name == "sqlite":
-        told = connection.exec_driver_sql(
+        given_out = connection.exec_driver_sql(
             "SELECT name, seq FROM sqlite_sequence WHERE typeof(seq) = 'integer'"
         )
-        return found | {name: seq for name, seq in told if name in found}
+        return found | {name: seq for name, seq in given_out if name in found}
     found = {name: _last_of_server(connection, name) for name in found}
     pending = f"SELECT count(*) FROM {pending_events.name}"
     found[events.name] += int(connection.exec_driver_sql(pending).scalar_one())

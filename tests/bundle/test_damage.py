@@ -165,6 +165,12 @@ def test_rows_that_are_none_of_ours(copy, place, refused):
     lies("blobs", lambda lines: lines[1].__setitem__(2, "gone"), "is listed as no blob can be")
     lies("blobs", lambda lines: lines[1].__setitem__(0, "../../evil"), "listed as no blob can be")
     lies("blobs", lambda lines: lines.insert(1, ["0" * 64, 5, None]), "is missing")
+    part = next(one for one in manifest_of(copy)[1]["parts"] if one["kind"] == "rows/frames")
+    more = [part["digest"], part["bytes"], None]  # a blob that is there, and that no row refers to
+    replace_part(copy, "blobs", lambda lines: lines.append(more))
+    blobs = {"blobs": 10, "blob_bytes": manifest_of(copy)[1]["blob_bytes"] + part["bytes"]}
+    rewrite(copy, lambda one: one.update(blobs))
+    refused("the blobs that its rows refer to")
 
 
 def part_of(folder: Path, kind: str) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -145,19 +146,31 @@ def test_somebody_else_is_faster(place, tmp_path, name):
 
 
 def test_what_a_killed_restore_left_is_used_or_removed(place, tmp_path, content):
-    """A whole blob is not read again, and half of one is not put among the others."""
+    """A whole blob stays, one that was changed comes again, and half of one goes."""
     restore_to_folder(place, tmp_path / "sound")
-    blob = next((tmp_path / "sound" / "blobs").glob("??/*"))
-    new = tmp_path / "new" / ".restoring" / "blobs" / blob.parent.name
-    new.mkdir(parents=True)
-    (new / blob.name).write_bytes(bytes(blob.stat().st_size))  # seen by its size alone
-    (new / ".0123456789ab.part").write_bytes(b"half")
-    (new.parents[1] / "sceneprint.db").write_bytes(b"half")
+    whole, other = list((tmp_path / "sound" / "blobs").glob("??/*"))[:2]
+    work = tmp_path / "new" / ".restoring"
+    for blob in (whole, other):
+        (work / "blobs" / blob.parent.name).mkdir(parents=True, exist_ok=True)
+    kept = Path(shutil.copy(whole, work / "blobs" / whole.parent.name / whole.name)).stat().st_ino
+    changed = work / "blobs" / other.parent.name
+    (changed / other.name).write_bytes(bytes(other.stat().st_size))
+    (changed / ".0123456789ab.part").write_bytes(b"half")
+    (work / "sceneprint.db").write_bytes(b"half")
     restore_to_folder(place, tmp_path / "new")
-    found, expected = content(tmp_path / "new"), content(tmp_path / "sound")
-    name = f"blobs/{blob.parent.name}/{blob.name}"
-    assert found.pop(name) != expected.pop(name)
-    assert found == expected
+    assert content(tmp_path / "new") == content(tmp_path / "sound")
+    assert (tmp_path / "new" / "blobs" / whole.parent.name / whole.name).stat().st_ino == kept
+
+
+def test_a_restore_killed_between_two_names_goes_on(place, tmp_path, content):
+    """The blobs have their name by then, and the database has not."""
+    restore_to_folder(place, tmp_path / "sound")
+    new = Path(shutil.copytree(tmp_path / "sound", tmp_path / "new"))
+    (new / ".restoring").mkdir()
+    (new / "sceneprint.db").rename(new / ".restoring" / "sceneprint.db")
+    restore_to_folder(place, new)
+    assert content(new) == content(tmp_path / "sound")
+    assert names_in(new) == ["blobs", "sceneprint.db"]
 
 
 def test_two_at_once(place, tmp_path):

@@ -42,6 +42,7 @@ from sceneprint.store.copy_rows import (
 from sceneprint.store.deletion import BLOCK, delete_frames, remove_map
 from sceneprint.store.frames import write_map
 from sceneprint.store.maps import add_map, find_map, keep_model, list_maps
+from sceneprint.store.postgres.connection import allow
 from sceneprint.store.signatures import StoredSignature
 from sceneprint.store.tables import FrameRow, MapRow
 from sceneprint_client.api.copies import CopyPart, MapCopy
@@ -82,6 +83,7 @@ class MapCopies:
         """
         parts, sent, size = list[CopyPart](), list[bytes](), 0
         with self._store.database.read() as connection:
+            allow(connection, 0)  # the rows of a large map take a while to put in order
             row = find_map(connection, map_name)
             name, _ = model_of(connection, row.model_id)
             for digest, data, count in copy_parts(connection, row):
