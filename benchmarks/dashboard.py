@@ -1,4 +1,4 @@
-"""How soon a person sees something: the dashboard in a real browser, with an empty cache."""
+"""Measure how soon the dashboard shows its content in a real browser with an empty cache."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def measure(frames: int = FRAMES, runs: int = RUNS) -> list[str]:
         f"Without a window or a graphics card (SwiftShader), cache empty, median of {runs}; "
         "service and browser share the processors.",
         "",
-        "| | measured | asked |",
+        "| | measured | bound |",
         "|---|--:|--:|",
         *(f"| {what} | {value} | {aim} |" for what, (value, aim) in rows.items()),
         "",
@@ -200,7 +200,7 @@ def _load(
 
 
 def _draw(browser: Browser, address: str, mark: str, canvas: str, size: str) -> dict[str, Any]:
-    """Draw a canvas again and again; `size` is an expression that counts what is drawn."""
+    """Draw a canvas repeatedly; `size` is an expression for the number of points or cells drawn."""
     context = browser.new_context(viewport={"width": 1280, "height": 800})
     try:
         page = watched(context.new_page())

@@ -101,7 +101,7 @@ def measure(frames: Sequence[DepthFrame], preset: str, warm_up: int = 3) -> list
         if o3d is not None:
             theirs.append(fpfh_stages(points_of(frame, p.minimum_depth, p.maximum_depth), o3d))
     sums, other = [sum(row.values()) for row in ours], [sum(row.values()) for row in theirs]
-    made = [sum(row.values()) - row["artifact from bytes"] for row, _ in artifacts]
+    signing = [sum(row.values()) - row["artifact from bytes"] for row, _ in artifacts]
     lines = [
         f"### Signing, `{preset}`: median of {len(frames)} frames, one thread, warm",
         "",
@@ -113,7 +113,7 @@ def measure(frames: Sequence[DepthFrame], preset: str, warm_up: int = 3) -> list
         *stage_rows(theirs),
     ]
     if other:
-        whole = np.add(sums, made)
+        whole = np.add(sums, signing)
         lines += [
             f"| **FPFH, sum** | **{np.median(other):.1f}** |",
             f"| **signing / FPFH** | **{np.median(np.divide(sums, other)):.2f}** |",

@@ -1,4 +1,4 @@
-"""How soon a service with a large map answers, what a second worker brings, and disk a frame."""
+"""Measure the first answer of a service with a large map, a second worker's gain, and disk use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a search costs by the number of frames in a map: all compared, and by sketches.
+"""Measure the time of a search by the number of frames in a map, exhaustive and by sketches.
 
 Frames are clustered as a building is: places at random, and some fifty frames about each. Times are
 of one thread, warm. Memory is of a process of its own that opens the index and searches.
@@ -36,19 +36,19 @@ import sys, time
 from pathlib import Path
 import numpy as np
 from sceneprint.index import Tail, newest, search
-folder, asked = Path(sys.argv[1]), np.load(sys.argv[2])
+folder, queries = Path(sys.argv[1]), np.load(sys.argv[2])
 def held():
     lines = dict(line.split()[:2] for line in open("/proc/self/smaps_rollup") if "kB" in line)
     anonymous = int(lines["Anonymous:"])
     return np.array([anonymous, int(lines["Rss:"]) - anonymous]) * 1024
-small = Tail(np.arange(2), asked[:2])
-search(asked[0], None, small, 2, metric="l2")
+small = Tail(np.arange(2), queries[:2])
+search(queries[0], None, small, 2, metric="l2")
 import faiss
 before, begin = held(), time.perf_counter()
-generation = newest(folder, "bench", asked.shape[1])
+generation = newest(folder, "bench", queries.shape[1])
 opened = time.perf_counter() - begin
-for query in asked:
-    search(query, generation, Tail.empty(asked.shape[1]), 200, metric="l2")
+for query in queries:
+    search(query, generation, Tail.empty(queries.shape[1]), 200, metric="l2")
 print(1e3 * opened, *(held() - before))
 """
 
@@ -145,8 +145,8 @@ def table() -> list[str]:
 
 
 def _probed(folder: Path, queries: Bytes) -> list[float]:
-    asked = folder.parent / "asked.npy"
-    np.save(asked, queries)
-    command = [sys.executable, "-c", _PROBE, str(folder), str(asked)]
+    file = folder.parent / "queries.npy"
+    np.save(file, queries)
+    command = [sys.executable, "-c", _PROBE, str(folder), str(file)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     return [float(value) for value in done.stdout.split()]

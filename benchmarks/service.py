@@ -1,4 +1,4 @@
-"""What HTTP and the store add to a query, and whether the service answers many at once."""
+"""Measure the time that HTTP and the store add to a query, and many queries at once."""
 
 from __future__ import annotations
 

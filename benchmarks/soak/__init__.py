@@ -1,1 +1,1 @@
-"""`make soak`, `fleet`, `siege`: robots on a service that is disturbed, and what was lost."""
+"""Robots that use a disturbed service, and a count of all that it lost: `make soak|fleet|siege`."""

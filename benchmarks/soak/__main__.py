@@ -1,4 +1,4 @@
-"""Disturb a service while robots use it, and count what was lost.
+"""Disturb a service while robots use it, and count the frames that it loses.
 
 `python -m benchmarks.soak soak --page docs/reliability.md` runs a plan and puts its figures into
 the page. `--store`, `--faults` and the other options change the plan:
@@ -79,9 +79,9 @@ _UNKILLED = {
 
 
 def rows(figures: SoakFigures) -> dict[str, str]:
-    """Return the rows of the table: what, and how much."""
+    """Return the rows of the table: labels and figures."""
     plan, found = figures.plan, figures.found
-    known = {
+    figure_of = {
         "frames acknowledged, and those that robots deleted again":
             f"{found.acknowledged + figures.deleted}, {figures.deleted}",
         "of the rest indexed, or in a state that says why not": f"{found.indexed}, {found.stated}",
@@ -90,16 +90,16 @@ def rows(figures: SoakFigures) -> dict[str, str]:
         "**lost**": f"**{figures.lost}**",
     }  # fmt: skip
     if plan.retention_s is not None:
-        known["deleted by retention, with an event"] = f"{found.aged}"
+        figure_of["deleted by retention, with an event"] = f"{found.aged}"
     if plan.count("offline-hour"):
         sent = f"{figures.spooled}, {figures.spooled_twice}"
-        known["frames of the robot that was offline, and those sent again"] = sent
+        figure_of["frames of the robot that was offline, and those sent again"] = sent
     if plan.asynchronous:
-        known[
+        figure_of[
             "acknowledged, and not received by the standby when its primary died: missing, of "
             "those that only the dead primary has"
         ] = f"{len(found.missing)}, {figures.window}"
-    known |= {
+    figure_of |= {
         "**stored twice; stored, and not acknowledged; back after a deletion**":
             f"**{found.doubled}, {found.strangers}, {found.returned}**",
         "**changes without their event or line of the audit log**": f"**{found.separated}**",
@@ -114,15 +114,17 @@ def rows(figures: SoakFigures) -> dict[str, str]:
             f"{figures.queries}, {figures.repeated}, {len(figures.faults)}",
     }  # fmt: skip
     for kind, (p50, p99) in figures.waits_ms.items():
-        known[f"{kind}: median, p99"] = f"{p50:,.0f}, {p99:,.0f} ms"
+        figure_of[f"{kind}: median, p99"] = f"{p50:,.0f}, {p99:,.0f} ms"
     if plan.store == "postgresql":
         turns = "{:.1f}, {:.1f} ms".format(*figures.turn_ms)
-        known["of a frame, all writers wait for one; those of its map do"] = turns
+        figure_of["of a frame, all writers wait for one; those of its map do"] = turns
     else:
-        known['**"database is locked"**'] = f"**{figures.locked}**"
+        figure_of['**"database is locked"**'] = f"**{figures.locked}**"
     service, worker = (one / 1e6 for one in figures.memory)
-    known["most memory of a service's process, of a worker's"] = f"{service:,.0f}, {worker:,.0f} MB"
-    return known
+    figure_of["most memory of a service's process, of a worker's"] = (
+        f"{service:,.0f}, {worker:,.0f} MB"
+    )
+    return figure_of
 
 
 def table(figures: SoakFigures) -> list[str]:

@@ -1,4 +1,4 @@
-"""What a store holds and answers in the end, compared with what was acknowledged to clients."""
+"""Compare the content and the answers of a store with what it acknowledged to clients."""
 
 from __future__ import annotations
 
@@ -55,7 +55,8 @@ class Found:
     unheard, heard_twice : events of acknowledged frames that came never, or more than once
     disagreeing : answers and lists that are not the same at every address
     separated : changes whose event or line of the audit log is missing
-    searches, wrong : of readers and of this check, and what is wrong with them
+    searches : number of searches by readers and by this check
+    wrong : descriptions of their faults
     """
 
     acknowledged: int = 0
@@ -99,38 +100,38 @@ def check(
 
     Parameters
     ----------
-    ledger : of what was acknowledged
+    ledger : everything that was acknowledged
     stable : ids of the frames that readers searched
     clients : one for each service
     listeners : one for each map
     aging : seconds for which some maps keep a frame
     """
-    known = {one.frame_id: one for one in ledger.frames if one.frame_id not in ledger.deleted}
+    expected = {one.frame_id: one for one in ledger.frames if one.frame_id not in ledger.deleted}
     maps = sorted({one.map_name for one in ledger.frames})
     lists = [{name: list(client.frames(name)) for name in maps} for client in clients]
     stored = {frame.frame_id: frame for frames in lists[0].values() for frame in frames}
-    present = {name: frame for name, frame in stored.items() if name in known}
+    present = {name: frame for name, frame in stored.items() if name in expected}
     indexed = {name for name, one in present.items() if one.state == FrameState.INDEXED}
     stated = sum(one.state in STATED for one in present.values())
     contents = Counter((one.map, one.content_id) for one in stored.values())
     # frames of maps that age may go while they are looked up
     lasting = [
-        one for one in known.values() if one.frame_id in indexed and one.map_name not in aging
+        one for one in expected.values() if one.frame_id in indexed and one.map_name not in aging
     ]
     looked_up = lasting[:: -(-len(lasting) // LOOKED_UP) or 1]
     with ThreadPoolExecutor(len(clients)) as pool:
         parts = [looked_up[i :: len(clients)] for i in range(len(clients))]
         found = sum(pool.map(_count_found, clients, parts))
-    gone = set(known) - set(stored)
+    gone = set(expected) - set(stored)
     aged = {
         str(name)
         for one in listeners
         for name, at in one.retired.items()
         if name in gone
-        and at - known[name].begun >= aging.get(known[name].map_name, math.inf)
+        and at - expected[name].begun >= aging.get(expected[name].map_name, math.inf)
     }  # fmt: skip
     result = Found(
-        acknowledged=len(known),
+        acknowledged=len(expected),
         indexed=len(indexed),
         stated=stated,
         aged=len(aged),
@@ -140,12 +141,12 @@ def check(
         returned=len(stored.keys() & ledger.deleted.keys()),
         stuck=len(present) - len(indexed) - stated,
         doubled=sum(contents.values()) - len(contents),
-        strangers=len(stored.keys() - known.keys() - ledger.deleted.keys()),
+        strangers=len(stored.keys() - expected.keys() - ledger.deleted.keys()),
         disagreeing=sum(_plain(one, aging) != _plain(lists[0], aging) for one in lists[1:]),
     )
     some = sorted(lasting, key=lambda one: one.frame_id)[:: max(len(lasting) // COMPARED, 1)]
     _compare_searches(result, ledger, stable, clients, some)
-    _compare_events(result, [known[name] for name in (*present, *sorted(aged))], listeners)
+    _compare_events(result, [expected[name] for name in (*present, *sorted(aged))], listeners)
     return result
 
 
@@ -174,7 +175,7 @@ def _compare_searches(
     some: Sequence[Acknowledged],
 ) -> None:  # fmt: skip
     """Compare searches with each other, and with signatures that the library alone computes."""
-    known = {one.frame_id: one for one in ledger.frames}
+    frames = {one.frame_id: one for one in ledger.frames}
     searches = list(ledger.searches)
     for one in some:
         begun = time.monotonic()
@@ -182,9 +183,9 @@ def _compare_searches(
         result.disagreeing += any(answer != answers[0] for answer in answers[1:])
         searches.append(Search(one.frame_id, answers[0], begun, time.monotonic()))
     result.searches = len(searches)
-    vectors = {name: signature(known[name].shot) for name in _named(searches, stable, known)}
+    vectors = {name: signature(frames[name].shot) for name in _named(searches, stable, frames)}
     for search in searches:
-        own = stable if known[search.frame_id].map_name == known[stable[0]].map_name else ()
+        own = stable if frames[search.frame_id].map_name == frames[stable[0]].map_name else ()
         result.wrong += wrong_matches(search, ledger.deleted, own, vectors)
 
 
