@@ -28,6 +28,7 @@ from sqlalchemy import (
     String,
     Table,
 )
+from sqlalchemy.exc import IntegrityError
 
 from sceneprint.errors import BundleError, DamagedBundle, UnusableStore
 from sceneprint.store.tables import events, metadata, pending_events
@@ -255,13 +256,17 @@ def write_rows(connection: Connection, table: Table, rows: Iterator[Row]) -> Non
 
     Raises
     ------
+    DamagedBundle : they break a constraint of the table.
     BundleError : the database cannot hold one of them.
     """
     if connection.dialect.name == "sqlite":
         marks = ", ".join("?" * len(table.columns))
         statement = f"INSERT INTO {table.name} ({column_names(table)}) VALUES ({marks})"
-        while block := [tuple(row) for row in islice(rows, _BLOCK)]:
-            connection.exec_driver_sql(statement, block)
+        try:
+            while block := [tuple(row) for row in islice(rows, _BLOCK)]:
+                connection.exec_driver_sql(statement, block)
+        except IntegrityError as error:
+            raise _contradiction(table, error.orig) from error
         return
     import psycopg
 
@@ -271,6 +276,8 @@ def write_rows(connection: Connection, table: Table, rows: Iterator[Row]) -> Non
         with driver as cursor, cursor.copy(statement) as copy:
             for row in rows:
                 copy.write_row(row)
+    except psycopg.IntegrityError as error:
+        raise _contradiction(table, error) from error
     except psycopg.DataError as error:
         # SQLite keeps what it is given: a file that somebody has edited may hold anything
         raise BundleError(
@@ -278,6 +285,13 @@ def write_rows(connection: Connection, table: Table, rows: Iterator[Row]) -> Non
             f"({str(error).partition(chr(10))[0]}), and nothing was restored. Restore the bundle "
             "to a folder, mend the row there, and take a snapshot of that."
         ) from error
+
+
+def _contradiction(table: Table, error: object) -> DamagedBundle:
+    return DamagedBundle(
+        f"The rows of table {table.name} of the bundle contradict each other or those before "
+        f"({str(error).partition(chr(10))[0]}), and nothing was restored. Restore another bundle."
+    )
 
 
 def count_on(connection: Connection, numbers: dict[str, int]) -> None:

@@ -11,10 +11,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import psycopg
 import pytest
+from pydantic import SecretStr
 
+from sceneprint.bundle import restoration
 from sceneprint.bundle.restoration import restore_to_folder, verify_bundle
 from sceneprint.errors import BundleError, DamagedBundle, NewerSchema
+from sceneprint.settings import Settings
 
 Record = dict[str, Any]
 
@@ -144,9 +148,7 @@ def test_rows_that_are_none_of_ours(copy, place, refused):
 
     replace_part(copy, "rows/frames", lambda lines: None)
     assert verify_bundle(str(copy)).manifest.blobs == 9
-    blob = manifest_of(copy) and json.loads(
-        zlib.decompress(part_of(copy, "rows/frames")).split(b"\n")[0]
-    ).index("blob")
+    blob = lines_of(copy, "rows/frames")[0].index("blob")
     lies("rows/frames", lambda lines: lines[1].pop(), "another number of columns")
     lies("rows/frames", lambda lines: lines[0].reverse(), "it has other columns")
     lies("rows/frames", lambda lines: lines.insert(1, {}), "another number of columns")
@@ -155,6 +157,10 @@ def test_rows_that_are_none_of_ours(copy, place, refused):
             "rows/frames", lambda lines, value=value: lines[1].__setitem__(blob, value),
             r"A row of table frames .*\(column blob holds a ",
         )  # fmt: skip
+    lies("rows/frames", lambda lines: lines.insert(2, lines[1]), "UNIQUE constraint failed")
+    lies("rows/frames", lambda lines: lines[1].__setitem__(blob, None), "NOT NULL constraint")
+    of = lines_of(copy, "rows/frames")[0].index("map_number")
+    lies("rows/frames", lambda lines: lines[1].__setitem__(of, 9), "of maps that is missing")
     lies("rows/secrets", lambda lines: lines[1].__setitem__(1, "?"), "A row of table secrets")
     for name in ("../evil", "0" * 64):
         lies(
@@ -173,10 +179,35 @@ def test_rows_that_are_none_of_ours(copy, place, refused):
     refused("the blobs that its rows refer to")
 
 
-def part_of(folder: Path, kind: str) -> bytes:
+def lines_of(folder: Path, kind: str) -> list[Any]:
     _, record = manifest_of(folder)
     digest = next(one["digest"] for one in record["parts"] if one["kind"] == kind)
-    return (folder / "parts" / digest[:2] / digest).read_bytes()
+    data = (folder / "parts" / digest[:2] / digest).read_bytes()
+    return [json.loads(line) for line in zlib.decompress(data).split(b"\n")]
+
+
+@pytest.mark.parametrize("large", [restoration.LARGE, 20])
+def test_a_damaged_blob_is_named_as_it_is_restored(copy, tmp_path, monkeypatch, large):
+    """Blobs that are copied in parts as well as those that memory holds."""
+    monkeypatch.setattr(restoration, "LARGE", large)
+    digest = lines_of(copy, "blobs")[3][0]
+    path = copy / "parts" / digest[:2] / digest
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    with pytest.raises(DamagedBundle, match=digest):
+        restore_to_folder(str(copy), tmp_path / "new")
+    assert not (tmp_path / "new" / "sceneprint.db").exists()
+
+
+@pytest.mark.sqlite_only("has a server of its own")
+def test_rows_that_contradict_each_other_are_no_row_of_a_server(copy, postgres, tmp_path):
+    url = postgres.create("contradicted")
+    of = lines_of(copy, "rows/frames")[0].index("map_number")
+    replace_part(copy, "rows/frames", lambda lines: lines[1].__setitem__(of, 9))
+    fleet = Settings(data_dir=tmp_path / "fleet", database_url=SecretStr(url), index_dir=None)
+    with pytest.raises(DamagedBundle, match=r"rows of table frames .* contradict"):
+        restoration.restore_to_server(str(copy), fleet)
+    with psycopg.connect(url.replace("+psycopg", "")) as connection:
+        assert connection.execute("SELECT count(*) FROM maps").fetchone() == (0,)
 
 
 def test_a_part_of_gigabytes_takes_no_memory(copy, refused):

@@ -78,6 +78,8 @@ def test_a_backup_has_all_that_is_kept_and_can_be_restored(tmp_path: Path) -> No
                 ("b", None, 0), ("a", 1.0, 9)
             ]  # fmt: skip
             assert read_kept(connection, rows[1].number) == b"an answer"
+            count = connection.exec_driver_sql("SELECT count(*) FROM queries").scalar_one()
+            assert count == 2  # not the one that was stored only to look at its answer
         assert engine.tombstones.restore("hall", deletion).frames == 1
         assert [one.robot for one in engine.list_frames("hall").items] == ["r1"]
     assert list(fsck(again, grace_s=0)) == []
