@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import registration, scan
 from benchmarks.machine import peak_megabytes_of_signing
 from benchmarks.pairs import FramePair, pairs_among
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics
-from sceneprint.models import Model
 from sceneprint.types import DepthFrame, Floats, Intrinsics
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
@@ -30,20 +27,6 @@ def pair_of(frames: tuple[DepthFrame, ...]) -> FramePair:
     return FramePair(frames[0], frames[0], 1.0, np.eye(4))
 
 
-def test_scan_compares_a_read_and_four_scans() -> None:
-    lines = scan.measure(signatures=5, length=64, runs=3)
-    assert "5 signatures of 64 bytes (0.0 MB)" in lines[0]
-    rows = [line.strip("| ").split(" | ") for line in lines if line.startswith("| L")]
-    assert [row[0] for row in rows] == [
-        f"{norm}, {queries}" for norm in ("L1", "L2")
-        for queries in ("one query", f"{scan.TOGETHER} queries at once")
-    ]  # fmt: skip
-    for _, ms, share, quartiles in rows:
-        low, high = map(float, quartiles.split(" to "))
-        assert float(ms) >= 0
-        assert 0 <= low <= float(share) <= high
-
-
 def test_pairs_by_hand() -> None:
     half = 40 / 70 * 2  # half of the width that is seen
     pairs = pairs_among([wall(), wall(half), wall(2 * half), wall(2.5 * half)])
@@ -59,19 +42,6 @@ def test_pairs_by_hand() -> None:
     np.testing.assert_allclose(pairs[0].T_match_query[:3, :3], np.eye(3), atol=1e-12)
     assert pairs_among([wall(), wall(), wall()], apart=2)[0].match.name == "0 m"
     assert len(pairs_among([wall(), wall(), wall()], apart=2)) == 1
-
-
-def test_without_open3d_the_row_says_so(
-    small_model: Model, room_frames: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    lines = registration.measure([pair_of(room_frames)], small_model, warm_up=0)
-    rows = dict(line.strip("| ").split(" | ", 1) for line in lines if line.startswith("| "))
-    stages = [float(rows[name]) for name in ("geometry of both frames", "validation")]
-    assert float(rows["**ours, sum**"].strip("*")) == pytest.approx(sum(stages), abs=0.11)
-    assert rows["Open3D"].startswith("not measured: FPFH needs Open3D, which cannot be imported")
-    assert not any("ours / Open3D" in line or "Open3D's" in line for line in lines)
-    assert "truth: 1.00 of the pairs." in "\n".join(lines)
 
 
 @pytest.mark.parametrize("preset", ["paper", "depth"])

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.pages import put_between
 from benchmarks.postgres import NoServer, binaries
 from benchmarks.soak import attacks, audit, faults
-from benchmarks.soak.__main__ import parse_faults, table
+from benchmarks.soak.__main__ import parse_faults
 from benchmarks.soak.attacks import ATTACKS, AttackFigures
 from benchmarks.soak.audit import Found, check, count_separated, wrong_matches
 from benchmarks.soak.broken_uploads import FILES, BrokenFigures, mutated
@@ -367,20 +366,6 @@ def test_a_wait_counts_for_the_first_fault_within_it() -> None:
         Exchange("upload", 1.0, 30.0, 1),
     ]  # fmt: skip
     assert outages(kills, exchanges) == {"service": [3.0, 0.0], "worker": [1.0]}
-
-
-def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
-    page, begin, end = tmp_path / "page.md", "<!-- soak:begin -->", "<!-- soak:end -->"
-    page.write_text(f"before\n{begin}\nof yesterday\n{end}\nafter\n")
-    put_between(page, begin, end, table(figures({}, deleted=1, lost=0, broken=broken())))
-    text = page.read_text()
-    assert text.startswith(f"before\n{begin}\n### 8 robots for 120 s, PostgreSQL with")
-    assert text.endswith(f"{end}\nafter\n")
-    assert "SIGKILL of 1 of primary, 2 of service." in text
-    assert "| frames acknowledged, and those that robots deleted again | 10, 1 |" in text
-    assert "| service, 2 | 1.2 |" in text
-    assert "Primary dead for 1.5 s until the standby was promoted" in text
-    assert "of yesterday" not in text
 
 
 def test_every_plan_has_known_faults_and_marks_in_the_page() -> None:

@@ -353,11 +353,6 @@ def test_interrupted_it_leaves_no_bundle(master, tmp_path, settings):
     assert BundlePlace.open(folder).names() == []
     taken = take_backup(settings(master), folder)
     assert 0 < taken.written < sum(map(len, parts_in(Path(folder)).values()))
-    with pytest.raises(KeyboardInterrupt):
-        restore_to_folder(folder, tmp_path / "new", progress=stop)
-    assert names_in(tmp_path / "new") == [".restoring"]
-    restore_to_folder(folder, tmp_path / "new")
-    assert names_in(tmp_path / "new") == ["blobs", "sceneprint.db"]
 
 
 @pytest.mark.parametrize("kind", ["snapshot", "verify"])

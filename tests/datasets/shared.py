@@ -5,8 +5,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from sceneprint.errors import FrameError
-from sceneprint.formats.dataset import make_frame
+from sceneprint.formats.dataset import Camera, make_frame
 from sceneprint.types import DepthFrame, Intrinsics
+
+CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)
+DEPTH = np.arange(12, dtype=np.float32).reshape(3, 4) / 8
 
 
 def frame_or_error(

@@ -35,11 +35,8 @@ from sceneprint.formats.dataset import (
     write_intrinsics,
     write_pose,
 )
-from sceneprint.types import Intrinsics
-from tests.datasets.shared import pose_at
+from tests.datasets.shared import CAMERA, DEPTH, pose_at
 
-CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)
-DEPTH = np.arange(12, dtype=np.float32).reshape(3, 4) / 8
 PACKERS: dict[str, Callable[[bytes], bytes]] = {
     "gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress,
 }  # fmt: skip

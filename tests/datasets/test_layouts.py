@@ -16,11 +16,7 @@ from sceneprint.formats.dataset import (
 )
 from sceneprint.formats.dataset.frame_names import is_beside_depth
 from sceneprint.formats.dataset.sequences import natural
-from sceneprint.types import Intrinsics
-from tests.datasets.shared import pose_at
-
-CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)
-DEPTH = np.arange(12, dtype=np.float32).reshape(3, 4) / 8
+from tests.datasets.shared import CAMERA, DEPTH, pose_at
 
 
 def tum(folder: Path) -> Path:
