@@ -27,7 +27,7 @@ help:
 	@echo "make test-thorough  tests that make test leaves out, as they take minutes or seldom fail"
 	@echo "make test-portable  numeric tests as other processors compute them, one after another [TARGET=generic]"
 	@echo "make test-postgres  the tests of what stands on the database, on PostgreSQL"
-	@echo "make goldens  what tests/golden freezes, after an intended change; read the diff"
+	@echo "make goldens  rewrite tests/golden and docs/settings.md after an intended change; read the diff"
 	@echo "make lint    lint, types and import contracts only, of the dashboard's JavaScript too"
 	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
 	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
@@ -99,6 +99,7 @@ test-postgres: $(STAMP) kernels
 # What tests/test_golden.py compares with, after an intended change: read the diff.
 goldens: $(STAMP) kernels
 	SCENEPRINT_UPDATE_GOLDEN=1 $(BIN)/python -m pytest -q tests/test_golden.py
+	$(BIN)/python -m tools.settings_page
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -1,11 +1,11 @@
-"""All that an operator can set, in one place; built once, then handed down."""
+"""The settings of service, workers and command line, read once from the environment."""
 
 from __future__ import annotations
 
 import os
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 from urllib.parse import unquote, urlsplit
 
 import platformdirs
@@ -18,157 +18,338 @@ from sceneprint_client.api.base import is_loopback
 
 
 def default_data_dir() -> Path:
-    """Where a user's maps are kept unless told otherwise."""
+    """Return the folder in which a user's maps are kept by default."""
     return Path(platformdirs.user_data_dir("sceneprint", appauthor=False))
 
 
-#: Where blobs and indexes may be, by what their URL begins with.
+#: Schemes of the URLs of object stores.
 OBJECT_SCHEMES = ("s3", "gs", "az", "file", "memory")
 
 
+def _setting(help_text: str, change: str = "", *, shown: str = "", **field: Any) -> Any:
+    """Return a field whose help, and advice on when to change it, docs/settings.md shows.
+
+    Parameters
+    ----------
+    help_text : what the value is, and its unit
+    change : when to change it
+    shown : default in words, where it is computed
+    **field : arguments of `pydantic.Field`
+    """
+    extra: dict[str, Any] = {"change": change, "shown": shown}
+    return Field(description=help_text, json_schema_extra=extra, **field)
+
+
 class Settings(BaseSettings):
-    """Read from the environment: SCENEPRINT_<FIELD>. Nothing has to be set."""
+    """The settings, read from environment variables SCENEPRINT_<FIELD>; all have defaults."""
 
     model_config = SettingsConfigDict(
         env_prefix="SCENEPRINT_", frozen=True,
         hide_input_in_errors=True,  # it may be a URL with a password
     )  # fmt: skip
 
-    #: Folder of derived files (pair tables). Deleting it loses nothing but seconds.
-    cache_dir: Path = Field(default_factory=default_cache_dir)
-    #: Folder of what must not be lost: the SQLite database and the blobs.
-    data_dir: Path = Field(default_factory=default_data_dir)
-    #: SQLAlchemy URL of the database; default: SQLite in the data folder.
-    database_url: SecretStr | None = None
-    #: Where blobs are kept: s3://bucket/prefix, gs://, az://, file:/// or memory:///; default:
-    #: `blobs` in the data folder. Credentials come from the environment of the cloud, never here.
-    blob_url: SecretStr | None = None
-    #: Folder of search indexes, of this machine alone. Deleting it loses nothing but minutes;
-    #: default: `index` in the data folder.
-    index_dir: Path | None = None
-    #: Where a fleet shares search indexes: s3://bucket/prefix, gs://, az:// or file:///; each is
-    #: then built once, and fetched by nodes that serve its map. Default: each host builds its own.
-    index_url: str | None = None
-    #: Room for search indexes on this machine where they are shared, bytes; those of maps that were
-    #: not asked for longest are removed.
-    index_bytes: int = Field(default=16 << 30, ge=0)
-    #: Address the service listens on. Any but a loopback address asks callers for a key.
-    host: str = "127.0.0.1"
-    #: Port of the service; 0 for a free one.
-    port: int = Field(default=8008, ge=0, le=65535)
-    #: Certificate of the service and its chain, PEM. With its key the service speaks HTTPS alone.
-    tls_cert: Path | None = None
-    #: Key of the certificate, PEM, not encrypted.
-    tls_key: Path | None = Field(default=None, validate_default=True)
-    #: Worker processes that sign frames; they give way to requests.
-    workers: int = Field(default_factory=lambda: os.cpu_count() or 1, ge=0, le=256)
-    #: Uploads and queries that are worked on at once; more wait.
-    concurrency: int = Field(default_factory=lambda: max(os.cpu_count() or 1, 2), ge=1, le=256)
-    #: Cores that the queries of a service process share; one that finds a core free is faster.
-    query_cores: int = Field(default_factory=lambda: os.cpu_count() or 1, ge=1, le=256)
-    #: Memory of a process for geometry of frames that it compared lately, bytes; 0 for none.
-    geometry_bytes: int = Field(default=256 << 20, ge=0)
-    #: Uploads and queries that may wait; more are asked to come back (503).
-    waiting: int = Field(default=64, ge=0, le=10_000)
-    #: Seconds that an upload or a query may wait for its turn; then it is asked to come back (503).
-    wait_s: float = Field(default=5.0, gt=0, le=3600)
-    #: Largest body of a request, bytes.
-    upload_bytes: int = Field(default=72 << 20, ge=1024, le=512 << 20)
-    #: Largest archive that is imported, bytes; inflated it may have four times as many.
-    import_bytes: int = Field(default=4 << 30, ge=1024)
-    #: Seconds for a body of hardly any bytes; each MiB of it may take 4 s more.
-    body_s: float = Field(default=30.0, ge=1, le=3600)
-    #: Ask callers for a key on a loopback address as well, as behind a proxy.
-    require_keys: bool = False
-    #: Requests a second of each tenant, weighted by work, over five seconds; 0 for no limit.
-    requests_per_s: float = Field(default=200.0, ge=0, le=1e6)
-    #: Wrong keys a minute from each address; 0 for no limit.
-    failed_keys_per_minute: float = Field(default=60.0, ge=0, le=1e6)
-    #: Origins whose web pages may ask, with commas between: https://fleet.example; * for all.
-    cors_origins: Annotated[tuple[str, ...], NoDecode] = ()
-    #: Seconds after which a silent worker loses its job.
-    lease_s: float = Field(default=60.0, ge=0.1, le=3600)
-    #: Longest time for one job, seconds; a worker that takes longer hangs, and is ended.
-    job_s: float = Field(default=120.0, ge=1, le=3600)
-    #: Memory that a worker may take for its work, bytes, beyond what it has when it is ready;
-    #: 0 for no limit. What needs more fails, and no other process is killed for it.
-    worker_bytes: int = Field(default=2 << 30, ge=0)
-    #: Processes that uploads are decoded in, of the service at most; a worker has one of its own.
-    #: They may do nothing but compute. 0: uploads are decoded in the service and the workers.
-    decoders: int = Field(default_factory=lambda: min(max(os.cpu_count() or 1, 2), 8), ge=0, le=256)
-    #: Memory that a decoder may take for an upload, bytes; 0 for no limit.
-    decoder_bytes: int = Field(default=2 << 30, ge=0)
-    #: Processor time that a decoder may take for an upload, seconds.
-    decoder_s: float = Field(default=30.0, ge=0.1, le=3600)
-    #: Frames newer than the index above which a worker publishes a new one.
-    tail_frames: int = Field(default=1000, ge=1, le=100_000)
-    #: Seconds after which a worker reads all index files again, to see that they are sound.
-    scrub_s: float = Field(default=3600.0, ge=1, le=31_536_000)
-    #: Stored bytes that workers read each second, to see that they are sound, MB; 0: none are read.
-    scrub_mb_per_s: float = Field(default=1.0, ge=0, le=10_000)
-    #: Days for which queries are listed, and their answers can be looked at; 0: none is stored.
-    answer_days: float = Field(default=30.0, ge=0, le=36_500)
-    #: Room for answers, bytes; the oldest are removed first. 0: none is stored.
-    answer_bytes: int = Field(default=256 << 20, ge=0)
-    #: Seconds for which deleted frames can be restored; 0: a deletion is for good at once.
-    undo_s: float = Field(default=600.0, ge=0, le=31_536_000)
-    #: Days for which rows of deleted and of redundant frames, and of their jobs, stay.
-    deleted_rows_days: float = Field(default=7.0, ge=1, le=36_500)
-    #: Streams of events that one service process keeps open at once; more are refused (503).
-    event_streams: int = Field(default=64, ge=0, le=10_000)
-    #: Newest events of each map that are kept; older ones are removed, 200 bytes each.
-    events_kept: int = Field(default=1_000_000, ge=1000)
-    #: Days for which lines of the audit log are kept; of each tenant at most 200,000 changes and as
-    #: many refusals.
-    audit_kept_days: float = Field(default=365.0, gt=0, le=36_500)
-    #: Who begins the fused surface of a map: workers, as frames come, or whoever asks for it.
-    #: Deleted frames are always taken out of one that there is.
-    surfaces: Literal["auto", "asked"] = "auto"
-    #: Who starts the associations that join the parent frames of a map: workers, as sessions come,
-    #: or whoever asks for one. Only a strong join moves poses.
-    joins: Literal["auto", "asked"] = "auto"
-    #: Seconds after which no byte of a deleted frame is left in the caches of this node.
-    purge_s: float = Field(default=3600.0, ge=1, le=31_536_000)
+    # Places
+    data_dir: Path = _setting(
+        "Folder of the SQLite database and the blobs; also `--data`. Back it up.",
+        "On a server: name a disk with room.",
+        shown="`sceneprint` in the user's data folder",
+        default_factory=default_data_dir,
+    )
+    database_url: SecretStr | None = _setting(
+        "SQLAlchemy URL of the database: `postgresql+psycopg://user:password@host/db`.",
+        "If several machines share the maps.",
+        shown="SQLite in the data folder",
+        default=None,
+    )
+    blob_url: SecretStr | None = _setting(
+        "Store of uploads, artifacts and kept answers: `s3://bucket/prefix`, `gs://bucket/prefix`, "
+        "`az://account/container/prefix`, `file:///folder` or `memory:///`, which ends with the "
+        "process. Credentials come from the environment of the cloud, never from the URL.",
+        "If several machines share the maps.",
+        shown="`blobs` in the data folder",
+        default=None,
+    )
+    index_dir: Path | None = _setting(
+        "Folder of this machine's search indexes. Workers rebuild it if it is deleted.",
+        "For a faster disk than that of the blobs.",
+        shown="`index` in the data folder",
+        default=None,
+    )
+    index_url: str | None = _setting(
+        "Object store in which a fleet shares search indexes, written like `BLOB_URL`. Each is "
+        "built once, and nodes fetch the indexes that they search.",
+        "If several hosts search the same maps.",
+        shown="none: each host builds its own",
+        default=None,
+    )
+    index_bytes: int = _setting(
+        "Maximum size of this machine's copies of shared indexes, bytes. The least recently used "
+        "are removed; none that was used within ten minutes is.",
+        "For smaller disks or larger maps.",
+        default=16 << 30, ge=0,
+    )  # fmt: skip
+    cache_dir: Path = _setting(
+        "Folder of the pair tables of models, 28 MB each. Processes compute them again if it is "
+        "deleted.",
+        "If the home folder cannot be written.",
+        shown="`sceneprint` in the user's cache folder",
+        default_factory=default_cache_dir,
+    )
+
+    # Service
+    host: str = _setting(
+        "Address on which the service listens; also `--host`. Any address except a loopback "
+        "address requires keys.",
+        "To serve other machines.",
+        default="127.0.0.1",
+    )
+    port: int = _setting(
+        "Port of the service; also `--port`. 0 selects a free port, which is printed.",
+        "If the port is in use.",
+        default=8008, ge=0, le=65535,
+    )  # fmt: skip
+    tls_cert: Path | None = _setting(
+        "PEM file of the service's certificate and its chain. Together with `TLS_KEY`, the service "
+        "accepts HTTPS only.",
+        "To serve other machines without a proxy.",
+        default=None,
+    )
+    tls_key: Path | None = _setting(
+        "PEM file of the certificate's key, not encrypted.",
+        "Together with `TLS_CERT`.",
+        default=None, validate_default=True,
+    )  # fmt: skip
+    require_keys: bool = _setting(
+        "Whether a loopback address requires keys as well.",
+        "Behind a proxy or tunnel on this machine.",
+        default=False,
+    )
+    cors_origins: Annotated[tuple[str, ...], NoDecode] = _setting(
+        "Origins whose web pages may send requests, separated by commas: `https://fleet.example`; "
+        "`*` for all.",
+        "For a dashboard on another host.",
+        default=(),
+    )
+    concurrency: int = _setting(
+        "Number of uploads, and of queries, that run at once.",
+        "Rarely: more does not add processors.",
+        shown="number of processors, at least 2",
+        default_factory=lambda: max(os.cpu_count() or 1, 2), ge=1, le=256,
+    )  # fmt: skip
+    query_cores: int = _setting(
+        "Number of cores that the queries of a service share. A query that finds a free core runs "
+        "its two halves in parallel, with the same answer.",
+        "Fewer, if workers on the same machine need them.",
+        shown="number of processors",
+        default_factory=lambda: os.cpu_count() or 1, ge=1, le=256,
+    )  # fmt: skip
+    geometry_bytes: int = _setting(
+        "Memory of each process for the geometry of recently compared frames, bytes; 0.8 MB a "
+        "frame; 0 disables it. Further queries in the same place are answered sooner.",
+        "Less if many services share a machine; more for large maps.",
+        default=256 << 20, ge=0,
+    )  # fmt: skip
+
+    # Limits of requests
+    waiting: int = _setting(
+        "Number of uploads, and of queries, that may wait; the next one gets 503.",
+        "Higher if many robots send at once.",
+        default=64, ge=0, le=10_000,
+    )  # fmt: skip
+    wait_s: float = _setting(
+        "Maximum wait of an upload or query before it starts, seconds; then it gets 503.",
+        "Lower if a late answer is of no use.",
+        default=5.0, gt=0, le=3600,
+    )  # fmt: skip
+    upload_bytes: int = _setting(
+        "Maximum size of a request's body, bytes: a cloud of 6 million points of three float32.",
+        "Higher for larger files of points; lower if only small sensors send.",
+        default=72 << 20, ge=1024, le=512 << 20,
+    )  # fmt: skip
+    import_bytes: int = _setting(
+        "Maximum size of an imported archive, bytes. Its content may be four times as large.",
+        "According to your recordings.",
+        default=4 << 30, ge=1024,
+    )  # fmt: skip
+    body_s: float = _setting(
+        "Time in which a small body must arrive, seconds; each MiB adds 4 s.",
+        "Longer for very poor links.",
+        default=30.0, ge=1, le=3600,
+    )  # fmt: skip
+    requests_per_s: float = _setting(
+        "Rate of each tenant's requests at each service process, averaged over five seconds; 0 for "
+        "no limit. A query counts as 5, a page as 1 and 1 more for each 50 rows.",
+        "According to the size of the fleet.",
+        default=200.0, ge=0, le=1e6,
+    )  # fmt: skip
+    failed_keys_per_minute: float = _setting(
+        "Rate of wrong keys from each address; 0 for no limit.",
+        "Rarely.",
+        default=60.0, ge=0, le=1e6,
+    )  # fmt: skip
+    event_streams: int = _setting(
+        "Number of event streams that a service process keeps open; the next gets 503. A tenant "
+        "has three quarters of them at most, and then gets 429.",
+        "According to the number of dashboards.",
+        default=64, ge=0, le=10_000,
+    )  # fmt: skip
+
+    # Workers and decoders
+    workers: int = _setting(
+        "Number of worker processes; also `--workers`. They sign frames and run long jobs, at a "
+        "lower priority than requests.",
+        "Fewer if memory is short (220 MB each); 0 if `sceneprint work` runs them.",
+        shown="number of processors",
+        default_factory=lambda: os.cpu_count() or 1, ge=0, le=256,
+    )  # fmt: skip
+    worker_bytes: int = _setting(
+        "Memory that a worker may allocate beyond what it has when it is ready, bytes; 0 for no "
+        "limit. A job that needs more fails, and no other process is affected.",
+        "Lower on small machines; higher for very large maps.",
+        default=2 << 30, ge=0,
+    )  # fmt: skip
+    lease_s: float = _setting(
+        "Time after which a silent worker loses its job, seconds.",
+        "Longer on machines that are suspended.",
+        default=60.0, ge=0.1, le=3600,
+    )  # fmt: skip
+    job_s: float = _setting(
+        "Maximum time of a job, or of one slice of a long job, seconds. A worker that takes longer "
+        "is ended.",
+        "Longer on very slow machines.",
+        default=120.0, ge=1, le=3600,
+    )  # fmt: skip
+    decoders: int = _setting(
+        "Number of confined processes in which a service decodes uploads, 100 MB each, and 240 MB "
+        "after they have read PLY or PCD. Each worker has one of its own. 0 decodes uploads in the "
+        "service and its workers.",
+        "0 if every sender is trusted and memory is short.",
+        shown="number of processors, from 2 to 8",
+        default_factory=lambda: min(max(os.cpu_count() or 1, 2), 8), ge=0, le=256,
+    )  # fmt: skip
+    decoder_bytes: int = _setting(
+        "Memory that a decoder may allocate for one upload, bytes; 0 for no limit.",
+        "Lower on small machines.",
+        default=2 << 30, ge=0,
+    )  # fmt: skip
+    decoder_s: float = _setting(
+        "Processor time that a decoder may take for one upload, seconds.",
+        "Longer on very slow machines.",
+        default=30.0, ge=0.1, le=3600,
+    )  # fmt: skip
+
+    # Upkeep
+    tail_frames: int = _setting(
+        "Number of frames or deletions newer than the index at which a worker publishes the next "
+        "index.",
+        "Rarely: queries read these frames from memory.",
+        default=1000, ge=1, le=100_000,
+    )  # fmt: skip
+    scrub_s: float = _setting(
+        "Interval at which workers verify all index files, seconds.",
+        "Longer for indexes of many gigabytes.",
+        default=3600.0, ge=1, le=31_536_000,
+    )  # fmt: skip
+    scrub_mb_per_s: float = _setting(
+        "Rate at which workers verify stored blobs, MB per second; 0 disables it.",
+        "Higher for more than 86 GB, which takes a day; 0 if an object store charges for reading "
+        "and verifies its bytes itself.",
+        default=1.0, ge=0, le=10_000,
+    )  # fmt: skip
+    surfaces: Literal["auto", "asked"] = _setting(
+        "Whether workers build the surface of each map (`auto`), or only on request (`asked`). "
+        "Deleted frames are always removed from a surface that exists.",
+        "If nobody looks at surfaces, to spare workers and disk.",
+        default="auto",
+    )
+    joins: Literal["auto", "asked"] = _setting(
+        "Whether workers associate sessions of different parent frames (`auto`), or only on "
+        "request (`asked`). Only a strong join moves poses.",
+        "If parent frames are to stay apart, or to spare workers.",
+        default="auto",
+    )
+
+    # Retention
+    undo_s: float = _setting(
+        "Time for which a deletion can be undone, seconds; 0 makes it final at once.",
+        "0 if a deletion must be final; longer for people who notice late.",
+        default=600.0, ge=0, le=31_536_000,
+    )  # fmt: skip
+    purge_s: float = _setting(
+        "Maximum time until no byte of a deleted frame is left on this node, seconds, counted from "
+        "when the deletion can no longer be undone.",
+        "According to what you promised the people in the frames.",
+        default=3600.0, ge=1, le=31_536_000,
+    )  # fmt: skip
+    deleted_rows_days: float = _setting(
+        "Time for which rows of deleted and redundant frames, and of their jobs, stay in the "
+        "database, days.",
+        "Longer than any host is ever off: an older index is built again from the database.",
+        default=7.0, ge=1, le=36_500,
+    )  # fmt: skip
+    answer_days: float = _setting(
+        "Time for which queries are listed with their answers, days. 0 stores none, and no event "
+        "reports a query.",
+        "According to what you promised the operators of the robots.",
+        default=30.0, ge=0, le=36_500,
+    )  # fmt: skip
+    answer_bytes: int = _setting(
+        "Maximum size of all stored answers, bytes, 200 kB each. The oldest are removed first; 0 "
+        "stores none.",
+        "According to the rate of queries.",
+        default=256 << 20, ge=0,
+    )  # fmt: skip
+    events_kept: int = _setting(
+        "Number of events of each map that are kept, 200 bytes each.",
+        "According to how long a robot may be away.",
+        default=1_000_000, ge=1000,
+    )  # fmt: skip
+    audit_kept_days: float = _setting(
+        "Time for which entries of the audit log are kept, days. A tenant has at most 200,000 "
+        "changes and as many refusals.",
+        "According to your auditors.",
+        default=365.0, gt=0, le=36_500,
+    )  # fmt: skip
 
     @field_validator("tls_key")
     @classmethod
-    def _has_certificate(cls, given: Path | None, info: ValidationInfo) -> Path | None:
-        if (given is None) != (info.data.get("tls_cert") is None):
+    def _has_certificate(cls, value: Path | None, info: ValidationInfo) -> Path | None:
+        if (value is None) != (info.data.get("tls_cert") is None):
             raise ValueError("HTTPS needs SCENEPRINT_TLS_CERT and SCENEPRINT_TLS_KEY; set both")
-        return given
+        return value
 
     @field_validator("index_url")
     @classmethod
-    def _is_shared(cls, given: str | None) -> str | None:
-        if given is not None and given.startswith("memory:"):
+    def _is_shared(cls, value: str | None) -> str | None:
+        if value is not None and value.startswith("memory:"):
             raise ValueError("memory:/// is inside one process; use file:///folder")
-        return given
+        return value
 
     @field_validator("blob_url", "index_url")
     @classmethod
-    def _holds_objects(cls, given: SecretStr | str | None) -> SecretStr | str | None:
-        if given is not None:
-            _require_objects(given if isinstance(given, str) else given.get_secret_value())
-        return given
+    def _holds_objects(cls, value: SecretStr | str | None) -> SecretStr | str | None:
+        if value is not None:
+            _require_objects(value if isinstance(value, str) else value.get_secret_value())
+        return value
 
     @field_validator("cors_origins", mode="before")
     @classmethod
-    def _origins(cls, given: object) -> object:
-        if not isinstance(given, str):
-            return given
-        return tuple(one.strip() for one in given.split(",") if one.strip())
+    def _origins(cls, value: object) -> object:
+        if not isinstance(value, str):
+            return value
+        return tuple(one.strip() for one in value.split(",") if one.strip())
 
     @field_validator("cors_origins")
     @classmethod
-    def _are_origins(cls, given: tuple[str, ...]) -> tuple[str, ...]:
-        for one in given:
+    def _are_origins(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for one in value:
             if one != "*" and not re.fullmatch(r"https?://[^/?#@\s*]+", one):
                 raise ValueError(f"{one!r:.80} is not an origin such as https://fleet.example")
-        return given
+        return value
 
     @property
     def asks_for_keys(self) -> bool:
-        """Whether callers must show a key."""
+        """Whether requests need a key."""
         return self.require_keys or not is_loopback(self.host)
 
     @property
@@ -178,23 +359,23 @@ class Settings(BaseSettings):
 
         if self.database_url is not None:
             return self.database_url.get_secret_value()
-        # put together by SQLAlchemy: a folder's name may hold what means something in a URL
+        # SQLAlchemy escapes characters of the folder's name that have a meaning in a URL
         url = URL.create("sqlite", database=str((self.data_dir / "sceneprint.db").absolute()))
         return url.render_as_string(hide_password=False)
 
     @property
     def blobs(self) -> Path | str:
-        """Where uploads and geometry artifacts are kept: a folder, or a URL."""
-        given = "" if self.blob_url is None else self.blob_url.get_secret_value()
-        return given if given and not given.startswith("file:") else self.blob_dir
+        """Folder or URL of uploads and geometry artifacts."""
+        value = "" if self.blob_url is None else self.blob_url.get_secret_value()
+        return value if value and not value.startswith("file:") else self.blob_dir
 
     @property
     def served_blobs(self) -> Path | str:
-        """As `blobs`, for a service whose workers are other processes.
+        """Folder or URL of the blobs of a service, whose workers are other processes.
 
         Raises
         ------
-        UnusableStore : they would be kept inside one process.
+        UnusableStore : BLOB_URL keeps blobs inside one process.
         """
         if str(self.blobs).startswith("memory:"):
             raise UnusableStore(
@@ -205,29 +386,29 @@ class Settings(BaseSettings):
 
     @property
     def blob_dir(self) -> Path:
-        """Folder of uploads and geometry artifacts, where they are in one."""
+        """Folder of uploads and geometry artifacts, if BLOB_URL is a folder."""
         return self._blob_root / "blobs"
 
     @property
     def quarantine_dir(self) -> Path:
-        """Folder of damaged bytes that `sceneprint fsck --repair` has set aside."""
+        """Folder of damaged blobs that `sceneprint fsck --repair` has moved away."""
         return self.data_dir / "quarantine"
 
     @property
     def query_dir(self) -> Path:
-        """Folder of answers that can be looked at afterwards. Deleting it loses only those."""
+        """Folder of stored answers. Deleting it loses only these."""
         return self._blob_root / "queries"
 
     @property
     def _blob_root(self) -> Path:
-        given = "" if self.blob_url is None else self.blob_url.get_secret_value()
-        if given.startswith("file:"):
-            return Path(unquote(urlsplit(given).path))
+        value = "" if self.blob_url is None else self.blob_url.get_secret_value()
+        if value.startswith("file:"):
+            return Path(unquote(urlsplit(value).path))
         return self.data_dir
 
     @property
     def bell_dir(self) -> Path:
-        """Folder of what wakes waiting workers."""
+        """Folder of the FIFOs that wake idle workers."""
         return self.data_dir / "bells"
 
     @property
@@ -237,7 +418,7 @@ class Settings(BaseSettings):
 
 
 def _require_objects(url: str) -> None:
-    """See that a URL names a place for objects, and holds no credentials. It is never repeated."""
+    """Raise ValueError if a URL names no object store or holds credentials; never repeat it."""
     scheme, _, rest = url.partition("://")
     if scheme not in OBJECT_SCHEMES or "://" not in url:
         known = ", ".join(f"{one}://" for one in OBJECT_SCHEMES)

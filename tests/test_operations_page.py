@@ -1,4 +1,4 @@
-"""docs/operations.md and the dashboard are held to settings, states, events, metrics, commands."""
+"""docs/operations.md, docs/settings.md and the dashboard say what the code has."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from sceneprint.settings import Settings
 from sceneprint_client.api import AnswerStatus, FrameState, JobState
 from sceneprint_client.api.admin import KINDS, MISSED
 from service.metrics import Metrics
+from tools.settings_page import settings_page
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGE = (DOCS / "operations.md").read_text()
@@ -69,14 +70,17 @@ def check(expression: str) -> None:
     assert by <= labels, expression
 
 
-def test_every_setting_is_told_with_its_default():
-    told = rows(section("Settings"))
-    assert set(told) == {name.upper() for name in Settings.model_fields}
-    for name, field in Settings.model_fields.items():
-        default, *_ = told[name.upper()]
-        if isinstance(field.default, str | int | float | tuple):
-            assert default.split("`")[1] == f"{field.default}"
-    assert all(len(cells) == 3 and all(cells) for cells in told.values())
+def test_the_page_of_settings_is_written_from_their_fields() -> None:
+    text = (DOCS / "settings.md").read_text()
+    assert text == settings_page(), "run: make goldens"
+    listed = rows(text)
+    assert list(listed) == [name.upper() for name in Settings.model_fields]
+    assert all(len(cells) == 4 and all(cells) for cells in listed.values())
+    assert listed["PORT"][:2] == ["whole number, at least 0, at most 65,535", "`8008`"]
+    assert listed["UPLOAD_BYTES"][1] == f"`{72 << 20}` (72 MiB)"
+    assert listed["WORKERS"][1] == "number of processors"
+    assert listed["DATABASE_URL"][:2] == ["text", "SQLite in the data folder"]
+    assert listed["SURFACES"][0] == "`auto` or `asked`"
 
 
 def test_every_state_is_told():

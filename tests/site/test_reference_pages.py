@@ -13,11 +13,10 @@ import pytest
 import sceneprint_client
 from sceneprint import errors
 from sceneprint.cli import all_commands
-from sceneprint.settings import Settings
 from sceneprint_client import Client
 from service.problems import type_of as problem_type
 from tools.site import http_pages
-from tools.site.code_pages import commands, metric_families, read_settings
+from tools.site.code_pages import commands, metric_families
 from tools.site.error_page import kinds, remedy, status
 from tools.site.markup import cell
 from tools.site.reference import GeneratedPage, api_document, generated_pages
@@ -109,25 +108,6 @@ def test_every_record_has_its_fields(
     assert answer["`alternatives`"] == "list of [Alternative](records.md#alternative)"
     assert "received" in found["FrameState"]
     assert r"Page\[Frame\]" in found
-
-
-def test_every_setting_is_listed_with_its_type_default_and_meaning(
-    pages: dict[str, GeneratedPage],
-) -> None:
-    names = [f"SCENEPRINT_{name.upper()}" for name in Settings.model_fields]
-    assert [one.name for one in read_settings()] == names
-    assert all(one.meaning.endswith((".", "none")) for one in read_settings())
-    text = pages["reference/settings.md"].text
-    assert f"{len(names)} environment variables" in text
-    told = {cells[0].strip("`"): cells[1:] for cells in rows(text)[1:]}
-    assert list(told) == names
-    assert told["SCENEPRINT_PORT"] == [
-        "`int`, at least 0, at most 65,535", "`8008`", "Port of the service; 0 for a free one.",
-    ]  # fmt: skip
-    assert told["SCENEPRINT_UPLOAD_BYTES"][1] == f"`{72 << 20}` (72 MiB)"
-    assert told["SCENEPRINT_WORKERS"][1] == "number of processors"
-    assert told["SCENEPRINT_DATABASE_URL"][:2] == ["`str", "None`"]  # never as a secret
-    assert told["SCENEPRINT_CORS_ORIGINS"][:1] == ["`tuple[str, ...]`"]
 
 
 def test_every_metric_is_listed_with_its_labels(pages: dict[str, GeneratedPage]) -> None:

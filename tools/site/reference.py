@@ -12,7 +12,7 @@ from sceneprint.settings import Settings
 from service.app import create_app
 from tools.site import http_pages
 from tools.site.client_page import client_page
-from tools.site.code_pages import commands_page, metrics_page, settings_page
+from tools.site.code_pages import commands_page, metrics_page
 from tools.site.error_page import error_page
 
 
@@ -48,9 +48,6 @@ def generated_pages() -> list[GeneratedPage]:
         ),
         GeneratedPage(
             "reference/commands.md", "Command line", commands_page(), "every command and option"
-        ),
-        GeneratedPage(
-            "reference/settings.md", "Settings", settings_page(), "every variable and its default"
         ),
         GeneratedPage("reference/metrics.md", "Metrics", metrics_page(), "what Prometheus is told"),
     ]
