@@ -7,11 +7,14 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from datetime import timedelta
+from importlib import import_module
 from importlib.metadata import entry_points
+from inspect import cleandoc
 from pkgutil import resolve_name
+from typing import NamedTuple
 
 from sceneprint import __version__
 from sceneprint.errors import SceneprintError
@@ -21,56 +24,72 @@ from sceneprint.process import read_secret_files
 USAGE = 2
 
 
-#: The module of this package that has each command, in the order in which the help lists them.
+#: The module of each command in this package and its line in `sceneprint --help`, in the order of
+#: that help. `add_NAME` of the module adds the options, and the docstring of the function that
+#: they are for is the command's description.
 COMMANDS = {
-    "serve": "serve",
-    "work": "serve",
-    "keys": "admin",
-    "tenants": "admin",
-    "audit": "audit",
-    "maps": "inventory",
-    "upload": "upload",
-    "spool": "spool",
-    "query": "query",
-    "localize": "query",
-    "queries": "inventory",
-    "associate": "sessions",
-    "frames": "inventory",
-    "sessions": "sessions",
-    "reconstruct": "reconstruct",
-    "jobs": "inventory",
-    "bag": "bag",
-    "doctor": "doctor",
-    "migrate": "storage",
-    "fsck": "storage",
-    "reencode": "storage",
-    "purge": "storage",
-    "snapshot": "storage",
-    "restore": "storage",
-    "pull": "storage",
-    "sign": "sign",
+    "serve": ("serve", "run the HTTP service and its workers"),
+    "work": ("serve", "run workers without the HTTP service"),
+    "keys": ("admin", "create, list, rotate and revoke the API keys of a service"),
+    "tenants": ("admin", "create, list and delete the tenants that API keys belong to"),
+    "audit": ("audit", "print or export the audit log"),
+    "maps": ("inventory", "list, create, edit or delete the maps of a service"),
+    "upload": ("upload", "upload depth frames, point clouds or a whole map to a map of a service"),
+    "spool": ("spool", "keep frames on disk while there is no service, and upload them later"),
+    "query": ("query", "find frames of the same place in a map"),
+    "localize": ("query", "find the pose of a frame in a map"),
+    "queries": ("inventory", "list the queries that came, and what came of them"),
+    "associate": ("sessions", "join two sessions of a map, or find the loop closures of one"),
+    "frames": ("inventory", "list frames of a map, download their files, edit metadata"),
+    "sessions": ("sessions", "list, rename, tag or delete the sessions of a map"),
+    "reconstruct": ("reconstruct", "fuse the matches of a frame to a mesh"),
+    "jobs": ("inventory", "list, retry or cancel the jobs of a service"),
+    "bag": ("bag", "show what a recording of ROS holds"),
+    "doctor": ("doctor", "check this machine, the data folder and the service"),
+    "migrate": ("storage", "create the database's schema, or upgrade it to this version's"),
+    "fsck": ("storage", "check and repair database, blobs and indexes"),
+    "reencode": ("storage", "switch a map to another model"),
+    "purge": ("storage", "erase every byte of deleted frames on this node now"),
+    "snapshot": ("storage", "back up database and blobs as a bundle, while the service runs"),
+    "restore": ("storage", "verify a bundle and restore it to a data folder or a database"),
+    "pull": ("storage", "copy maps of a service to this machine, to localise without network"),
+    "sign": ("sign", "sign depth frames and point clouds"),
 }
 
 
-def all_commands() -> dict[str, str]:
-    """Return the function that describes each command, as `MODULE:FUNCTION`, by its name.
+class Command(NamedTuple):
+    """The function that adds the options of a command, as `MODULE:FUNCTION`, and a line of help."""
 
-    Other distributions, such as sceneprint-lab, add theirs as entry points.
+    function: str
+    line: str
+
+
+def own_command(name: str) -> Command:
+    """Return a command of this package."""
+    module, line = COMMANDS[name]
+    return Command(f"sceneprint.cli.{module}:add_{name}", line)
+
+
+def all_commands() -> dict[str, Command]:
+    """Return all commands by their names, without importing the module of any.
+
+    Other distributions, such as sceneprint-lab, add theirs as entry points. The package of their
+    modules has the lines of help in its `COMMANDS`.
     """
-    added = entry_points(group="sceneprint.commands")
-    return {name: _own(name) for name in COMMANDS} | {one.name: one.value for one in added}
+    found = {name: own_command(name) for name in COMMANDS}
+    for one in entry_points(group="sceneprint.commands"):
+        lines = import_module(one.module.rpartition(".")[0]).COMMANDS
+        found[one.name] = Command(one.value, lines[one.name])
+    return found
 
 
-def _own(name: str) -> str:
-    return f"sceneprint.cli.{COMMANDS[name]}:add_{name.replace('-', '_')}"
-
-
-def parser(known: Mapping[str, str] | None = None) -> argparse.ArgumentParser:
-    """Return the parser of commands with their options.
+def parser(name: str | None = None) -> argparse.ArgumentParser:
+    """Return the parser of one command, or of all.
 
     Parameters
     ----------
-    known : what `all_commands` returns, or a part of it; only its modules are loaded
+    name : of the command whose options are known; no module of another one is imported. With None,
+        all options are known, and with a name that is no command's, none
     """
     top = argparse.ArgumentParser(
         prog="sceneprint",
@@ -78,23 +97,14 @@ def parser(known: Mapping[str, str] | None = None) -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"sceneprint {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for function in (all_commands() if known is None else known).values():
-        resolve_name(function)(commands)
+    # to look for entry points takes as long as all the rest of a small command's parser
+    found = {name: own_command(name)} if name in COMMANDS else all_commands()
+    for each, (function, line) in found.items():
+        command = commands.add_parser(each, help=line)
+        if name in (None, each):
+            resolve_name(function)(command)
+            command.description = cleandoc(command.get_default("run").__doc__ or "")
     return top
-
-
-def _needed(arguments: Sequence[str]) -> Mapping[str, str]:
-    """Return the commands that have to be known to read these arguments.
-
-    To load them all takes a second, which is most of what a small command needs.
-    """
-    first = arguments[0] if arguments else ""
-    if first == "--version":
-        return {}
-    if first in COMMANDS:
-        return {first: _own(first)}
-    found = all_commands()
-    return {first: found[first]} if first in found else found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -103,9 +113,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     command = "sceneprint"
-    given = sys.argv[1:] if arguments is None else arguments
-    try:  # from the first import on, which takes a second
-        options = parser(_needed(given)).parse_args(given)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    # httpx imports rich and click for a command of its own, which takes longer than all else here
+    sys.modules.setdefault("httpx._main", None)  # type: ignore[arg-type]
+    try:
+        options = parser(arguments[0] if arguments else "").parse_args(arguments)
         command = f"sceneprint {options.command}"
         read_secret_files(os.environ)
         return int(options.run(options))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sceneprint.cli import duration
 from sceneprint.cli.options import one_line
@@ -21,15 +21,8 @@ if TYPE_CHECKING:
 SOON = timedelta(days=7)
 
 
-def add_keys(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "keys",
-        help="create, list, rotate and revoke the API keys of a service",
-        description="Create, list, rotate or revoke API keys. A service needs them once it listens "
-        "beyond its own machine. The secret of a key is printed once; only its "
-        "hash is stored.",
-    )
+def add_keys(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint keys`."""
     what = command.add_mutually_exclusive_group(required=True)
     what.add_argument("--create", metavar="NAME", help="create a key and print its secret")
     what.add_argument(
@@ -76,7 +69,9 @@ def add_keys(commands: Any) -> None:
 
 
 def run_keys(options: argparse.Namespace) -> int:
-    """Do what was asked for with the keys of the data folder."""
+    """Create, list, rotate or revoke API keys. A service needs them once it listens beyond its
+    own machine. The secret of a key is printed once; only its hash is stored.
+    """
     from sceneprint.engine import Engine
     from sceneprint.errors import InvalidRequest
 
@@ -155,15 +150,8 @@ def _key_line(key: Key) -> str:
 # `sceneprint tenants`: whom keys belong to.
 
 
-def add_tenants(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "tenants",
-        help="create, list and delete the tenants that API keys belong to",
-        description="Create, list or delete tenants. What the keys of a tenant ask at once and "
-        "per second is counted together, and tenants take turns at the workers. A key that is "
-        "created without --tenant belongs to a tenant of its own name.",
-    )
+def add_tenants(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint tenants`."""
     what = command.add_mutually_exclusive_group(required=True)
     what.add_argument("--create", metavar="NAME", help="create a tenant without keys")
     what.add_argument(
@@ -177,7 +165,10 @@ def add_tenants(commands: Any) -> None:
 
 
 def run_tenants(options: argparse.Namespace) -> int:
-    """Do what was asked for with the tenants of the data folder."""
+    """Create, list or delete tenants. What the keys of a tenant ask at once and per second is
+    counted together, and tenants take turns at the workers. A key that is created without
+    --tenant belongs to a tenant of its own name.
+    """
     from sceneprint.engine import Engine
     from sceneprint.engine.admin.operations import create_tenant, delete_tenant
     from sceneprint.store.tenants import list_tenants

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from datetime import UTC
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sceneprint.cli import duration, whole_number
 from sceneprint.cli.options import one_line, require_database
@@ -25,15 +25,8 @@ if TYPE_CHECKING:
 _PRIORITY = 13 * 8 + 5
 
 
-def add_audit(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "audit",
-        help="print or export the audit log",
-        description="Print the newest entries of the audit log, newest first. Each entry names "
-        "the key, its address, and the change or the refused request. With --format, export all "
-        "entries, oldest first.",
-    )
+def add_audit(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint audit`."""
     command.add_argument(
         "--actor",
         metavar="NAME",
@@ -72,7 +65,10 @@ def add_audit(commands: Any) -> None:
 
 
 def run_audit(options: argparse.Namespace) -> int:
-    """Print the newest entries, or export all."""
+    """Print the newest entries of the audit log, newest first. Each entry names the key, its
+    address, and the change or the refused request. With --format, export all entries, oldest
+    first.
+    """
     from sceneprint.engine import Engine
     from sceneprint.errors import InvalidRequest
     from sceneprint.store.audit_log import AuditFilter

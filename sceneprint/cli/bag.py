@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
@@ -152,14 +151,8 @@ def tell(sequence: FrameSequence) -> None:
 # `sceneprint bag info`.
 
 
-def add_bag(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "bag",
-        help="show what a recording of ROS holds",
-        description="Look into a recording of ROS: an MCAP file, a rosbag2 folder or database, or "
-        "a ROS 1 bag.",
-    )
+def add_bag(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint bag`."""
     what = command.add_subparsers(dest="what", required=True, metavar="ACTION")
     info = what.add_parser(
         "info",
@@ -171,7 +164,7 @@ def add_bag(commands: Any) -> None:
 
 
 def run_bag(options: argparse.Namespace) -> int:
-    """Print what is in recordings; returns 1 where nothing of one would be taken."""
+    """Look into a recording of ROS: an MCAP file, a rosbag2 folder or database, or a ROS 1 bag."""
     outlines: list[BagOutline] = []
     for path in find_recordings(options.path) or [options.path]:
         with recording_options(options) as recording:

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
 from sceneprint import __version__
@@ -491,23 +491,18 @@ def _unwritable(folder: Path) -> int | None:
         return error.errno or errno.EIO
 
 
-def add_doctor(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "doctor",
-        help="check this machine, the data folder and the service",
-        description="Check this machine, the data folder and the service, and suggest fixes. "
-        "With --url alone, ask that service: version, store, workers, queue, disk, clock and "
-        "models. Changes nothing. Exit code 2 if something required is missing; missing optional "
-        "parts are noted.",
-    )
+def add_doctor(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint doctor`."""
     add_data_option(command)
     add_service_options(command)
     command.set_defaults(run=run_doctor)
 
 
 def run_doctor(options: argparse.Namespace) -> int:
-    """Look at everything; returns 2 where something needed is wrong."""
+    """Check this machine, the data folder and the service, and suggest fixes. With --url alone,
+    ask that service: version, store, workers, queue, disk, clock and models. Changes nothing.
+    Exit code 2 if something required is missing; missing optional parts are noted.
+    """
     wrong = 0
     for finding in (*_all(options),):
         print(f"{finding.verdict:5}  {finding.subject:16}  {one_line(finding.text)}", flush=True)

@@ -39,15 +39,8 @@ if TYPE_CHECKING:
 _FILES = ("cloud", "preview", "patches", "signature", "upload")
 
 
-def add_frames(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "frames",
-        help="list frames of a map, download their files, edit metadata",
-        description="List the frames of a map in order of upload, those of one session in the "
-        "order they were taken, or write the trajectory of a session. With FRAME: show that "
-        "frame, download its files, or edit its metadata.",
-    )
+def add_frames(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint frames`."""
     command.add_argument("map", metavar="MAP")
     command.add_argument("frame_id", nargs="?", metavar="FRAME", help="id of one frame")
     _add_listing(command.add_argument_group("select frames or poses"))
@@ -118,7 +111,10 @@ def _add_files(group: Any) -> None:
 
 
 def run_frames(options: argparse.Namespace) -> int:
-    """List, write or edit."""
+    """List the frames of a map in order of upload, those of one session in the order they were
+    taken, or write the trajectory of a session. With FRAME: show that frame, download its files,
+    or edit its metadata.
+    """
     of_one = [name for name in (*_FILES, "edit") if getattr(options, name) is not None]
     if options.frame_id is None and of_one:
         raise InvalidRequest(f"--{of_one[0]} applies to one frame. Give its id after the map.")
@@ -266,14 +262,8 @@ def _changes(text: str) -> dict[str, Any]:
 # `sceneprint queries`: what robots asked, and what came of it.
 
 
-def add_queries(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "queries",
-        help="list the queries that came, and what came of them",
-        description="List the latest queries of a map, or of all maps, newest first: when each "
-        "came, what came of it, who asked, where that is, and why it failed.",
-    )
+def add_queries(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint queries`."""
     command.add_argument("map", nargs="?", metavar="MAP", help="only queries of this map")
     command.add_argument(
         "--status", action="append", default=[], choices=RECORD_STATUSES,
@@ -300,7 +290,9 @@ def add_queries(commands: Any) -> None:
 
 
 def run_queries(options: argparse.Namespace) -> int:
-    """List."""
+    """List the latest queries of a map, or of all maps, newest first: when each came, what came
+    of it, who asked, where that is, and why it failed.
+    """
     with open_client(options) as client:
         found = client.queries(
             options.map, status=options.status, robot=options.robot, since=options.since,
@@ -340,13 +332,8 @@ def _where_or_why(one: QueryRecord) -> str:
 # `sceneprint jobs`: the jobs of a service, given up or tried again.
 
 
-def add_jobs(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "jobs",
-        help="list, retry or cancel the jobs of a service",
-        description="List the jobs of a service, newest first, or retry or cancel some.",
-    )
+def add_jobs(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint jobs`."""
     choice = command.add_mutually_exclusive_group()
     choice.add_argument("--retry", metavar="ID", help="retry a dead or cancelled job")
     choice.add_argument(
@@ -364,7 +351,7 @@ def add_jobs(commands: Any) -> None:
 
 
 def run_jobs(options: argparse.Namespace) -> int:
-    """List, cancel or retry."""
+    """List the jobs of a service, newest first, or retry or cancel some."""
     asked = options.retry is not None or options.retry_dead or options.cancel is not None
     if asked and options.state is not None:
         raise InvalidRequest(
@@ -430,14 +417,8 @@ def _print_jobs(jobs: Iterable[Job], *, as_json: bool) -> None:
 NONE = "none"
 
 
-def add_maps(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "maps",
-        help="list, create, edit or delete the maps of a service",
-        description="List the maps of a service, or create, edit or delete one. Only operators "
-        "can set quotas: that needs a key with `admin` for `*`.",
-    )
+def add_maps(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint maps`."""
     choice = command.add_mutually_exclusive_group()
     choice.add_argument(
         "--create", metavar="NAME", help="create a map; its name may contain a-z, 0-9, - and _"
@@ -470,7 +451,9 @@ def add_maps(commands: Any) -> None:
 
 
 def run_maps(options: argparse.Namespace) -> int:
-    """List, make, change or delete."""
+    """List the maps of a service, or create, edit or delete one. Only operators can set quotas:
+    that needs a key with `admin` for `*`.
+    """
     names = ("title", "quota_frames", "quota_bytes", "retention_days", "up")
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     limits = {n: None if value == NONE else value for n, value in given.items() if n != "title"}

@@ -123,16 +123,8 @@ def save_overlay(client: Client, answer: Answer, options: argparse.Namespace) ->
     return f"{options.overlay}: the query aligned with {frame_label(best.frame_id, best.name)}"
 
 
-def add_query(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "query",
-        help="find frames of the same place in a map",
-        description="Query a map with depth frames or point clouds: one file, or the frames of "
-        "a folder (7-Scenes, TUM RGB-D or plain depth images, with an intrinsics.json beside "
-        "them or in a folder above; or clouds), or the keyframes of a recording of ROS. They are "
-        "not added to the map.",
-    )
+def add_query(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint query`."""
     command.add_argument("map", metavar="MAP")
     command.add_argument("path", type=Path, metavar="PATH")
     command.add_argument(
@@ -167,7 +159,11 @@ def add_query(commands: Any) -> None:
 
 
 def run_query(options: argparse.Namespace) -> int:
-    """Ask; returns 2 where a frame could not be looked up."""
+    """Query a map with depth frames or point clouds: one file, or the frames of a folder
+    (7-Scenes, TUM RGB-D or plain depth images, with an intrinsics.json beside them or in a
+    folder above; or clouds), or the keyframes of a recording of ROS. They are not added to the
+    map.
+    """
     check_scene(options)
     check_kept(options)
     references = query_frames(options)
@@ -400,14 +396,8 @@ def _degrees(transform: Transform | None) -> str:
 _LAST, _FARTHEST_BACK = 3, 200
 
 
-def add_localize(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "localize",
-        help="find the pose of a frame in a map",
-        description="Find the poses in a map at which depth frames or clouds were taken. They are "
-        "not added to the map. Exit code 0: all are found; 1: one is ambiguous or not found.",
-    )
+def add_localize(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint localize`."""
     command.add_argument("map", metavar="MAP")
     command.add_argument(
         "path", type=Path, metavar="FRAME", help="a depth image, a cloud, a folder or a recording"
@@ -432,7 +422,9 @@ def add_localize(commands: Any) -> None:
 
 
 def run_localize(options: argparse.Namespace) -> int:
-    """Ask; returns 1 where a frame is not found, and 2 where one could not be looked up."""
+    """Find the poses in a map at which depth frames or clouds were taken. They are not added to
+    the map. Exit code 0: all are found; 1: one is ambiguous or not found.
+    """
     check_scene(options)
     check_kept(options)
     every = [frame for one in sequences_at(options.path, options) for frame in one.frames]

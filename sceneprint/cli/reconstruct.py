@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli import positive
@@ -29,14 +29,8 @@ if TYPE_CHECKING:
 _TIMEOUT_S = 600.0
 
 
-def add_reconstruct(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "reconstruct",
-        help="fuse the matches of a frame to a mesh",
-        description="Query a map with a depth frame, and let a worker fuse the accepted matches "
-        "to a surface in the camera frame of the query. Exit code 1 if no match is accepted.",
-    )
+def add_reconstruct(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint reconstruct`."""
     command.add_argument("map", metavar="MAP")
     command.add_argument(
         "frame", metavar="FRAME", help="a depth image, or the id of a frame of the map"
@@ -72,7 +66,9 @@ def add_reconstruct(commands: Any) -> None:
 
 
 def run_reconstruct(options: argparse.Namespace) -> int:
-    """Query, reconstruct and write the mesh; return 1 if no match was accepted."""
+    """Query a map with a depth frame, and let a worker fuse the accepted matches to a surface in
+    the camera frame of the query. Exit code 1 if no match is accepted.
+    """
     check_writable(options.out)
     with open_client(options) as client:
         answer = _query(client, options)

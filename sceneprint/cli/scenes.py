@@ -9,17 +9,19 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from sceneprint.atomic_files import check_writable
 from sceneprint.cli import whole_number
 from sceneprint.cli.options import ended_by_signals, one_line
 from sceneprint.errors import InvalidRequest, MissingDependency
-from sceneprint_client import Client
-from sceneprint_client.api import Answer, Frame
-from sceneprint_client.api.base import CameraIntrinsics
-from sceneprint_client.api.sessions import Association
-from sceneprint_client.frame_files import FrameFile
+
+if TYPE_CHECKING:
+    from sceneprint_client import Client
+    from sceneprint_client.api import Answer, Frame
+    from sceneprint_client.api.base import CameraIntrinsics
+    from sceneprint_client.api.sessions import Association
+    from sceneprint_client.frame_files import FrameFile
 
 
 class Scene(Protocol):
@@ -57,7 +59,7 @@ class Scene(Protocol):
 
 #: Opens the scene of a file; also takes the client to fetch with, and how many frames of a map
 #: are shown. The file is there only when the block ends without an error.
-SceneOpener = Callable[[Path, Client, int], AbstractContextManager[Scene]]
+SceneOpener: TypeAlias = "Callable[[Path, Client, int], AbstractContextManager[Scene]]"
 
 
 def add_scene_options(command: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ import logging
 import signal
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sceneprint.cli import whole_number
 
@@ -16,14 +16,8 @@ if TYPE_CHECKING:
     from sceneprint.settings import Settings
 
 
-def add_serve(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "serve",
-        help="run the HTTP service and its workers",
-        description="Run the HTTP service and its workers. It needs no configuration; you can "
-        "also set every option in the environment (SCENEPRINT_HOST, _PORT, _WORKERS, _DATA_DIR).",
-    )
+def add_serve(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint serve`."""
     add_data_option(command)
     command.add_argument(
         "--host",
@@ -93,7 +87,9 @@ def settings_of(options: argparse.Namespace) -> Settings:
 
 
 def run_serve(options: argparse.Namespace) -> int:
-    """Serve until told to stop."""
+    """Run the HTTP service and its workers. It needs no configuration; you can also set every
+    option in the environment (SCENEPRINT_HOST, _PORT, _WORKERS, _DATA_DIR).
+    """
     gc.disable()  # until all is imported: a twelfth of the start would go to it
     from sceneprint.process import log_as_json
     from service.server import run as serve
@@ -143,20 +139,15 @@ def run_serve(options: argparse.Namespace) -> int:
 # `sceneprint work`: workers alone, beside a service that runs elsewhere on the same store.
 
 
-def add_work(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "work",
-        help="run workers without the HTTP service",
-        description="Run worker processes for a service that uses the same store.",
-    )
+def add_work(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint work`."""
     add_data_option(command)
     add_workers_option(command)
     command.set_defaults(run=run_work)
 
 
 def run_work(options: argparse.Namespace) -> int:
-    """Work until told to stop."""
+    """Run worker processes for a service that uses the same store."""
     from sceneprint.atomic_files import warn_if_public
     from sceneprint.cli.preparation import prepare_presets
     from sceneprint.engine.engine import open_engine

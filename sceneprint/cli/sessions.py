@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
@@ -30,14 +30,8 @@ if TYPE_CHECKING:
 _FORMATS: dict[str, GraphFormat] = {".g2o": "g2o", ".txt": "tum", ".tum": "tum", ".json": "json"}
 
 
-def add_sessions(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "sessions",
-        help="list, rename, tag or delete the sessions of a map",
-        description="List the sessions of a map. With SESSION: rename it, change the tags of its "
-        "frames, or delete it with all its frames. Deletions can be undone for a while.",
-    )
+def add_sessions(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint sessions`."""
     command.add_argument("map", metavar="MAP")
     command.add_argument("session", nargs="?", metavar="SESSION", help="name of one session")
     command.add_argument("--robot", metavar="NAME", help="only the frames of this robot")
@@ -63,7 +57,9 @@ def add_sessions(commands: Any) -> None:
 
 
 def run_sessions(options: argparse.Namespace) -> int:
-    """List, edit or delete."""
+    """List the sessions of a map. With SESSION: rename it, change the tags of its frames, or
+    delete it with all its frames. Deletions can be undone for a while.
+    """
     edits = {
         "rename": options.rename, "rename_robot": options.rename_robot, "add_tags": options.tag,
         "remove_tags": options.untag,
@@ -159,18 +155,11 @@ def _sessions(sessions: Iterable[Session], *, as_json: bool) -> None:
         print("no sessions yet")
 
 
-def add_associate(commands: Any) -> None:
-    """Describe the command to the parser.
+def add_associate(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint associate`.
 
     Length: a statement for each option, in the order of `--help`.
     """
-    command = commands.add_parser(
-        "associate",
-        help="join two sessions of a map, or find the loop closures of one",
-        description="Find where two sessions of a map see the same places and how they align, "
-        "or find the loop closures of a single session. Can write the pose graph for an "
-        "optimiser.",
-    )
     command.add_argument("map", metavar="MAP")
     which = command.add_mutually_exclusive_group(required=True)
     which.add_argument(
@@ -252,7 +241,9 @@ def add_associate(commands: Any) -> None:
 
 
 def run_associate(options: argparse.Namespace) -> int:
-    """Associate, and wait, or undo a join; returns 2 where it did not succeed."""
+    """Find where two sessions of a map see the same places and how they align, or find the loop
+    closures of a single session. Can write the pose graph for an optimiser.
+    """
     from sceneprint_client.api.sessions import Association
 
     if options.undo is not None:

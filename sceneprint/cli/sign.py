@@ -22,15 +22,8 @@ from sceneprint.pipeline import Signature, Signer, sign
 from sceneprint.settings import Settings
 
 
-def add_sign(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "sign",
-        help="sign depth frames and point clouds",
-        description="Sign every frame of the given files and folders (7-Scenes, TUM RGB-D or "
-        "plain depth images, with an intrinsics.json beside them or in a folder above; or point "
-        "clouds).",
-    )
+def add_sign(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint sign`."""
     command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
     add_model_options(command)
     command.add_argument(
@@ -89,7 +82,9 @@ def named_frames(options: argparse.Namespace) -> list[tuple[str, FrameReference]
 
 
 def run_sign(options: argparse.Namespace) -> int:
-    """Sign; returns 2 where a frame could not be signed."""
+    """Sign every frame of the given files and folders (7-Scenes, TUM RGB-D or plain depth
+    images, with an intrinsics.json beside them or in a folder above; or point clouds).
+    """
     frames = named_frames(options)
     signer = open_for(options, Settings(), psi=options.psi)
     if options.out is not None:

@@ -8,7 +8,6 @@ import sys
 from dataclasses import asdict
 from datetime import UTC
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
@@ -27,15 +26,8 @@ from sceneprint_client.api.base import NOVEL
 from sceneprint_client.spool import MOST_BYTES, Spool, SpoolRefusal, SyncReport
 
 
-def add_spool(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "spool",
-        help="keep frames on disk while there is no service, and upload them later",
-        description="Keep frames in a file of bounded size while a robot is offline, and upload "
-        "them when it is back. A full spool gives up the frames that are nearest to others. A "
-        "frame leaves the spool once the map has it; whatever is interrupted, run `sync` again.",
-    )
+def add_spool(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint spool`."""
     what = command.add_subparsers(dest="what", required=True, metavar="ACTION")
     add = what.add_parser("add", help="add frames to a spool, which is created if missing")
     _add_file(add)
@@ -77,7 +69,10 @@ def _add_file(command: argparse.ArgumentParser) -> None:
 
 
 def run_spool(options: argparse.Namespace) -> int:
-    """Do what was asked for with a spool."""
+    """Keep frames in a file of bounded size while a robot is offline, and upload them when it is
+    back. A full spool gives up the frames that are nearest to others. A frame leaves the spool
+    once the map has it; whatever is interrupted, run `sync` again.
+    """
     if options.what == "add":
         return _add(options)
     if not options.spool.is_file():

@@ -42,17 +42,8 @@ _COUNTED = (
 )  # fmt: skip
 
 
-def add_migrate(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "migrate",
-        help="create the database's schema, or upgrade it to this version's",
-        description="Create or upgrade the schema of a data folder or of DATABASE_URL, in one "
-        "transaction, and print the revisions. `serve` and `work` do so by themselves when they "
-        "start; use this as a step of its own in a deployment. Where the schema is up to date it "
-        "changes nothing. Exit code 2 if a later version wrote the database, or it cannot be "
-        "reached.",
-    )
+def add_migrate(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint migrate`."""
     add_data_option(command)
     command.add_argument(
         "--check",
@@ -63,7 +54,11 @@ def add_migrate(commands: Any) -> None:
 
 
 def run_migrate(options: argparse.Namespace) -> int:
-    """Bring the schema up to this version's, and say from which revision to which."""
+    """Create or upgrade the schema of a data folder or of DATABASE_URL, in one transaction, and
+    print the revisions. `serve` and `work` do so by themselves when they start; use this as a
+    step of its own in a deployment. Where the schema is up to date it changes nothing. Exit code
+    2 if a later version wrote the database, or it cannot be reached.
+    """
     from sceneprint.engine import Engine
     from sceneprint.store.database import is_there, reach_database
 
@@ -91,16 +86,8 @@ def _revisions(database: Database) -> tuple[str | None, bool]:
         return revision_of(connection), current_revision(connection) == known_revisions()[0]
 
 
-def add_fsck(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "fsck",
-        help="check and repair database, blobs and indexes",
-        description="Check rows, signatures, blobs and indexes of a data folder, "
-        "and report problems and what --repair would do. Changes nothing without --repair. The "
-        "service may be running. Exit code 1 if problems remain, 2 if the folder cannot be "
-        "checked.",
-    )
+def add_fsck(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint fsck`."""
     add_data_option(command)
     command.add_argument("--map", metavar="MAP", help="check only this map")
     how = command.add_mutually_exclusive_group()
@@ -127,7 +114,10 @@ def add_fsck(commands: Any) -> None:
 
 
 def run_fsck(options: argparse.Namespace) -> int:
-    """Check, tell, and repair if asked to; returns 1 where something is left."""
+    """Check rows, signatures, blobs and indexes of a data folder, and report problems and what
+    --repair would do. Changes nothing without --repair. The service may be running. Exit code 1
+    if problems remain, 2 if the folder cannot be checked.
+    """
     from sceneprint.engine import Engine
     from sceneprint.maintenance.fsck.check import fsck
     from sceneprint.maintenance.fsck.findings import GRACE_S
@@ -204,20 +194,16 @@ def _progress_bar() -> Iterator[Callable[[str, int, int], None]]:
 # `sceneprint purge`: deletions made final now.
 
 
-def add_purge(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "purge",
-        help="erase every byte of deleted frames on this node now",
-        description="Erase every byte of deleted frames on this node now, without waiting for "
-        "SCENEPRINT_PURGE_S. Their deletion cannot be undone afterwards.",
-    )
+def add_purge(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint purge`."""
     add_data_option(command)
     command.set_defaults(run=run_purge)
 
 
 def run_purge(options: argparse.Namespace) -> int:
-    """Purge; returns 1 where the database's log could not be emptied."""
+    """Erase every byte of deleted frames on this node now, without waiting for
+    SCENEPRINT_PURGE_S. Their deletion cannot be undone afterwards.
+    """
     from sceneprint.engine import Engine
 
     settings = settings_of(options)
@@ -240,17 +226,8 @@ def run_purge(options: argparse.Namespace) -> int:
 _SHOWN = 10
 
 
-def add_snapshot(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "snapshot",
-        help="back up database and blobs as a bundle, while the service runs",
-        description="Write a bundle of database and blobs to a folder or an object store. The "
-        "service and its workers may keep running. What an earlier bundle there holds is not "
-        "written again. Search indexes are left out, as they can be rebuilt. Exit code 1 if a blob "
-        "was missing or damaged and could not be included. A bundle contains all frames and the "
-        "hashes of keys: protect it like the data folder.",
-    )
+def add_snapshot(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint snapshot`."""
     add_data_option(command)
     add_database_option(command)
     command.add_argument(
@@ -269,7 +246,12 @@ def add_snapshot(commands: Any) -> None:
 
 
 def run_snapshot(options: argparse.Namespace) -> int:
-    """Write a bundle; return 1 if blobs were damaged, and so are not in it."""
+    """Write a bundle of database and blobs to a folder or an object store. The service and its
+    workers may keep running. What an earlier bundle there holds is not written again. Search
+    indexes are left out, as they can be rebuilt. Exit code 1 if a blob was missing or damaged
+    and could not be included. A bundle contains all frames and the hashes of keys: protect it
+    like the data folder.
+    """
     from sceneprint.bundle.backup import take_backup
 
     start = time.perf_counter()
@@ -361,17 +343,8 @@ def name_lost(bundle: Bundle, advice: str) -> bool:
 # `sceneprint restore`: a data folder of a bundle, or the store of a fleet.
 
 
-def add_restore(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "restore",
-        help="verify a bundle and restore it to a data folder or a database",
-        description="Restore a bundle to a data folder, verifying every byte. With the URL of an "
-        "empty PostgreSQL database, its rows go there in one transaction, and its blobs to "
-        "SCENEPRINT_BLOB_URL or else the data folder. A folder that is not empty stays untouched. "
-        "A restore that was interrupted goes on when you run it again. Exit code 1 if the bundle "
-        "lists blobs that were damaged when it was taken; 2 if nothing was restored.",
-    )
+def add_restore(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint restore`."""
     command.add_argument(
         "place",
         metavar="PLACE",
@@ -392,7 +365,12 @@ def add_restore(commands: Any) -> None:
 
 
 def run_restore(options: argparse.Namespace) -> int:
-    """Verify or restore; return 1 if blobs were damaged when the bundle was taken."""
+    """Restore a bundle to a data folder, verifying every byte. With the URL of an empty
+    PostgreSQL database, its rows go there in one transaction, and its blobs to
+    SCENEPRINT_BLOB_URL or else the data folder. A folder that is not empty stays untouched. A
+    restore that was interrupted goes on when you run it again. Exit code 1 if the bundle lists
+    blobs that were damaged when it was taken; 2 if nothing was restored.
+    """
     from sceneprint.bundle import restoration
 
     settings, start = named_database(options), time.perf_counter()
@@ -454,15 +432,8 @@ def _server(settings: Settings) -> str:
 # `sceneprint pull`: a robot's copies of maps, to localise without network.
 
 
-def add_pull(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "pull",
-        help="copy maps of a service to this machine, to localise without network",
-        description="Copy maps of a service to a data folder, without uploads and keys. Only what "
-        "is new is downloaded. A key that may read the maps suffices, and programs may use the "
-        "folder meanwhile.",
-    )
+def add_pull(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint pull`."""
     command.add_argument(
         "--map", action="append", metavar="NAME", required=True, help="a map; may be repeated"
     )
@@ -472,7 +443,9 @@ def add_pull(commands: Any) -> None:
 
 
 def run_pull(options: argparse.Namespace) -> int:
-    """Bring copies of maps to what the service has now."""
+    """Copy maps of a service to a data folder, without uploads and keys. Only what is new is
+    downloaded. A key that may read the maps suffices, and programs may use the folder meanwhile.
+    """
     from sceneprint.engine.maps.map_copy import claim_folder, pull_map
     from sceneprint.store import open_store
 
@@ -515,16 +488,8 @@ STALL_S = 120.0
 LOOK_S = 0.5
 
 
-def add_reencode(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "reencode",
-        help="switch a map to another model",
-        description="Sign every frame of a map again with another model, from the stored "
-        "uploads. Workers sign new uploads first. Queries use the current model until all "
-        "frames are signed; then the map switches at once. Works on the data folder, also while "
-        "a service runs on it. Run the same command again to retry failed frames.",
-    )
+def add_reencode(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint reencode`."""
     command.add_argument("map", metavar="MAP")
     what = command.add_mutually_exclusive_group(required=True)
     what.add_argument("--model", metavar="MODEL", help="depth, lidar, paper, or a model file")
@@ -540,7 +505,11 @@ def add_reencode(commands: Any) -> None:
 
 
 def run_reencode(options: argparse.Namespace) -> int:
-    """Begin, watch or give up; returns 2 where waiting was no use."""
+    """Sign every frame of a map again with another model, from the stored uploads. Workers sign
+    new uploads first. Queries use the current model until all frames are signed; then the map
+    switches at once. Works on the data folder, also while a service runs on it. Run the same
+    command again to retry failed frames.
+    """
     from sceneprint.engine import Engine
     from sceneprint.engine.maps import map_lifecycle
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
@@ -265,22 +265,11 @@ OF_FRAME = (
 )  # fmt: skip
 
 
-def add_upload(commands: Any) -> None:
-    """Describe the command to the parser.
+def add_upload(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint upload`.
 
     Length: a statement for each option, in the order of `--help`.
     """
-    command = commands.add_parser(
-        "upload",
-        help="upload depth frames, point clouds or a whole map to a map of a service",
-        description="Upload every frame of the given files and folders (7-Scenes, TUM RGB-D or "
-        "plain depth images, with an intrinsics.json beside them or in a folder above; or point "
-        "clouds), and wait until they are signed. Of a recording of ROS (MCAP, rosbag2, ROS 1 "
-        "bag) keyframes are uploaded. RTAB-Map databases, E57 files, and exports of Polycam, "
-        "Record3D and nerfstudio are taken with their poses. A zip or tar archive is sent whole "
-        "and unpacked by the service. With --as-map, one cloud or mesh of a whole place becomes "
-        "the map. A frame that the map already has is not stored twice.",
-    )
     command.add_argument(
         "map", metavar="MAP", help="map to upload to; created if it does not exist"
     )
@@ -336,7 +325,14 @@ def add_upload(commands: Any) -> None:
 
 
 def run_upload(options: argparse.Namespace) -> int:
-    """Upload; return 2 where a frame was not indexed, or left out though nobody asked for it."""
+    """Upload every frame of the given files and folders (7-Scenes, TUM RGB-D or plain depth
+    images, with an intrinsics.json beside them or in a folder above; or point clouds), and wait
+    until they are signed. Of a recording of ROS (MCAP, rosbag2, ROS 1 bag) keyframes are
+    uploaded. RTAB-Map databases, E57 files, and exports of Polycam, Record3D and nerfstudio are
+    taken with their poses. A zip or tar archive is sent whole and unpacked by the service. With
+    --as-map, one cloud or mesh of a whole place becomes the map. A frame that the map already
+    has is not stored twice.
+    """
     check_map_options(options)
     if options.as_map:
         with open_client(options) as client:

@@ -1,1 +1,10 @@
 """Commands that the lab adds to `sceneprint`."""
+
+#: The line of each in `sceneprint --help`; the entry points of this distribution name the modules.
+COMMANDS = {
+    "demo": "run a service, upload a map, query it over HTTP and print the accuracy",
+    "evaluate": "measure retrieval, validation and pose accuracy on frames with known poses",
+    "evaluate-pairs": "measure registration and acceptance on pairs of frames with known poses",
+    "synth": "generate synthetic rooms with known poses",
+    "train": "train a model",
+}

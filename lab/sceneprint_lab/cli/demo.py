@@ -155,16 +155,8 @@ def _thinned(frames: Sequence[DemoFrame], most: int) -> list[DemoFrame]:
     return list(frames[:: max(-(-len(frames) // most), 1)])
 
 
-def add_demo(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "demo",
-        help="run a service, upload a map, query it over HTTP and print the accuracy",
-        description="Start a service with an empty folder, upload the frames of a small "
-        "synthetic building (or of --dataset) to a map, query it with other frames, print the "
-        "rows of the paper with true pose errors, and draw a match. The service and its data are "
-        "removed at the end.",
-    )
+def add_demo(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint demo`."""
     command.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR")
     command.add_argument(
         "--dataset",
@@ -187,7 +179,10 @@ def add_demo(commands: Any) -> None:
 
 
 def run_demo(options: argparse.Namespace) -> int:
-    """Show the whole way of a frame, over HTTP."""
+    """Start a service with an empty folder, upload the frames of a small synthetic building (or
+    of --dataset) to a map, query it with other frames, print the rows of the paper with true
+    pose errors, and draw a match. The service and its data are removed at the end.
+    """
     from sceneprint.cli.preparation import prepare_presets
     from sceneprint_client import Client
 

@@ -43,16 +43,10 @@ a scanner that returns to a place after more than 30 m of travel:
 """
 
 
-def add_evaluate(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "evaluate",
-        help="measure retrieval, validation and pose accuracy on frames with known poses",
-        description="Query a database of frames with each query frame, and compare the answers "
-        "with the true\nposes: the rows R, VR, DR, VDR of the paper, and the averaged pose.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_evaluate(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint evaluate`."""
+    command.epilog = _EXAMPLES
+    command.formatter_class = argparse.RawDescriptionHelpFormatter
     command.add_argument(
         "paths", nargs="*", metavar="PATH", help="PATH or PATH@db=RANGES,queries=RANGES"
     )
@@ -183,7 +177,9 @@ def _share(text: str) -> float:
 
 
 def run_evaluate(options: argparse.Namespace) -> int:
-    """Evaluate, print, and write what was asked for."""
+    """Query a database of frames with each query frame, and compare the answers with the true
+    poses: the rows R, VR, DR, VDR of the paper, and the averaged pose.
+    """
     from sceneprint_lab.evaluation.protocol import FrameStore
     from sceneprint_lab.evaluation.report import figures, seven_scenes_table, table, to_json
     from sceneprint_lab.evaluation.run import EvaluationSettings, evaluate
@@ -385,16 +381,10 @@ compare with Open3D (FPFH with RANSAC or FGR, then ICP):
 """
 
 
-def add_evaluate_pairs(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "evaluate-pairs",
-        help="measure registration and acceptance on pairs of frames with known poses",
-        description="Sample pairs of frames by their true overlap, validate each, and compare "
-        "the result with the\ntrue poses: success by overlap, precision, recall, false accepts.",
-        epilog=_PAIR_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_evaluate_pairs(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint evaluate-pairs`."""
+    command.epilog = _PAIR_EXAMPLES
+    command.formatter_class = argparse.RawDescriptionHelpFormatter
     command.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="of sequences")
     add_model_options(command)
     _add_drawing(command)
@@ -455,7 +445,9 @@ def _limit(text: str) -> float:
 
 
 def run_evaluate_pairs(options: argparse.Namespace) -> int:
-    """Evaluate, print, and write what was asked for."""
+    """Sample pairs of frames by their true overlap, validate each, and compare the result with
+    the true poses: success by overlap, precision, recall, false accepts.
+    """
     from sceneprint_lab.evaluation.pair_report import pair_figures, pair_table
     from sceneprint_lab.evaluation.pair_run import Drawing, PairSettings, evaluate_pairs
     from sceneprint_lab.evaluation.protocol import FrameStore

@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
@@ -31,18 +31,8 @@ LOOKALIKES = {
 }
 
 
-def add_synth(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "synth",
-        help="generate synthetic rooms with known poses",
-        description="Render furnished rooms as a Kinect would see them, in 7-Scenes layout: "
-        "OUT/room-000/seq-01/frame-000000.depth.png and .pose.txt. With --sensor lidar: halls, "
-        "storeys and blocks as a spinning laser would see them, OUT/site-000/scan-000000.ply "
-        "and .pose.txt. With --lookalikes: sites that look like themselves or like another, as "
-        "scenes whose TrainSplit.txt and TestSplit.txt say what is the map and what the "
-        "queries, so that `sceneprint evaluate OUT` measures wrong answers.",
-    )
+def add_synth(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint synth`."""
     command.add_argument("out", type=Path, metavar="OUT", help="output folder, new or empty")
     command.add_argument(
         "--sensor", choices=("kinect", "lidar"), default="kinect", help="default: kinect"
@@ -89,7 +79,13 @@ def add_synth(commands: Any) -> None:
 
 
 def run_synth(options: argparse.Namespace) -> int:
-    """Make the rooms."""
+    """Render furnished rooms as a Kinect would see them, in 7-Scenes layout:
+    OUT/room-000/seq-01/frame-000000.depth.png and .pose.txt. With --sensor lidar: halls, storeys
+    and blocks as a spinning laser would see them, OUT/site-000/scan-000000.ply and .pose.txt.
+    With --lookalikes: sites that look like themselves or like another, as scenes whose
+    TrainSplit.txt and TestSplit.txt say what is the map and what the queries, so that
+    `sceneprint evaluate OUT` measures wrong answers.
+    """
     if options.lookalikes and options.path:
         raise DatasetError(
             "--lookalikes and --path: look-alike sites have paths of their own. Leave --path out."

@@ -17,15 +17,8 @@ from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.models import PRESETS, ModelParameters, save_model
 
 
-def add_train(commands: Any) -> None:
-    """Describe the command to the parser."""
-    command = commands.add_parser(
-        "train",
-        help="train a model",
-        description="Train a model on synthetic rooms or, for the preset lidar, on synthetic "
-        "halls, storeys and blocks. The presets cover indoor depth cameras and spinning LiDAR; "
-        "docs/model.md explains when to train your own.",
-    )
+def add_train(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint train`."""
     command.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help="model file to write"
     )
@@ -79,7 +72,10 @@ def add_train(commands: Any) -> None:
 
 
 def run_train(options: argparse.Namespace) -> int:
-    """Train and write the model."""
+    """Train a model on synthetic rooms or, for the preset lidar, on synthetic halls, storeys and
+    blocks. The presets cover indoor depth cameras and spinning LiDAR; docs/model.md explains
+    when to train your own.
+    """
     from sceneprint_lab.training import (
         TrainingParameters,
         preset_answer,
