@@ -29,11 +29,11 @@ help:
 	@echo "make test-postgres  the tests of what stands on the database, on PostgreSQL"
 	@echo "make goldens  rewrite tests/golden and docs/settings.md after an intended change; read the diff"
 	@echo "make lint    lint, types and import contracts only, of the dashboard's JavaScript too"
-	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
+	@echo "make bench   what each stage costs, beside others"
 	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
 	@echo "make docs    the documentation as a site, into out/site; a dead link is an error"
 	@echo "make docs-serve  the same at http://127.0.0.1:8009, made anew when a page changes"
-	@echo "make soak    robots on SQLite, 100 kills, a full disk; rewrites its part of docs/reliability.md"
+	@echo "make soak    robots on SQLite, 100 kills, a full disk; rewrites its part of docs/fault_injection.md"
 	@echo "make siege   broken uploads, every operation, tenants that attack; likewise"
 	@echo "make fleet   robots on PostgreSQL with a standby, parts killed; likewise"
 	@echo "make models  train the presets that ship with the package (minutes)"
@@ -106,7 +106,7 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 bench: $(STAMP)
-	$(BIN)/python -m benchmarks --page docs/performance.md
+	$(BIN)/python -m benchmarks
 
 screenshots: $(STAMP)
 	$(BIN)/python -m benchmarks.screenshots --out out/screenshots
@@ -120,7 +120,7 @@ docs-serve: export NO_MKDOCS_2_WARNING = 1
 docs-serve: $(STAMP)
 	$(BIN)/python -m mkdocs serve --dev-addr 127.0.0.1:8009 --watch tools/site
 
-SOAK = $(BIN)/python -m benchmarks.soak --page docs/reliability.md
+SOAK = $(BIN)/python -m benchmarks.soak --page docs/fault_injection.md
 
 soak: $(STAMP) kernels
 	$(SOAK) soak soak-crowd

@@ -1,6 +1,6 @@
 """Measure what each part costs beside references in the same run, and print tables.
 
-`make bench` measures all parts, and rewrites its section of docs/performance.md.
+`make bench` measures all parts.
 `python -m benchmarks --only service --map-frames 10000` measures one part.
 """
 
@@ -23,7 +23,6 @@ from benchmarks.machine import (
     pin_to_one_processor,
     seconds_to_import,
 )
-from benchmarks.pages import put_between
 from benchmarks.pairs import real_pairs, synthetic_pairs
 from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.models import PRESETS
@@ -35,7 +34,6 @@ from sceneprint_lab.synth import synthesise_room
 ROOT = Path(__file__).resolve().parent.parent
 #: Folder of real recordings, which need not be there.
 RECORDINGS = Path(os.environ.get("SCENEPRINT_DATA", ROOT.parent / "shared" / "data"))
-BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
 
 
 def frames_to_sign(n: int) -> list[DepthFrame]:
@@ -94,7 +92,7 @@ def parts(options: argparse.Namespace) -> dict[str, Callable[[], list[str]]]:
 
 
 def main() -> int:
-    """Measure, print, and rewrite the page that is named."""
+    """Measure, and print."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -104,7 +102,6 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=50, help="that are signed")
     parser.add_argument("--pairs", type=int, default=20, help="that are registered")
     parser.add_argument("--map-frames", type=int, default=0, help="of the served map, with random")
-    parser.add_argument("--page", type=Path, help="Markdown file whose marked section is replaced")
     options = parser.parse_args()
     every = parts(options)
     if unknown := set(options.only or ()) - set(every):
@@ -123,8 +120,6 @@ def main() -> int:
             lines += measure()
     lines.append(f"`import sceneprint`: {seconds_to_import():.2f} s.")
     print("\n".join(lines))
-    if options.page is not None:
-        put_between(options.page, BEGIN, END, lines)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Rows of `make bench`: what they compare is the same work, and pages hold what was measured."""
+"""Rows of `make bench`: what they compare is the same work."""
 
 from __future__ import annotations
 

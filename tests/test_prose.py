@@ -24,6 +24,7 @@ EDITED = [
     "docs/upgrading.md",
     "docs/operations.md",
     "docs/deployment.md",
+    "docs/fault_injection.md",
     "docs/reliability.md",
     "docs/trust.md",
     "docs/dashboard.md",

@@ -369,7 +369,7 @@ def test_a_wait_counts_for_the_first_fault_within_it() -> None:
 
 
 def test_every_plan_has_known_faults_and_marks_in_the_page() -> None:
-    text = (Path(__file__).parent.parent / "docs" / "reliability.md").read_text()
+    text = (Path(__file__).parent.parent / "docs" / "fault_injection.md").read_text()
     for name, plan in PLANS.items():
         assert set(plan.faults) <= set(FAULTS)
         assert text.count(f"<!-- {name}:begin -->") == text.count(f"<!-- {name}:end -->") == 1

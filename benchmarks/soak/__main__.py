@@ -1,7 +1,7 @@
 """Disturb a service while robots use it, and count the frames that it loses.
 
-`python -m benchmarks.soak soak --page docs/reliability.md` runs a plan and puts its figures into
-the page. `--store`, `--faults` and the other options change the plan:
+`python -m benchmarks.soak soak --page docs/fault_injection.md` runs a plan and puts its figures
+into the page. `--store`, `--faults` and the other options change the plan:
 `python -m benchmarks.soak fleet --faults kill=50 failover=5 --seconds 300`.
 """
 
@@ -16,7 +16,6 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from benchmarks.machine import measured_on
-from benchmarks.pages import put_between
 from benchmarks.soak.attacks import attack_table
 from benchmarks.soak.broken_uploads import broken_table
 from benchmarks.soak.faults import CUT_OFF, CUT_OFF_S, FROZEN, FROZEN_S, FULL, FULL_S
@@ -217,7 +216,9 @@ def _run(name: str, plan: Plan, page: Path | None, keep: Path | None) -> int:
     lines = ["", measured_on(command), "", *table(figures)]
     print("\n".join(lines))
     if page is not None:
-        put_between(page, f"<!-- {name}:begin -->", f"<!-- {name}:end -->", lines)
+        begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+        head, rest = page.read_text().split(begin)
+        page.write_text("\n".join([head + begin, *lines, end]) + rest.split(end)[1])
     return 0 if figures.sound else 1
 
 

@@ -87,7 +87,7 @@ class Plan:
 
 
 _FLEET = {"kill": 20, "failover": 2}
-#: By the marks of their tables in docs/reliability.md.
+#: By the marks of their tables in docs/fault_injection.md.
 PLANS = {
     "soak": Plan("sqlite", {"kill": 100, "full-disk": 3}, seconds=400, workers=2, rate=0.5),
     "soak-crowd": Plan("sqlite", workers=2, rate=2.0, readers=8),

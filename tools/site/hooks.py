@@ -38,8 +38,8 @@ PROJECT = {"Contribute": "CONTRIBUTING.md", "Changelog": "CHANGELOG.md"}
 RANKED_LAST = {
     f"docs/{name}.md"
     for name in (
-        "architecture", "dependencies", "evaluation", "model", "paper", "performance",
-        "reliability", "style",
+        "architecture", "dependencies", "evaluation", "fault_injection", "model", "paper",
+        "performance", "style",
     )
 }  # fmt: skip
 #: What their scores are multiplied by: a match in a title counts a thousand times one in the text.
