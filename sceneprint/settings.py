@@ -233,7 +233,7 @@ class Settings(BaseSettings):
         default=2 << 30, ge=0,
     )  # fmt: skip
     decoder_s: float = _setting(
-        "Processor time that a decoder may take for one upload, seconds.",
+        "Time for which a decoder may compute, or hang, with one upload, seconds.",
         "Longer on very slow machines.",
         default=30.0, ge=0.1, le=3600,
     )  # fmt: skip

@@ -244,6 +244,8 @@ class Spool:
             )
         self._path, self._lock = Path(path), RLock()
         with self._told():
+            with suppress(OSError):  # private: frames are pictures; SQLite gives its log the same
+                self._path.touch(0o600)
             self._database = sqlite3.connect(
                 self._path, timeout=_LOCKED_S, isolation_level=None, check_same_thread=False
             )

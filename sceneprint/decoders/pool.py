@@ -24,6 +24,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,7 @@ _ERRORS = {
 _BEGIN_S, _LOOK_S, _WAIT_S = 300.0, 0.25, 60.0
 #: How much longer than its processor time a task may take on a busy machine.
 _PATIENCE = 8
-#: Shared memory beyond which it is given back after a task.
+#: Size of a task above which its shared memory is given back, and not erased, bytes.
 _KEPT_BYTES = 8 << 20
 #: Variables that a decoder needs to find its code, and no other: they may be secrets.
 _ENVIRONMENT = (
@@ -96,6 +97,7 @@ class DecoderProcess:
         more: tuple[str, ...] = (),
     ) -> None:
         self.compiled, self._more_bytes = compiled, more_bytes
+        self._sent = self._used = 0  # bytes of the upload, and of the memory that the task used
         self.protections = Protections(no_new_privileges=False, seccomp=False, landlock=0)
         memory = os.memfd_create("sceneprint-decoder", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -144,6 +146,7 @@ class DecoderProcess:
         DecoderEnded : it died of the task.
         DecoderFailure : it took too long.
         """
+        self._sent, self._used = len(data), SHARED_BYTES  # until a reply says how much it wrote
         self._shared[: len(data)] = data
         try:
             self._socket.send(json.dumps({**request, "bytes": len(data)}).encode())
@@ -175,6 +178,7 @@ class DecoderProcess:
             text = str(reply["broke"])
             log.error("decoder failed", extra={"pid": self.pid, "traceback": text})
             raise RuntimeError(f"A decoder failed: {text.strip().rpartition(chr(10))[2][:200]}")
+        self._used = self._sent
         if "error" in reply:
             raise _error_of(reply)
         try:
@@ -184,14 +188,16 @@ class DecoderProcess:
 
     def array_of(self, kind: str, shape: tuple[int, ...], first: int = 0) -> NDArray[Any]:
         """A copy of the array that came with a reply, from its first byte in the memory."""
-        count = math.prod(shape)
-        found = np.frombuffer(self._shared, kind, count, first).copy()
+        found = np.frombuffer(self._shared, kind, math.prod(shape), first).copy()
+        self._used = max(self._used, first + found.nbytes)
         return found.reshape(shape)
 
-    def forget(self, size: int) -> None:
-        """Give memory back that a large upload took."""
-        if size > _KEPT_BYTES:
-            self._shared.madvise(mmap.MADV_REMOVE)
+    def clear(self) -> None:
+        """Erase the shared memory: the next upload may be another tenant's."""
+        if self._used > _KEPT_BYTES:
+            self._shared.madvise(mmap.MADV_REMOVE)  # gives the memory back, and reads as zeros
+        else:
+            self._shared[: self._used] = bytes(self._used)
 
     def end(self) -> None:
         """Kill it."""
@@ -205,8 +211,10 @@ class DecoderProcess:
         begun, until = self._cpu_s(), time.monotonic() + longest_s
         waiting = select.poll()
         waiting.register(self._socket, select.POLLIN)
+        asleep_s = 0.0
         while not waiting.poll(1e3 * _LOOK_S):
-            if self._cpu_s() - begun > cpu_s or time.monotonic() > until:
+            asleep_s = asleep_s + _LOOK_S if self._is_asleep() else 0.0
+            if max(self._cpu_s() - begun, asleep_s) > cpu_s or time.monotonic() > until:
                 raise DecoderFailure(f"it takes longer than {cpu_s:g} s to decode")
         try:
             message = self._socket.recv(MESSAGE_BYTES)
@@ -227,6 +235,13 @@ class DecoderProcess:
         with suppress(OSError):  # it is gone, as its socket will tell
             return time.clock_gettime((~self._process.pid << 3) | 2)
         return 0.0
+
+    def _is_asleep(self) -> bool:
+        """Return whether the process waits for neither a processor nor a disk."""
+        with suppress(OSError):
+            stat = Path(f"/proc/{self._process.pid}/stat").read_text()
+            return stat.rpartition(")")[2].split()[0] not in ("R", "D")
+        return False
 
     def _cause(self) -> str:
         code = self._process.wait()
@@ -331,11 +346,10 @@ class _Slot:
         if process is None or (compiled and not process.compiled):
             self.end()
             process = self.process = self._pool.begin(compiled=compiled)
-        reply = process.run(request, data, self._pool.seconds)
-        found = process.result(reply, checked)
-        size = getattr(found, "nbytes", len(data))
-        process.forget(max(size, len(data)))
-        return found
+        try:
+            return process.result(process.run(request, data, self._pool.seconds), checked)
+        finally:
+            process.clear()
 
 
 class DecoderPool:

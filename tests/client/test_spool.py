@@ -195,6 +195,7 @@ def test_a_frame_is_there_once_and_survives(tmp_path: Path) -> None:
     path = tmp_path / "spool"
     with Spool(path, 100 * CHARGE) as spool:
         assert spool.add(depth(1), meta(0))
+        assert {one.stat().st_mode & 0o777 for one in tmp_path.iterdir()} == {0o600}
         assert not spool.add(depth(1), meta(0))
         assert spool.add(depth(1), meta(1))
         assert spool.add(depth(2), meta(0))

@@ -6,6 +6,7 @@ import ctypes
 import os
 import signal
 import socket
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,11 @@ def _hang(_data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], None]
         pass
 
 
+def _sleep(_data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+    time.sleep(3600)
+    return {}, None
+
+
 def _hoard(_data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], None]:
     return {"sum": float(np.ones(request["numbers"]).sum())}, None
 
@@ -58,5 +64,6 @@ def _fail(_data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], None]
 
 if __name__ == "__main__":
     serve(TASKS | {
-        "escape": _escape, "crash": _crash, "hang": _hang, "hoard": _hoard, "fail": _fail,
+        "escape": _escape, "crash": _crash, "hang": _hang, "sleep": _sleep, "hoard": _hoard,
+        "fail": _fail,
     })  # fmt: skip

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -110,10 +111,23 @@ def test_memory_is_limited(pool: DecoderPool) -> None:
     assert do(pool, "hoard", numbers=2) == {"sum": 2.0}
 
 
-def test_processor_time_is_limited(pool: DecoderPool) -> None:
+@pytest.mark.parametrize("task", ["hang", "sleep"])
+def test_time_is_limited_of_work_and_of_sleep(pool: DecoderPool, task: str) -> None:
     with pytest.raises(errors.DecoderFailure, match=r"longer than 0\.5 s"):
-        do(pool, "hang")
+        do(pool, task)
     assert do(pool, "hoard", numbers=3) == {"sum": 3.0}
+
+
+def test_nothing_of_an_upload_stays_in_the_shared_memory(pool: DecoderPool) -> None:
+    points = np.full((500, 3), 2.0, np.float32).tobytes()  # of 16-byte rows, a part of one is left
+    with pool.place() as slot:
+        for data in (_images()[0], b"no image"):
+            with suppress(errors.UnreadableFrame):
+                slot.samples(data)
+        with suppress(errors.UnreadableCloud, errors.UselessFrame):
+            slot.points(points, "kitti", UNSAID, 1.0)
+        assert slot.process is not None
+        assert not np.frombuffer(slot.process._shared, np.uint8, 1 << 20).any()
 
 
 def test_a_bug_is_not_an_error_of_the_upload(pool: DecoderPool) -> None:
