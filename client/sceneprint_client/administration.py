@@ -57,7 +57,7 @@ class AdminMethods(JobMethods):
         return self._ask(MadeKey, "POST", "/v1/keys", json=new.model_dump(mode="json"))
 
     def keys(self) -> list[Key]:
-        """All keys by name, without secrets."""
+        """Return all keys by name, without secrets."""
         return list(self._items(Page[Key], "/v1/keys"))
 
     def rotate_key(self, name: str, overlap_s: float = 3600.0) -> MadeKey:
@@ -131,7 +131,7 @@ class AdminMethods(JobMethods):
         self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
         cursor: str | None = None, limit: int = 100, newest_first: bool = True,
     ) -> EventPage:  # fmt: skip
-        """A page of kept events, newest first; `cursor` comes from the page before."""
+        """Return a page of kept events, newest first; `cursor` comes from the page before."""
         asked = given(
             map=map_name, kind=list(kinds), after=after, cursor=cursor, limit=limit,
             order="newest" if newest_first else "oldest",

@@ -68,7 +68,7 @@ class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMetho
 
     @classmethod
     def embedded(cls, path: str | Path) -> Self:
-        """A client without a service: everything runs in this process, on a data folder.
+        """Return a client without a service: everything runs in this process, on a data folder.
 
         Frames are signed in this process, while you wait for them (`wait`, or
         `upload` with `wait_s`). Everything is in the folder, whatever SCENEPRINT_DATABASE_URL
@@ -105,11 +105,11 @@ class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMetho
         self.close()
 
     def status(self) -> Status:
-        """The version, and the number of frames and jobs in each state."""
+        """Return the version, and the number of frames and jobs in each state."""
         return self._ask(Status, "GET", "/readyz")
 
     def healthy(self) -> bool:
-        """Whether the service answers; asks once, with a short timeout."""
+        """Return whether the service answers; asks once, with a short timeout."""
         try:
             timeout = min(self._timeout_s, _HEALTHY_S)
             response = self._http.get("/healthz", timeout=timeout)

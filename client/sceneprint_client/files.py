@@ -60,7 +60,7 @@ def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
 
 
 def _read_some(file: BinaryIO, most: int) -> bytes:
-    """At most so many bytes; `file.read(most)` would allocate as many for a file of ten."""
+    """Return at most so many bytes; `file.read(most)` would allocate as many for a file of ten."""
     pieces, left = [], most
     while piece := file.read(min(left, _PIECE)):
         pieces.append(piece)
@@ -137,7 +137,7 @@ class NpyHeader:
 def npy_header(
     data: bytes, error: type[FrameError], advice: str, shapes: str, *, whole: bool = False
 ) -> NpyHeader:
-    """The header of an NPY file of floating numbers in rows and columns.
+    """Return the header of an NPY file of floating numbers in rows and columns.
 
     Parameters
     ----------
@@ -324,7 +324,7 @@ class _Reader:
         return len(self._data) - self._at
 
     def bytes(self, count: int) -> memoryview:
-        """The next bytes."""
+        """Return the next bytes."""
         if count > self.left:
             raise UnreadableCloud(
                 f"The PointCloud2 ends early: {count} bytes are announced at byte {self._at}, and "
@@ -334,17 +334,17 @@ class _Reader:
         return self._data[self._at - count : self._at]
 
     def byte(self) -> int:
-        """The next byte."""
+        """Return the next byte."""
         return self.bytes(1)[0]
 
     def word(self) -> int:
-        """The next number of four bytes, after what aligns it."""
+        """Return the next number of four bytes, after what aligns it."""
         self.bytes(-self._at % 4)
         (value,) = self._word.unpack(self.bytes(4))
         return int(value)
 
     def text(self) -> str:
-        """The next string, without the zero at its end."""
+        """Return the next string, without the zero at its end."""
         length = self.word()
         if length > _LONGEST_NAME + 1:
             raise UnreadableCloud(

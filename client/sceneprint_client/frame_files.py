@@ -205,7 +205,7 @@ def is_kitti(path: Path) -> bool:
 
 
 def _is_npy_of_points(file: Path) -> bool:
-    """Whether clouds.json is beside it; or no camera, and its content is N x 3 or N x 4."""
+    """Return whether clouds.json is beside it; or no camera, and its content is N x 3 or N x 4."""
     if file.suffix.lower() != ".npy":
         return False
     if (file.parent / CLOUDS_FILE).is_file():
@@ -451,7 +451,7 @@ def _meta_without_array(meta: MetaInput | None) -> FrameMeta | None:
 def array_sendable(
     array: NDArray[Any], meta: MetaInput | None, *, up: Sequence[float] | None = None
 ) -> tuple[bytes, FrameMeta]:
-    """An array as NPY, and what is known of it: with a camera it is depth, else points.
+    """Return an array as NPY, and what is known of it: with a camera it is depth, else points.
 
     Parameters
     ----------
@@ -487,7 +487,7 @@ _DEPTH = ("u2", "f2", "f4", "f8")
 
 
 def _checked_points(array: NDArray[Any]) -> NDArray[Any]:
-    """An array of points; UnreadableFrame for what is depth without its camera."""
+    """Return an array of points; UnreadableFrame for what is depth without its camera."""
     if array.ndim == 2 and array.shape[1] in (3, 4) and array.dtype.kind == "f":
         if array.dtype.itemsize in (2, 4, 8):
             return array
@@ -506,7 +506,7 @@ def camera_of(
     camera: CameraIntrinsics | PinholeCamera | Sequence[float] | NDArray[Any],
     size: tuple[int, int],
 ) -> CameraIntrinsics:
-    """The camera of an image of a size (width, height).
+    """Return the camera of an image of a size (width, height).
 
     Parameters
     ----------
@@ -563,7 +563,7 @@ _MOST_LOST_M = 1e-4
 
 
 def _npy(array: NDArray[Any], most_lost: float = np.inf) -> bytes:
-    """An NPY file. It is not compressed: to compress takes longer than to send.
+    """Return an NPY file. It is not compressed: to compress takes longer than to send.
 
     float64 is sent as float32 where no number changes by more than `most_lost`.
     """
@@ -578,7 +578,7 @@ def _npy(array: NDArray[Any], most_lost: float = np.inf) -> bytes:
 
 
 def _named(path: Path) -> FrameFile:
-    """The frame of a path, which a caller gave."""
+    """Return the frame of a path, which a caller gave."""
     if path.is_dir():
         raise DatasetError(
             f"{path}: This is a folder, and one frame is wanted. Name a depth image or a cloud, "

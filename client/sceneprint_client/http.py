@@ -81,7 +81,7 @@ QueryFrame = NamedFrame | tuple[bytes, FrameMeta]
 
 
 def given(**parameters: Any) -> dict[str, Any]:
-    """Those parameters of a request that are not None."""
+    """Return those parameters of a request that are not None."""
     return {name: value for name, value in parameters.items() if value is not None}
 
 
@@ -164,7 +164,7 @@ def surface_tile_path(map_name: str, digest: str) -> str:
 
 
 def _part(name: str, what: str, error: type[SceneprintError]) -> str:
-    """A name that stays one part of a path: `..` would lead to another resource."""
+    """Return a name that stays one part of a path: `..` would lead to another resource."""
     if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name):
         raise error(f"There is no {what} {name!r:.80}. Check the name.")
     return name
@@ -215,7 +215,7 @@ def named_or_sent(
     map_name: str | None, frame: FrameInput | None, meta: MetaInput | None,
     frame_id: str | None, up: Sequence[float] | None = None,
 ) -> tuple[str, QueryFrame]:  # fmt: skip
-    """The frame that is asked for, of the map that it is asked of."""
+    """Return the frame that is asked for, of the map that it is asked of."""
     if map_name is None:
         raise TypeError("give `map_name`, or `maps`")
     if frame_id is not None and frame is None:
@@ -251,7 +251,7 @@ def query_form(data: bytes, meta: FrameMeta, query: Query) -> dict[str, Any]:
 
 
 def form_text(value: object) -> str:
-    """A field of a form: names with commas between, else JSON."""
+    """Return a field of a form: names with commas between, else JSON."""
     if isinstance(value, str):
         return value
     if isinstance(value, list):
@@ -354,7 +354,7 @@ class ServiceConnection:
         return read_record(kind, self._send(method, path, **request))
 
     def _begin(self, kind: type[Record], path: str, wanted: BaseModel) -> Record:
-        """The job that a record asks for."""
+        """Return the job that a record asks for."""
         document = wanted.model_dump(mode="json", exclude_unset=True)
         return self._ask(kind, "POST", path, json=document)
 
@@ -366,7 +366,7 @@ class ServiceConnection:
         self._send("DELETE", path)
 
     def _items(self, kind: type[Page[Item]], path: str, **parameters: Any) -> Iterator[Item]:
-        """The items of all pages of a list; the first page is asked for at once."""
+        """Yield the items of all pages of a list; the first page is asked for at once."""
 
         def page_after(cursor: str | None) -> Page[Item]:
             asked = given(**parameters, cursor=cursor, limit=PAGE)
@@ -396,7 +396,7 @@ class ServiceConnection:
     def _open_stream(
         self, path: str, last: str | None, parameters: dict[str, Any]
     ) -> httpx.Response:
-        """A stream of events that begins behind an id."""
+        """Return a stream of events that begins behind an id."""
 
         def send() -> httpx.Response:
             headers = {"Accept": "text/event-stream"} | given(**{"Last-Event-ID": last})
@@ -549,7 +549,7 @@ def retry_after_s(text: str) -> float:
 
 
 def read_record(kind: type[Record], response: httpx.Response) -> Record:
-    """The record in an answer; Refused where the answer is none of ours."""
+    """Return the record in an answer; Refused where the answer is none of ours."""
     try:
         return kind.model_validate_json(response.content)
     except ValidationError as error:
@@ -562,7 +562,7 @@ def read_record(kind: type[Record], response: httpx.Response) -> Record:
 
 
 def error_of(response: httpx.Response) -> errors.SceneprintError:
-    """The error that an answer tells of: of the class its `type` names, or else Refused."""
+    """Return the error that an answer tells of: of the class its `type` names, or else Refused."""
     error = _error_of(response)
     error.retry_after_s = retry_after_s(response.headers.get("Retry-After", ""))
     return error
@@ -592,7 +592,7 @@ def _error_of(response: httpx.Response) -> errors.SceneprintError:
 
 
 def problem_kinds() -> dict[str, type[errors.SceneprintError]]:
-    """The classes of the tree by the last part of a problem's `type`."""
+    """Return the classes of the tree by the last part of a problem's `type`."""
     return {
         errors.kebab_case(name): kind
         for name, kind in vars(errors).items()

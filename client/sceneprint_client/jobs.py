@@ -61,7 +61,7 @@ class JobMethods(ServiceConnection):
     """Jobs, and what is begun as one."""
 
     def job(self, job_id: str) -> Job:
-        """A job; UnknownJob if it does not exist."""
+        """Return a job; UnknownJob if it does not exist."""
         return self._ask(Job, "GET", job_path(job_id))
 
     def jobs(self, state: JobState | None = None) -> Iterator[Job]:
@@ -271,7 +271,7 @@ class JobMethods(ServiceConnection):
         return self.wait_for_product(begun, timeout_s=timeout_s, progress=progress)
 
     def product(self, kind: type[_Product], map_name: str | None, job_id: str) -> _Product:
-        """A product as it is now; UnknownMap or UnknownJob if it does not exist.
+        """Return a product as it is now; UnknownMap or UnknownJob if it does not exist.
 
         Parameters
         ----------
@@ -304,7 +304,7 @@ class JobMethods(ServiceConnection):
         self, product: _Product, *, timeout_s: float = 3600.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> _Product:  # fmt: skip
-        """A product once it has ended, or when the time ran out.
+        """Return a product once it has ended, or when the time ran out.
 
         Parameters
         ----------
@@ -365,7 +365,7 @@ class JobMethods(ServiceConnection):
         self, map_name: str, job_id: str, kind: GraphFormat = "g2o", *,
         min_overlap: float = 0.0, odometry: bool = False, consistent: bool = True,
     ) -> str:  # fmt: skip
-        """The pose graph of an association that has succeeded, as a file.
+        """Return the pose graph of an association that has succeeded, as a file.
 
         Parameters
         ----------
@@ -466,7 +466,7 @@ class JobMethods(ServiceConnection):
         return begun if wait_s is None else self.wait_for_product(begun, timeout_s=wait_s)
 
     def reconstruction_mesh(self, job_id: str) -> bytes:
-        """The surface of a reconstruction as a PLY file.
+        """Return the surface of a reconstruction as a PLY file.
 
         Raises
         ------

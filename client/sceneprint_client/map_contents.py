@@ -86,11 +86,11 @@ class MapMethods(ServiceConnection):
         return self._ask(Map, "POST", "/v1/maps", json=new.model_dump(exclude_unset=True))
 
     def maps(self) -> list[Map]:
-        """All maps by name."""
+        """Return all maps by name."""
         return self._ask(Page[Map], "GET", "/v1/maps").items
 
     def map(self, name: str) -> Map:
-        """A map; UnknownMap if it does not exist."""
+        """Return a map; UnknownMap if it does not exist."""
         return self._ask(Map, "GET", map_path(name))
 
     def edit_map(
@@ -139,7 +139,7 @@ class MapMethods(ServiceConnection):
         return self._ask(Map, "DELETE", f"{map_path(map_name)}/reencoding")
 
     def frame(self, map_name: str, frame_id: str) -> Frame:
-        """A frame; UnknownMap or UnknownFrame if it does not exist."""
+        """Return a frame; UnknownMap or UnknownFrame if it does not exist."""
         return self._ask(Frame, "GET", frame_path(map_name, frame_id))
 
     def frames(
@@ -387,7 +387,7 @@ class MapMethods(ServiceConnection):
         captured_before: datetime | None = None, most: int | None = None,
         clock: Clock = "taken",
     ) -> Trajectory:  # fmt: skip
-        """The poses of a session in the order they were taken.
+        """Return the poses of a session in the order they were taken.
 
         Parameters
         ----------
@@ -421,7 +421,7 @@ class MapMethods(ServiceConnection):
     # what is made of a frame
 
     def cloud(self, map_name: str, frame_id: str, within: CloudFrame = "optical") -> bytes:
-        """The surface that a frame saw: points and normals as PLY.
+        """Return the surface that a frame saw: points and normals as PLY.
 
         Parameters
         ----------
@@ -443,7 +443,7 @@ class MapMethods(ServiceConnection):
         self, map_name: str, frame_id: str, within: CloudFrame = "optical",
         limit: int = MOST_DRAWN,
     ) -> SurfacePoints:  # fmt: skip
-        """The points of `cloud` as arrays, in a third of the bytes. Errors as for `cloud`.
+        """Return the points of `cloud` as arrays, in a third of the bytes. Errors as for `cloud`.
 
         Parameters
         ----------
@@ -475,15 +475,15 @@ class MapMethods(ServiceConnection):
         )
 
     def patches(self, map_name: str, frame_id: str) -> FramePatches:
-        """The surface patches of an indexed frame. Errors as for `cloud`."""
+        """Return the surface patches of an indexed frame. Errors as for `cloud`."""
         return self._ask(FramePatches, "GET", f"{frame_path(map_name, frame_id)}/patches")
 
     def signature(self, map_name: str, frame_id: str) -> FrameSignature:
-        """The signature of an indexed frame. Errors as for `cloud`."""
+        """Return the signature of an indexed frame. Errors as for `cloud`."""
         return self._ask(FrameSignature, "GET", f"{frame_path(map_name, frame_id)}/signature")
 
     def upload_of(self, map_name: str, frame_id: str) -> bytes:
-        """A frame's upload, byte for byte.
+        """Return a frame's upload, byte for byte.
 
         Raises
         ------
@@ -495,7 +495,7 @@ class MapMethods(ServiceConnection):
     # a copy of a map, part by part
 
     def map_copy(self, map_name: str, have: Sequence[str] = ()) -> tuple[MapCopy, dict[str, bytes]]:
-        """A map at one moment, and those parts of its rows that you lack, as many as fit.
+        """Return a map at one moment, and those parts of its rows that you lack, as many as fit.
 
         Raises
         ------
@@ -517,7 +517,7 @@ class MapMethods(ServiceConnection):
         return self._bytes(f"{map_path(map_name)}/copy/artifacts/{digest}")
 
     def copied_model(self, map_name: str) -> bytes:
-        """The file of a map's model; UnknownMap if there is no such map."""
+        """Return the file of a map's model; UnknownMap if there is no such map."""
         return self._bytes(f"{map_path(map_name)}/copy/model")
 
 
@@ -565,7 +565,7 @@ class SurfaceMethods(ServiceConnection):
     """Surfaces of maps."""
 
     def surface(self, map_name: str) -> MapSurface:
-        """The fused surface of a map's posed frames; UnknownMap if it does not exist."""
+        """Return the fused surface of a map's posed frames; UnknownMap if it does not exist."""
         return self._ask(MapSurface, "GET", surface_path(map_name))
 
     def begin_surface(self, map_name: str) -> MapSurface:
@@ -603,7 +603,7 @@ class SurfaceMethods(ServiceConnection):
         return self._items(Page[SurfaceTile], path, parent=parent, level=level)
 
     def surface_tile(self, map_name: str, digest: str) -> bytes:
-        """The cells of a tile; `sceneprint_client.surface_encoding.decode_tile` reads them.
+        """Return the cells of a tile; `sceneprint_client.surface_encoding.decode_tile` reads them.
 
         Raises
         ------
@@ -642,7 +642,7 @@ class SurfaceMethods(ServiceConnection):
         self, map_name: str, parent: str | None = None, *, width: int = PLAN_WIDTH,
         low: float | None = None, high: float | None = None,
     ) -> bytes:  # fmt: skip
-        """A surface seen from above as a PNG file, transparent where it is empty.
+        """Return a surface seen from above as a PNG file, transparent where it is empty.
 
         Parameters
         ----------

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 
 def rotation_of(quaternion: Floats) -> Floats:
-    """The rotation (3, 3) of a unit quaternion (4,): x, y, z, w."""
+    """Return the rotation (3, 3) of a unit quaternion (4,): x, y, z, w."""
     x, y, z, w = quaternion
     return np.array(
         [

@@ -267,7 +267,7 @@ class QueryMethods(ServiceConnection):
         self._send("DELETE", f"{query_path(query_id)}/keep")
 
     def query_cloud(self, query_id: str) -> bytes:
-        """The surface that a query saw: points and normals as PLY, in its sensor's frame.
+        """Return the surface that a query saw: points and normals as PLY, in its sensor's frame.
 
         Raises
         ------
@@ -329,7 +329,7 @@ class QueryMethods(ServiceConnection):
         self, query_id: str, frame_id: str, map_name: str | None = None,
         color: OverlayColour = "source", transform: OverlayTransform = "aligned",
     ) -> bytes:  # fmt: skip
-        """Points of a query and a match, coloured, as PLY in the match's sensor frame.
+        """Return points of a query and a match, coloured, as PLY in the match's sensor frame.
 
         Parameters
         ----------
@@ -367,7 +367,7 @@ def _query_request(frame: QueryFrame, query: Query, robot: str | None) -> dict[s
 
 
 def _asked_by(robot: str | None, data: bytes, meta: FrameMeta) -> tuple[bytes, FrameMeta]:
-    """A frame that is asked for, with who asks where its metadata does not say."""
+    """Return a frame that is asked for, with who asks where its metadata does not say."""
     if robot is None or meta.robot is not None:
         return data, meta
     return data, meta.model_copy(update={"robot": robot})

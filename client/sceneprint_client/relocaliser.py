@@ -420,7 +420,7 @@ class Relocaliser:
 
 
 def planar(T: Floats) -> Floats:
-    """The pose (4, 4) on the plane z = 0 with the same x, y and heading of its x axis."""
+    """Return the pose (4, 4) on the plane z = 0 with the same x, y and heading of its x axis."""
     cosine, sine = T[0, 0], T[1, 0]
     length = math.hypot(cosine, sine) or 1.0
     flat = np.eye(4)

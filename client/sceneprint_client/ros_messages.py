@@ -231,7 +231,7 @@ def rvl_samples(data: bytes) -> NDArray[np.uint16]:
 
 
 def is_calibrated(info: Any) -> bool:
-    """Whether a CameraInfo says anything: drivers without a calibration send zeros."""
+    """Return whether a CameraInfo says anything: drivers without a calibration send zeros."""
     k = _numbers(info, "k", 9)
     return k is not None and k[0] > 0 and k[4] > 0
 
@@ -270,12 +270,12 @@ def camera_intrinsics(info: Any, *, rectified: bool) -> Intrinsics:
 
 
 def is_rectified(topic: str) -> bool:
-    """Whether a topic's images have been rectified, by the name that ROS gives them."""
+    """Return whether a topic's images have been rectified, by the name that ROS gives them."""
     return "rect" in topic_without_transport(topic).rpartition("/")[2]
 
 
 def topic_without_transport(topic: str) -> str:
-    """The name of an image's topic without that of how it is compressed."""
+    """Return the name of an image's topic without that of how it is compressed."""
     base, _, last = topic.rpartition("/")
     return base if last in ("compressedDepth", "compressed") else topic
 
@@ -301,7 +301,7 @@ def _distortion(info: Any) -> tuple[float, ...]:
 
 
 def _numbers(info: Any, name: str, count: int) -> list[float] | None:
-    """A matrix of a CameraInfo: ROS 1 has capital names, ROS 2 small ones."""
+    """Return a matrix of a CameraInfo: ROS 1 has capital names, ROS 2 small ones."""
     found = getattr(info, name, None)
     numbers = [float(value) for value in (getattr(info, name.upper()) if found is None else found)]
     return numbers if len(numbers) == count else None
@@ -340,7 +340,7 @@ def cloud_points(message: Any) -> NDArray[np.float32]:
 
 
 def cloud_table(message: Any) -> NDArray[np.void]:
-    """The x, y and z of a PointCloud2 in place (rows, columns); raises as `cloud_points`."""
+    """Return the x, y and z of a PointCloud2 in place (rows, columns); raises as `cloud_points`."""
     width, height = int(message.width), int(message.height)
     step, row = int(message.point_step), int(message.row_step)
     data = memoryview(message.data).cast("B")

@@ -73,7 +73,7 @@ class Camera:
 
 
 def is_unit(vector: Position) -> bool:
-    """Whether three numbers are of length 1, to a hundredth."""
+    """Return whether three numbers are of length 1, to a hundredth."""
     return abs(math.hypot(*vector) - 1.0) <= TOLERANCE
 
 

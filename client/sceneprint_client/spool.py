@@ -399,7 +399,7 @@ class Spool:
     # uploads
 
     def _oldest(self, last: int) -> list[_Waiting]:
-        """The first frames that wait, up to an id: as many as fit one request."""
+        """Return the first frames that wait, up to an id: as many as fit one request."""
         with self._transaction(write=False) as database:
             rows = database.execute(
                 "SELECT id, length(data) FROM frames WHERE reason IS NULL AND id <= ? "
@@ -587,7 +587,7 @@ def separation(a: SpoolPlace, b: SpoolPlace) -> float:
 
 
 def pose_matrix(pose: GivenPose | None) -> NDArray[np.float64] | None:
-    """A pose as (4, 4); None where there is none, or its numbers are none of a pose."""
+    """Return a pose as (4, 4); None where there is none, or its numbers are none of a pose."""
     if pose is None:
         return None
     T = np.eye(4)
@@ -627,7 +627,7 @@ def _give_up_one(database: sqlite3.Connection) -> None:
 
 
 def _neighbour(database: sqlite3.Connection, run: str, number: int | None, side: int) -> int | None:
-    """The waiting frame of a run before (-1) or after (1) one; of None the last."""
+    """Return the waiting frame of a run before (-1) or after (1) one; of None the last."""
     order, compared = ("DESC", "<") if side < 0 else ("ASC", ">")
     row = database.execute(
         f"SELECT id FROM frames WHERE reason IS NULL AND run = ? AND id {compared} ? "
@@ -675,7 +675,7 @@ _OF_A_FRAME = (400, 409, 413, 415, 422)
 
 
 def _is_about_content(error: errors.SceneprintError) -> bool:
-    """Whether a request was refused for what is in it."""
+    """Return whether a request was refused for what is in it."""
     if isinstance(error, errors.Refused):  # a proxy before the service, or a problem we do not know
         return error.status in (409, 413, 415, 422)
     return isinstance(error, (errors.FrameError, errors.Conflict, errors.InvalidRequest))

@@ -52,7 +52,7 @@ class SurfacePoints:
 
 
 def decode_points(data: bytes) -> SurfacePoints:
-    """The points of an answer of type `application/vnd.sceneprint.points`.
+    """Return the points of an answer of type `application/vnd.sceneprint.points`.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def cell_points(
 
 
 def decode_tile(data: bytes, tile: SurfaceTile, tile_m: float) -> SurfaceCells:
-    """The cells of a tile.
+    """Return the cells of a tile.
 
     Parameters
     ----------

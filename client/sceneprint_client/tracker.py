@@ -121,7 +121,7 @@ class Tracker:
         return self.answer(frame, odom_pose, up, stamp, meta, self.epoch)
 
     def move(self, odom_pose: NDArray[Any], stamp: float | None = None) -> State:
-        """The state by odometry alone, between frames."""
+        """Return the state by odometry alone, between frames."""
         stamp = time.time() if stamp is None else stamp
         with self._lock:
             state = self._core.move(stamp, np.asarray(odom_pose, np.float64))
@@ -129,7 +129,7 @@ class Tracker:
             return state
 
     def state(self) -> State:
-        """The state as it is, by what came so far."""
+        """Return the state as it is, by what came so far."""
         with self._lock:
             return self._core.state()
 
@@ -318,7 +318,7 @@ class AsyncTracker:
 
 
 def replay(lines: Iterable[str], parameters: TrackerParameters | None = None) -> Iterator[State]:
-    """The states of a log that a tracker wrote, one for each call.
+    """Yield the states of a log that a tracker wrote, one for each call.
 
     Parameters
     ----------

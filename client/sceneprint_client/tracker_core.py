@@ -243,14 +243,14 @@ class TrackerCore:
         self._verdict: tuple[TrackerStatus, str] = ("lost", "nothing was seen yet")
 
     def move(self, stamp: float, T_odom_sensor: Array) -> State:
-        """The state after a move of the odometry, without an answer."""
+        """Return the state after a move of the odometry, without an answer."""
         mark = self._mark(stamp, rigid_transform(T_odom_sensor))
         if self._belief is not None:
             self._verdict = self._tracked(mark)
         return self.state()
 
     def update(self, stamp: float, T_odom_sensor: Array, observation: Observation) -> State:
-        """The state after an answer.
+        """Return the state after an answer.
 
         Parameters
         ----------
@@ -294,7 +294,7 @@ class TrackerCore:
         return self.state()
 
     def state(self) -> State:
-        """The state as it is."""
+        """Return the state as it is."""
         status, reason = self._verdict
         stamp = self._marks[-1].stamp if self._marks else self._stamp
         belief = self._belief
@@ -316,7 +316,7 @@ class TrackerCore:
     # Odometry.
 
     def _mark(self, stamp: float, T: Array) -> _Mark:
-        """The place of a frame; the way to it is measured where it is new."""
+        """Return the place of a frame; the way to it is measured where it is new."""
         if self._marks and stamp <= self._marks[-1].stamp:
             at = bisect_right([one.stamp for one in self._marks], stamp) - 1
             known = self._marks[max(at, 0)]
@@ -468,7 +468,7 @@ class TrackerCore:
         return T, carried + _diagonal(drift_m, drift_rad)
 
     def _is_tracked(self, pose: PoseEvidence, T: Array, P: Array) -> bool:
-        """Whether a pose is the tracked one, as far as the gate and its covariance say."""
+        """Return whether a pose is the tracked one, as far as the gate and its covariance say."""
         if self._belief is None or pose.parent_frame != self._belief.parent_frame:
             return False
         step, turn = difference(T, pose.T_map_sensor)
@@ -527,7 +527,7 @@ class TrackerCore:
         )
 
     def _tracked(self, mark: _Mark) -> tuple[TrackerStatus, str]:
-        """The verdict on the belief; one that cannot be kept is dropped."""
+        """Return the verdict on the belief; one that cannot be kept is dropped."""
         p, belief = self.parameters, self._belief
         if belief is None:
             return self._verdict
@@ -664,5 +664,5 @@ def _measured(pose: PoseEvidence) -> Array:
 
 
 def _deviation(P: Array) -> float:
-    """The largest deviation in any direction."""
+    """Return the largest deviation in any direction."""
     return math.sqrt(max(float(np.linalg.eigvalsh(P)[-1]), 0.0))

@@ -171,7 +171,7 @@ class UploadMethods(ServiceConnection):
         return read_record(Added, response), response.status_code != 200
 
     def _settled(self, map_name: str, added: Added, until: float) -> Added:
-        """An upload once its job is over, or as it is at a time of `time.monotonic`."""
+        """Return an upload once its job is over, or as it is at a time of `time.monotonic`."""
         for pause in growing_pauses(until):
             if added.state not in (FrameState.RECEIVED, FrameState.SIGNING):
                 break

@@ -1,8 +1,8 @@
-"""Decoders of uploads in processes of their own, which may do nothing but compute.
+"""Decode uploads, in confined processes that can only compute, or in this process.
 
-bytes of a stranger  --Decoders.place-->  Decoder  --samples | points-->  arrays, checked again
+untrusted bytes  --Decoders.place-->  Decoder  --samples | points-->  arrays, checked again
 
-`DecoderPool` (pool.py) runs them apart; `LocalDecoders` here, for data that is the program's own.
+`DecoderPool` (pool.py) uses processes, and `LocalDecoders` this process, for trusted data.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ class Decoder(Protocol):
     """Turns bytes of an upload into arrays."""
 
     def samples(self, data: bytes) -> Samples:
-        """Samples of a depth image; see `decode_samples`."""
+        """Return the samples of a depth image; see `decode_samples`."""
 
     def points(
         self, data: bytes, file_format: CloudFormat, viewpoint: Position | Unsaid | None,
         units_per_metre: float,
     ) -> ReadPoints:  # fmt: skip
-        """Points of a cloud; see `read_points`."""
+        """Return the points of a cloud; see `read_points`."""
 
 
 class Decoders(Protocol):
     """A number of decoders; safe to share between threads."""
 
     def place(self) -> AbstractContextManager[Decoder]:
-        """Wait for a decoder, and have it to oneself. What is made of the arrays is made meanwhile:
-        so memory and processors are bounded too.
+        """Wait for a decoder and hold it. Process the arrays while you hold it, so that the number
+        of decoders bounds memory and processors as well.
         """
 
     def start(self) -> None:
-        """Begin what the first upload would have to wait for."""
+        """Start what the first upload would otherwise wait for."""
 
     def close(self) -> None:
-        """End all of them."""
+        """End all decoders."""
 
 
 class LocalDecoders:
@@ -51,7 +51,7 @@ class LocalDecoders:
 
     Parameters
     ----------
-    count : of uploads that are decoded at once
+    count : number of uploads that are decoded at once
     """
 
     def __init__(self, count: int) -> None:
@@ -75,7 +75,7 @@ class LocalDecoders:
         return read_points(data, file_format, viewpoint, units_per_metre)
 
     def start(self) -> None:
-        """Nothing has to be."""
+        """Do nothing."""
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing."""

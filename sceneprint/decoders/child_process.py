@@ -1,10 +1,10 @@
-"""A decoder's process: loads what it needs, gives up everything else, decodes until it is ended.
+"""The process of a decoder: it loads code, gives up all rights, and decodes until it is ended.
 
     python -m sceneprint.decoders.child_process CONTROL MEMORY PARENT BYTES plain|kernels [MORE]
 
-CONTROL is a socket with a JSON message each way for each task. MEMORY is shared with the parent: it
-holds the bytes of the upload, then the array. MORE is for other programs that serve tasks like this
-one. Nothing is pickled: the parent checks every reply.
+CONTROL is a socket for one JSON message each way per task. MEMORY is shared with the parent: it
+holds the bytes of the upload, and then the array. MORE is for other programs that serve tasks.
+Nothing is pickled, and the parent checks every reply.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from sceneprint.geometry.kernel import Kernel
 from sceneprint_client.formats import formats_of, function_at
 from sceneprint_client.sidecars import UNSAID
 
-#: Bytes of the shared memory: the largest upload; arrays that are made of it are smaller.
+#: Size of the shared memory, bytes: that of the largest upload, whose arrays are smaller.
 SHARED_BYTES = 512 << 20
-#: Most bytes of a message, and characters of an error or traceback in it.
+#: Maximum size of a message, bytes, and of an error or traceback in it, characters.
 MESSAGE_BYTES, MOST_TEXT = 1 << 16, 8000
 
-#: One array, or several behind one another.
+#: One array, or several that follow each other.
 Arrays = NDArray[Any] | tuple[NDArray[Any], ...] | None
-#: bytes, request -> reply, and the arrays that come with it
+#: Function of the upload's bytes and the request that returns the reply and its arrays.
 Task = Callable[[bytes, dict[str, Any]], tuple[dict[str, Any], Arrays]]
 
 
@@ -61,15 +61,16 @@ TASKS: Mapping[str, Task] = {"samples": _samples, "points": _points}
 
 
 def serve(tasks: Mapping[str, Task], warm: Callable[[bool], None] | None = None) -> None:
-    """Be a decoder until the parent closes the socket, or is gone.
+    """Run tasks until the parent closes the socket or ends.
 
     Parameters
     ----------
-    tasks : by their names
-    warm : loads all that the tasks need, and kernels if so asked; default: `load_decoders`
+    tasks : functions by name
+    warm : loads what the tasks need, with kernels if its argument is true; default:
+        `load_decoders`
     """
     control, memory, parent, more_bytes = map(int, sys.argv[1:5])
-    # signals that stop a service reach its whole group, and it still has uploads in hand
+    # signals that stop a service reach its whole group, while uploads are still in progress
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     if not die_with_parent(parent):
@@ -88,7 +89,7 @@ def serve(tasks: Mapping[str, Task], warm: Callable[[bool], None] | None = None)
 
 
 def _done(tasks: Mapping[str, Task], request: dict[str, Any], shared: mmap.mmap) -> dict[str, Any]:
-    """Do a task; what is wrong with the upload is a reply too."""
+    """Run a task and return its reply, which may be an error of the upload."""
     try:
         reply, arrays = tasks[request["task"]](shared[: request["bytes"]], request)
         if arrays is None:
@@ -114,25 +115,25 @@ def _tell(control: int, reply: dict[str, Any]) -> None:
 
 
 def _to_nowhere() -> None:
-    """Leave no file open but those two."""
+    """Redirect standard input, output and error to the null device."""
     nowhere = os.open(os.devnull, os.O_RDWR)
     for number in (0, 1, 2):
         os.dup2(nowhere, number)
     os.close(nowhere)
 
 
-# What is imported or compiled on first use, used once: afterwards no file can be read.
+# Everything that is imported or compiled on first use is used once before the process is confined.
 
 
 def load_decoders(kernels: bool) -> None:
-    """Read a file of each format, those of compiled decoders only if kernels are wanted."""
+    """Read a file of each format; PCD and PLY, whose readers are compiled, only with kernels."""
     for data in _images():
         decode_samples(data)
     for data, form in array_samples():
         read_points(data, form, UNSAID, 1.0)
     for one in formats_of("depth", "cloud"):
         function_at(one.reader)
-    with suppress(ImportError):  # an extra; a LAZ file says what is missing
+    with suppress(ImportError):  # an extra, which a LAZ file's error names
         import lazrs  # noqa: F401
     for wrong in (b"\x89PNG\r\n\x1a\n" + bytes(40), b"\x93NUMPY\x01\x00\x02\x00{}", b"no image"):
         with suppress(SceneprintError):
@@ -143,7 +144,7 @@ def load_decoders(kernels: bool) -> None:
         read_points(data, form, UNSAID, 1.0)
     for module in (rows, pcd, ply):
         for one in vars(module).values():
-            # what was not compiled by now never is: a clean error. Others are part of their callers
+            # an uncompiled variant raises an error; kernels without signatures are inlined
             if isinstance(one, Kernel) and one.compiler.signatures:
                 one.compiler.disable_compile()
 
@@ -155,7 +156,7 @@ def _images() -> list[bytes]:
 
 
 def array_samples() -> list[tuple[bytes, Any]]:
-    """Files whose decoders need no kernels."""
+    """Return files whose readers need no kernels, with their formats."""
     points = np.ones((12, 3), np.float32)
     header = bytearray(227)
     struct.pack_into("<4s", header, 0, b"LASF")
@@ -168,7 +169,7 @@ def array_samples() -> list[tuple[bytes, Any]]:
 
 
 def text_samples() -> list[tuple[bytes, Any]]:
-    """Files whose decoders are compiled: PCD and PLY."""
+    """Return files of PCD and PLY, whose readers are compiled, with their formats."""
     row = b"1 2 3\n"
     head = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 12\nHEIGHT 1\n"
     head += b"POINTS 12\nDATA "

@@ -1,9 +1,10 @@
-"""A pool of decoders' processes: started when needed, shared fairly, replaced when they fail.
+"""A pool of decoder processes: started when needed, shared fairly, replaced after failures.
 
     DecoderPool.place  -->  a decoder for one upload  --samples | points-->  arrays
 
-A decoder that was taken over can say anything. So its replies are JSON and plain arrays, copied out
-of the shared memory before they are checked. It cannot shrink that memory, which would crash us.
+A compromised decoder can send any reply. Replies are therefore JSON and plain arrays, which are
+copied from the shared memory before they are checked. The memory is sealed: a decoder that shrank
+it would crash the service.
 """
 
 from __future__ import annotations
@@ -46,9 +47,9 @@ from sceneprint_client.sidecars import Position, Unsaid
 log = logging.getLogger(__name__)
 
 PROGRAM = "sceneprint.decoders.child_process"
-#: Formats whose decoders are compiled: their process takes 1 s and 140 MB more.
+#: Formats with compiled readers: their process takes 1 s and 140 MB more.
 _COMPILED = ("ply", "pcd")
-#: What a decoder may say of an upload.
+#: Errors of an upload that a decoder may report.
 _ERRORS = {
     one.__name__: one
     for one in (
@@ -56,14 +57,14 @@ _ERRORS = {
         errors.InvalidIntrinsics, errors.MissingDependency,
     )
 }  # fmt: skip
-#: Seconds until a process is ready, which may have to compile first; between two looks at its
-#: processor time; and until an upload gets a decoder.
+#: Maximum seconds until a process is ready, which may compile first; seconds between two looks at
+#: its processor time; and maximum seconds until an upload gets a decoder.
 _BEGIN_S, _LOOK_S, _WAIT_S = 300.0, 0.25, 60.0
-#: How much longer than its processor time a task may take on a busy machine.
+#: Maximum ratio of a task's wall time to its limit of processor time, for busy machines.
 _PATIENCE = 8
 #: Size of a task above which its shared memory is given back, and not erased, bytes.
 _KEPT_BYTES = 8 << 20
-#: Variables that a decoder needs to find its code, and no other: they may be secrets.
+#: Variables that a decoder needs to find its code; others may be secrets.
 _ENVIRONMENT = (
     "PATH", "LANG", "LC_ALL", "HOME", "USER", "TMPDIR", "XDG_CACHE_HOME", "PYTHONPATH",
     "PYTHONHOME", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "NUMBA_CPU_NAME",
@@ -72,18 +73,18 @@ _ENVIRONMENT = (
 
 
 class DecoderEnded(Exception):
-    """The process is gone; its text says of what."""
+    """The process ended; the message says why."""
 
 
 class DecoderProcess:
-    """One process, and what it shares with this one. It has one task at a time.
+    """A decoder process, its socket and its shared memory. It runs one task at a time.
 
     Parameters
     ----------
     program : module that it runs
-    more_bytes : that it may take for its work; 0 for no limit
+    more_bytes : memory that it may allocate for its work, bytes; 0 for no limit
     compiled : whether it loads kernels
-    files : descriptors that it may read, and arguments of the program
+    files : descriptors that it may read, which are arguments of the program
     more : arguments after these
     """
 
@@ -125,11 +126,11 @@ class DecoderProcess:
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """The process id."""
         return self._process.pid
 
     def await_ready(self) -> None:
-        """Wait until it has closed itself in; DecoderEnded where it cannot."""
+        """Wait until the process is confined; raise DecoderEnded if that fails."""
         reply = self._receive(_BEGIN_S)
         walls = reply.get("ready")
         if not isinstance(walls, dict):
@@ -139,12 +140,12 @@ class DecoderProcess:
         )
 
     def run(self, request: dict[str, Any], data: bytes, seconds: float) -> dict[str, Any]:
-        """Have it do a task; its reply, unchecked. The array is in `array_of`.
+        """Run a task and return its reply, unchecked; `array_of` returns its arrays.
 
         Raises
         ------
-        DecoderEnded : it died of the task.
-        DecoderFailure : it took too long.
+        DecoderEnded : The process ended during the task.
+        DecoderFailure : The task took too long.
         """
         self._sent, self._used = len(data), SHARED_BYTES  # until a reply says how much it wrote
         self._shared[: len(data)] = data
@@ -161,14 +162,14 @@ class DecoderProcess:
 
         Parameters
         ----------
-        reply : of `run`
-        checked : makes the result of a reply that it has looked at; any error: a lie
+        reply : a reply of `run`
+        checked : checks a reply and returns its result; an error means that the reply is false
 
         Raises
         ------
-        DecoderEnded : the reply is none.
-        DecoderFailure : the task needed too much memory.
-        FrameError, MissingDependency : what the decoder found.
+        DecoderEnded : The reply is false.
+        DecoderFailure : The task needed too much memory.
+        FrameError, MissingDependency : The decoder reports an error of the upload.
         """
         if reply.get("memory") is True:
             raise DecoderFailure(
@@ -187,7 +188,7 @@ class DecoderProcess:
             raise DecoderEnded(f"its answer is no result: {str(error)[:80]}") from error
 
     def array_of(self, kind: str, shape: tuple[int, ...], first: int = 0) -> NDArray[Any]:
-        """A copy of the array that came with a reply, from its first byte in the memory."""
+        """Return a copy of an array of the reply, which starts at byte `first` of the memory."""
         found = np.frombuffer(self._shared, kind, math.prod(shape), first).copy()
         self._used = max(self._used, first + found.nbytes)
         return found.reshape(shape)
@@ -200,7 +201,7 @@ class DecoderProcess:
             self._shared[: self._used] = bytes(self._used)
 
     def end(self) -> None:
-        """Kill it."""
+        """Kill the process."""
         self._process.kill()
         self._process.wait()
         self._socket.close()
@@ -231,8 +232,8 @@ class DecoderProcess:
         return reply
 
     def _cpu_s(self) -> float:
-        """Processor time that it took, seconds."""
-        with suppress(OSError):  # it is gone, as its socket will tell
+        """Return the processor time of the process, seconds."""
+        with suppress(OSError):  # it ended, and the socket will show it
             return time.clock_gettime((~self._process.pid << 3) | 2)
         return 0.0
 
@@ -251,7 +252,7 @@ class DecoderProcess:
 
 
 class _Slot:
-    """A place for a process, and the decoder that who holds it uses."""
+    """A place in the pool, with the process that it has; a decoder while an upload holds it."""
 
     def __init__(self, pool: DecoderPool) -> None:
         self._pool = pool
@@ -305,19 +306,19 @@ class _Slot:
         self, request: dict[str, Any], data: bytes,
         checked: Callable[[DecoderProcess, dict[str, Any]], Any], *, compiled: bool = False,
     ) -> Any:  # fmt: skip
-        """Have a task done; once more in another process if the first died, perhaps not of it.
+        """Run a task, and again in another process if the first one ended, whatever the cause.
 
         Parameters
         ----------
         request : task and its parameters
-        checked : makes the result of a reply that it has looked at; any error: a lie
+        checked : checks a reply and returns its result; an error means that the reply is false
         compiled : whether kernels are needed
 
         Raises
         ------
-        DecoderFailure : it crashed twice, took too long, or needed too much memory.
-        FrameError, MissingDependency : what the decoder found.
-        Busy : no process can be started.
+        DecoderFailure : The task crashed twice, took too long, or needed too much memory.
+        FrameError, MissingDependency : The decoder reports an error of the upload.
+        Busy : No process can be started.
         """
         try:
             return self._run(request, data, checked, compiled=compiled)
@@ -333,7 +334,7 @@ class _Slot:
             raise
 
     def end(self) -> None:
-        """End the process, if there is one."""
+        """End the process if there is one."""
         process, self.process = self.process, None
         if process is not None:
             process.end()
@@ -353,17 +354,15 @@ class _Slot:
 
 
 class DecoderPool:
-    """Decoders in processes of their own; see Decoders.
-
-    Tenants take turns: see `sceneprint.turns`.
+    """Decoders in confined processes; see Decoders. Tenants take turns (`sceneprint.turns`).
 
     Parameters
     ----------
-    count : of processes at most
-    more_bytes : memory of each for its work, bytes; 0 for no limit
-    seconds : processor time of an upload
-    whose : names the tenant that this thread works for
-    program : module that decoders run
+    count : maximum number of processes
+    more_bytes : memory that each may allocate for its work, bytes; 0 for no limit
+    seconds : maximum processor time of an upload
+    whose : returns the tenant of this thread's request
+    program : module that the processes run
     """
 
     def __init__(
@@ -376,21 +375,21 @@ class DecoderPool:
         self._free = [_Slot(self) for _ in range(count)]
         self._slots = tuple(self._free)
         self._closed = False
-        # a process ends with the thread that started it, so one thread starts all of them
+        # a process ends with the thread that started it, so one thread starts all processes
         self._starter = ThreadPoolExecutor(1, "decoder-starter")
         self._compiling = threading.Lock()
-        #: What stands around the processes; None before the first is ready.
+        #: Confinement of the processes; None before the first is ready.
         self.protections: Protections | None = None
 
     @contextmanager
     def place(self) -> Iterator[_Slot]:
-        """See Decoders; Busy where no decoder gets free in time."""
+        """See Decoders; raise Busy if no decoder becomes free in time."""
         tenant = self._whose()
         if not self._turns.acquire(tenant, _WAIT_S):
             raise errors.Busy(
                 f"No decoder is free within {_WAIT_S:g} s. Nothing was stored. Retry in a minute."
             )
-        slot = self._free.pop()  # the last is taken first: the others need not be started
+        slot = self._free.pop()  # the last one first, so that the others need not be started
         try:
             yield slot
         finally:
@@ -404,11 +403,11 @@ class DecoderPool:
                 slot.process = self.begin(compiled=False)
 
     def pids(self) -> list[int]:
-        """Processes that there are."""
+        """Return the ids of the running processes."""
         return [one.process.pid for one in self._slots if one.process is not None]
 
     def close(self) -> None:
-        """End all processes; uploads in hand fail."""
+        """End all processes; uploads in progress fail."""
         self._closed = True
         self._turns.close()
         for slot in self._slots:
@@ -416,7 +415,7 @@ class DecoderPool:
         self._starter.shutdown()
 
     def begin(self, *, compiled: bool) -> DecoderProcess:
-        """Start a process and wait until it is ready; Busy where that fails."""
+        """Start a process and wait until it is ready; raise Busy if that fails."""
         try:
             if self._closed:
                 raise DecoderEnded("the service stops")
@@ -425,7 +424,7 @@ class DecoderPool:
             )
             process = begin.result()
             try:
-                if compiled:  # the first may compile, and the others find that on disk
+                if compiled:  # the first may compile, and the others load the result
                     with self._compiling:
                         process.await_ready()
                 else:
@@ -455,7 +454,7 @@ class DecoderPool:
 
 
 def _shape(reply: dict[str, Any], most: int) -> tuple[int, int]:
-    """Shape of an array with two dimensions and so many numbers at most."""
+    """Return the shape of a two-dimensional array with `most` numbers at most."""
     height, width = reply["shape"]
     if not (type(height) is int and type(width) is int and height >= 0 and width >= 1):
         raise ValueError("no shape")

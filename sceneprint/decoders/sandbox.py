@@ -1,10 +1,10 @@
-"""What a process gives up before it reads bytes of strangers: files, network, processes, memory.
+"""Confine a process before it reads untrusted bytes: no files, network, processes, or more memory.
 
-close_process  -->  Protections: which walls this kernel has put up
+close_process  -->  Protections: the protections that this kernel supports
 
-The walls are independent of each other, and a kernel or container may lack some: limits of the
-process (setrlimit), no new privileges, a filter of system calls (seccomp), and rules for files,
-TCP and signals (Landlock). What is open stays open: import and load everything first.
+The protections are independent of each other, and a kernel or container may lack some: limits of
+the process (setrlimit), no new privileges, a filter of system calls (seccomp), and rules for files,
+TCP and signals (Landlock). Open files stay open: import and load everything first.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _PR_SET_PDEATHSIG, _PR_SET_NO_NEW_PRIVS = 1, 38
 
 @dataclass(frozen=True)
 class Protections:
-    """Which walls stand around a process, besides limits on memory, files and processes.
+    """The protections of a process, besides limits on memory, files and processes.
 
     Parameters
     ----------
-    no_new_privileges : no program that it could start would have more rights
-    seccomp : only system calls for memory, time and its two pipes work
-    landlock : version of Landlock's rules that forbid files, TCP and signals; 0 without
+    no_new_privileges : whether programs that it starts cannot gain rights
+    seccomp : whether only system calls for memory, time and open files work
+    landlock : version of Landlock, which forbids files, TCP and signals; 0 without
     """
 
     no_new_privileges: bool
@@ -40,7 +40,7 @@ class Protections:
 
     @property
     def text(self) -> str:
-        """The walls as a list for people."""
+        """The protections as a list for people."""
         walls = ["limits on memory and time"]
         walls += ["no new privileges"] if self.no_new_privileges else []
         walls += ["seccomp"] if self.seccomp else []
@@ -49,21 +49,21 @@ class Protections:
 
 
 def die_with_parent(parent: int) -> bool:
-    """End this process when the thread that started it ends; False if that is gone already."""
+    """End this process with the thread that started it; return False if the parent has ended."""
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     return os.getppid() == parent
 
 
 def close_process(more_bytes: int) -> Protections:
-    """Give up everything but computing and what is open; it cannot be taken back.
+    """Give up all rights except computing and open files, irrevocably.
 
     Parameters
     ----------
-    more_bytes : that this process may take beyond what it has; 0 for no limit
+    more_bytes : memory that this process may allocate from now on, bytes; 0 for no limit
     """
     limit_memory(more_bytes)
     no_new = _LIBC.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0
-    # both need no new privileges; the filter last, as nothing of this is on its list
+    # both need no new privileges; the filter comes last, because it forbids these calls
     landlock = _restrict_by_landlock() if no_new else 0
     for what in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE,
                  resource.RLIMIT_NPROC):  # fmt: skip
@@ -71,22 +71,22 @@ def close_process(more_bytes: int) -> Protections:
     return Protections(no_new, no_new and _filter_system_calls(), landlock)
 
 
-# Landlock: an empty set of rules, so that all that it knows is forbidden.
+# Landlock: an empty set of rules forbids everything that Landlock controls.
 
 _CREATE_RULESET, _RESTRICT_SELF = 444, 446  #: system calls, the same on all processors
 _ASK_VERSION = 1
-#: Bits of what each version forbids of files: how many there are.
+#: Number of rights on files that each version can forbid.
 _FILE_BITS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
 
 
 def _restrict_by_landlock() -> int:
-    """Forbid all that this kernel's Landlock knows; its version, or 0."""
+    """Forbid everything that this kernel's Landlock controls; return its version, or 0."""
     version = int(_LIBC.syscall(_CREATE_RULESET, None, 0, _ASK_VERSION))
     if version < 1:
         return 0
     files = (1 << _FILE_BITS[min(version, max(_FILE_BITS))]) - 1
     network = 3 if version >= 4 else 0  # bind, connect
-    scoped = 3 if version >= 6 else 0  # abstract sockets and signals of others
+    scoped = 3 if version >= 6 else 0  # abstract sockets, and signals to other processes
     rules = struct.pack("=QQQ", files, network, scoped)
     size = 24 if version >= 6 else 16 if version >= 4 else 8
     ruleset = int(_LIBC.syscall(_CREATE_RULESET, rules, size, 0))
@@ -101,7 +101,7 @@ def _restrict_by_landlock() -> int:
 
 _SECCOMP = {"x86_64": 317, "aarch64": 277}
 _ARCHITECTURE = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
-#: Calls that stay: reading and writing what is open, memory, time, and ending.
+#: Allowed calls: reading and writing open files, memory, time, and exit.
 _ALLOWED = {
     "x86_64": {
         "read": 0, "write": 1, "close": 3, "fstat": 5, "munmap": 11, "brk": 12,
@@ -120,10 +120,10 @@ _ALLOWED = {
         "exit_group": 94, "getrandom": 278, "rseq": 293,
     },
 }  # fmt: skip
-#: mmap and mprotect, which stay for memory that is not executable.
+#: mmap and mprotect, which are allowed for memory that is not executable.
 _MAPPING = {"x86_64": (9, 10), "aarch64": (222, 226)}
 _PROT_EXEC = 4
-_FIRST_X32 = 0x40000000  #: other names of x86-64's calls
+_FIRST_X32 = 0x40000000  #: numbers of x32's calls on x86-64
 _LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
 _NUMBER, _ARCH, _THIRD_ARGUMENT = 0, 4, 32
 _ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050000 | 1, 0x80000000  #: refuse: EPERM
@@ -131,11 +131,11 @@ _SET_FILTER, _ALL_THREADS = 1, 1
 
 
 def filter_program(machine: str) -> list[tuple[int, int, int, int]]:
-    """The filter as instructions of BPF: code, jump if true, jump if false, operand.
+    """Return the filter as instructions of BPF: code, jump if true, jump if false, operand.
 
     Parameters
     ----------
-    machine : as `platform.machine()` names the processor; x86_64 or aarch64
+    machine : `platform.machine()`: x86_64 or aarch64
     """
     allowed, mapping = sorted(_ALLOWED[machine].values()), _MAPPING[machine]
     program = [
@@ -147,7 +147,7 @@ def filter_program(machine: str) -> list[tuple[int, int, int, int]]:
         (_RETURN, 0, 0, _KILL),
     ]
     rest = len(allowed)
-    # behind the list: refuse, allow, and what looks at the protection of a mapping
+    # after the list: refuse, allow, and the check of a mapping's protection
     program += [(_EQUAL, rest + 1 - i + 2, 0, number) for i, number in enumerate(mapping)]
     program += [(_EQUAL, rest - i, 0, number) for i, number in enumerate(allowed)]
     program += [

@@ -1,8 +1,8 @@
-"""A file of a whole map, read in a process of its own that may do nothing but compute.
+"""Read a file of a whole map in a confined process that can only compute.
 
 file, name, options  --read_surface_confined-->  ReadSurface, checked again
 
-The file is handed over open, so its bytes are not copied; the arrays come back in shared memory.
+The process gets the open file, so its bytes are not copied, and returns arrays in shared memory.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ from sceneprint_client.files import naming
 from sceneprint_client.formats import HEAD
 
 _PROGRAM = "sceneprint.decoders.surface_process"
-#: Most notes of a file, and characters of one.
+#: Maximum number of notes on a file, and of characters in one.
 _MOST_NOTES, _LONGEST_NOTE = 20, 1000
 
 
 @dataclass(frozen=True)
 class SurfaceLimits:
-    """Limits of the reading of one file.
+    """Limits on reading one file.
 
     Parameters
     ----------
-    more_bytes : memory beside the file and the result; 0 for no limit
+    more_bytes : memory besides the file and the result, bytes; 0 for no limit
     seconds : processor time
     """
 
@@ -58,21 +58,21 @@ def read_surface_confined(
     file: int | Path, name: str, options: SurfaceOptions | None = None,
     limits: SurfaceLimits | None = None,
 ) -> ReadSurface:  # fmt: skip
-    """Return the surface of a file, read by a process of its own; see `read_surface`.
+    """Return the surface of a file, read in a confined process; see `read_surface`.
 
     Parameters
     ----------
-    file : open for reading, or its path; a regular file that nobody changes meanwhile
-    name : of the file, for errors and for formats that only its suffix tells
-    options : what the user states
+    file : descriptor or path of a regular file that nobody changes meanwhile
+    name : name of the file, for errors, and for formats that only the suffix shows
+    options : the user's statements about the file
     limits : default: 2 GiB and 10 minutes
 
     Raises
     ------
     UnreadableCloud, UselessFrame, MissingDependency : as `read_surface`.
-    DecoderFailure : the reading crashed, took too long, or needed too much memory.
-    Busy : no process can be started.
-    OSError : the file cannot be opened.
+    DecoderFailure : The process crashed, took too long, or needed too much memory.
+    Busy : No process can be started.
+    OSError : The file cannot be opened.
     """
     if isinstance(file, int):
         return _read(file, name, options or SurfaceOptions(), limits or SurfaceLimits())
@@ -114,7 +114,7 @@ def _read(file: int, name: str, options: SurfaceOptions, limits: SurfaceLimits) 
 
 
 def _checked(process: DecoderProcess, reply: dict[str, Any]) -> ReadSurface:
-    """Return the result of a reply; an error means that the process is not to be trusted."""
+    """Return the result of a reply; an error means that the reply is false."""
     n, m, file_points = reply["points"], reply["triangles"], reply["file_points"]
     _check(_is_whole(n, 1, MOST_VERTICES), "points")
     _check(_is_whole(file_points, n, MOST_FILE_POINTS), "points of the file")
@@ -150,7 +150,7 @@ def _is_whole(value: object, least: int, most: int) -> bool:
 
 
 def _numbers(values: list[float]) -> Floats:
-    """Three finite numbers."""
+    """Return three finite numbers; raise ValueError for others."""
     x, y, z = map(float, values)
     found = np.array([x, y, z])
     _check(bool(np.isfinite(found).all()), "no position")

@@ -1,8 +1,8 @@
-"""A process that reads one file of a whole map, and then ends.
+"""The process that reads one file of a whole map.
 
     python -m sceneprint.decoders.surface_process CONTROL MEMORY PARENT BYTES kernels FILE FORMAT
 
-FILE is mapped, and what reads FORMAT is loaded, before the process gives up everything else. See
+FILE is mapped, and the reader of FORMAT is loaded, before the process is confined. See
 child_process.py.
 """
 
@@ -33,7 +33,7 @@ from sceneprint.geometry.surface.upright import estimate_up
 
 
 def _mapped(descriptor: int) -> FileBytes:
-    """The bytes of an open file, read when they are used."""
+    """Map an open file into memory."""
     if os.fstat(descriptor).st_size == 0:
         return b""
     return mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ)
@@ -60,28 +60,28 @@ def _main() -> None:
     serve({"surface": surface}, lambda _: _load(form))
 
 
-# What is imported or compiled on first use, used once: afterwards no file can be read.
+# Everything that is imported or compiled on first use is used once before the process is confined.
 
 
 def _load(form: SurfaceFormat) -> None:
-    """Read a file of each way that a format has."""
+    """Read a sample of each variant of a format."""
     points = np.ones((20, 3), np.float32)
     thinned(points, 8)
     estimate_up(points, None, np.array([0.0, 0.0, 1.0]))
     ElementTree.fromstring("<a/>")
     for data, one in (*array_samples(), *text_samples(), *mesh_samples()):
         if one == form:
-            with suppress(SceneprintError):  # a reader is not installed, or a sample is no mesh
+            with suppress(SceneprintError):  # a reader is not installed, or a sample has no mesh
                 read_surface(data, "", None, form)
     for module in (rows, pcd, ply, ply_faces):
         for kernel in vars(module).values():
-            # a kernel that no sample needed would have to be compiled: it raises an error instead
+            # a kernel that no sample has compiled raises an error
             if isinstance(kernel, Kernel) and kernel.compiler.signatures:
                 kernel.compiler.disable_compile()
 
 
 def mesh_samples() -> list[tuple[bytes, Any]]:
-    """A file of each format of meshes, in each of its ways."""
+    """Return a sample of each variant of each mesh format, with its format."""
     corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
     head = "element vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
@@ -105,7 +105,7 @@ def mesh_samples() -> list[tuple[bytes, Any]]:
 
 
 def _gltf(corners: list[tuple[int, int, int]]) -> bytes:
-    """Triangles with and without indices, points and lines, in JSON."""
+    """Return a glTF file in JSON with triangles, with and without indices, points and lines."""
     body = np.array(corners[:3], "<f4").tobytes() + struct.pack("<3I", 0, 1, 2)
     uri = "data:application/octet-stream;base64," + base64.b64encode(body).decode()
     position = {"POSITION": 0}
@@ -131,7 +131,7 @@ def _gltf(corners: list[tuple[int, int, int]]) -> bytes:
 
 
 def _glb(tree: dict[str, Any]) -> bytes:
-    """The same in the binary container."""
+    """Return the glTF file in its binary container."""
     body = base64.b64decode(tree["buffers"][0].pop("uri").partition(",")[2])
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)

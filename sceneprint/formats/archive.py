@@ -1,15 +1,15 @@
-"""Frames in tar and zip files, read in place: no archive chooses where anything is written.
+"""Read frames in tar and zip files in place, so that no archive decides where a file is written.
 
 file  --open_archive-->  Archive: sequences, refused, frame_of(reference)
 file  --tar_entries, zip_entries-->  ArchiveEntry, ...  --read_entry-->  bytes
-name  --parts_of-->  parts of a relative path, or why there is none
+name  --parts_of-->  parts of a relative path
 
-Only camera, pose and list files are unpacked, bounded, into a private folder, under names of
-harmless parts; images are empty files there, so that `find_each` finds sequences as it does on a
-disk. An image is read out of the archive when its turn comes.
+Only files of cameras, poses and lists are unpacked, into a private folder, with limits on their
+size and names. Images are empty files there, so `find_each` finds sequences as it does on a disk.
+An image is read from the archive when it is needed.
 
-`tarfile` and `zipfile` believe the sizes that headers announce: here counts, bytes of headers and
-what becomes of a name are bounded.
+`tarfile` and `zipfile` trust the sizes in headers. This module limits the number of members, the
+size of headers, and the names.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ from sceneprint_client.formats import is_cloud, titles_of
 from sceneprint_client.frame_files import POSE_FOLDERS, rows_as_npy
 from sceneprint_client.sidecars import CLOUDS_FILE, INTRINSICS_FILE
 
-# Members of a tar or a zip, by the standard library behind guards.
+# Members of a tar or a zip, read by the standard library within limits.
 
-#: Members an archive may have: a hundred thousand files are a month of one robot.
+#: Maximum number of members: a hundred thousand files are a month of one robot.
 MOST_MEMBERS = 100_000
-#: Bytes of a member's name, and folders in it.
+#: Maximum length of a member's name, bytes, and maximum number of folders in it.
 LONGEST_NAME, DEEPEST = 1024, 16
 _LONGEST_PART = 200  #: bytes: no file system takes more than 255
 _ENCRYPTED = 0x1 | 0x40 | 0x2000  #: flags of a zip's member
@@ -64,16 +64,16 @@ _MALFORMED = (
 
 @dataclass(frozen=True, slots=True)
 class ArchiveEntry:
-    """A member of an archive, not yet read.
+    """A member of an archive that has not been read.
 
     Parameters
     ----------
-    name : as the archive writes it; of no use as a path
-    size : of its content, bytes, as announced
-    start : where its bytes begin in a tar
-    packed : bytes that it takes there
-    open : its content, of a zip
-    trouble : why it cannot be read, or None
+    name : name in the archive; never used as a path
+    size : announced size of the content, bytes
+    start : offset of the content in a tar
+    packed : size of the content in the tar, bytes
+    open : opens the content of a zip's member
+    trouble : reason why the member cannot be read, or None
     """
 
     name: str
@@ -85,21 +85,21 @@ class ArchiveEntry:
 
 
 class OddName(Exception):
-    """A name that leads nowhere, or elsewhere; its text says why."""
+    """A member's name cannot be used as a relative path; the message says why."""
 
 
 def parts_of(name: str) -> tuple[str, ...]:
-    """The parts of a member's name as a relative path.
+    """Return the parts of a member's name as a relative path.
 
     Returns
     -------
-    parts : none of them empty, `.`, `..`, or with a character that is not printed
+    parts : printable names; none is empty, `.` or `..`
 
     Raises
     ------
-    OddName : it is absolute, leads upwards, is too long or too deep, or cannot be printed.
+    OddName : The name is absolute, leads upwards, is too long or too deep, or not printable.
     """
-    text = name.replace("\\", "/")  # as some packers of Windows write them
+    text = name.replace("\\", "/")  # some programs for Windows write backslashes
     if len(name.encode(errors="replace")) > LONGEST_NAME:
         raise OddName(f"its name has more than {LONGEST_NAME} bytes")
     if text.startswith("/") or re.match(r"[A-Za-z]:", text):
@@ -117,7 +117,7 @@ def parts_of(name: str) -> tuple[str, ...]:
 
 
 def printable_name(name: str) -> str:
-    """A member's name in a message: one line, of bounded length."""
+    """Return a member's name for a message: one line of limited length."""
     text = name if name.isprintable() else ascii(name)[1:-1]
     return text if len(text) <= 200 else f"{text[:120]}...{text[-60:]}"
 
@@ -127,17 +127,17 @@ def _is_plain(part: str) -> bool:
     return not any(unicodedata.category(letter).startswith("C") for letter in part)
 
 
-#: Bytes of the headers of one member, and of a zip's directory: the standard library reads
-#: what they announce into memory.
+#: Maximum sizes of one member's headers and of a zip's directory, bytes: the standard library
+#: reads them into memory.
 _MAXIMUM_HEADERS, _MAXIMUM_DIRECTORY = 65_536, 64 << 20
 _DIRECTORY_ENTRY = b"PK\x01\x02"
 BLOCK = tarfile.BLOCKSIZE
-PIECE = 1 << 20  #: bytes that are inflated at once
+PIECE = 1 << 20  #: size of the pieces that are decompressed, bytes
 _DAMAGED = "the tar is damaged after it, and the rest cannot be found"
 
 
 class _HeaderFile:
-    """A file of which the standard library may read `allowance` bytes more."""
+    """A file from which the standard library may read `allowance` more bytes."""
 
     def __init__(self, file: BinaryIO, allowance: int) -> None:
         self.allowance = allowance
@@ -157,7 +157,7 @@ class _HeaderFile:
 
 
 def is_tar_header(block: bytes) -> bool:
-    """Whether a block is the header of a tar's member."""
+    """Return whether a block is the header of a tar's member."""
     try:
         tarfile.TarInfo.frombuf(block[:BLOCK], "utf-8", "surrogateescape")
     except tarfile.HeaderError:
@@ -166,23 +166,23 @@ def is_tar_header(block: bytes) -> bool:
 
 
 def tar_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
-    """Yield the members; folders are left out, and what is odd has `trouble`.
+    """Yield the members of a tar except folders; unreadable members have `trouble`.
 
-    Where the tar is damaged or ends early, the last member says so: what comes before is sound.
+    If the tar is damaged or truncated, the last member says so, and those before it are sound.
 
     Parameters
     ----------
-    file : that can be sought in; not compressed
+    file : a seekable file that is not compressed
 
     Raises
     ------
-    UnreadableArchive : it has too many members, or not even the first one can be read.
+    UnreadableArchive : There are too many members, or the first is unreadable.
     """
     end = file.seek(0, os.SEEK_END)
     file.seek(0)
     headers, last = _HeaderFile(file, _MAXIMUM_HEADERS), ""
     try:
-        # TarFile itself: its `open` reads on after an error
+        # TarFile itself, because `tarfile.open` continues after an error
         tar = tarfile.TarFile(fileobj=cast("BinaryIO", headers), encoding="utf-8")
     except (UnreadableArchive, *_MALFORMED) as error:
         raise UnreadableArchive("The tar is damaged at its start. Pack it again.") from error
@@ -193,12 +193,12 @@ def tar_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
         except (UnreadableArchive, *_MALFORMED):
             yield ArchiveEntry(last, trouble=_DAMAGED)
             return
-        if info is None:  # the end, or no header that tarfile knows
+        if info is None:  # the end, or an unknown header
             file.seek(tar.offset)
             if any(file.read(BLOCK)):
                 yield ArchiveEntry(last, trouble=_DAMAGED)
             return
-        # it keeps all of them, and the headers for all that follow; typeshed does not know
+        # TarFile keeps all members and their headers; the attribute is missing in typeshed
         cast("Any", tar).members.clear()
         tar.pax_headers = {}
         if info.size < 0:
@@ -225,15 +225,15 @@ def _tar_trouble(info: tarfile.TarInfo) -> str | None:
 
 
 def zip_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
-    """Yield the members; folders are left out, and what is odd has `trouble`.
+    """Yield the members of a zip except folders; unreadable members have `trouble`.
 
     Parameters
     ----------
-    file : that can be sought in, and stays open
+    file : a seekable file that stays open
 
     Raises
     ------
-    UnreadableArchive : its directory is missing or damaged, or has too many entries.
+    UnreadableArchive : The directory is missing or damaged, or has too many entries.
     """
     end = file.seek(0, os.SEEK_END)
     headers = _HeaderFile(file, _MAXIMUM_DIRECTORY)
@@ -257,7 +257,7 @@ def zip_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
 
 def _opened_zip(headers: _HeaderFile) -> zipfile.ZipFile:
     file = cast("BinaryIO", headers)
-    try:  # most packers write UTF-8, whether they say so or not
+    try:  # most programs write UTF-8, with or without the flag
         return zipfile.ZipFile(file, metadata_encoding="utf-8")
     except UnicodeDecodeError:
         return zipfile.ZipFile(file)
@@ -270,7 +270,7 @@ def _zip_trouble(info: zipfile.ZipInfo, mode: int, beyond: bool) -> str | None:
         return "it is a link"
     if stat.S_IFMT(mode) not in (0, stat.S_IFREG):
         return "it is no plain file"
-    # LZMA is left out as well: its memory is what the file asks for
+    # LZMA is refused as well, because the file decides how much memory it needs
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         return (
             f"it is packed by method {info.compress_type}, and only stored and deflated ones are "
@@ -280,11 +280,11 @@ def _zip_trouble(info: zipfile.ZipInfo, mode: int, beyond: bool) -> str | None:
 
 
 def read_entry(file: BinaryIO, entry: ArchiveEntry) -> bytes:
-    """The content of a member without `trouble`; of its size at most.
+    """Return the content of a member without `trouble`.
 
     Raises
     ------
-    UnreadableArchive : it is damaged, or of another size than announced.
+    UnreadableArchive : The content is damaged, or of another size than announced.
     """
     if entry.open is None:
         file.seek(entry.start)
@@ -307,17 +307,17 @@ def _too_many() -> UnreadableArchive:
     )
 
 
-# A compressed tar inflated while it is sent, as members are sought in afterwards, perhaps in an
-# object store. `gzip.open` and the like pull from a file, and chunks of a request are pushed: so
-# the decompressors are called here, and a bomb is refused while it bursts.
+# Decompression of tars while they are received: members are read later by random access, perhaps
+# from an object store. `gzip.open` and its like pull from a file, but the chunks of a request are
+# pushed, so this class calls the decompressors, and stops a bomb early.
 #
 # chunks  --Inflater.pieces-->  bytes of a zip or of a plain tar
 
-#: How much more an archive may hold than it weighs, once it holds `FREE` bytes. Depth images are
-#: compressed already, and NPY files of noisy depth give a fifth.
+#: Maximum ratio of content to archive size, beyond `FREE` bytes of content. Depth images are
+#: compressed already, and NPY files of noisy depth shrink to a fifth.
 MOST_RATIO, FREE = 50, 64 << 20
-_MAXIMUM_STREAMS = 65_536  #: one after the other, as parallel packers write them
-_XZ_MEMORY = 192 << 20  #: as `xz -9` needs, and more
+_MAXIMUM_STREAMS = 65_536  #: concatenated streams, which parallel compressors write
+_XZ_MEMORY = 192 << 20  #: bytes; `xz -9` needs less
 
 _MAGIC = (b"PK\x03\x04", b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00")
 _KINDS = "a zip, or a tar (plain, .gz, .bz2 or .xz)"
@@ -335,34 +335,34 @@ class _Stream(Protocol):
 
 
 def is_archive(head: bytes) -> bool:
-    """Whether a file that begins so is one of the archives read here; its content decides."""
+    """Return whether the first bytes of a file are those of a readable archive."""
     return head.startswith(_MAGIC) or is_tar_header(head[:BLOCK])
 
 
 class Inflater:
-    """Takes an archive in chunks of any size, and gives it in pieces, compressed tars inflated.
+    """Receives an archive in chunks of any size, and returns it in pieces, tars decompressed.
 
     Parameters
     ----------
-    most_bytes : that it may give
+    most_bytes : maximum size of the returned archive
     """
 
     def __init__(self, most_bytes: int) -> None:
         self._most = most_bytes
         self._head: bytes | None = b""
-        self._packing: bytes | None = None  # magic of what packs the tar
+        self._packing: bytes | None = None  # magic number of the tar's compression
         self._stream: _Stream | None = None
         self._streams = 0
-        self._start = b""  # of the tar
-        #: Bytes that came, and that were given.
+        self._start = b""  # first bytes of the tar
+        #: Bytes received, and bytes returned.
         self.taken, self.given = 0, 0
 
     def pieces(self, chunk: bytes) -> Iterator[bytes]:
-        """What a chunk adds to the archive.
+        """Yield the pieces of the archive that a chunk completes.
 
         Raises
         ------
-        UnreadableArchive : it is none, is damaged, or holds more than it may.
+        UnreadableArchive : The file is no archive, is damaged, or exceeds `most_bytes`.
         """
         self.taken += len(chunk)
         if self._head is not None:
@@ -374,8 +374,8 @@ class Inflater:
         yield from self._given(chunk)
 
     def end(self) -> Iterator[bytes]:
-        """What is left when all has come; raises as `pieces`."""
-        if self._head is not None:  # all of it is shorter than a block: an empty zip, or nothing
+        """Yield the remaining pieces after the last chunk; raises as `pieces`."""
+        if self._head is not None:  # shorter than a block: an empty zip, or an empty file
             chunk, self._head = self._head, None
             self._open(chunk)
             yield from self._given(chunk)
@@ -413,7 +413,7 @@ class Inflater:
     def _inflated(self, chunk: bytes) -> Iterator[bytes]:
         data = chunk
         while True:
-            if self._stream is None:  # between two, or behind the last one
+            if self._stream is None:  # between two streams, or after the last
                 data = data.lstrip(b"\0")
                 if not data:
                     return
@@ -435,7 +435,7 @@ class Inflater:
             if self._stream.eof:
                 data, self._stream = self._stream.unused_data, None
                 continue
-            # zlib keeps what it has not taken beside itself, the others within
+            # zlib returns unused input in this attribute; the others keep it
             data = getattr(self._stream, "unconsumed_tail", b"")
             if not data and len(piece) < PIECE:
                 return
@@ -449,67 +449,68 @@ def _open_entry(magic: bytes) -> _Stream:
     return lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY)
 
 
-# Sequences in an archive, read in place.
+# Sequences in an archive.
 
-#: What an archive and its sequence are called where nobody says.
+#: Default name of an archive and its sequence.
 DEFAULT_NAME = "import"
 _LISTS = ("depth.txt", "groundtruth.txt", TRANSFORMS)
 _TEXTS = (INTRINSICS_FILE, CLOUDS_FILE, "TrainSplit.txt", "TestSplit.txt")
-_MAXIMUM_LIST, _MAXIMUM_TEXT, _MAXIMUM_TEXTS = 1 << 26, 1 << 16, 1 << 27  #: bytes; of all of them
-_HEAD_BYTES = 1024  #: of an image, which tell its size
-_PARENTS = ("0", "1", "2", "3", "4")  #: a camera is looked for above the frames: not beyond these
+#: Maximum sizes of a list, of another text, and of all texts together, bytes.
+_MAXIMUM_LIST, _MAXIMUM_TEXT, _MAXIMUM_TEXTS = 1 << 26, 1 << 16, 1 << 27
+_HEAD_BYTES = 1024  #: first bytes of an image, which show its size
+_PARENTS = ("0", "1", "2", "3", "4")  #: parents of the root, in which a camera is searched
 
-#: What a file system says where a file and a folder have one name, or a name is none for it.
+#: Errors of a file system if a file and a folder have the same name, or a name is invalid.
 _CLASHES = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EINVAL)
 
 Wanted = Literal["image", "text"]
 
 
 class Archive:
-    """An archive that is open; see `open_archive`.
+    """An open archive; see `open_archive`.
 
     Parameters
     ----------
-    file : of the archive
-    root : private folder that its sequences are laid out in
+    file : the archive
+    root : private folder for the layout of its sequences
     """
 
     def __init__(self, file: BinaryIO, root: Path) -> None:
         self._file, self._root = file, root
         self._members: dict[Path, ArchiveEntry] = {}
-        #: Name of a member or a sequence, and why it is not taken.
+        #: Names of refused members and sequences, with the reasons.
         self.refused: list[tuple[str, str]] = []
-        #: Members that are no part of a sequence, such as colour images.
+        #: Number of members that belong to no sequence, such as colour images.
         self.ignored = 0
-        #: Whether it has depth as Record3D packs it.
+        #: Whether the archive has depth of Record3D.
         self.is_record3d = False
-        #: Sound ones, though each of their frames may still turn out damaged.
+        #: The sequences; each of their frames may still be damaged.
         self.sequences: tuple[FrameSequence, ...] = ()
 
     def name_of(self, reference: FrameReference) -> str:
-        """The name of a frame's member, as the archive writes it."""
+        """Return the name of a frame's member in the archive."""
         return printable_name(self._members[reference.path].name)
 
     def size_of(self, reference: FrameReference) -> int:
-        """Bytes of a frame of `sequences`, as the archive announces them."""
+        """Return the announced size of a frame's member, bytes."""
         return self._members[reference.path].size
 
     def data_of(self, reference: FrameReference) -> bytes:
-        """The bytes of a frame of `sequences`.
+        """Return the bytes of a frame.
 
         Raises
         ------
-        UnreadableArchive : its member is damaged, encrypted or too large.
+        UnreadableArchive : The member is damaged, encrypted or too large.
         """
         limit = MAXIMUM_IMAGE_BYTES if reference.cloud is None else MAXIMUM_CLOUD_BYTES
         data = self._read(self._members[reference.path], limit)
         if reference.row is not None:
             return rows_as_npy(data, reference.row)
-        # depth in units that no camera can state
+        # units that no camera file can express
         return reference.source.converted(data) if isinstance(reference.source, ScaledNpy) else data
 
     def told(self, error: SceneprintError) -> str:
-        """What an error says, without the private folder."""
+        """Return the message of an error without the private folder."""
         return str(error).replace(f"{self._root}/", "")
 
     def _read(self, member: ArchiveEntry, limit: int) -> bytes:
@@ -533,7 +534,7 @@ class Archive:
         single = len(tops) == 1 and all(len(parts) > 1 for parts, _, _ in found)
         above = self._root.joinpath(name)
         weight = self._file.seek(0, 2)
-        # of a tar this is at most one; a zip's members may lie over each other
+        # a zip's members may overlap, so their total may exceed the archive's size
         unpacked = sum(member.size for _, member, _ in found)
         if unpacked > FREE + MOST_RATIO * weight:
             raise UnreadableArchive(
@@ -541,7 +542,7 @@ class Archive:
                 "weighs, which no depth images do. Pack them less."
             )
         left = _MAXIMUM_TEXTS
-        # cameras of other systems are of colour images; sizes of depth images are in their heads
+        # cameras of other systems describe colour images; depth images show their own size
         of_exports = any(_is_of_export(parts) for parts, _, _ in found)
         for parts, member, wanted in found:
             path = above.joinpath(*parts)
@@ -553,7 +554,7 @@ class Archive:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.touch(exist_ok=False)
             except OSError as error:
-                if error.errno not in _CLASHES:  # a full disk is no fault of the archive's
+                if error.errno not in _CLASHES:  # the archive does not cause a full disk
                     raise
                 self._refuse(member, "another member has the name of its folder, or its own")
                 continue
@@ -573,7 +574,7 @@ class Archive:
             self.refused += [(printable_name(one), self.told(error)) for one, error in refused]
 
     def _head(self, member: ArchiveEntry) -> bytes:
-        """Return the first bytes of a member; none where they cannot be read."""
+        """Return the first bytes of a member; empty if it is unreadable."""
         if member.open is None:
             self._file.seek(member.start)
             return self._file.read(min(_HEAD_BYTES, member.size))
@@ -584,7 +585,7 @@ class Archive:
             return b""
 
     def _unpack(self, path: Path, member: ArchiveEntry, left: int) -> int:
-        """Write a text; a damaged one stays empty, which its reader refuses."""
+        """Write a text; a damaged one stays empty, so its reader refuses it."""
         limit = min(_MAXIMUM_LIST if path.name in _LISTS else _MAXIMUM_TEXT, left)
         try:
             data = self._read(member, limit)
@@ -595,7 +596,7 @@ class Archive:
         return len(data)
 
     def _wanted(self) -> list[tuple[tuple[str, ...], ArchiveEntry, Wanted]]:
-        """Members that may be part of a sequence, with the parts of their names."""
+        """Return the members that may belong to a sequence, with the parts of their names."""
         found: list[tuple[tuple[str, ...], ArchiveEntry, Wanted]] = []
         for count, member in enumerate(_entries_of(self._file), start=1):
             if count > MOST_MEMBERS:
@@ -610,7 +611,7 @@ class Archive:
             wanted = _wanted(parts)
             if wanted is not None:
                 found.append((parts, member, wanted))
-            elif member.trouble is not None and not member.size:  # links, and where a tar breaks
+            elif member.trouble is not None and not member.size:  # links, and damage of a tar
                 self._refuse(member, member.trouble)
             else:
                 self.ignored += 1
@@ -625,20 +626,19 @@ class Archive:
 
 @contextmanager
 def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iterator[Archive]:
-    """Look into an archive, and find what sequences it has.
+    """Open an archive and find its sequences.
 
     Parameters
     ----------
-    file : a zip, or a tar that is not compressed; stays open as long as the archive is used
-    folder : below which a private one is made, and removed in the end
-    name : of the place that the sequences are of, where the archive has no folder for it; a path's
-        part
+    file : a zip, or a tar that is not compressed; it stays open while the archive is used
+    folder : parent of the private folder, which is removed at the end
+    name : name of the scene if the archive has no folder for it; one part of a path
 
     Raises
     ------
-    UnreadableArchive : it is none, damaged as a whole, holds too much, nothing that is depth, or
-        two scenes of one name.
-    OSError : the folder cannot be written.
+    UnreadableArchive : The file is no archive, is damaged, exceeds a limit, has no depth, or has
+        two scenes of the same name.
+    OSError : The folder cannot be written.
     """
     with tempfile.TemporaryDirectory(prefix="archive-", dir=folder) as private:
         archive = Archive(file, Path(private).joinpath(*_PARENTS).absolute())
@@ -675,20 +675,20 @@ def _entries_of(file: BinaryIO) -> Iterator[ArchiveEntry]:
 
 
 def _is_of_export(parts: tuple[str, ...]) -> bool:
-    """Whether a member is what other systems write beside their depth images."""
+    """Return whether other systems write a member of this name beside their depth images."""
     *folders, name = parts
     of_camera = name.lower().endswith(".json") and folders[-1:] in ([one] for one in CAMERAS)
     return of_camera or name == TRANSFORMS
 
 
 def _wanted(parts: tuple[str, ...]) -> Wanted | None:
-    """What a member is to a sequence by its name; hidden files and colour are nothing."""
+    """Return the role of a member in a sequence by its name; None for hidden files and colour."""
     *folders, name = parts
     hidden = any(part.startswith(".") or part == "__MACOSX" for part in parts)
-    # the first folder may be what the packed folder was called
+    # the first folder may be the one that was packed, whatever its name
     if hidden or any(is_beside_depth(folder) for folder in folders[1:]):
         return None
-    # `find_pose_file` decides which of these belongs to a frame
+    # `find_pose_file` finds the one that belongs to a frame
     is_pose = name.endswith(".txt") and ("pose" in name or {*folders[-1:]} & {*POSE_FOLDERS})
     if name in _TEXTS or name in _LISTS or is_pose or _is_of_export(parts):
         return "text"

@@ -1,12 +1,12 @@
-"""Surfaces as 16-bit numbers, and back: what geometry artifacts hold of what a sensor saw.
+"""Geometry artifacts: the surface that a sensor saw, quantised to 16 bits, and its patches.
 
     Surface  --pack_image | pack_points-->  (h, w, 3) or (N, 5) uint16
     uint16  --unpack_image | unpack_points-->  Surface
 
-A pinhole's pixels are inverse depths (its steps are far below a sensor's noise), a sphere's are
-ranges, points in no order are offsets in a cube. A normal is 2 x 16 bits on an octahedron; 2 x 8
-of a scan with spread points. Steps of range and offset are powers of two, so that to pack again
-what was unpacked changes nothing.
+Pixels of a pinhole camera are inverse depths, whose steps are far below a sensor's noise. Pixels of
+a sphere are ranges, and unordered points are offsets in a cube. A normal has 2 x 16 bits on an
+octahedron, or 2 x 8 for scans with spread points. Steps of range and offset are powers of two, so
+packing an unpacked surface again changes nothing.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from sceneprint.types import (
 
 Packed = NDArray[np.uint16]
 MOST = 65535
-#: Least share of its largest coordinate that a step of 32 bits can tell.
+#: Smallest step relative to the largest coordinate that float32 resolves.
 _TOLD = 2.0**-22
 
 
@@ -46,13 +46,13 @@ _TOLD = 2.0**-22
 def _to_octahedron(nx: float, ny: float, nz: float, most: float) -> tuple[int, int]:
     total = abs(nx) + abs(ny) + abs(nz)
     u, v = nx / total, ny / total
-    if nz > 0:  # normals face a depth sensor, -z: that half is the middle of the square
+    if nz > 0:  # normals face the sensor (-z), and this half is the middle of the square
         u, v = (
             (1.0 - abs(v)) * (1.0 if u >= 0 else -1.0),
             (1.0 - abs(u)) * (1.0 if v >= 0 else -1.0),
         )
     a, b = round((u * 0.5 + 0.5) * most), round((v * 0.5 + 0.5) * most)
-    # of the two places on the edge of the square that are one direction, one
+    # two places on the edge of the square are the same direction: choose one
     a_on_edge, b_on_edge = a == 0 or a == most, b == 0 or b == most
     if a_on_edge:
         b = max(b, int(most) - b)
@@ -78,7 +78,7 @@ def _of_octahedron(a: int, b: int, most: float) -> tuple[float, float, float]:
 def _pack_image(
     points: Floats32, normals: Floats32, pinhole: bool, scale: float, most: float, out: Packed
 ) -> None:
-    """Inverse depth or range, and normal, of every pixel; 0 where not valid: out (h, w, 3)."""
+    """Write inverse depth or range, and normal, of every pixel to out (h, w, 3); 0 if invalid."""
     height, width = points.shape[0], points.shape[1]
     for y in range(height):
         for x in range(width):
@@ -104,8 +104,9 @@ def _pack_image(
 def _unpack_line(
     inverse: Floats, across: Floats, down: Floats, xn: Floats, yn: float, area: float, out: Floats
 ) -> None:
-    """Points, normals and areas (7, w) of a line of pixels: inverse depths, and the two numbers of
-    their normals. All pixels, valid or not: so the compiler works on several at once.
+    """Write points, normals and areas (7, w) of a line of pixels to `out`.
+
+    Invalid pixels are computed as well, so that the compiler can vectorise the loop.
     """
     px, py, pz, nx, ny, nz, areas = out[0], out[1], out[2], out[3], out[4], out[5], out[6]
     for x in range(len(inverse)):
@@ -185,13 +186,13 @@ def _unpack_normals(packed: Packed, most: float, out: Floats32) -> None:
 
 
 def _step(span: float) -> float:
-    """The power of two of which 65535 reach as far, but for what rounding may have added."""
+    """Return the power of two whose 65535-fold covers `span`, apart from rounding."""
     return 2.0 ** math.ceil(math.log2(span / MOST) - 1e-4) if span > 0 else 1.0
 
 
 def pack_image(surface: Surface, most: int = MOST) -> tuple[Packed, float]:
-    """Pixels (h, w, 3) of a surface that a camera saw; and the inverse depth of 1 (of a pinhole),
-    or the range of 1 (of a sphere). Numbers of normals are 0 to `most`.
+    """Return the pixels (h, w, 3) of a camera's surface, and the scale of their first number: the
+    inverse depth (pinhole) or range (sphere) of 1. Numbers of normals are 0 to `most`.
     """
     pinhole = isinstance(surface.camera, Intrinsics)
     if pinhole:
@@ -208,7 +209,7 @@ def pack_image(surface: Surface, most: int = MOST) -> tuple[Packed, float]:
 def unpack_image(
     packed: Packed, scale: float, camera: Intrinsics | Sphere, most: int = MOST
 ) -> Surface:
-    """The surface of `pack_image`."""
+    """Return the surface of the pixels of `pack_image`."""
     shape = (camera.height, camera.width)
     points, normals = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
     areas, valid = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
@@ -224,7 +225,7 @@ def unpack_image(
 
 
 def pack_points(surface: Surface, most: int = MOST) -> tuple[Packed, Floats, float]:
-    """Points in no order as (N, 5): offsets and normal; the corner they are from, and a step."""
+    """Return unordered points as (N, 5) offsets and normals, with their corner and step."""
     points, normals = surface.points[surface.valid], surface.normals[surface.valid]
     packed = np.zeros((len(points), 5), np.uint16)
     if not len(points):
@@ -239,7 +240,7 @@ def pack_points(surface: Surface, most: int = MOST) -> tuple[Packed, Floats, flo
 
 
 def unpack_points(packed: Packed, corner: Floats, step: float, most: int = MOST) -> Surface:
-    """The surface of `pack_points`, a map of one row without areas."""
+    """Return the surface of the points of `pack_points`: one row, without areas."""
     points = (packed[:, :3] * step + corner).astype(np.float32)
     normals = np.zeros((len(packed), 3), np.float32)
     _unpack_normals(packed[:, 3:], float(most), normals)
@@ -249,43 +250,43 @@ def unpack_points(packed: Packed, corner: Floats, step: float, most: int = MOST)
     )
 
 
-# Geometry artifacts as bytes: what is kept of a frame so that its upload is not read again.
+# Artifacts as bytes, from which a frame is validated without reading its upload again.
 #
 #     Geometry  --write_geometry-->  bytes  --read_geometry-->  Geometry
 #
-# Little-endian, in this order: magic, schema, CRC-32 of all that follows, sizes and camera, id of
-# the model, then the arrays; those of the surface are as above. Depth images have schema 1,
-# clouds 2, scans with spread points 3: of these offset and ranges come first, then all normals.
+# Little-endian, in this order: magic, schema, CRC-32 of the rest, sizes and camera, id of the
+# model, arrays. Depth images have schema 1, clouds 2, and scans with spread points 3, in which
+# offsets and ranges come first, and then all normals.
 
 MAGIC = b"SPGEO"
-#: Of the bytes and of what they mean, for depth images, for clouds, and for scans with spread
-#: points. Raise it when either changes.
+#: Versions of the format for depth images, clouds, and scans with spread points. Raise a version
+#: if its bytes or their meaning change.
 SCHEMA_VERSION, CLOUD_SCHEMA, SCAN_SCHEMA = 1, 2, 3
 #: magic, schema, checksum
 _HEAD = struct.Struct("<5sHI")
-#: Of a depth image: width, height, patches, bytes of a descriptor, fx, fy, cx, cy, inverse depth
-#: of 65535, model
+#: Depth image: width, height, patches, bytes of a descriptor, fx, fy, cx, cy, inverse depth of
+#: 65535, model.
 _DEPTH = struct.Struct("<HHHH5d32s")
-#: Of a cloud: width, height, patches, bytes of a descriptor, kind, pole, then step, left and top
-#: of a sphere or the corner of points in no order, then the step of 1, model
+#: Cloud: width, height, patches, bytes of a descriptor, kind, pole, then step, left and top of a
+#: sphere or the corner of unordered points, then the step of 1, model.
 _CLOUD = struct.Struct("<HHHHBB4d32s")
 _SPHERE, _POINTS = 1, 2
-#: Of a scan, after what is told of a cloud: spread points, their corner and their step of 1
+#: Scan, after the fields of a cloud: number of spread points, their corner, and their step of 1.
 _SPREAD = struct.Struct("<H4d")
-#: Greatest number of a normal of a scan with spread points: half a degree off, at most.
+#: Largest number of a normal of a scan with spread points: an error of half a degree at most.
 _COARSE = 255
-#: Most points in no order that are kept: as many as pixels of a depth image.
+#: Maximum number of unordered points: as many as a depth image has pixels.
 MAXIMUM_POINTS = 20_000
-#: Most patches and longest descriptor that are believed: validation compares all patches with all,
-#: and no model makes more of either.
+#: Maximum number of patches, and of bytes of a descriptor, that are accepted: validation compares
+#: all patches with all, and no model exceeds these numbers.
 MAXIMUM_PATCHES, MAXIMUM_DESCRIPTOR = 4096, 1024
-#: Least and most of the nearest depth, metres: points and areas stay finite in 32 bits.
+#: Range of the nearest depth, metres, in which points and areas stay finite in float32.
 NEAREST = (1e-6, 1e6)
-#: Least and most of a step of range or offset, metres.
+#: Range of a step of range or offset, metres.
 STEPS = (2.0**-40, 16.0)
-#: Farthest patch, metres, and largest, square metres, that are believed.
+#: Largest distance, metres, and area, square metres, of a patch that are accepted.
 FARTHEST, LARGEST = 1e9, 1e18
-#: Bytes of a patch beside its descriptor: mean, normal, area, coherence as float32, and its size.
+#: A patch without its descriptor: mean, normal, area, coherence as float32, and its size.
 _PATCH = np.dtype(
     [
         ("mean", "<f4", 3), ("normal", "<f4", 3), ("area", "<f4"), ("coherence", "<f4"),
@@ -295,12 +296,12 @@ _PATCH = np.dtype(
 
 
 def write_geometry(geometry: Geometry) -> bytes:
-    """A geometry artifact as bytes, the same ones for the same artifact.
+    """Return the bytes of a geometry artifact; equal artifacts have equal bytes.
 
     Parameters
     ----------
-    geometry : see Geometry; its model id is 64 hexadecimal digits. Of points in no order at most
-        MAXIMUM_POINTS are kept
+    geometry : an artifact whose model id is 64 hexadecimal digits, and which has MAXIMUM_POINTS
+        unordered points at most
     """
     patches, camera, spread = geometry.patches, geometry.surface.camera, geometry.surface.spread
     schema = SCHEMA_VERSION if isinstance(camera, Intrinsics) else CLOUD_SCHEMA
@@ -332,14 +333,14 @@ def write_geometry(geometry: Geometry) -> bytes:
 
 
 def _split(packed: Packed, places: int) -> bytes:
-    """The first numbers of each row as 16 bits, then those of the normals as 8."""
+    """Return the first numbers of each row as 16 bits, then those of the normals as 8."""
     return (
         packed[..., :places].astype("<u2").tobytes() + packed[..., places:].astype("u1").tobytes()
     )
 
 
 def _joined(data: memoryview, shape: tuple[int, ...], places: int) -> Packed:
-    """Of `_split`, (*shape, places + 2)."""
+    """Return the numbers (*shape, places + 2) that `_split` has written."""
     end = 2 * places * math.prod(shape)
     first = np.frombuffer(data[:end], "<u2").reshape(*shape, places)
     normals = np.frombuffer(data[end:], np.uint8).reshape(*shape, 2)
@@ -347,16 +348,12 @@ def _joined(data: memoryview, shape: tuple[int, ...], places: int) -> Packed:
 
 
 def read_geometry(data: bytes) -> Geometry:
-    """A geometry artifact from its bytes.
-
-    Parameters
-    ----------
-    data : of `write_geometry`
+    """Return the geometry artifact of the bytes of `write_geometry`.
 
     Raises
     ------
-    UnreadableGeometry : not an artifact, cut short, damaged, of another schema, or with numbers
-        that are no camera, no depth or no patches.
+    UnreadableGeometry : The bytes are no artifact, truncated, damaged, of another schema, or
+        describe an impossible camera, depth or patch.
     """
     nothing = f"{len(data)} bytes are no geometry artifact."
     if len(data) < _HEAD.size or data[: len(MAGIC)] != MAGIC:
@@ -417,7 +414,7 @@ def _depth(
 
 
 def _scan(packed: Packed, points: memoryview, told: list[Any], spread: tuple[Any, ...]) -> Surface:
-    """A range image, and points in no order that are spread over what it shows."""
+    """Return the surface of a range image with its spread points."""
     count, *corner, step = spread
     near = all(abs(one) <= NEAREST[1] for one in corner)  # false for NaN
     if not (told[0] == _SPHERE and 0 < count <= SPREAD_POINTS and near):
@@ -456,7 +453,7 @@ def _patches(rows: NDArray[np.void]) -> Patches:
 
 
 def _sound(patches: Patches) -> bool:
-    """Whether the numbers are those of patches: comparisons with NaN are false."""
+    """Return whether the numbers describe patches; comparisons with NaN are false."""
     length = np.sqrt((patches.normals**2).sum(axis=1))
     return bool(
         (np.abs(patches.means) <= FARTHEST).all()

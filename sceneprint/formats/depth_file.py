@@ -1,4 +1,4 @@
-"""The door for frames: stored samples and a camera in, a `Frame` out.
+"""Read depth images: stored samples and a camera become a `Frame`.
 
 bytes  --decode_png | decode_npy-->  samples (H, W)  --make_frame-->  Frame
 """
@@ -36,10 +36,10 @@ from sceneprint_client.formats import format_at, function_at, titles_of
 from sceneprint_client.poses import rigid_transform
 from sceneprint_client.ros_messages import TRANSPORT_BYTES, inverse_depth
 
-#: What a depth image is stored as: whole numbers of some unit, or metres.
+#: Samples of a depth image: whole numbers of a unit, or metres.
 Samples = NDArray[np.uint16] | Floats32
 
-#: Most bytes a frame may have: all samples as float64, and room for a header.
+#: Maximum size of a frame, bytes: all samples as float64, and a header.
 _MAXIMUM_CHUNKS = 65_536  # 16 megapixels in pieces of 1 KB; each costs time even if empty
 _COLOURS = {2: "colour (RGB)", 3: "palette", 4: "greyscale with alpha", 6: "colour with alpha"}
 #: Adam7: first column and row of each pass, and its steps
@@ -80,7 +80,7 @@ def decode_png(data: bytes) -> NDArray[np.uint16]:
             pixels += content
         elif kind == b"acTL":
             raise UnreadableFrame("The PNG is animated. Send one image per frame.")
-        elif kind != b"IEND" and kind[0:1].isupper():  # upper case: not to be ignored
+        elif kind != b"IEND" and kind[0:1].isupper():  # upper case: a critical chunk
             raise UnreadableFrame(
                 f"The PNG has a {kind!r} chunk, which 16-bit greyscale has not. "
                 "Write it as a plain PNG."
@@ -108,7 +108,7 @@ def png_size(head: bytes) -> tuple[int, int]:
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield kind and content of each chunk up to IEND, check sums compared."""
+    """Yield kind and content of each chunk up to IEND, after comparing its checksum."""
     view, position = memoryview(data), len(PNG_SIGNATURE)
     for _ in range(_MAXIMUM_CHUNKS):
         if position + 12 > len(data):
@@ -157,12 +157,12 @@ def _checked_header(content: memoryview) -> bytes:
     return bytes(content)
 
 
-#: Its stub declares an instance.
+#: The stub of isal declares an instance.
 _DAMAGED = cast(type[Exception], isal_zlib.error)
 
 
 def _inflate(pixels: bytes, header: bytes) -> bytes:
-    """Return the filtered rows, exactly as many bytes as the header announces."""
+    """Return the filtered rows, exactly the number of bytes that the header announces."""
     width, height, interlaced = *struct.unpack_from(">II", header), header[12]
     passes = _PASSES if interlaced else ((0, 0, 1, 1),)
     expected = 0
@@ -186,19 +186,19 @@ def _inflate(pixels: bytes, header: bytes) -> bytes:
 
 
 def _samples(header: bytes, rows: bytes) -> NDArray[np.uint16]:
-    """Undo filters and interlacing: Pillow on a PNG of nothing but header and pixels."""
+    """Return the samples of filtered rows, decoded by Pillow from a PNG of header and pixels."""
     from PIL.PngImagePlugin import PngImageFile
 
     plain = _png(header, zlib.compress(rows, 0))
     try:
-        # not by Image.open, whose limit of pixels is the program's
+        # Image.open has a limit on pixels that belongs to the whole program
         with PngImageFile(io.BytesIO(plain)) as image:
             samples = np.asarray(image)
     except (OSError, ValueError, SyntaxError) as cause:
         raise UnreadableFrame(
             f"The PNG is damaged: its rows do not decode ({cause}). Write it again."
         ) from cause
-    return np.array(samples, dtype=np.uint16)  # some versions of Pillow give int32
+    return np.array(samples, dtype=np.uint16)  # some versions of Pillow return int32
 
 
 def encode_npy(array: NDArray[Any]) -> bytes:
@@ -224,7 +224,7 @@ def encode_png(samples: NDArray[np.uint16]) -> bytes:
 
 
 def _png(header: bytes, pixels: bytes) -> bytes:
-    """A PNG of a header and compressed rows, and nothing else."""
+    """Return a PNG of a header and compressed rows."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         check = crc32(content, crc32(kind))
@@ -237,9 +237,9 @@ def _png(header: bytes, pixels: bytes) -> bytes:
 
 # Images of ROS's compressed_depth_image_transport: a PNG after a header of 12 bytes.
 
-#: What a of 32FC1 images may be: q (q + 1) of a quantisation q, which is 100 unless it is set.
+#: Range of the parameter a of 32FC1 images: q (q + 1) for the quantisation q, 100 by default.
 _A = (1.0, 1e8)
-#: Depth that an inverse depth of 1 may stand for, metres: the transport's limit, 10 by default.
+#: Range of the depth of an inverse depth of 1, metres: the transport's limit, 10 by default.
 _DEEPEST_M = (0.1, 1e3)
 
 
@@ -252,7 +252,7 @@ def decode_transported(data: bytes) -> Samples:
     """Return the samples of a 16UC1 image, or the metres of one of 32FC1, as its header says."""
     samples = decode_png(data[TRANSPORT_BYTES:])
     a, b = struct.unpack_from("<ff", data, 4)
-    # of 16UC1 images the transport leaves these numbers unset: most often zero, or tiny
+    # the transport leaves these numbers unset for 16UC1 images: usually zero, or tiny
     if not (1e-3 < a < 1e9 and 1e-3 < abs(b) < 1e9):
         return samples
     if b < 1 and _A[0] < a < _A[1] and _DEEPEST_M[0] <= a / (1 - b) <= _DEEPEST_M[1]:
@@ -263,7 +263,7 @@ def decode_transported(data: bytes) -> Samples:
     )
 
 
-# NPY files of float metres or of stored units, read without trusting their header.
+# NPY files of float metres or stored units, read without trust in their header.
 #
 # bytes  --decode_npy-->  samples (H, W) float32 or uint16
 
@@ -286,11 +286,11 @@ def decode_npy(data: bytes) -> Samples:
 
     Returns
     -------
-    samples : (H, W) float32, with whatever NaN and infinities the file holds; or uint16
+    samples : (H, W) float32, with the NaN and infinities of the file; or uint16
 
     Raises
     ------
-    UnreadableFrame : the file is empty, no NPY, too large, of another type or shape, holds
+    UnreadableFrame : The file is empty, not NPY, too large, of another type or shape, contains
         Python objects, or its size contradicts its header.
     """
     check_length(data)
@@ -332,7 +332,7 @@ def _header(data: bytes) -> NpyHeader:
     return header
 
 
-#: What some sensors store, besides 0, where they measured nothing.
+#: Value of missing samples of some sensors, besides 0.
 _MISSING = 65_535
 
 
@@ -345,16 +345,16 @@ def make_frame(
     name: str = "",
     pose: Floats | None = None,
 ) -> DepthFrame:
-    """Return the frame that the geometry reads: metres, z along the axis, no distortion.
+    """Return a frame without lens distortion, in metres along the optical axis.
 
     Parameters
     ----------
     samples : (H, W) uint16 in stored units, 0 and 65535 where missing; or floating in
         metres, NaN, infinite and <= 0 where missing
     intrinsics : the camera that took the image, with its distortion
-    depth_scale : stored units per metre; floating samples are metres whatever it is
-    along_ray : the samples are ranges along the pixel's ray and not z
-    name : what to call the frame in lines and errors
+    depth_scale : stored units per metre; ignored for floating samples, which are metres
+    along_ray : whether the samples are ranges along the pixel's ray instead of z
+    name : name of the frame in messages
     pose : (4, 4) T_parent_sensor, or None where unknown
 
     Returns
@@ -363,10 +363,10 @@ def make_frame(
 
     Raises
     ------
-    UnreadableFrame : the samples are of another type or not two-dimensional.
-    InvalidIntrinsics : they do not fit the image, or the depth scale is no positive number.
-    InvalidPose : the pose is not a rigid transform.
-    UselessFrame : no sample remains.
+    UnreadableFrame : The samples are of another type or not two-dimensional.
+    InvalidIntrinsics : They do not fit the image, or the depth scale is not positive.
+    InvalidPose : The pose is not a rigid transform.
+    UselessFrame : No valid sample remains.
     """
     with naming(name):
         if not (math.isfinite(depth_scale) and depth_scale > 0):
@@ -382,7 +382,7 @@ def make_frame(
                 f"{intrinsics.width} x {intrinsics.height}. Give those of this image, as a "
                 "resized image has others."
             )
-        # the ray of a sample is that of the distorted pixel, so before undistorting
+        # before undistorting, because the ray of a sample is that of the distorted pixel
         if along_ray:
             depth = ray_to_axis(depth, intrinsics)
         if intrinsics.distortion:
@@ -409,15 +409,15 @@ def read_frame(
     name: str = "",
     pose: Floats | None = None,
 ) -> DepthFrame:
-    """Return the frame of a depth image; its content shows the format, not its name.
+    """Return the frame of a depth image, whose content determines the format.
 
     Parameters
     ----------
-    path : the file; the rest as for `make_frame`
+    path : the file; for the others see `make_frame`
 
     Raises
     ------
-    UnreadableFrame : the file is absent or too large; and as `decode_frame`. Each error names
+    UnreadableFrame : The file is missing or too large; and as `decode_frame`. Each error names
         the file.
     """
     data = read_bytes(path, MAXIMUM_IMAGE_BYTES, UnreadableFrame)
@@ -443,9 +443,9 @@ def decode_frame(
 
     Parameters
     ----------
-    data : the whole file; the rest as for `make_frame`
-    samples_of : decodes the file elsewhere; default: `decode_samples`
-    trust_depth : take samples for depth that do not look like it
+    data : the whole file; for the others see `make_frame`
+    samples_of : decoder of the file; default: `decode_samples`
+    trust_depth : whether to accept samples that do not look like depth
 
     Raises
     ------
@@ -466,7 +466,7 @@ def decode_samples(data: bytes) -> Samples:
 
     Raises
     ------
-    UnreadableFrame : its first bytes show no format of depth; and as the reader of its format.
+    UnreadableFrame : The first bytes show no depth format; and as the reader of the format.
     """
     check_length(data)
     found = format_at(data, "depth")
@@ -506,15 +506,13 @@ def _metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
     return depth
 
 
-# The size of a depth image, by its header alone.
+# The size of a depth image by its header.
 #
 # first bytes  --size_of-->  width, height
 
 
 def size_of(head: bytes) -> tuple[int, int] | None:
-    """Return the width and height of a depth image by its first `HEAD` bytes; None if they do not
-    show them.
-    """
+    """Return the width and height of a depth image by its first `HEAD` bytes; None if unknown."""
     found = format_at(head, "depth")
     if found is None:
         return None

@@ -1,4 +1,4 @@
-"""Whether stored samples are depth, by how smooth they are along the rows.
+"""Check that stored samples are depth, by their smoothness along the rows.
 
 samples (H, W), stored units per metre  --check_depth-->  nothing, or UnreadableFrame
 
@@ -26,13 +26,13 @@ from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableFrame
 
-_ROWS = 40  #: rows that are looked at
-_PAIRS, _BENDS = 500, 4000  #: fewest of them that tell something
-_LEAST_SHARE = 0.1  #: of samples with neighbours on both sides; fewer are a sparse image
-_LEAST_VARYING = 0.25  #: of these that differ from a neighbour; of fewer, edges would decide
+_ROWS = 40  #: number of rows that are checked
+_PAIRS, _BENDS = 500, 4000  #: minimum numbers of pairs and of triples for a decision
+_LEAST_SHARE = 0.1  #: minimum share of samples with both neighbours; below, the image is sparse
+_LEAST_VARYING = 0.25  #: minimum share of varying triples; below, edges would decide
 _SWAPPED = 0.9  #: share of differing neighbours that would be nearer with their bytes swapped
-_ROUGH, _SMOOTH = 0.05, 0.025  #: median bends: too rough for depth, and smooth once bits are back
-_SHIFTED = 0.8  #: share of samples that are multiples of 8; of depth it is an eighth
+_ROUGH, _SMOOTH = 0.05, 0.025  #: median bends: too rough for depth; smooth with the bits restored
+_SHIFTED = 0.8  #: share of multiples of 8 among the samples; one eighth in depth images
 
 _TRUST = "If this is depth as it is, say so: --trust-depth, or `trust_depth` in the metadata."
 
@@ -40,9 +40,9 @@ Rows = NDArray[Any]
 
 
 def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
-    """Refuse samples that are no depth, or depth whose bytes or bits are in another order.
+    """Refuse samples that are not depth, or whose bytes or bits are in another order.
 
-    Takes 0.6 ms for 640 x 480. Where a caller knows better, `trust_depth` leaves it out.
+    It takes 0.6 ms for 640 x 480. Callers skip it if the user sets `trust_depth`.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
 
     Raises
     ------
-    UnreadableFrame : they are not; says what to do.
+    UnreadableFrame : The samples are not depth; the message says what to do.
     """
     rows = samples[:: max(1, len(samples) // _ROWS)]
     is_whole = rows.dtype == np.uint16
@@ -82,9 +82,9 @@ def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
 
 
 def _rotation(rows: Rows) -> int | None:
-    """Return by how many bits samples are to be rotated left to be smooth; None where none does.
+    """Return the left rotation, in bits, that makes samples smooth; None if there is none.
 
-    Twice the depth is as smooth as depth: the one of the smallest samples is meant.
+    Twice the depth is as smooth as the depth, so the rotation with the smallest samples counts.
     """
     turned = [(bits, rows << bits | rows >> 16 - bits) for bits in range(1, 16)]
     smooth = [(float(one.mean()), bits) for bits, one in turned if 0.0 < _bend(one) < _SMOOTH]
@@ -103,7 +103,7 @@ def _is_swapped(rows: Rows) -> bool:
 
 
 def _is_shifted(rows: Rows) -> bool:
-    """Return whether samples are multiples of 8, and of nothing more."""
+    """Return whether samples are multiples of 8, but not of 16 as well."""
     taken = rows[_valid(rows)]
     if len(taken) < _PAIRS or float((taken & 7 == 0).mean()) < _SHIFTED:
         return False
@@ -111,9 +111,7 @@ def _is_shifted(rows: Rows) -> bool:
 
 
 def _bend(rows: Rows) -> float:
-    """Return how far samples are from the mean of their neighbours: the median of
-    |a - 2 b + c| / min(a, b, c) over three samples in a row that are not all the same.
-    """
+    """Return the median of |a - 2 b + c| / min(a, b, c) over three samples in a row that differ."""
     valid = _valid(rows)
     whole = valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:]
     with np.errstate(all="ignore"):  # damaged floats overflow

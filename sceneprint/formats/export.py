@@ -1,4 +1,4 @@
-"""Points, surfaces and pose graphs as others read them: PLY, bytes for web pages, g2o.
+"""Write points, surfaces and pose graphs in formats of other programs: PLY, web pages, g2o.
 
 points, normals, colours, faces, edges  --write_ply-->  bytes of a PLY file
 points, normals, patches, residuals  --encode_points-->  bytes that a page draws, 12 a point
@@ -8,28 +8,28 @@ Bytes for web pages are little-endian. A header of 48 bytes:
 
     0  4 x u8   "SPPT"
     4  u16      version, 1
-    6  u16      flags: 1 normals, 2 patches, 4 residuals are told
+    6  u16      flags: 1 normals, 2 patches, 4 residuals are present
     8  u32      points that follow
     12 u32      bytes of a point, 12
     16 3 x f32  origin, metres
     28 3 x f32  extent, metres
-    40 u32      points that there are, before thinning
-    44 f32      metres that a residual of 250 stands for near by, as the model's validation allows
-                (with distance it grows); 0 where none is told
+    40 u32      number of points before thinning
+    44 f32      metres of a residual of 250 at short range, as the model's validation allows
+                (it grows with distance); 0 without residuals
 
 Then, of each point:
 
     0  3 x u16  position: origin + value / 65535 * extent
     6  u16      index of its validation patch; 65535 for none
     8  3 x i8   normal, times 127
-    11 u8       residual, from the surface that another frame saw: 1 to 250; 253 where the other
-                did not look, or beside or behind what it saw; 254 where it saw through; 255 where
-                nothing was compared
+    11 u8       residual, from the surface of another frame: 1 to 250; 253 if the point is outside
+                that frame's view, or beside or behind its surface; 254 if that frame saw through
+                the point; 255 if it was not compared
 
-Information of g2o is about the right perturbation T exp(xi), xi = (shift in metres, turn in
-radians) in the axes of the edge's second vertex. Its error is the shift and the *vector part of the
-quaternion* of Z^-1 X_i^-1 X_j, and half a small turn is what that part holds: so that its
-information about a turn is four times that about radians, and twice between shift and turn.
+The information matrix of g2o refers to the right perturbation T exp(xi), xi = (shift in metres,
+turn in radians) in the axes of the edge's second vertex. The error of g2o is the shift and the
+*vector part of the quaternion* of Z^-1 X_i^-1 X_j, which is half of a small turn. Its information
+about a turn is therefore four times that in radians, and twice between shift and turn.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ from sceneprint_client.surface_encoding import (
     VERSION,
 )
 
-# PLY files, which every viewer of clouds opens.
+# PLY files.
 
 Ints = NDArray[np.int32] | NDArray[np.int64]
 
-#: What PLY calls the types that are written.
+#: Names of types in PLY.
 _WORDS = {"<f4": "float", "u1": "uchar"}
 
 
@@ -70,7 +70,7 @@ def write_ply(
     edges: Ints | None = None,
     comments: Sequence[str] = (),
 ) -> bytes:
-    """A PLY file, binary little-endian; the same bytes for the same arrays.
+    """Return a binary little-endian PLY file; equal arrays give equal bytes.
 
     Parameters
     ----------
@@ -79,12 +79,11 @@ def write_ply(
     colours : (N, 3) red, green, blue
     faces : (F, 3) triangles, as indices of points
     edges : (E, 2) lines, as indices of points
-    comments : of the header, one line each: the coordinate frame belongs there. What is no
-        printable ASCII is escaped
+    comments : lines of the header, such as the coordinate frame; escaped to printable ASCII
 
     Raises
     ------
-    ValueError : arrays of other shapes, or indices of no point.
+    ValueError : The arrays have other shapes, or an index has no point.
     """
     n = len(points)
     kinds = [(name, "<f4") for name in "xyz"]
@@ -115,8 +114,8 @@ def write_ply(
 
 
 def points_of(surface: Surface) -> tuple[Floats32, Floats32]:
-    """What a sensor saw as a cloud: points (N, 3) and normals (N, 3) of its valid pixels, row by
-    row, in the sensor's frame.
+    """Return points (N, 3) and normals (N, 3) of the valid pixels, row by row, in the sensor's
+    frame.
     """
     return surface.points[surface.valid], surface.normals[surface.valid]
 
@@ -136,15 +135,15 @@ def _indices(values: Ints, width: int, n: int) -> Ints:
 
 
 def _one_line(comment: str) -> str:
-    """Without what would end the line or is not ASCII: a frame may be called anything."""
+    """Return a comment as one line of ASCII: names of frames are arbitrary."""
     return comment.encode("unicode_escape").decode("ascii")
 
 
-# Points as bytes that a web page draws as they are.
+# Points as bytes that a web page draws without decoding.
 
 MEDIA_TYPE = "application/vnd.sceneprint.points"
 NOT_COMPARED = 255
-#: Points that are told by default, and at most.
+#: Default and maximum number of points.
 LIMIT, MOST = MOST_DRAWN, 100_000
 
 Indices = NDArray[np.intp]
@@ -159,15 +158,15 @@ def encode_points(
     total: int | None = None,
     scale: float = 0.0,
 ) -> bytes:
-    """Points as the module's text says; the same bytes for the same arrays.
+    """Return points in the format of the module's docstring; equal arrays give equal bytes.
 
     Parameters
     ----------
     points : (N, 3) metres
     normals : (N, 3) unit length
-    patches : (N,) indices; -1, or NO_PATCH or more, for none
-    residuals : (N,) see above
-    total : points before thinning; default: N
+    patches : (N,) indices of patches; -1, or NO_PATCH and above, for none
+    residuals : (N,) as in the module's docstring
+    total : number of points before thinning; default: N
     scale : metres of a residual of 250
     """
     n = len(points)
@@ -193,9 +192,7 @@ def encode_points(
 
 
 def thinned(count: int, limit: int) -> Indices:
-    """Indices of at most `limit` of so many points, rising: always the same, and in no pattern
-    that rows of an image could show.
-    """
+    """Return rising indices of at most `limit` of `count` points: pseudorandom, always the same."""
     if count <= limit:
         return np.arange(count)
     keys = np.arange(1, count + 1, dtype=np.uint64)  # SplitMix64
@@ -205,21 +202,22 @@ def thinned(count: int, limit: int) -> Indices:
     return np.sort(np.argsort(keys, kind="stable")[:limit])
 
 
-# Pose graphs as the text that optimisers read.
+# Pose graphs in g2o's format.
 
-#: Of radians to the vector part of a quaternion: xi = _PER_QUATERNION * (shift, vector part).
+#: Factors from (shift, vector part of the quaternion) to xi.
 _PER_QUATERNION = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
 
 
 @dataclass(frozen=True, eq=False)
 class PoseEdge:
-    """How one vertex lies to another.
+    """A relative pose of two vertices.
 
     Parameters
     ----------
     first, second : numbers of the vertices
     T : (4, 4) T_first_second
-    information : (6, 6) of T exp(xi); shift (metres) before turn (radians), in axes of `second`
+    information : (6, 6) information matrix of xi in T exp(xi): shift (metres) before turn
+        (radians), in the axes of `second`
     """
 
     first: int
@@ -229,14 +227,14 @@ class PoseEdge:
 
 
 def g2o(poses: Sequence[Floats], edges: Sequence[PoseEdge]) -> str:
-    """A graph as g2o's text: vertices numbered from 0, then edges.
+    """Return a graph in g2o's format: vertices numbered from 0, then edges.
 
-    No other lines: some readers stop at a comment, or at what fixes a vertex.
+    There are no other lines, as some readers stop at comments and at fixed vertices.
 
     Parameters
     ----------
-    poses : (4, 4) T_parent_vertex of each
-    edges : between these
+    poses : (4, 4) T_parent_vertex of each vertex
+    edges : edges between the vertices
     """
     lines = [f"VERTEX_SE3:QUAT {i} {_pose(pose)}" for i, pose in enumerate(poses)]
     upper = np.triu_indices(6)
@@ -248,12 +246,12 @@ def g2o(poses: Sequence[Floats], edges: Sequence[PoseEdge]) -> str:
 
 
 def information_of(covariance: Floats, T: Floats) -> Floats:
-    """The information of an edge: (6, 6) as in `GraphEdge`.
+    """Return the information matrix (6, 6) of an edge, as in `PoseEdge`.
 
     Parameters
     ----------
-    covariance : (6, 6) of T as `geometry.covariance` has it: the error is added to the translation
-        and put before the rotation, both along the axes of the edge's first vertex
+    covariance : (6, 6) covariance of T, as in `geometry.covariance`: the error is added to the
+        translation and multiplied before the rotation, in the axes of the edge's first vertex
     T : (4, 4) T_first_second
     """
     # [exp(r) R, t + x] = T exp(xi) where x = R shift and r = R turn

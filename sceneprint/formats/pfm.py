@@ -1,4 +1,4 @@
-"""Depth images as portable float maps (PFM), which programs of multi-view stereo write.
+"""Read portable float maps (PFM), which programs for multi-view stereo write.
 
 bytes  --decode_pfm-->  samples (H, W) float32, metres
 """
@@ -13,7 +13,7 @@ import numpy as np
 from sceneprint.errors import UnreadableFrame
 from sceneprint.types import MAXIMUM_SAMPLES, Floats32
 
-#: Three lines: one channel, width and height, and a scale whose sign is the byte order.
+#: Three lines: one channel, width and height, and a scale whose sign gives the byte order.
 _HEADER = re.compile(
     rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+"
     rb"([-+]?(?:\d{1,9}\.?\d{0,20}|\.\d{1,20})(?:[eE][-+]?\d{1,3})?)[ \t\r]*\n"
@@ -21,11 +21,11 @@ _HEADER = re.compile(
 
 
 def decode_pfm(data: bytes) -> Floats32:
-    """Return the samples of a PFM file in metres; its rows go from the bottom to the top.
+    """Return the samples of a PFM file, metres, whose rows go from the bottom to the top.
 
     Raises
     ------
-    UnreadableFrame : the header is damaged, or does not fit what follows it.
+    UnreadableFrame : The header is damaged, or does not fit the size of the data.
     """
     (width, height), scale, start = _header(data)
     if len(data) - start != 4 * width * height:
@@ -44,7 +44,7 @@ def pfm_size(head: bytes) -> tuple[int, int]:
 
 
 def _header(data: bytes) -> tuple[tuple[int, int], float, int]:
-    """Return width and height, scale, and the place of the samples."""
+    """Return width and height, scale, and offset of the samples."""
     found = _HEADER.match(data)
     if found is not None:
         width, height, scale = int(found[1]), int(found[2]), float(found[3])

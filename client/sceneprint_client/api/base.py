@@ -280,7 +280,7 @@ _OF_JOBS = {
 
 
 def checked(kind: type[Record], what: str, **fields: Any) -> Record:
-    """A record of the API, or what is wrong with its fields in our words.
+    """Return a record of the API, or what is wrong with its fields in our words.
 
     Raises
     ------
@@ -404,7 +404,7 @@ class Intrinsics:
             )
 
     def without_distortion(self) -> Intrinsics:
-        """The same camera after its images have been undistorted."""
+        """Return the same camera after its images have been undistorted."""
         return replace(self, distortion=())
 
 
@@ -591,7 +591,7 @@ NOVEL = 0.25
 
 
 def novelty_of(given: bool | float | str | None) -> float | None:
-    """The distance beyond which a frame is kept, as a share of that of unrelated frames.
+    """Return the distance beyond which a frame is kept, as a share of that of unrelated frames.
 
     Parameters
     ----------
@@ -619,7 +619,7 @@ def novelty_of(given: bool | float | str | None) -> float | None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a name or address, without port or brackets, is only ever this machine."""
+    """Return whether a name or address, without port or brackets, is only ever this machine."""
     if host.lower() == "localhost":
         return True
     try:

@@ -370,7 +370,7 @@ def _note_of(left_out: list[Path], root: Path) -> str:
 
 
 def find_recordings(path: Path) -> list[Path]:
-    """The recordings of ROS at a path: itself, or those in a folder and up to 4 below it, in
+    """Return the recordings of ROS at a path: itself, or those in a folder and up to 4 below it, in
     natural order.
     """
     from sceneprint.formats.recording import is_recording
@@ -381,7 +381,7 @@ def find_recordings(path: Path) -> list[Path]:
 
 
 def _bags(walked: Iterable[tuple[Path, list[str], Layout]]) -> list[Path]:
-    """The recordings among what `_walk` yields."""
+    """Return the recordings among what `_walk` yields."""
     return [folder / name for folder, names, layout in walked
             if layout is Layout.RECORDING for name in names]  # fmt: skip
 
@@ -389,7 +389,7 @@ def _bags(walked: Iterable[tuple[Path, list[str], Layout]]) -> list[Path]:
 def _recordings(
     root: Path, walked: list[tuple[Path, list[str], Layout]], options: RecordingOptions
 ) -> tuple[FrameSequence, ...]:
-    """The frames of several recordings, a sequence each, named by their places.
+    """Return the frames of several recordings, a sequence each, named by their places.
 
     Raises
     ------
@@ -511,7 +511,7 @@ def _walk(
 
 
 def _recordings_in(folder: Path, files: list[str], folders: list[str]) -> list[str]:
-    """Names of the recordings of ROS among the files and folders of a folder."""
+    """Return names of the recordings of ROS among the files and folders of a folder."""
     from sceneprint.formats.recording import is_recording
 
     found = [name for name in files if format_named(name, "recording")]
@@ -708,13 +708,13 @@ def write_pose(path: Path, T_parent_sensor: Floats) -> None:
 
 
 def trajectory_row(stamp: float, T_parent_sensor: Floats) -> list[float]:
-    """A pose (4, 4) as TUM has it: t tx ty tz qx qy qz qw, seconds and metres."""
+    """Return a pose (4, 4) as TUM has it: t tx ty tz qx qy qz qw, seconds and metres."""
     T = T_parent_sensor
     return [stamp, *T[:3, 3].tolist(), *quaternion_of(T[:3, :3]).tolist()]
 
 
 def trajectory_text(rows: Iterable[Sequence[float]], comments: Iterable[str] = ()) -> str:
-    """A TUM trajectory as text, without loss.
+    """Return a TUM trajectory as text, without loss.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Files of points in: PLY, PCD, KITTI, NPY, LAS and LAZ, read without trusting them.
+"""Read untrusted files of points: PLY, PCD, KITTI, NPY, LAS, LAZ and E57.
 
 bytes  --decode_cloud-->  Cloud
 """

@@ -1,9 +1,10 @@
-"""The door for points: the bytes of a file in, a `Cloud` out.
+"""Read clouds: the bytes of a file become a `Cloud`.
 
 bytes  --decode_scan-->  Scan: the cloud, and how it was read
 bytes  --read_kitti | read_npy | read_pointcloud2-->  FilePoints
 
-Plain arrays are read here: KITTI's .bin, NPY, and a serialised sensor_msgs/PointCloud2 of ROS 2.
+This module reads plain arrays itself: KITTI's .bin, NPY, and serialised messages of the type
+sensor_msgs/PointCloud2 of ROS 2.
 """
 
 from __future__ import annotations
@@ -45,11 +46,11 @@ _KITTI_ROW = 16  #: bytes: x, y, z, intensity
 
 
 def read_kitti(data: bytes) -> FilePoints:
-    """The points of a KITTI scan: x, y, z, intensity as float32, little-endian, and nothing else.
+    """Return the points of a KITTI scan: rows of x, y, z, intensity as little-endian float32.
 
     Raises
     ------
-    UnreadableCloud : it is no whole number of points, or its rows have another length.
+    UnreadableCloud : The size is no whole number of rows, or the rows have another length.
     """
     count, rest = divmod(len(data), _KITTI_ROW)
     if (floats := _row_length(data)) is not None:
@@ -69,19 +70,19 @@ def read_kitti(data: bytes) -> FilePoints:
     return FilePoints(count, (rows[i : i + n, :3].astype(np.float64) for i, n in steps(count)))
 
 
-#: Lengths that rows may have, and the fewest rows that tell.
+#: Row lengths that are recognised, and minimum number of rows for a decision.
 _LENGTHS, _FEWEST_ROWS = range(3, 9), 500
-_LEAST_SPREAD = 0.02  #: of columns, for values that tell
-_LEAST_OF_BEST = 0.93  #: spread of rows of four as a share of the largest
+_LEAST_SPREAD = 0.02  #: minimum spread of columns for a decision
+_LEAST_OF_BEST = 0.93  #: minimum spread of rows of four, relative to the largest
 
 
 def _row_length(data: bytes) -> int | None:
-    """Return how many float32 a row has where it is clearly not four; None else.
+    """Return the number of float32 in a row if it is clearly not four, else None.
 
-    Columns of rows that are cut at a wrong length mix all fields, and so have one mean. The spread
-    of the means of columns, as a share of that of all values, is largest for the true length. Of
-    57 scans of three sensors that were written in rows of 3 to 8, that of rows of four was .99 of
-    the largest or more where four was true, and at most .87 elsewhere.
+    At a wrong length, columns mix all fields and have similar means. The variance of the means of
+    columns, relative to that of all values, is largest for the true length. In 57 scans of three
+    sensors, written in rows of 3 to 8, the value for rows of four was at least .99 of the largest
+    if four was true, and at most .87 otherwise.
     """
     values = np.frombuffer(data, "<f4", len(data) // 4)
     if len(values) < _FEWEST_ROWS * _KITTI_ROW // 4:
@@ -94,7 +95,7 @@ def _row_length(data: bytes) -> int | None:
 
 
 def _column_spread(values: Floats32, length: int) -> float:
-    """Return the variance of the means of columns as a share of that of all values, compressed."""
+    """Return the variance of the means of columns relative to that of all values, compressed."""
     rows = len(values) // length
     chosen = np.linspace(0, rows - 1, min(rows, 20_000 // length)).astype(np.int64)
     table = values[: rows * length].reshape(rows, length)[chosen].astype(np.float64)
@@ -105,12 +106,12 @@ def _column_spread(values: Floats32, length: int) -> float:
 
 
 def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
-    """The points, at most so many, of an NPY file of shape (N, 3), or (N, 4), the fourth column
-    passed over.
+    """Return the points of an NPY file of shape (N, 3) or (N, 4), without the fourth column.
 
     Raises
     ------
-    UnreadableCloud : it is none, of another type or shape, or its size contradicts its header.
+    UnreadableCloud : The file is not NPY, has another type or shape or more than `most` points, or
+        its size contradicts its header.
     """
     if data[: len(NPY_SIGNATURE)] != NPY_SIGNATURE:
         raise UnreadableCloud("This is no NPY file. Write the points with numpy.save.")
@@ -135,49 +136,49 @@ def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     return FilePoints(count, (rows[i : i + n, :3].astype(np.float64) for i, n in steps(count)))
 
 
-# Points as ROS 2 sends them.
+# Points of ROS 2.
 
 
 def read_pointcloud2(data: bytes) -> FilePoints:
-    """The points of a serialised PointCloud2, those exactly at the sensor missing.
+    """Return the points of a serialised PointCloud2; those at the origin count as missing.
 
     Raises
     ------
-    UnreadableCloud : the bytes are no such message or damaged, it has no x, y and z, or its sizes
+    UnreadableCloud : The bytes are no such message, damaged, lack x, y or z, or their sizes
         contradict each other.
     """
     table = cloud_table(read_point_cloud(data))
     return FilePoints(table.size, cloud_blocks(table))
 
 
-# The door.
+# Thinning and decoding of clouds.
 
-#: Edge of the smallest voxels, metres: 2^21 of them are more than 20 km.
+#: Edge of the smallest voxels, metres: 2^21 voxels extend over 20 km.
 _FINEST = 0.01
 
 Keys = NDArray[np.int64]
 
 
 def thinned(points: Floats32, most: int, finest: float = _FINEST) -> tuple[Floats32, float]:
-    """At most so many of the points: of each voxel the first, in their order.
+    """Return the first point of each voxel, at most `most` points, in their order.
 
-    Voxels are the smallest of 1, 1.4, 2, ... times the finest that leave no more.
+    The edge of the voxels is the smallest of 1, 1.4, 2, ... times `finest` that suffices.
 
     Parameters
     ----------
-    points : (N, 3), none beyond a million times the finest
-    most : at least 8: so many voxels meet at the origin, of any size
-    finest : edge of a voxel
+    points : (N, 3), none beyond a million times `finest`
+    most : maximum number; at least 8, because eight voxels of any size meet at the origin
+    finest : smallest edge of a voxel
 
     Returns
     -------
     points : (n, 3)
-    edge : of the voxels
+    edge : edge of the voxels
     """
     slots = 1 << max(4, math.ceil(math.log2(1.5 * most)))
     table, kept = np.empty(slots, np.int64), np.empty(most, np.int32)
-    # who knows the hash can write a file all of whose voxels share a slot; which point is kept
-    # does not depend on it
+    # a secret, because a file could be written whose voxels all share a slot of a known hash; the
+    # choice of points does not depend on it
     secret, step = secrets.randbits(62), 0
     while True:
         edge = finest * math.sqrt(2.0) ** step
@@ -191,7 +192,9 @@ def thinned(points: Floats32, most: int, finest: float = _FINEST) -> tuple[Float
 def _firsts(
     points: Floats32, scale: float, secret: int, table: Keys, kept: NDArray[np.int32]
 ) -> int:
-    """Indices of the first point of each voxel, and how many; -1 if more than there is room."""
+    """Write the indices of the first point of each voxel to `kept`; return their number, or -1 if
+    there is no room.
+    """
     table[:] = -1
     mask, n = len(table) - 1, 0
     for i in range(len(points)):
@@ -213,13 +216,13 @@ def _firsts(
     return n
 
 
-#: Fewest and most points of a cloud; of more, one to a voxel is kept.
+#: Minimum and maximum number of points of a cloud; larger ones are thinned.
 FEWEST_POINTS, MOST_POINTS = 10, 5_000_000
 
-#: Farthest that a point may be from the viewpoint, metres.
+#: Maximum distance of a point from the viewpoint, metres.
 FARTHEST_M = 10_000.0
 
-#: Farthest that a viewpoint may be from the origin of its file, metres: half round the Earth.
+#: Maximum distance of a viewpoint from the origin of its file, metres: half round the Earth.
 _FARTHEST_VIEWPOINT_M = 2e7
 
 _READERS = {one.name: one.reader for one in formats_of("cloud")}
@@ -227,13 +230,13 @@ _READERS = {one.name: one.reader for one in formats_of("cloud")}
 
 @dataclass(frozen=True, eq=False)
 class ReadPoints:
-    """What a file of points holds.
+    """The content of a file of points.
 
     Parameters
     ----------
     points : (n, 3) float32, metres from the viewpoint; finite, none beyond `FARTHEST_M`
-    viewpoint : metres in the file's axes; None where there is none
-    given : how many points the file has, missing ones too
+    viewpoint : metres in the file's axes; None without a viewpoint
+    given : number of points in the file, including missing ones
     """
 
     points: Floats32
@@ -241,20 +244,20 @@ class ReadPoints:
     given: int
 
 
-#: As `read_points`.
+#: A function with the parameters of `read_points`.
 PointsOf = Callable[[bytes, CloudFormat, Position | Unsaid | None, float], ReadPoints]
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A cloud, and how it was read.
+    """A cloud with the parameters that it was read with.
 
     Parameters
     ----------
-    cloud : its points, from the viewpoint
-    file_format : of the file
-    viewpoint : that was used, metres in the file's axes; None where there is none
-    given : how many points the file has, missing ones too
+    cloud : points relative to the viewpoint
+    file_format : format of the file
+    viewpoint : viewpoint that was used, metres in the file's axes; None without a viewpoint
+    given : number of points in the file, including missing ones
     """
 
     cloud: Cloud
@@ -295,31 +298,31 @@ def decode_scan(
     pose: Floats | None = None,
     points_of: PointsOf | None = None,
 ) -> Scan:
-    """Return the cloud of a file's bytes, and how it was read.
+    """Return the cloud of a file's bytes with the parameters that it was read with.
 
     Parameters
     ----------
     data : the whole file
-    file_format : of it; where None its first bytes tell, which those of a KITTI scan do not
-    viewpoint : where the sensor was, metres in the file's axes; None for points of many views;
-        nothing said: the VIEWPOINT of a PCD file, else the origin, as sensors write
-    units_per_metre : of the file's coordinates, 1000 for millimetres
-    name : what to call the frame in lines and errors
-    pose : (4, 4) T_parent_sensor, or None where unknown
-    points_of : reads the file elsewhere; default: `read_points`
+    file_format : format of the file; None: recognised by its first bytes, except for KITTI scans
+    viewpoint : position of the sensor, metres in the file's axes; None for points of many views;
+        default: the VIEWPOINT of a PCD file, else the origin
+    units_per_metre : of the file's coordinates: 1000 for millimetres
+    name : name of the frame in messages
+    pose : (4, 4) T_parent_sensor, or None if unknown
+    points_of : reader of the file; default: `read_points`
 
     Returns
     -------
-    scan : points at the place of the viewpoint are at the origin, the axes stay; points that are
-        missing (NaN, infinite) are left out
+    scan : points in the file's axes, with the viewpoint at the origin, without missing (NaN or
+        infinite) points
 
     Raises
     ------
-    UnreadableCloud : the bytes are of no such format, or damaged; there are more than 20 million
+    UnreadableCloud : The bytes are of another format or damaged; there are more than 20 million
         points, or one is more than 10 km from the viewpoint.
-    UselessFrame : fewer than 10 points are there.
-    InvalidPose : the pose is not a rigid transform.
-    MissingDependency : the file is LAZ, and lazrs is not installed.
+    UselessFrame : There are fewer than 10 points.
+    InvalidPose : The pose is not a rigid transform.
+    MissingDependency : The file is LAZ, and lazrs is not installed.
     """
     with naming(name):
         _check_units(units_per_metre)
@@ -363,10 +366,10 @@ def read_points(
     viewpoint: Position | Unsaid | None,
     units_per_metre: float,
 ) -> ReadPoints:
-    """Read the points of a file; parameters and errors as of `decode_scan`, of a known format."""
+    """Return the points of a file of a known format; see `decode_scan`."""
     raw: FilePoints = function_at(_READERS[file_format])(data)
     place = _place(viewpoint, raw, units_per_metre)
-    # lengths were checked: a header of twenty million points has bytes for them
+    # the reader has checked that the file has bytes for the points that its header announces
     points = _from(raw, place or (0.0, 0.0, 0.0), units_per_metre)
     return ReadPoints(points, place, raw.count)
 
@@ -403,7 +406,7 @@ def _check_units(units: float) -> None:
 
 
 def _place(told: Position | Unsaid | None, raw: FilePoints, units: float) -> Position | None:
-    """Where the sensor was, metres; None where it was nowhere."""
+    """Return the position of the sensor, metres; None for points of many views."""
     if isinstance(told, Unsaid):
         x, y, z = raw.viewpoint or (0.0, 0.0, 0.0)
         told = (x / units, y / units, z / units)
@@ -416,9 +419,9 @@ def _place(told: Position | Unsaid | None, raw: FilePoints, units: float) -> Pos
 
 
 def _from(raw: FilePoints, place: Position, units: float) -> Floats32:
-    """Points (n, 3) from a place, metres, without those that are missing."""
+    """Return points (n, 3) relative to a place, metres, without missing ones."""
     points, n = np.empty((raw.count, 3), np.float32), 0
-    with np.errstate(all="ignore"):  # what overflows is no number, and so missing
+    with np.errstate(all="ignore"):  # overflowing points become infinite, and so missing
         for block in raw.blocks:
             block /= units
             block -= place

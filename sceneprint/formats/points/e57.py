@@ -1,4 +1,4 @@
-"""E57 files (ASTM E2807): the scans of laser scanners, each with the pose of its scanner.
+"""Read E57 files (ASTM E2807): scans of laser scanners with their poses.
 
 bytes  --read_e57-->  E57Scan, ...  --points-->  FilePoints
 
@@ -28,7 +28,7 @@ from sceneprint.types import Bytes, Floats
 from sceneprint_client.errors import printable
 from sceneprint_client.poses import rigid_transform, rotation_of
 
-#: What an E57 file can be read from.
+#: Types of the bytes of an E57 file.
 Buffer = bytes | bytearray | memoryview | mmap
 
 E57_SIGNATURE = b"ASTM-E57"
@@ -36,10 +36,10 @@ _HEADER = struct.Struct("<8sIIQQQQ")
 _SECTION = struct.Struct("<B7xQQQ")
 _CHECKSUM_BYTES = 4
 _PAGE_BYTES = (256, 1 << 16)  #: smallest and largest page; the standard asks for 1024
-_WINDOW_BYTES = 4 << 20  #: of pages whose checksums are compared at once
+_WINDOW_BYTES = 4 << 20  #: size of the pages whose checksums are compared at once, bytes
 _MAXIMUM_XML_BYTES = 64 << 20
 _MAXIMUM_SCANS = 10_000
-#: Most points of one scan. Points of few bits take hardly any bytes, and their number takes time.
+#: Maximum number of points of a scan: points of few bits take time, but hardly any bytes.
 MAXIMUM_SCAN_POINTS = 200_000_000
 _NAMESPACE = "{http://www.astm.org/COMMIT/E57/2010-e57-v1.0}"
 _AGAIN = "Copy the file again, or export it again as E57."
@@ -52,13 +52,13 @@ _INDEX, _DATA, _EMPTY = 0, 1, 2  #: kinds of packets
 
 @dataclass(frozen=True)
 class _Field:
-    """A number that every point has: how it is packed.
+    """A field of every point, and its packing.
 
     Parameters
     ----------
     name : such as "cartesianX"; empty for a field of an extension
-    bits : of each value
-    dtype : of a floating-point field; None for a whole number
+    bits : number of bits of a value
+    dtype : type of a floating-point field; None for whole numbers
     minimum : smallest whole number, which is stored as 0
     scale, offset : value = scale * whole number + offset
     """
@@ -77,8 +77,8 @@ class E57Scan:
 
     Parameters
     ----------
-    name : as the file calls it; may be empty
-    count : number of its points, including invalid ones
+    name : name in the file; may be empty
+    count : number of points, including invalid ones
     T_world_scan : (4, 4) float64 pose of the scan in the file's frame, metres
     has_pose : whether the file states that pose; otherwise it is the identity
     is_structured : whether the points have rows and columns, as one scanner at one place sees them
@@ -96,10 +96,10 @@ class E57Scan:
     _fields: tuple[_Field, ...] = field(repr=False)
 
     def points(self) -> FilePoints:
-        """Return the points in the axes of the scan, metres; NaN where the scan marks them invalid.
+        """Return the points in the axes of the scan, metres; invalid points are NaN.
 
-        The blocks are decoded while they are iterated, and raise UnreadableCloud where the packed
-        points are damaged or end early.
+        The blocks are decoded during iteration, and raise UnreadableCloud if the packed points are
+        damaged or truncated.
         """
         return FilePoints(self.count, self._blocks())
 
@@ -128,7 +128,7 @@ class E57Scan:
 
 
 def _from_angles(distance: Floats, azimuth: Floats, elevation: Floats) -> Floats:
-    """Return (n, 3) positions; azimuth (n,) turns from x to y, elevation (n,) from there to z."""
+    """Return positions (n, 3); azimuth (n,) turns from x to y, elevation (n,) from there to z."""
     with np.errstate(all="ignore"):
         level = distance * np.cos(elevation)
         return np.stack(
@@ -137,7 +137,7 @@ def _from_angles(distance: Floats, azimuth: Floats, elevation: Floats) -> Floats
 
 
 def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
-    """Return the scans of an E57 file, in its order; their points are not decoded yet.
+    """Return the scans of an E57 file in their order; their points are not decoded yet.
 
     Parameters
     ----------
@@ -149,8 +149,8 @@ def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
 
     Raises
     ------
-    UnreadableCloud : the file is no E57 file, damaged, or of a later version; it holds no scan; a
-        scan has no coordinates, or more than 200 million points; a pose is not rigid.
+    UnreadableCloud : The file is not E57, damaged, or of a later version; it has no scan; a scan
+        has no coordinates, or more than 200 million points; a pose is not rigid.
     """
     if len(data) < _HEADER.size or bytes(data[:8]) != E57_SIGNATURE:
         raise UnreadableCloud(f"This is no E57 file. {_AGAIN}")
@@ -180,7 +180,7 @@ def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
 
 
 def with_viewpoint(scans: tuple[E57Scan, ...]) -> list[bool]:
-    """Return for each scan of a file whether its points were seen from the scan's origin.
+    """Return, for each scan of a file, whether its points were seen from the scan's origin.
 
     That holds for structured scans and for ranges and angles. It also holds for scans with a pose
     in a file whose poses differ or turn a scan: merged clouds have none, or one that shifts them
@@ -192,7 +192,7 @@ def with_viewpoint(scans: tuple[E57Scan, ...]) -> list[bool]:
     return [one.is_structured or one.is_spherical or (one.has_pose and registered) for one in scans]
 
 
-# Pages: payload, and a checksum of it.
+# Pages: payload with a checksum.
 
 
 @lru_cache(maxsize=1)
@@ -216,22 +216,22 @@ def _checksums(payloads: Bytes) -> NDArray[np.uint32]:
 
 
 class _Pages:
-    """The payload of a file's pages, as one sequence of bytes; checksums are compared on reading.
+    """The payload of a file's pages as one sequence of bytes; reading compares checksums.
 
     Parameters
     ----------
     data : whole pages
-    page : bytes of each
+    page : size of a page, bytes
     """
 
     def __init__(self, data: memoryview, page: int) -> None:
         self._data, self._page = data, page
         self._payload = page - _CHECKSUM_BYTES
-        self._group = max(1, _WINDOW_BYTES // page)  # pages of a window
+        self._group = max(1, _WINDOW_BYTES // page)  # pages in a window
         self._window, self._number = b"", -1
 
     def logical(self, physical: int) -> int:
-        """Return the place within the payload of a place within the file."""
+        """Return the offset in the payload of an offset in the file."""
         number, within = divmod(physical, self._page)
         if physical >= len(self._data) or within >= self._payload:
             raise UnreadableCloud(f"A part of the file lies beyond its end. {_AGAIN}")
@@ -242,7 +242,7 @@ class _Pages:
 
         Raises
         ------
-        UnreadableCloud : they lie beyond the end, or a page's checksum does not fit it.
+        UnreadableCloud : The bytes are beyond the end, or a page's checksum is wrong.
         """
         total = len(self._data) // self._page * self._payload
         if length > total - start:
@@ -272,13 +272,13 @@ class _Pages:
         return self._window
 
 
-# The XML text: which scans there are, and how their points are packed.
+# The XML text, which describes the scans and the packing of their points.
 
 
 def _description(text: bytes) -> Element:
     try:
         content = text.decode("utf-8-sig")
-        # entities of a document type could expand without end, and E57 has none
+        # entities of a document type could expand without limit, and E57 uses none
         if "<!DOCTYPE" in content or "<!ENTITY" in content:
             raise UnreadableCloud(f"The description of the scans declares entities. {_AGAIN}")
         return ElementTree.fromstring(content)
@@ -348,12 +348,12 @@ def _fields(prototype: Element, place: str, *, nested: bool = False) -> Iterator
             if kind == "Integer":
                 scale, offset = 1.0, 0.0
             yield _Field(name, (high - low).bit_length(), None, low, scale, offset)
-        else:  # text: its length differs from point to point
+        else:  # text, whose length varies
             yield _Field("", 0)
 
 
 def _pose(node: Element, place: str) -> Floats:
-    """Return T_world_scan (4, 4) of a pose; parts that are absent are the identity."""
+    """Return T_world_scan (4, 4) of a pose; missing parts are the identity."""
 
     def numbers(part: str, names: str) -> Floats:
         texts = (node.findtext(f"{_NAMESPACE}{part}/{_NAMESPACE}{name}") for name in names)
@@ -392,7 +392,7 @@ def _number(text: str, place: str) -> float:
     return value
 
 
-# Packets: for every field some of its bytes, which continue those of the packet before.
+# Packets: some bytes of every field, which continue those of the previous packet.
 
 
 def _packets(pages: _Pages, start: int, fields: int) -> Iterator[list[bytes]]:
@@ -400,9 +400,9 @@ def _packets(pages: _Pages, start: int, fields: int) -> Iterator[list[bytes]]:
 
     Parameters
     ----------
-    pages : of the file
-    start : of the section, within the payload
-    fields : how many there are
+    pages : pages of the file
+    start : offset of the section in the payload
+    fields : number of fields
     """
     kind, length, data_start, _ = _SECTION.unpack(pages.read(start, _SECTION.size))
     if kind != 1:
@@ -425,7 +425,7 @@ def _packets(pages: _Pages, start: int, fields: int) -> Iterator[list[bytes]]:
 
 
 def _sizes(content: bytes, size: int, fields: int) -> tuple[int, ...]:
-    """Return the number of bytes of each field of a packet, which fit into it."""
+    """Return the number of bytes of each field in a packet, checked against its size."""
     head = 6 + 2 * fields
     if len(content) == size >= head and struct.unpack_from("<H", content, 4)[0] == fields:
         sizes: tuple[int, ...] = struct.unpack_from(f"<{fields}H", content, 6)
@@ -435,7 +435,7 @@ def _sizes(content: bytes, size: int, fields: int) -> tuple[int, ...]:
 
 
 class _Stream:
-    """Values of one field, as their bytes come."""
+    """The values of one field, whose bytes arrive in packets."""
 
     def __init__(self, packing: _Field) -> None:
         self._field, self._bytes = packing, bytearray()
@@ -444,11 +444,11 @@ class _Stream:
         self._bytes += piece
 
     def holds(self, n: int) -> bool:
-        """Return whether the bytes of n values have come."""
+        """Return whether the bytes of n values have arrived."""
         return 8 * len(self._bytes) >= n * self._field.bits
 
     def take(self, n: int) -> Floats:
-        """Return the next n values; n is a multiple of 8, except for the last ones."""
+        """Return the next n values; n is a multiple of 8, except for the last values."""
         one = self._field
         size = -(-n * one.bits // 8)
         content = bytes(self._bytes[:size])
@@ -460,7 +460,7 @@ class _Stream:
 
 
 def unpacked(content: bytes, bits: int, n: int) -> NDArray[np.uint64]:
-    """Return n whole numbers of 0 to 64 bits, packed one behind the other, lowest bit first."""
+    """Return n whole numbers of 0 to 64 bits that are packed without gaps, lowest bit first."""
     if bits == 0:
         return np.zeros(n, np.uint64)
     source = np.frombuffer(content + bytes(9), np.uint8)
@@ -470,7 +470,7 @@ def unpacked(content: bytes, bits: int, n: int) -> NDArray[np.uint64]:
     for k in range(min(8, (bits + 14) // 8)):
         values |= source[first + k].astype(np.uint64) << np.uint64(8 * k)
     values >>= shift
-    if bits > 57:  # the highest bits lie in a ninth byte, unless the number begins with its byte
+    if bits > 57:  # the highest bits are in a ninth byte, unless the number starts with its byte
         ninth = source[first + 8].astype(np.uint64)
         values |= np.where(shift > 0, ninth << ((np.uint64(64) - shift) & np.uint64(63)), 0)
     return values & np.uint64(2**bits - 1)

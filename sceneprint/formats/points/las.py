@@ -1,8 +1,8 @@
-"""LAS files (ASPRS LAS 1.0 to 1.4), and LAZ by the package lazrs.
+"""Read LAS files (ASPRS LAS 1.0 to 1.4), and LAZ files with the package lazrs.
 
 bytes  --read_las-->  FilePoints
 
-Every point format begins with X, Y, Z as whole numbers, which a scale and an offset make lengths.
+Every point format starts with X, Y, Z as whole numbers, with a scale and an offset.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from sceneprint.formats.points.rows import MAXIMUM_POINTS, FileBytes, FilePoints
 from sceneprint.types import Floats
 from sceneprint_client.files import LAS_SIGNATURE
 
-# The compressed points of LAZ files, by lazrs (Rust), which is an extra.
+# The compressed points of LAZ files, read by lazrs (Rust), which is an extra.
 #
 # bytes  --inflated_records-->  records, a block at a time
 #
-# lazrs takes memory as the file says, and a Rust program that gets none aborts: so all that it
-# allocates by is compared with the length of the file before it is called. Of the points that is
-# (M. Isenburg, LASzip 1.3 and 1.4): the kinds of values in a record, the number of chunks, and in
-# formats from 6 how long the layers of each chunk are.
+# lazrs allocates memory according to the file, and Rust aborts if an allocation fails. All numbers
+# by which it allocates are therefore compared with the length of the file first (M. Isenburg,
+# LASzip 1.3 and 1.4): the kinds of values in a record, the number of chunks, and, from format 6 on,
+# the lengths of the layers of each chunk.
 
-_VLR = 54  #: bytes of a record's own header
+_VLR = 54  #: size of the header of a variable-length record, bytes
 _MAXIMUM_VLRS = 10_000
-_VARIABLE = 0xFFFFFFFF  #: chunk size that says each chunk has its own
-_MOST = 2 << 30  #: bytes of records, which are inflated block by block
-_MOST_RATIO, _FREE = 250, 64 << 20  #: how much more records are than their file, once beyond bytes
+_VARIABLE = 0xFFFFFFFF  #: chunk size that means that each chunk has its own
+_MOST = 2 << 30  #: maximum size of all records, bytes; they are decompressed block by block
+_MOST_RATIO, _FREE = 250, 64 << 20  #: maximum compression ratio, beyond so many bytes of records
 
-#: Bytes of a value by its kind, where that is fixed; kinds from 10 are in layers, so many each.
+#: Size of a value by its kind, bytes; from kind 10 on, the number of its layers.
 _ITEMS = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 _BYTES, _LAYERED_BYTES = 0, 14
@@ -51,16 +51,16 @@ def inflated_records(
     Parameters
     ----------
     data : the file
-    start : of its points
+    start : offset of the points
     form : point format
-    length : bytes of a record
-    count : of the points
-    row : of a record
+    length : size of a record, bytes
+    count : number of points
+    row : type of a record
 
     Raises
     ------
     MissingDependency : lazrs is not installed.
-    UnreadableCloud : the compressed points are not what the header says, or damaged.
+    UnreadableCloud : The compressed points contradict the header, or are damaged.
     """
     lazrs = _lazrs()
     vlr = _laszip_vlr(data)
@@ -134,7 +134,7 @@ def las_records(data: FileBytes) -> Iterator[tuple[bytes, int, bytes]]:
 
 
 def _laszip_vlr(data: FileBytes) -> bytes:
-    """Return the record that says how points are packed."""
+    """Return the record that describes the compression of the points."""
     for user, number, content in las_records(data):
         if (user, number) == (b"laszip encoded", 22204):
             return content
@@ -142,7 +142,7 @@ def _laszip_vlr(data: FileBytes) -> bytes:
 
 
 def _described(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
-    """Compressor, coder, points of a chunk, and kind and size of each value."""
+    """Return compressor, coder, points per chunk, and kind and size of each value."""
     if len(vlr) >= 34:
         compressor, coder = struct.unpack_from("<HH", vlr, 0)
         (chunk,) = struct.unpack_from("<I", vlr, 12)
@@ -154,7 +154,7 @@ def _described(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
 
 
 def _fits(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:
-    """Whether these are the values of a record: the point first, then each kind at most once."""
+    """Return whether these kinds form a record: the point first, then each kind once at most."""
     names = [kind for kind, _ in kinds]
     free = _LAYERED_BYTES if layered else _BYTES
     return (
@@ -169,17 +169,17 @@ def _fits(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:
 def _check_chunks(
     data: FileBytes, start: int, length: int, kinds: list[tuple[int, int]], count: int, chunk: int
 ) -> None:
-    """Refuse chunks that are longer than their file, too many, or too few."""
+    """Raise UnreadableCloud for chunks that are longer than their file, too many, or too few."""
     lie = UnreadableCloud(f"The chunks of the LAZ file are not those of its points. {_AGAIN}")
     if len(data) - start < 8:
         raise lie
     (table,) = struct.unpack_from("<q", data, start)
-    if table == -1:  # written to a pipe: its place is at the end
+    if table == -1:  # a file written to a pipe, which has the offset at the end
         (table,) = struct.unpack_from("<q", data, len(data) - 8)
     if not start + 8 <= table <= len(data) - 8:
         raise lie
     version, chunks = struct.unpack_from("<II", data, table)
-    # the first point of each is as it is
+    # the first point of each chunk is not compressed
     if version != 0 or chunks * length > len(data) or chunks > count:
         raise lie
     if chunk != _VARIABLE and chunks != -(-count // chunk):
@@ -202,19 +202,20 @@ def _check_chunks(
 _SMALLEST_HEADER = 227  #: bytes
 _AGAIN = "Copy or write the file again."
 
-#: Bytes of a record by point format.
+#: Size of a record by point format, bytes.
 _RECORDS = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
 
 Records = NDArray[np.void]
 
 
 def read_las(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
-    """The points of a LAS or LAZ file, at most so many.
+    """Return the points of a LAS or LAZ file.
 
     Raises
     ------
-    UnreadableCloud : it is none, of an unknown format, or its header does not fit what follows it.
-    MissingDependency : it is LAZ, and lazrs is not installed.
+    UnreadableCloud : The file is not LAS, of an unknown point format, has more than `most` points,
+        or its header does not fit the rest.
+    MissingDependency : The file is LAZ, and lazrs is not installed.
     """
     if len(data) < _SMALLEST_HEADER or data[:4] != LAS_SIGNATURE:
         raise UnreadableCloud("This is no LAS file, or its header is cut off. Copy it again.")
@@ -228,7 +229,7 @@ def read_las(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
             f"{_AGAIN}"
         )
     if minor == 4 and len(data) >= 255 and header >= 375:
-        (count,) = struct.unpack_from("<Q", data, 247)  # beyond 32 bits, and for formats from 6
+        (count,) = struct.unpack_from("<Q", data, 247)  # for more than 32 bits, and from format 6
     if not _SMALLEST_HEADER <= header <= start <= len(data):
         raise UnreadableCloud(
             f"The LAS header has {header} bytes, and points from byte {start} of {len(data)}. "

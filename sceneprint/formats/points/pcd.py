@@ -1,4 +1,4 @@
-"""PCD files, those of the Point Cloud Library: ascii, binary and binary_compressed.
+"""Read PCD files of the Point Cloud Library: ascii, binary and binary_compressed.
 
 bytes  --read_pcd-->  FilePoints
 """
@@ -30,29 +30,29 @@ from sceneprint.types import Bytes, Floats
 from sceneprint_client.formats import HEAD, format_of
 from sceneprint_client.sidecars import Position
 
-# LZF, which binary_compressed PCD files are packed with (M. Lehmann's liblzf 3.6).
+# LZF, the compression of binary_compressed PCD files (M. Lehmann's liblzf 3.6).
 #
 # packed, size  --inflate-->  bytes
 #
-# A control byte below 32 is followed by so many bytes and one more, as they are. Any other has, in
-# its upper three bits, how many bytes to repeat beyond two (7: and a byte more of them follows),
-# and in its lower five the upper part of how far back they begin.
+# A control byte c below 32 is followed by c + 1 literal bytes. Any other is a back reference: its
+# upper three bits are the number of bytes to repeat minus two (7: the next byte is added), and its
+# lower five bits the upper part of the distance.
 
-#: Most bytes that one packed byte can become: three of a repetition tell 264.
+#: Maximum compression ratio: three bytes of a back reference expand to 264.
 MOST_RATIO = 88
 
 
 def inflate(packed: Bytes, size: int) -> Bytes:
-    """The bytes that were packed.
+    """Return the decompressed bytes.
 
     Parameters
     ----------
-    packed : (n,)
-    size : how many there must be; the caller has made sure that so many are wanted
+    packed : (n,) compressed bytes
+    size : exact size of the result, which the caller has checked
 
     Raises
     ------
-    UnreadableCloud : there are more, fewer, or the packed ones make no sense.
+    UnreadableCloud : The result has another size, or the compressed bytes are damaged.
     """
     if size > MOST_RATIO * len(packed):  # before anything is allocated
         raise UnreadableCloud(
@@ -70,7 +70,7 @@ def inflate(packed: Bytes, size: int) -> Bytes:
 
 @kernel
 def _inflate(packed: Bytes, out: Bytes) -> int:
-    """Fill `out`, and return how many bytes there were; -1 where there are more, or none."""
+    """Fill `out` and return the number of bytes; -1 if they do not fit or are damaged."""
     i, o, size, room = 0, 0, len(packed), len(out)
     while i < size:
         control = int(packed[i])
@@ -96,7 +96,7 @@ def _inflate(packed: Bytes, out: Bytes) -> int:
             i += 1
             if back < 0 or o + length > room:
                 return -1
-            for k in range(length):  # one by one: what is repeated may overlap itself
+            for k in range(length):  # byte by byte, because source and target may overlap
                 out[o + k] = out[back + k]
         o += length
     return o
@@ -104,7 +104,7 @@ def _inflate(packed: Bytes, out: Bytes) -> int:
 
 _MAXIMUM_HEADER = 65_536  #: bytes
 _MAXIMUM_FIELDS = 1000
-_MAXIMUM_COUNT = 65_536  #: values of a field
+_MAXIMUM_COUNT = 65_536  #: maximum number of values of a field
 _AGAIN = "Copy or write the file again."
 _XYZ = ("x", "y", "z")
 _TYPES = {
@@ -119,27 +119,25 @@ _ENTRIES = (
 
 @dataclass(frozen=True)
 class Field:
-    """So many values of one type in each row."""
+    """A field of each row: a number of values of one type."""
 
     name: str
-    kind: str  #: of numpy
+    kind: str  #: type in numpy
     count: int
 
     @property
     def size(self) -> int:
-        """Bytes of it in a row."""
+        """Size of the field in a row, bytes."""
         return self.count * np.dtype(self.kind).itemsize
 
 
 def read_pcd(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
-    """The points of a PCD file, and the place of its VIEWPOINT where that is not the origin.
-
-    At most so many points are read.
+    """Return the points of a PCD file, and its VIEWPOINT if that is not the origin.
 
     Raises
     ------
-    UnreadableCloud : it is none, its points lack x, y or z, or its header does not fit what
-        follows it.
+    UnreadableCloud : The file is not PCD, its points lack x, y or z, there are more than `most`
+        points, or the header does not fit the rest.
     """
     entries, start = _header(data)
     fields, count = _fields(entries), _points(entries)
@@ -176,7 +174,7 @@ def read_pcd(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
 def _written_out(data: FileBytes, start: int, count: int, fields: list[Field]) -> Iterator[Floats]:
     text, counts = np.frombuffer(data, np.uint8), [field.count for field in fields]
     width = sum(counts)
-    if not count:  # a header alone must not ask for room for its columns
+    if not count:  # a header alone must not allocate columns
         return iter(())
     check_room(text, start, count, width)
     column = [_XYZ.index(field.name) if field.name in _XYZ else -1 for field in fields]
@@ -187,7 +185,7 @@ def _written_out(data: FileBytes, start: int, count: int, fields: list[Field]) -
 def _compressed(
     data: FileBytes, start: int, count: int, fields: list[Field], most: int
 ) -> Iterator[Floats]:
-    """Field after field, each of all points."""
+    """Yield the blocks of a compressed body, which stores each field for all points."""
     size = count * sum(field.size for field in fields)
     if len(data) - start < 8:
         raise UnreadableCloud(f"The PCD file ends before its compressed points. {_AGAIN}")
@@ -214,7 +212,7 @@ def _compressed(
 
 
 def _header(data: FileBytes) -> tuple[dict[str, list[str]], int]:
-    """Entries by their names, and where the points begin."""
+    """Return the entries by name, and the offset of the points."""
     head = data[:_MAXIMUM_HEADER]
     if format_of(head[:HEAD]) != "pcd":
         raise UnreadableCloud("This is no PCD file: it does not begin with VERSION or FIELDS.")
@@ -260,7 +258,7 @@ def _fields(entries: dict[str, list[str]]) -> list[Field]:
 
 
 def _points(entries: dict[str, list[str]]) -> int:
-    """How many points there are, told once or twice."""
+    """Return the number of points, which POINTS and WIDTH with HEIGHT state."""
     told = []
     if "POINTS" in entries:
         told.append(_whole("POINTS", " ".join(entries["POINTS"])))
@@ -282,7 +280,7 @@ def _whole(name: str, word: str) -> int:
 
 
 def _viewpoint(words: list[str] | None) -> Position | None:
-    """Translation of the entry; its rotation is that of the sensor, which nothing here needs."""
+    """Return the translation of VIEWPOINT; the rotation is not needed."""
     if words is None:
         return None
     try:

@@ -1,8 +1,8 @@
-"""PLY files: what they are made of, and the points among it.
+"""Read PLY files: their elements, and the points among them.
 
 bytes  --read_ply-->  FilePoints
 
-Nothing is allocated that the header alone asks for: each element must fit into what follows.
+Memory is allocated only for elements that fit into the rest of the file, whatever the header says.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from sceneprint.formats.points.rows import (
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Bytes, Floats
 
-# Binary rows that hold lists, as PLY has them: each has a length of its own.
+# Binary rows with lists, whose lengths vary.
 #
-# bytes, start, count, kinds  --skip_rows-->  place behind them
+# bytes, start, count, kinds  --skip_rows-->  offset after the rows
 #                             --list_blocks-->  three of their values (n, 3)
 
 Places = NDArray[np.int64]
 
-#: Type of each value, of numpy, and of a list's length before it.
+#: Type in numpy of each value, and of the length of a list.
 Kinds = Sequence[tuple[str, str | None]]
 
 
 def skip_rows(view: Bytes, start: int, count: int, kinds: Kinds, order: str) -> int:
-    """Where so many rows end.
+    """Return the offset after `count` rows.
 
     Raises
     ------
-    UnreadableCloud : the bytes end before.
+    UnreadableCloud : The file ends before.
     """
     end = start
     for _, behind in walked(view, start, count, kinds, (0, 0, 0), order):
@@ -69,9 +69,9 @@ def list_blocks(
 def walked(
     view: Bytes, start: int, count: int, kinds: Kinds, picked: tuple[int, int, int], order: str
 ) -> Iterator[tuple[Places, int]]:
-    """Yield where the picked values of each row are, and where its block ends.
+    """Yield the offsets of the picked values of each row, and the offset after each block.
 
-    Raises as `skip_rows`.
+    It raises as `skip_rows`.
     """
     sizes = np.array([np.dtype(kind).itemsize for kind, _ in kinds])
     lengths = np.array([np.dtype(length).itemsize if length else 0 for _, length in kinds])
@@ -93,7 +93,7 @@ def _walk(
     view: Bytes, start: int, places: Places, sizes: Places, lengths: Places,
     signed: NDArray[np.bool_], wanted: Places, little: bool,
 ) -> tuple[int, int]:  # fmt: skip
-    """Fill the places; return the one behind the last whole row, and how many there were."""
+    """Fill `places`; return the offset after the last whole row, and the number of rows."""
     at, end = start, len(view)
     for row in range(len(places)):
         for p in range(len(sizes)):
@@ -107,7 +107,7 @@ def _walk(
                 repeats = 0
                 for b in range(lengths[p]):
                     byte = int(view[at + (lengths[p] - 1 - b if little else b)])
-                    if b == 0 and signed[p] and byte > 127:  # fewer than none
+                    if b == 0 and signed[p] and byte > 127:  # a negative length
                         return at, row
                     repeats = 256 * repeats + byte
                 at += lengths[p]
@@ -118,7 +118,7 @@ def _walk(
 
 
 _MAXIMUM_HEADER = 65_536  #: bytes
-_MAXIMUM_PROPERTIES = 1000  #: of an element, and elements of a file
+_MAXIMUM_PROPERTIES = 1000  #: maximum number of properties of an element, and of elements
 _AGAIN = "Copy or write the file again."
 _XYZ = ("x", "y", "z")
 _TYPES = {
@@ -131,16 +131,16 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass(frozen=True)
 class Property:
-    """One value of an element, or a list of values with its length before it."""
+    """A property of an element: a value, or a list of values with its length before it."""
 
     name: str
-    kind: str  #: of numpy, without byte order
+    kind: str  #: type in numpy, without byte order
     length: str | None = None  #: type of a list's length
 
 
 @dataclass(frozen=True)
 class Element:
-    """So many rows of the same properties."""
+    """An element of a file: a number of rows with the same properties."""
 
     name: str
     count: int
@@ -148,22 +148,22 @@ class Element:
 
     @property
     def least(self) -> int:
-        """Bytes that a binary row takes at least; all of them where it has no list."""
+        """Minimum size of a binary row, bytes; the exact size without lists."""
         return sum(np.dtype(p.length or p.kind).itemsize for p in self.properties)
 
     @property
     def has_lists(self) -> bool:
-        """Whether rows differ in length."""
+        """Whether rows have lists, so that their lengths vary."""
         return any(p.length for p in self.properties)
 
 
 def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
-    """The vertices of a PLY file, at most so many; all else in it is passed over.
+    """Return the vertices of a PLY file.
 
     Raises
     ------
-    UnreadableCloud : it is none, its vertices lack x, y or z, or its header does not fit what
-        follows it.
+    UnreadableCloud : The file is not PLY, its vertices lack x, y or z, there are more than `most`,
+        or the header does not fit the rest.
     """
     order, elements, start = ply_header(data)
     names = [element.name for element in elements]
@@ -191,7 +191,7 @@ def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     rest = len(data) - start
     if rest > _MAXIMUM_HEADER or data[start:].strip(
         b"\r\n"
-    ):  # else a type or a count is not what the header says
+    ):  # otherwise the header states a wrong type or count
         raise UnreadableCloud(f"{rest} bytes follow what the PLY header announces. {_AGAIN}")
     if vertex.has_lists:
         kinds = [(p.kind, p.length) for p in vertex.properties]
@@ -204,7 +204,7 @@ def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
 
 
 def element_end(data: FileBytes, start: int, element: Element, order: str) -> int:
-    """Where a binary element ends."""
+    """Return the offset after a binary element."""
     left = len(data) - start
     if element.count * element.least > left:
         raise UnreadableCloud(
@@ -218,7 +218,7 @@ def element_end(data: FileBytes, start: int, element: Element, order: str) -> in
 
 
 def _written_out(data: FileBytes, start: int, elements: list[Element]) -> Iterator[Floats]:
-    """The blocks of the last of some elements of an ascii file."""
+    """Return the blocks of the last of `elements` in an ascii file."""
     *before, vertex = elements
     text = np.frombuffer(data, np.uint8)
     for element in before:
@@ -232,9 +232,9 @@ def _written_out(data: FileBytes, start: int, elements: list[Element]) -> Iterat
 
 
 def ply_header(data: FileBytes) -> tuple[str, list[Element], int]:
-    """Return byte order ("" for ascii), elements, and where the rows begin."""
+    """Return byte order ("" for ascii), elements, and offset of the rows."""
     head = data[:_MAXIMUM_HEADER]
-    old = head[3:4] == b"\r" and head[4:5] != b"\n"  # ends of lines of an old Macintosh
+    old = head[3:4] == b"\r" and head[4:5] != b"\n"  # line ends of old Macintoshes
     ending = b"\r" if old else b"\n"
     lines, start = [], 0
     while True:

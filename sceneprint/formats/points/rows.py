@@ -1,9 +1,9 @@
-"""Rows of points: what every parser hands to the door, what it may not exceed, and rows of text.
+"""Rows of points: the result of every reader, its limits, and the parser of rows of text.
 
-text, start  --parse_rows-->  coordinates (n, 3), place after them, what is wrong
+text, start  --parse_rows-->  coordinates (n, 3), offset after them, status
 
-A row of text has a point to a line, of which three columns are wanted. Python's own `float` would
-take a minute for the largest file.
+Each line of text is a point, of which three columns are read. Python's `float` would take a minute
+for the largest file.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Bytes, Floats
 from sceneprint_client.sidecars import Position
 
-#: Most points of a file that is read; more is refused by its header.
+#: Maximum number of points of a file; a larger one is refused by its header.
 MAXIMUM_POINTS = 20_000_000
 
-#: Most bytes that a compressed file is inflated to at once: 20 million points of x, y, z and one
-#: more, and what several uploads at a time may hold together.
+#: Maximum size that a compressed file is decompressed to at once, bytes: 20 million points of four
+#: values, and a size that several uploads may take at a time.
 MAXIMUM_INFLATED = 400 << 20
 
-#: Points that are parsed at a time: what they take beside the file stays in the cache.
+#: Number of points that are parsed at a time, so that they stay in the processor's cache.
 BLOCK = 1 << 16
 
 
-#: Bytes of a file, in memory or mapped from the disk.
+#: The bytes of a file, in memory or mapped from the disk.
 FileBytes = bytes | mmap.mmap
 
 
@@ -41,10 +41,10 @@ class FilePoints:
 
     Parameters
     ----------
-    count : of the points, checked against the length of the file
-    blocks : their coordinates in order, (n, 3) float64 each; NaN or infinite where missing, and
-        whoever takes them lets numpy's warnings be
-    viewpoint : that the file itself tells, or None
+    count : number of points, checked against the length of the file
+    blocks : coordinates in order, (n, 3) float64 each; missing ones are NaN or infinite, and may
+        cause warnings of numpy
+    viewpoint : viewpoint that the file states, or None
     """
 
     count: int
@@ -53,7 +53,7 @@ class FilePoints:
 
 
 def check_count(count: int, most: int) -> None:
-    """Refuse a header that announces more points than are read."""
+    """Raise UnreadableCloud if a header announces more than `most` points."""
     if count > most:
         raise UnreadableCloud(
             f"The file announces {count} points, and at most {most} are read. "
@@ -62,12 +62,12 @@ def check_count(count: int, most: int) -> None:
 
 
 def steps(count: int) -> Iterator[tuple[int, int]]:
-    """First index and length of each block of so many rows."""
+    """Yield first index and length of each block of `count` rows."""
     return ((first, min(BLOCK, count - first)) for first in range(0, count, BLOCK))
 
 
 def axis_names(names: list[str]) -> list[str]:
-    """The names of fields with x, y and z for X, Y and Z, as PDAL writes them."""
+    """Return the names of fields with x, y, z in place of X, Y, Z, which PDAL writes."""
     if {"x", "y", "z"}.isdisjoint(names):
         return [name.lower() if name in ("X", "Y", "Z") else name for name in names]
     return names
@@ -76,12 +76,12 @@ def axis_names(names: list[str]) -> list[str]:
 def record_blocks(
     data: FileBytes, start: int, count: int, fields: Iterable[tuple[str, str, int]]
 ) -> Iterator[Floats]:
-    """Yield x, y and z of packed records, which the file has room for, a block at a time.
+    """Yield x, y and z of packed records, a block at a time.
 
     Parameters
     ----------
-    data, start, count : the file, and place and number of its records
-    fields : name, type of numpy and number of values of each field; one each is x, y and z
+    data, start, count : the file, and offset and number of its records, which fit into it
+    fields : name, type in numpy and number of values of each field; x, y and z are among them
     """
     packed = [(name if name in ("x", "y", "z") else f"{place}", kind, (n,) * (n != 1))
               for place, (name, kind, n) in enumerate(fields)]  # fmt: skip
@@ -91,9 +91,9 @@ def record_blocks(
         yield np.stack([rows[name] for name in "xyz"], axis=1, dtype=np.float64)
 
 
-# Numbers written out, a row to a line.
+# Rows of text, one on each line.
 
-#: Why a row cannot be read.
+#: Status of a row: readable, or the reason why not.
 GOOD, ENDS, FEW, MANY, NO_NUMBER, CORNERS = 0, 1, 2, 3, 4, 5
 
 ROW_ERRORS = {
@@ -111,11 +111,11 @@ _TENS = np.array([float(f"1e{k}") for k in range(23)])
 def parse_blocks(
     text: Bytes, start: int, count: int, wanted: NDArray[np.int8], lists: NDArray[np.bool_]
 ) -> Iterator[Floats]:
-    """Yield the coordinates of so many rows, (n, 3) each; see `parse_rows`.
+    """Yield the coordinates of `count` rows, (n, 3) each; see `parse_rows`.
 
     Raises
     ------
-    UnreadableCloud : a row is missing or is none; names it.
+    UnreadableCloud : A row is missing or malformed; the message names it.
     """
     for first, n in steps(count):
         block = np.full((n, 3), np.nan)
@@ -129,11 +129,11 @@ def parse_blocks(
 
 
 def skip_lines(text: Bytes, start: int, count: int) -> int:
-    """Where the line after so many begins, empty ones not counted.
+    """Return the offset after `count` lines that are not empty.
 
     Raises
     ------
-    UnreadableCloud : there are not so many.
+    UnreadableCloud : There are fewer lines.
     """
     place, lines = _skip(text, start, count)
     if lines < count:
@@ -145,8 +145,8 @@ def skip_lines(text: Bytes, start: int, count: int) -> int:
 
 
 def check_room(text: Bytes, start: int, count: int, columns: int) -> None:
-    """Refuse a header that announces more rows than can be written into what follows."""
-    if count * columns * 2 - 1 > len(text) - start:  # a digit and a space each
+    """Raise UnreadableCloud if a header announces more rows than fit into the rest of the file."""
+    if count * columns * 2 - 1 > len(text) - start:  # a digit and a space for each value
         raise UnreadableCloud(
             f"The header announces {count} rows of {columns} values, and {len(text) - start} "
             "bytes follow. Copy or write the file again."
@@ -157,19 +157,19 @@ def check_room(text: Bytes, start: int, count: int, columns: int) -> None:
 def parse_rows(
     text: Bytes, start: int, out: Floats, wanted: NDArray[np.int8], lists: NDArray[np.bool_]
 ) -> tuple[int, int, int]:
-    """Read as many rows as `out` has; empty lines are passed over.
+    """Parse rows of text until `out` is full; empty lines are skipped.
 
     Parameters
     ----------
     text : (N,) bytes
-    start : where the first row begins
-    out : (n, 3), filled
-    wanted : (c,) column of `out` that each value goes to, or -1
-    lists : (c,) whether this is the length of a list that follows on the same line
+    start : offset of the first row
+    out : (n, 3) output
+    wanted : (c,) column of `out` for each value, or -1
+    lists : (c,) whether a value is the length of a list that follows on the same line
 
     Returns
     -------
-    place after the last row, rows that were read, and why there are no more
+    offset after the last row, number of rows, and status
     """
     i, size = start, len(text)
     for row in range(len(out)):
@@ -179,7 +179,7 @@ def parse_rows(
             return i, row, ENDS
         for c in range(len(wanted)):
             first, i = word(text, i)
-            if first == i:  # a line's end, or a sign that belongs in no text
+            if first == i:  # the end of a line, or a character that does not belong in text
                 return i, row, FEW
             if lists[c]:
                 value, good = number(text, first, i)
@@ -217,7 +217,7 @@ def _skip(text: Bytes, start: int, count: int) -> tuple[int, int]:
 
 @kernel
 def word(text: Bytes, start: int) -> tuple[int, int]:
-    """Where the next word of this line begins and ends; of no length where there is none."""
+    """Return start and end of the next word on this line; equal if there is none."""
     first = start
     while first < len(text) and (text[first] == 32 or text[first] == 9):
         first += 1
@@ -229,8 +229,8 @@ def word(text: Bytes, start: int) -> tuple[int, int]:
 
 @kernel
 def number(text: Bytes, start: int, end: int) -> tuple[float, bool]:
-    """The number of a word, to the last bit but one, and whether it is one; NaN for any NaN or
-    infinity, as printf writes them anywhere.
+    """Return the number of a word, exact to the last bit but one, and whether it is a number; NaN
+    for every spelling of NaN and infinity by printf.
     """
     i = start
     negative = i < end and text[i] == 45
@@ -245,7 +245,7 @@ def number(text: Bytes, start: int, end: int) -> tuple[float, bool]:
         sign = text[i]
         if 48 <= sign <= 57:
             digits += 1
-            if taken < 18:  # more digits than a float64 tells apart
+            if taken < 18:  # more digits than a float64 distinguishes
                 mantissa = 10 * mantissa + (int(sign) - 48)
                 if mantissa > 0:
                     taken += 1
@@ -255,7 +255,7 @@ def number(text: Bytes, start: int, end: int) -> tuple[float, bool]:
                 exponent += 1
         elif sign == 46 and not point:
             point = True
-        elif sign == 35 and point:  # 1.#QNAN, of Windows
+        elif sign == 35 and point:  # 1.#QNAN, on Windows
             return np.nan, True
         else:
             break

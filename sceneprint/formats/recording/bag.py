@@ -156,7 +156,7 @@ class Bag:
                 yield RawMessage(connection.topic, log_ns, bytes(data))
 
     def first(self, topic: str) -> RawMessage | None:
-        """The first message of a topic; None where it has none."""
+        """Return the first message of a topic; None where it has none."""
         with self._lock:
             messages = self.messages([topic])
             try:
@@ -165,7 +165,7 @@ class Bag:
                 messages.close()  # type: ignore[attr-defined]  # a generator, which holds the lock
 
     def at(self, topic: str, log_ns: int, occurrence: int) -> RawMessage:
-        """The message of a topic with this time of recording; of several, by number from 0.
+        """Return the message of a topic with this time of recording; of several, by number from 0.
 
         Raises
         ------
@@ -181,7 +181,7 @@ class Bag:
         return found[occurrence]
 
     def decode(self, message: RawMessage, kind: str) -> Any:
-        """The fields of a message, as attributes.
+        """Return the fields of a message, as attributes.
 
         Parameters
         ----------

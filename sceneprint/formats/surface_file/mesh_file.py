@@ -52,7 +52,7 @@ class FileMesh:
     notes: tuple[str, ...] = ()
 
     def blocks(self) -> Iterator[Floats]:
-        """The vertices, some at a time."""
+        """Yield the vertices, some at a time."""
         for first in range(0, len(self.vertices), BLOCK):
             yield self.vertices[first : first + BLOCK]
 
@@ -102,7 +102,7 @@ def _trimesh() -> ModuleType:
 
 
 def _joined(trimesh: ModuleType, scene: Any, name: str) -> FileMesh:
-    """All triangles of a scene; all its points where it has none."""
+    """Return all triangles of a scene; all its points where it has none."""
     parts = []
     for node in scene.graph.nodes_geometry:
         T, key = scene.graph[node]

@@ -200,7 +200,7 @@ def _raw(data: FileBytes, form: SurfaceFormat, options: SurfaceOptions) -> RawSu
 
 
 def _of_scans(scans: tuple[E57Scan, ...]) -> FilePoints:
-    """The points of all scans in the frame of their file."""
+    """Return the points of all scans in the frame of their file."""
     count = sum(scan.count for scan in scans)
     check_count(count, MOST_FILE_POINTS)
 
@@ -293,7 +293,7 @@ def _units(
 
 
 def _cleaned(raw: RawSurface, notes: list[str]) -> tuple[Floats32, Ints32 | None]:
-    """Points and triangles without what is missing."""
+    """Return points and triangles without what is missing."""
     if raw.triangles is None:
         missing = raw.file_points - len(raw.points)
         if missing and raw.voxel is None:
