@@ -21,13 +21,14 @@ from contextlib import contextmanager
 from datetime import datetime
 from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import BinaryIO, Literal
 from urllib.parse import quote
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from sceneprint.atomic_files import folder_turn, make_folder
 from sceneprint.errors import BundleError, DamagedBundle
+from sceneprint.sealed_record import StrictRecord, seal, unseal
 from sceneprint.store.blobs.folder import Condition, is_digest
 from sceneprint.store.blobs.object_client import Objects, open_objects
 
@@ -37,15 +38,9 @@ _NAME = re.compile(r"bundles/(\d{8}T\d{6}-\d{6}Z)\.json")
 LONGEST = 1 << 27
 #: Seconds for which a part that no bundle names is kept: it may be of a bundle that is written now.
 GRACE_S = 86_400.0
-#: Objects removed by one request.
-_AT_ONCE = 500
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-
-class Part(_Record):
+class Part(StrictRecord):
     """A part of a bundle.
 
     Parameters
@@ -62,7 +57,7 @@ class Part(_Record):
     rows: int = Field(ge=0)
 
 
-class BundleManifest(_Record):
+class BundleManifest(StrictRecord):
     """The content of a bundle.
 
     Parameters
@@ -217,9 +212,7 @@ class BundlePlace:
 
     def publish(self, manifest: BundleManifest) -> None:
         """Write a manifest; all parts that it names must be there."""
-        record = json.loads(manifest.model_dump_json())
-        data = json.dumps(record | {"sha256": _checksum(record)}, indent=1).encode()
-        self._objects.put(f"{_BUNDLES}{manifest.name}.json", data)
+        self._objects.put(f"{_BUNDLES}{manifest.name}.json", seal(manifest))
 
     # parts
 
@@ -287,23 +280,19 @@ class BundlePlace:
         -------
         removed : parts
         """
-        self._delete([f"{_BUNDLES}{name}.json" for name in self.names()[keep:]])
+        self._objects.delete(*(f"{_BUNDLES}{name}.json" for name in self.names()[keep:]))
         before = time.time() - GRACE_S
         found = [
             one.key for one in self._objects.list(_PARTS)
             if one.changed_at < before and is_digest(name := one.key.rpartition("/")[2])
             and name not in needed
         ]  # fmt: skip
-        self._delete(found)
+        self._objects.delete(*found)
         if self._folder is not None:  # what a writer that died left half written
             for path in self._folder.glob(f"{_PARTS}*/*#*"):
                 if path.stat().st_mtime < before:
                     path.unlink(missing_ok=True)
         return len(found)
-
-    def _delete(self, keys: list[str]) -> None:
-        for start in range(0, len(keys), _AT_ONCE):
-            self._objects.delete(*keys[start : start + _AT_ONCE])
 
     def _list(self, first: str) -> dict[str, int]:
         return {
@@ -317,24 +306,17 @@ def _key(digest: str) -> str:
 
 def _decode(data: bytes, place: str) -> BundleManifest:
     try:
-        record = json.loads(data)
-        if not isinstance(record, dict) or record.get("format") != "sceneprint-bundle":
+        record = unseal(data)
+        if record.get("format") != "sceneprint-bundle":
             raise ValueError("it is of another format")
-        if record.pop("sha256", None) != _checksum(record):
-            raise ValueError("its checksum does not fit")
         if record.get("version") != 1:
             raise BundleError(
                 f"{place}: a bundle of version {record.get('version')!r:.20}, and this sceneprint "
                 "reads 1. Restore it with the sceneprint that wrote it."
             )
         return BundleManifest.model_validate_json(json.dumps(record))
-    except (ValueError, ValidationError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise DamagedBundle(
             f"{place}: no manifest of a bundle, or damaged ({str(error).partition(chr(10))[0]}). "
             "Restore another bundle, or take another copy of this place."
         ) from error
-
-
-def _checksum(record: dict[str, Any]) -> str:
-    text = json.dumps(record, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()

@@ -35,10 +35,10 @@ from sceneprint.engine.products.session_differences import Differences
 from sceneprint.engine.results.query_entry import SentQuery
 from sceneprint.engine.results.query_log import QueryLog
 from sceneprint.engine.results.result_views import Inspection, PointClouds
+from sceneprint.engine.search.index_place import IndexPlace
 from sceneprint.engine.search.local_index import IndexView
 from sceneprint.engine.search.query import Queries
 from sceneprint.engine.search.retrieval import Readers
-from sceneprint.engine.search.shared_index import open_shared
 from sceneprint.engine.serializers import frame_records, map_record
 from sceneprint.engine.signers import Signers, warm
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
@@ -105,10 +105,10 @@ class Engine:
             settings.database, settings.blobs, settings.geometry_bytes, decoders_of(settings)
         )
         self.signers = Signers(self.store.database, settings.cache_dir)
-        self._shared = open_shared(self.store, settings)
-        self._upkeep = Upkeep(self.store, self.signers, settings, self._shared)
+        self._indexes = IndexPlace(self.store, settings)
+        self._upkeep = Upkeep(self.store, self.signers, settings, self._indexes)
         self._reencoding = Reencodings(self.store, self._upkeep)
-        self._readers = Readers(self.signers, settings.indexes, self._shared)
+        self._readers = Readers(self.signers, self._indexes)
         answers = open_answers(self.store.blobs, settings.query_dir)
         self.query_log = QueryLog(self.store, answers, settings)
         self.inspection = Inspection(self.store, self.signers, self.query_log)
@@ -151,8 +151,7 @@ class Engine:
 
     def close(self) -> None:
         """Give back what was opened."""
-        if self._shared is not None:
-            self._shared.close()
+        self._indexes.close()
         self.query_log.close()
         self._limits.restore_original_limits()
         self._cores.close()
@@ -209,11 +208,9 @@ class Engine:
                 return
             self._purged = time.monotonic()
             self.store.geometries.forget_older(self.settings.purge_s / 2)
+        self._indexes.purge_local()
+        with self.store.database.read() as connection:
             self._readers.purge(connection)
-        if self._shared is not None:
-            self._shared.purge_local()
-            with self.store.database.read() as connection:
-                self._readers.purge(connection)
 
     # jobs
 
@@ -394,7 +391,7 @@ class Engine:
         return published
 
     def rebuild_index(self, map_name: str) -> int:
-        """Publish the index of a map from nothing; returns the number of its generation.
+        """Publish the index of a map from nothing; returns its number.
 
         Raises
         ------

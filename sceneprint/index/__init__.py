@@ -3,8 +3,8 @@
     blocks of (keys, signatures)  --publish-->  Generation --\\
     frames newer than that        ----------->  Tail       ---+--search-->  Hits
 
-A generation is numbered and never changes: the signatures of the map in a few segments, each a
-FAISS file that all processes of a machine share in memory, and that the next generation most often
+A published index is numbered and never changes: the signatures of the map in a few segments, each
+a FAISS file that all processes of a machine share in memory, and that the next one most often
 shares too. A search compares all of them; a map of more than `segment.FLAT_BYTES` has sketches as
 well, which select the frames that are compared. The database is the truth: deleting the folder
 loses nothing but the time to publish it again.
@@ -20,7 +20,7 @@ from sceneprint.index.generation import (
     search,
     signatures_of,
 )
-from sceneprint.index.generation_files import manifests, newest_number, scrub
+from sceneprint.index.index_manifest import manifests, newest_number, scrub
 
 __all__ = [
     "Generation",

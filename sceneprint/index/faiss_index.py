@@ -33,7 +33,7 @@ def library() -> Any:
 
 
 def allocate(n: int, dimension: int) -> tuple[IndexScalarQuantizer, Bytes]:
-    """An index of n signatures that are yet to be written, and where: (n, d) uint8."""
+    """Return an index of n signatures that are yet to be written, and where: (n, d) uint8."""
     faiss = library()
     index = faiss.IndexScalarQuantizer(
         dimension, faiss.ScalarQuantizer.QT_8bit_direct, faiss.METRIC_L2
@@ -44,21 +44,17 @@ def allocate(n: int, dimension: int) -> tuple[IndexScalarQuantizer, Bytes]:
 
 
 def codes_of(index: IndexScalarQuantizer) -> Bytes:
-    """The signatures (n, d) of an index, where they are: read-only, and keeps the index alive."""
+    """Return the signatures (n, d) of an index, where they are, read-only."""
     return _view(index, read_only=True)
 
 
 class _Codes:
-    """What numpy is told of the memory of an index."""
+    """The memory of an index, as numpy reads it; it keeps the index alive."""
 
     def __init__(self, index: Any, read_only: bool) -> None:
         self._index = index
-        self.__array_interface__ = {
-            "version": 3,
-            "typestr": "|u1",
-            "shape": (index.ntotal, index.d),
-            "data": (int(index.codes.data()), read_only),
-        }
+        shape, data = (index.ntotal, index.d), (int(index.codes.data()), read_only)
+        self.__array_interface__ = {"version": 3, "typestr": "|u1", "shape": shape, "data": data}
 
 
 def _view(index: Any, *, read_only: bool) -> Bytes:
@@ -70,12 +66,7 @@ def _view(index: Any, *, read_only: bool) -> Bytes:
 def write_index(
     index: IndexScalarQuantizer | IndexBinaryFlat, take: Callable[[bytes], None]
 ) -> None:
-    """Pass an index to `take` as bytes, block by block.
-
-    Raises
-    ------
-    Exception : of `take`
-    """
+    """Pass an index to `take` as bytes, block by block; raises what `take` raises."""
     faiss = library()
     binary = isinstance(index, faiss.IndexBinaryFlat)
     write = faiss.write_index_binary if binary else faiss.write_index
@@ -95,10 +86,7 @@ def map_index(path: Path, n: int, dimension: int) -> IndexScalarQuantizer:
     DamagedIndex : missing, another kind or shape, or of a FAISS that this one cannot read.
     """
     faiss = library()
-    try:
-        index: Any = faiss.read_index(str(path), faiss.IO_FLAG_MMAP_IFC)
-    except RuntimeError as error:
-        raise DamagedIndex(f"{path}: FAISS cannot read it: {error}") from error
+    index = _map_file(path, faiss.read_index)
     if (
         not isinstance(index, faiss.IndexScalarQuantizer)
         or (index.d, index.ntotal, index.metric_type) != (dimension, n, faiss.METRIC_L2)
@@ -111,21 +99,20 @@ def map_index(path: Path, n: int, dimension: int) -> IndexScalarQuantizer:
 
 
 def map_binary(path: Path, n: int, bits: int) -> IndexBinaryFlat:
-    """Map an index over bits into memory, as `map_index` does.
-
-    Raises
-    ------
-    DamagedIndex : missing, another kind or shape, or of a FAISS that this one cannot read.
-    """
+    """Map an index over bits into memory, as `map_index` does."""
     faiss = library()
-    try:
-        index: Any = faiss.read_index_binary(str(path), faiss.IO_FLAG_MMAP_IFC)
-    except RuntimeError as error:
-        raise DamagedIndex(f"{path}: FAISS cannot read it: {error}") from error
+    index = _map_file(path, faiss.read_index_binary)
     if not isinstance(index, faiss.IndexBinaryFlat) or (index.d, index.ntotal) != (bits, n):
         raise DamagedIndex(f"{path}: no FAISS index of {n} sketches of {bits} bits.")
     found: IndexBinaryFlat = index
     return found
+
+
+def _map_file(path: Path, read: Callable[[str, int], Any]) -> Any:
+    try:
+        return read(str(path), library().IO_FLAG_MMAP_IFC)
+    except RuntimeError as error:
+        raise DamagedIndex(f"{path}: FAISS cannot read it: {error}") from error
 
 
 def selection(free: NDArray[np.bool_] | None) -> Any:
@@ -139,7 +126,7 @@ def selection(free: NDArray[np.bool_] | None) -> Any:
 def nearest(
     index: IndexScalarQuantizer, query: Bytes, count: int, free: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
-    """The rows nearest to a query, and their distances, in no order that is promised.
+    """Return the rows nearest to a query, and their distances, in no order that is promised.
 
     Parameters
     ----------

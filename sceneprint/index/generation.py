@@ -1,15 +1,16 @@
-"""Generations: one published state of the cache, opened, searched with newer frames, and published.
+"""Published states of an index: opened, searched together with newer frames, and published.
 
-A generation is a list of segments. The next one adds a segment of what is new, and merges some;
-most files stay what they are. Every file is durable before the manifest that names it, and the
-manifest comes last: a builder killed at any moment leaves the generation before, and files that
-the next builder removes.
+A published state is a list of segments. The next one adds a segment of what is new, and merges
+some; most parts stay what they are. Every part is durable before the manifest that names it, and
+the manifest comes last: a builder killed at any moment leaves the state before, and parts that the
+next builder removes.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,17 +21,15 @@ from numpy.typing import NDArray
 from sceneprint.atomic_files import folder_turn
 from sceneprint.errors import DamagedIndex
 from sceneprint.geometry.retrieval.ranking import Metric, distances
-from sceneprint.index import generation_files
-from sceneprint.index.generation_files import (
-    Block,
+from sceneprint.index.index_manifest import (
     GenerationManifest,
-    Keys,
     SegmentFiles,
-    is_ours,
     manifests,
+    newest_number,
     read_manifest,
     write_manifest,
 )
+from sceneprint.index.part_files import Block, Keys, check_block, is_ours, verify
 from sceneprint.index.segment import (
     FLAT_BYTES,
     Places,
@@ -49,14 +48,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Generation:
-    """One published state of the cache: immutable, and usable by any number of threads.
+    """One published state of an index: immutable, and usable by any number of threads.
 
-    It stays usable after its files have been removed: they are mapped, and processes share them.
+    It stays usable after its parts have been removed: they are mapped, and processes share them.
 
     Parameters
     ----------
     segments : that together hold each frame once
-    inodes : of the files by their names: another may have taken a name since
+    inodes : of the parts by their names: another file may have taken a name since
     """
 
     manifest: GenerationManifest
@@ -68,17 +67,17 @@ class Generation:
 
     @property
     def number(self) -> int:
-        """Of the generation in its folder."""
+        """Of its manifest."""
         return self.manifest.number
 
     @property
     def revision(self) -> int:
-        """Of the map, up to which the generation holds its frames."""
+        """Of the map, up to which the index holds its frames."""
         return self.manifest.revision
 
     @property
     def anchor(self) -> str:
-        """By which whoever published it knows the state of the database."""
+        """By which the publisher recognises the state of the database."""
         return self.manifest.anchor
 
     @property
@@ -88,29 +87,19 @@ class Generation:
 
     @cached_property
     def keys(self) -> Keys:
-        """Of the frames (N,), rising."""
+        """Keys of the frames (N,), rising."""
         standing = [one.keys[one.standing_rows(one.gone)] for one in self.segments]
         return np.sort(np.concatenate([np.empty(0, np.int64), *standing]))
 
     def has(self, keys: Keys) -> NDArray[np.bool_]:
-        """Which frames (n,) it holds."""
+        """Return which frames (n,) it holds."""
         held = np.zeros(len(keys), np.bool_)
         for one in self.segments:
             held |= one.rows_of(keys) >= 0
         return held
 
-    def holds_any(self, keys: Keys) -> bool:
-        """Whether a signature of one of these frames is in its files, or of any that is gone."""
-        rising = np.sort(keys)
-        return any(len(one.gone) or len(one.places.found(rising)) for one in self.segments)
-
     def vectors_of(self, keys: Keys) -> Bytes:
-        """Signatures (r, D) of some frames, a copy.
-
-        Raises
-        ------
-        ValueError : there is no such frame in it.
-        """
+        """Return a copy of the signatures (r, D) of frames; ValueError where one is missing."""
         result = np.empty((len(keys), self.manifest.dimension), np.uint8)
         missing = np.ones(len(keys), np.bool_)
         for one in self.segments:
@@ -131,35 +120,31 @@ def newest(
     known: Generation | None = None,
     sound: Mapping[str, int] | None = None,
 ) -> Generation | None:
-    """Open the newest sound generation of a folder.
+    """Open the newest sound index of a folder; None where there is none.
 
-    Every file is read and verified before it is used. A damaged one is skipped with a warning in
-    the log, and an older one is used.
+    Every part is read and verified before it is used. An index with a damaged one is skipped with a
+    warning in the log, and an older one is used.
 
     Parameters
     ----------
     folder : of the map; it need not exist
-    model_id, dimension : of the signatures; generations of others are passed over
-    known : a generation of this folder that is open: files that it has are not verified again,
-        and where it is the newest it is returned itself
-    sound : inodes, by name, of files that this process has verified before
-
-    Returns
-    -------
-    the generation; None where there is none, so that the map must be published from the database
+    model_id, dimension : of the signatures; indexes of others are passed over
+    known : an index of this folder that is open: its parts are not verified again, and where it is
+        the newest it is returned itself
+    sound : inodes, by name, of parts that this process has verified before
     """
     while True:
-        listed, found, errors = generation_files.manifests(folder), None, []
+        listed, found, errors = manifests(folder), None, []
         for _, path in listed:
             try:
-                manifest = generation_files.read_manifest(path)
+                manifest = read_manifest(path)
                 if (manifest.model_id, manifest.dimension) == (model_id, dimension):
                     found = open_generation(folder, manifest, known, sound)
                     break
             except DamagedIndex as error:
                 errors.append(error)
         # what a builder removed after it was listed is not damaged, and something newer is there
-        if not errors or generation_files.manifests(folder) == listed:
+        if not errors or manifests(folder) == listed:
             for each in errors:
                 log.warning("Damaged index skipped; it will be rebuilt: %s", each)
             return found
@@ -169,16 +154,11 @@ def open_generation(
     folder: Path, manifest: GenerationManifest, known: Generation | None = None,
     sound: Mapping[str, int] | None = None,
 ) -> Generation:  # fmt: skip
-    """Open the files of a generation.
+    """Open the parts that a manifest names; DamagedIndex where one is missing or damaged.
 
     Parameters
     ----------
-    folder, manifest : of the generation
     known, sound : see `newest`
-
-    Raises
-    ------
-    DamagedIndex : one of them is missing or damaged.
     """
     verified = {**(known.inodes if known is not None else {}), **(sound or {})}
     inodes = {name: _inode(folder / name) for name, _ in manifest.files}
@@ -186,10 +166,10 @@ def open_generation(
         return known
     for name, size in manifest.files:
         if inodes[name] != verified.get(name, -1):
-            for _ in generation_files.check(folder, name, size):
+            for _ in verify(folder, name, size):
                 pass
-    # what is open has its rows by key, and its pages, at hand; but where a damaged file was made
-    # anew under its name, what is mapped is the damaged one
+    # what is open has its rows by key, and its pages, at hand; but where a damaged part was written
+    # again under its name, what is mapped is the damaged one
     open_ones = {} if known is None else {one.record: one for one in known.segments}
     segments = tuple(
         open_ones[record]
@@ -220,9 +200,7 @@ def _inode(path: Path) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Tail:
-    """Frames newer than a generation.
-
-    A frame that is in both counts once, with the signature it has here.
+    """Frames newer than an index. A frame that is in both counts once, with its signature here.
 
     Parameters
     ----------
@@ -238,7 +216,7 @@ class Tail:
     signatures: Bytes
 
     def __post_init__(self) -> None:
-        generation_files.check_block(self.keys, self.signatures, self.signatures.shape[-1])
+        check_block(self.keys, self.signatures, self.signatures.shape[-1])
         _ = self.places
 
     def __len__(self) -> int:
@@ -246,7 +224,7 @@ class Tail:
 
     @classmethod
     def empty(cls, dimension: int) -> Tail:
-        """No frames, of signatures of that many bytes."""
+        """Return a tail of no frames, of signatures of that many bytes."""
         return cls(np.empty(0, np.int64), np.empty((0, dimension), np.uint8))
 
     @cached_property
@@ -255,7 +233,7 @@ class Tail:
         return Places(self.keys)
 
     def rows_among(self, gone: Keys, among: Keys | None) -> NDArray[np.int64]:
-        """Rows of the frames among some, None for all, that are not gone; both lists rise."""
+        """Return the rows of frames among some (None: all) that are not gone; both lists rise."""
         free = np.full(len(self), among is None)
         if among is not None:
             free[self.places.found(among)] = True
@@ -264,17 +242,7 @@ class Tail:
 
 
 def signatures_of(keys: Keys, generation: Generation | None, tail: Tail) -> Bytes:
-    """Signatures of some frames: of the hits of a search, to compare them among each other.
-
-    Parameters
-    ----------
-    keys : (r,) int64
-    generation : or None where there is none
-    tail : frames newer than that
-
-    Returns
-    -------
-    (r, D) uint8, in the order of `keys`; the tail's where a frame is in both
+    """Return the signatures (r, D) of frames (r,), in their order; the tail's where it has one.
 
     Raises
     ------
@@ -293,12 +261,7 @@ def signatures_of(keys: Keys, generation: Generation | None, tail: Tail) -> Byte
 
 
 def check_lengths(dimension: int, generation: Generation | None, tail: Tail) -> None:
-    """See that signatures of generation and tail have that many bytes.
-
-    Raises
-    ------
-    ValueError : they have not.
-    """
+    """Raise ValueError where signatures of the index or the tail have not that many bytes."""
     found = {tail.signatures.shape[1]}
     if generation is not None:
         found.add(generation.manifest.dimension)
@@ -338,12 +301,12 @@ def search(
     among: Keys | None = None,
     exact: bool = False,
 ) -> SearchHits:
-    """Find the nearest frames of a map. Any number of threads may search one generation.
+    """Find the nearest frames of a map. Any number of threads may search one index.
 
     Parameters
     ----------
     query : (D,) uint8, a signature of the model of the map
-    generation : or None where there is none
+    generation : the index; None where there is none
     tail : frames newer than that; where a frame is in both, this one counts
     size : of the answer; all frames where there are fewer
     metric : of the model of the map
@@ -378,7 +341,7 @@ def search(
 
 
 def _nearest(keys: Keys, found: NDArray[np.int64], size: int) -> NDArray[np.intp]:
-    """Places of the smallest `size`, rising, ties by key."""
+    """Return the places of the smallest `size`, rising, ties by key."""
     size = min(size, len(keys))
     if size == 0:
         return np.empty(0, np.intp)
@@ -405,12 +368,12 @@ def publish(
     after: int = 0,
     share: Callable[[GenerationManifest], bool] = lambda _: True,
 ) -> Generation | None:
-    """Publish the generation that follows `previous`.
+    """Publish the index that follows `previous`.
 
-    One process builds in a folder at a time. The two newest generations are kept, and files that
-    only older ones need removed; readers that hold them go on undisturbed. What is new is written,
-    and the segments that it is merged with; all others stay. Memory holds the signatures of what
-    is written, one segment at a time.
+    One process builds in a folder at a time. The two newest indexes are kept, and parts that only
+    older ones need removed; readers that hold them go on undisturbed. What is new is written, and
+    the segments that it is merged with; all others stay. Memory holds the signatures of what is
+    written, one segment at a time.
 
     Parameters
     ----------
@@ -419,37 +382,36 @@ def publish(
     revision : of the map, up to which `blocks` and `previous` hold its frames
     blocks : keys (n,) int64 and signatures (n, D) uint8 of the frames that are not in `previous`;
         a key that is there replaces the signature there. It is read once, and block by block.
-    previous : the newest generation of the folder, or None to build from nothing
+    previous : the newest index of the folder, or None to build from nothing
     drop : keys of frames that are no longer in the map
-    anchor : called once `blocks` are read: marks that state of the database or a later one. It is
-        kept as it is, for whoever opens the generation to check
-    clean : leave no file that has a byte of a frame that is no longer there: the generation
-        before is not kept
+    anchor : called once `blocks` are read: marks that state of the database or a later one
+    clean : leave no part that has a byte of a frame that is no longer there: the index before is
+        not kept
     flat_bytes : of signatures, above which there are sketches
     after : its number is larger than that
-    share : called with the manifest once all files are there and before it is: False where another
-        generation was published by that number elsewhere, so that this one is not published
+    share : called with the manifest once all parts are there and before it is: False where another
+        index was published by that number elsewhere, so that this one is not published
 
     Returns
     -------
-    the generation, open; None where somebody else is building or has published, or `previous` is
-    no longer the newest of the folder: then open the newest and try again
+    the index, open; None where somebody else is building or has published, or `previous` is no
+    longer the newest of the folder: then open the newest and try again
 
     Raises
     ------
     ValueError : blocks that are none, that have a key twice, or signatures of another model or
         length than `previous`; no frames and no `previous`.
-    OSError : a file cannot be written; the generation before remains.
+    OSError : a file cannot be written; the index before remains.
     """
     if previous is not None and previous.model_id != model_id:
         raise ValueError(f"frames of model {model_id} appended to those of {previous.model_id}")
     with folder_turn(folder) as mine:
-        if not mine or _overtaken(folder, previous):
+        if not mine or (previous is not None and _is_overtaken(folder, previous)):
             return None
-        listed = manifests(folder)
+        last = newest_number(folder) or 0
         records, dimension = _write_segments(folder, previous, blocks, drop, clean, flat_bytes)
         manifest = GenerationManifest(
-            number=max(after, listed[0][0] if listed else 0) + 1,
+            number=max(after, last) + 1,
             revision=revision,
             model_id=model_id,
             dimension=dimension,
@@ -459,12 +421,12 @@ def publish(
         if not share(manifest):
             remove_unneeded(folder)
             return None
-        own = write_manifest(folder, manifest)
-        if previous is not None:  # known to be sound, whatever lies between
-            listed = [each for each in listed if each[0] == previous.number]
-        _clean(folder, {own, *(path for _, path in listed[: 0 if clean else 1])})
-        before = {} if previous is None else previous.inodes
-        written = {name: _inode(folder / name) for name, _ in manifest.files if name not in before}
+        write_manifest(folder, manifest)
+        # the one before is known to be sound, whatever lies between
+        before = last if previous is None else previous.number
+        keep_only(folder, {manifest.number} if clean else {manifest.number, before})
+        known = {} if previous is None else previous.inodes
+        written = {name: _inode(folder / name) for name, _ in manifest.files if name not in known}
         return open_generation(folder, manifest, previous, written)
 
 
@@ -476,7 +438,7 @@ def _write_segments(
     dimension = None if previous is None else previous.manifest.dimension
     new_keys, stored = spool_blocks(folder, blocks, dimension)
     if previous is None and len(new_keys) == 0:
-        raise ValueError("a generation of no frames that follows none")
+        raise ValueError("an index of no frames that follows none")
     sources = segment_sources(() if previous is None else previous.segments, new_keys, stored, drop)
     most = sketch_threshold(sources, flat_bytes)
     groups = merge_plan([len(each) for each in sources])
@@ -487,53 +449,37 @@ def _write_segments(
     return records, dimension or stored.shape[1]
 
 
-def clear(folder: Path, but: int | None = None) -> bool:
-    """Remove all generations of a folder, or all but one; False where somebody is building there.
-
-    Readers that hold them go on undisturbed.
-    """
-    with folder_turn(folder) as mine:
-        if mine:
-            _clean(folder, {path for number, path in manifests(folder) if number == but})
-        return mine
-
-
-def remove_all_but(folder: Path, manifest: GenerationManifest) -> None:
-    """Publish a generation whose files are in a folder, and remove all others; while building.
-
-    Raises
-    ------
-    OSError : it cannot be written.
-    """
-    _clean(folder, {write_manifest(folder, manifest)})
-
-
-def remove_unneeded(folder: Path) -> None:
-    """Remove files that no generation of a folder needs; while building."""
-    _clean(folder, {path for _, path in manifests(folder)})
-
-
-def _overtaken(folder: Path, previous: Generation | None) -> bool:
-    """Whether a generation was published, or the folder emptied, since `previous` was opened."""
-    if previous is None:
-        return False
+def _is_overtaken(folder: Path, previous: Generation) -> bool:
+    """Return whether another was published, or the folder emptied, since `previous` was opened."""
     found = newest(folder, previous.model_id, previous.manifest.dimension, known=previous)
     return found is None or found.number != previous.number
 
 
-def _clean(folder: Path, kept: set[Path]) -> None:
-    """Remove all manifests but some, and every file that none of these needs."""
-    needed = {name for path in kept for name, _ in _files(path)}
-    for _, path in manifests(folder):
-        if path not in kept:  # before its files: a manifest should not promise what is gone
+def clear(folder: Path, but: int | None = None) -> bool:
+    """Remove all manifests of a folder, or all but one, and the parts that only they need.
+
+    Readers that hold them go on undisturbed. Returns False where somebody is building there.
+    """
+    with folder_turn(folder) as mine:
+        if mine:
+            keep_only(folder, () if but is None else (but,))
+        return mine
+
+
+def remove_unneeded(folder: Path) -> None:
+    """Remove the parts that no manifest of a folder needs; for whoever has its turn."""
+    keep_only(folder, [number for number, _ in manifests(folder)])
+
+
+def keep_only(folder: Path, numbers: Collection[int]) -> None:
+    """Remove all manifests but some, and the parts these do not need; for whoever has the turn."""
+    needed: set[str] = set()
+    for number, path in manifests(folder):
+        if number not in numbers:  # before its parts: a manifest should not promise what is gone
             path.unlink(missing_ok=True)
+            continue
+        with suppress(DamagedIndex):  # nothing will be read by it
+            needed |= {name for name, _ in read_manifest(path).files}
     for path in folder.iterdir():
         if is_ours(path.name) and path.name not in needed:
             path.unlink(missing_ok=True)
-
-
-def _files(path: Path) -> tuple[tuple[str, int], ...]:
-    try:
-        return read_manifest(path).files
-    except DamagedIndex:  # it was not sound, and nothing will be read by it
-        return ()

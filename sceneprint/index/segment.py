@@ -13,7 +13,6 @@ again.
 
 from __future__ import annotations
 
-import logging
 import mmap
 import os
 from collections.abc import Iterable, Sequence
@@ -30,12 +29,11 @@ from sceneprint.errors import DamagedIndex
 from sceneprint.geometry.retrieval.ranking import Metric, distances
 from sceneprint.index import faiss_index
 from sceneprint.index.faiss_index import codes_of, map_index, nearest
-from sceneprint.index.generation_files import (
+from sceneprint.index.index_manifest import PartOfIndex, Recall, SegmentFiles
+from sceneprint.index.part_files import (
     BLOCK_BYTES,
     Block,
     Keys,
-    Recall,
-    SegmentFiles,
     check_block,
     mapped,
     put,
@@ -52,8 +50,6 @@ from sceneprint.types import Bytes
 
 if TYPE_CHECKING:
     from faiss import IndexScalarQuantizer
-
-log = logging.getLogger(__name__)
 
 #: A segment has at least this many times the frames of the next smaller one. By 2 a map of 100,000
 #: frames has up to 7 segments, a search takes a fifth longer, and a fifth less is written.
@@ -176,7 +172,7 @@ class Segment:
         self, query: Bytes, size: int, gone: Keys, among: Keys | None, *, metric: Metric,
         exact: bool,
     ) -> tuple[Found, bool, int]:  # fmt: skip
-        """The nearest frames of those that may be found.
+        """Find the nearest frames of those that may be found.
 
         Parameters
         ----------
@@ -193,9 +189,19 @@ class Segment:
         """
         free = self._free_rows(gone, among)
         count = len(self.keys) if free is None else int(np.count_nonzero(free))
-        own, whole = self._candidates(query, free, count, size, exact)
-        rows, distant = self._compared(query, metric, free, count, size, own)
-        return (self.keys[rows], distant), whole, count if own is None else len(own)
+        rows: NDArray[np.int64] | None = None  # None: all that are free
+        if free is not None and count < len(free) // FEW:
+            rows = np.flatnonzero(free)
+        elif self.sketches is not None and not exact:
+            rows = self.sketches.candidates(query, min(size, count), free)
+        elif size <= LONGEST and metric == "l2":
+            found = nearest(self.index, query, min(size, count), free)
+            if found is not None:
+                return (self.keys[found[0]], found[1]), True, count
+        if rows is None:
+            rows = np.arange(len(self.keys)) if free is None else np.flatnonzero(free)
+        distant = distances(query, self.vectors, metric, rows)
+        return (self.keys[rows], distant), len(rows) == count, len(rows)
 
     def _free_rows(self, gone: Keys, among: Keys | None) -> NDArray[np.bool_] | None:
         """Which rows (N,) may be found; None: all."""
@@ -208,37 +214,9 @@ class Segment:
         free[rows] = free[self.gone_rows] = False
         return free
 
-    def _candidates(
-        self, query: Bytes, free: NDArray[np.bool_] | None, count: int, size: int, exact: bool
-    ) -> tuple[NDArray[np.int64] | None, bool]:
-        """Rows that are compared one by one, None for all that are free; whether they are all."""
-        if free is not None and count < len(free) // FEW:
-            return np.flatnonzero(free), True
-        if self.sketches is None or exact:
-            return None, True
-        rows = self.sketches.candidates(query, min(size, count), free)
-        return rows, len(rows) == count
-
-    def _compared(
-        self, query: Bytes, metric: Metric, free: NDArray[np.bool_] | None, count: int, size: int,
-        rows: NDArray[np.int64] | None,
-    ) -> Found:  # fmt: skip
-        """Rows among which the nearest are, and their distances."""
-        if rows is None and size <= LONGEST and metric == "l2":
-            found = nearest(self.index, query, min(size, count), free)
-            if found is not None:
-                return found
-        if rows is None:
-            rows = np.arange(len(self.keys)) if free is None else np.flatnonzero(free)
-        return rows, distances(query, self.vectors, metric, rows)
-
 
 def open_segment(folder: Path, record: SegmentFiles, dimension: int) -> Segment:
-    """Map the files of a segment, whose checksums the caller has checked.
-
-    Parameters
-    ----------
-    folder, record, dimension : of the map, the segment, its signatures
+    """Map the parts of a segment, which the caller has verified.
 
     Raises
     ------
@@ -271,16 +249,7 @@ def _rising_keys(path: Path) -> Keys:
 
 
 def merge_plan(sizes: Sequence[int]) -> list[list[int]]:
-    """Which segments are merged.
-
-    Parameters
-    ----------
-    sizes : frames of each, the new one among them
-
-    Returns
-    -------
-    groups of places in `sizes`, the smallest group first; each becomes one segment
-    """
+    """Return the groups of places in `sizes`, the smallest first, that each become one segment."""
     groups: list[list[int]] = []
     total = 0
     for at in sorted(range(len(sizes)), key=lambda each: sizes[each]):
@@ -319,7 +288,7 @@ class SegmentSource:
 def segment_sources(
     segments: Sequence[Segment], new_keys: Keys, stored: Bytes, drop: frozenset[int]
 ) -> list[SegmentSource]:
-    """What stays of segments, and what is new; nothing of which nothing stays."""
+    """Return what stays of segments, and what is new; nothing of which nothing stays."""
     none, dropped = np.empty(0, np.int64), np.fromiter(drop, np.int64, len(drop))
     changed = np.union1d(dropped, new_keys)
     found = []
@@ -334,7 +303,7 @@ def segment_sources(
 def spool_blocks(
     folder: Path, blocks: Iterable[Block], dimension: int | None
 ) -> tuple[Keys, Bytes]:
-    """Keys (n,) and signatures (n, D) as they come: in a file without a name, not in memory.
+    """Return keys (n,) and signatures (n, D) in a file without a name, not in memory.
 
     Raises
     ------
@@ -379,8 +348,11 @@ def write_segment(
     """
     only = sources[0]
     if len(sources) == 1 and only.segment is not None and not only.is_worn(clean):
-        return _renamed(folder, only.segment, only.gone, flat_bytes)
-    keys, order = _merged_keys(sources)
+        return _keep_segment(folder, only.segment, only.gone, flat_bytes)
+    keys = np.concatenate([each.keys[each.rows] for each in sources])
+    by_key = np.argsort(keys)
+    keys, order = keys[by_key], np.empty(len(keys), np.int64)
+    order[by_key] = np.arange(len(keys))
     index, vectors = faiss_index.allocate(len(keys), only.vectors.shape[1])
     step, start = max(BLOCK_BYTES // vectors.shape[1], 1), 0
     for each in sources:
@@ -397,10 +369,10 @@ def write_segment(
     if vectors.nbytes > flat_bytes:
         sketches, recall = _put_sketches(folder, vectors)
         files += sketches
-    return SegmentFiles(tuple(files), recall)
+    return SegmentFiles(files=tuple(files), recall=recall)
 
 
-def _put_sketches(folder: Path, vectors: Bytes) -> tuple[list[tuple[str, int]], Recall]:
+def _put_sketches(folder: Path, vectors: Bytes) -> tuple[list[PartOfIndex], Recall]:
     sketches, recall = measure_sketches(make_sketches(vectors), vectors)
     files = [
         put(folder, "sketches", lambda take: faiss_index.write_index(sketches.index, take)),
@@ -409,40 +381,28 @@ def _put_sketches(folder: Path, vectors: Bytes) -> tuple[list[tuple[str, int]], 
     return files, recall
 
 
-def _merged_keys(sources: Sequence[SegmentSource]) -> tuple[Keys, NDArray[np.int64]]:
-    """Keys (n,), rising, and the places (n,) of the frames of one source after the other."""
-    keys = np.concatenate([each.keys[each.rows] for each in sources])
-    by_key = np.argsort(keys)
-    order = np.empty(len(keys), np.int64)
-    order[by_key] = np.arange(len(keys))
-    return keys[by_key], order
-
-
 def _flat_recall(frames: int) -> Recall:
-    return Recall(1.0, NEAR, 0, 0, frames)
+    return Recall(share=1.0, near=NEAR, sample=0, probes=0, frames=frames)
 
 
-def _renamed(folder: Path, segment: Segment, gone: Keys, flat_bytes: float) -> SegmentFiles:
-    """Return the files of a segment that stays, with other frames gone, and sketches if need be.
+def _keep_segment(folder: Path, segment: Segment, gone: Keys, flat_bytes: float) -> SegmentFiles:
+    """Return the parts of a segment that stays, with other frames gone, and sketches if need be.
 
     Of a map that has become large its older segments get sketches, which no search needed before.
     """
-    files = [one for one in segment.record.files if one[0].endswith((".keys", ".faiss"))]
-    recall = segment.record.recall
-    sketches = [segment.record.file(kind) for kind in ("sketches", "means")]
+    kept, recall, more = ["keys", "faiss"], segment.record.recall, list[PartOfIndex]()
     if segment.vectors.nbytes <= flat_bytes:
         recall = _flat_recall(len(segment.keys))
     elif segment.sketches is not None:
-        files += [one for one in sketches if one is not None]
+        kept += ["sketches", "means"]
     else:
         more, recall = _put_sketches(folder, segment.vectors)
-        files += more
-    before = segment.record.file("gone")
-    if before is not None and len(gone) == len(segment.gone):
-        files.append(before)
-    elif len(gone):
-        files.append(put(folder, "gone", lambda take: take(gone.astype("<i8").tobytes())))
-    return SegmentFiles(tuple(files), recall)
+    if len(gone) == len(segment.gone):
+        kept.append("gone")
+    else:
+        more.append(put(folder, "gone", lambda take: take(gone.astype("<i8").tobytes())))
+    files = [one for one in segment.record.files if one[0].rpartition(".")[2] in kept]
+    return SegmentFiles(files=(*files, *more), recall=recall)
 
 
 def sketch_threshold(sources: Sequence[SegmentSource], flat_bytes: int) -> float:

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from sceneprint.errors import DamagedIndex
 from sceneprint.geometry.retrieval.ranking import distances
 from sceneprint.index.faiss_index import library, map_binary, selection
-from sceneprint.index.generation_files import BLOCK_BYTES, Recall, draw, mapped
+from sceneprint.index.index_manifest import Recall
+from sceneprint.index.part_files import BLOCK_BYTES, mapped
 from sceneprint.types import Bytes, Floats32
 
 if TYPE_CHECKING:
@@ -88,6 +89,18 @@ class Sketches:
         return np.sort(self.nearest(query, min(max(self.probes, TIMES_WANTED * size), there), free))
 
 
+def draw(n: int, limit: int, seed: int) -> NDArray[np.int64]:
+    """Return at most `limit` of n rows: one at random from each of as many equal stretches.
+
+    Even, so that every place of a map counts alike; at random, so that nothing periodic in the
+    order of the frames (two robots in turn) is missed.
+    """
+    if n <= limit:
+        return np.arange(n)
+    edges = np.arange(limit + 1) * n // limit
+    return np.random.default_rng(seed).integers(edges[:-1], edges[1:])
+
+
 def sketch(signatures: Bytes, means: Bytes) -> Bytes:
     """Return the sketches (n, ceil(d / 8)) of signatures (n, d): see `Sketches`."""
     return np.packbits(signatures > means, axis=1, bitorder="little")
@@ -121,7 +134,8 @@ def measure_sketches(sketches: Sketches, vectors: Bytes, seed: int = 0) -> tuple
     probes = LEAST_SELECTED
     while (share := _share_found(sketches, vectors, wanted, probes)) < ENOUGH and probes < n:
         probes *= 2
-    return replace(sketches, probes=probes), Recall(share, NEAR, len(chosen), probes, n)
+    recall = Recall(share=share, near=NEAR, sample=len(chosen), probes=probes, frames=n)
+    return replace(sketches, probes=probes), recall
 
 
 def _share_found(
@@ -138,7 +152,7 @@ def _share_found(
 def neighbours(
     vectors: Bytes, chosen: NDArray[np.int64], most: int
 ) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Each of some rows (c,), and the others nearest to it, at most `most`, in no order.
+    """Return each of some rows (c,) and the others nearest to it, at most `most`, in no order.
 
     They are compared with all signatures (N, d), N > 1, by products of matrices, in a third of the
     time that `distances` takes. Of rows whose distances hardly differ, rounding may choose another.
@@ -160,13 +174,7 @@ def neighbours(
 
 
 def map_sketches(path: Path, means: Path, n: int, dimension: int, probes: int) -> Sketches:
-    """Map sketches into memory that processes share.
-
-    Parameters
-    ----------
-    path, means : files whose checksums the caller has checked
-    n, dimension : of the signatures
-    probes : rows that a search selects at least
+    """Map the sketches of n signatures, and their means, from parts that the caller has verified.
 
     Raises
     ------

@@ -15,6 +15,7 @@ from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.upkeep.purge import Retention
 from sceneprint.errors import UnknownFrame, UnknownJob
+from sceneprint.index.index_manifest import manifests, read_manifest
 from sceneprint.store.deletion import DAY_S, maps_with_ended
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, jobs, maps, surface_frames
@@ -178,7 +179,7 @@ def test_an_index_is_published_before_it_would_be_too_old(
 def test_purging_leaves_no_byte_of_a_frame_whose_row_is_gone(
     data: Path, make_engine: Make, ids: Ids
 ) -> None:
-    """On a node that was off meanwhile, where too little is left for another index."""
+    """On a node that was off meanwhile: its index is built anew, as nobody knows what went."""
     engine = make_engine(data, tail_frames=11)
     assert engine.publish_due() == 1
     engine.tombstones = Tombstones(engine.store, 0.0, engine.bell.ring)
@@ -188,9 +189,11 @@ def test_purging_leaves_no_byte_of_a_frame_whose_row_is_gone(
     with engine.store.database.read() as connection:
         row = find_map(connection, "hall")
     folder = index_folder(engine.settings.indexes, row)
-    assert list(folder.glob("*.json"))
+    before = {path.name for path in folder.glob("*.faiss")}
     assert engine.purging.now().indexes == 1
-    assert not list(folder.glob("*.json"))
+    ((number, path),) = manifests(folder)
+    assert (number, read_manifest(path).frames) == (2, 6)
+    assert before.isdisjoint(path.name for path in folder.glob("*.faiss"))
     assert engine.purging.now().indexes == 0
 
 

@@ -14,8 +14,9 @@ from sceneprint.engine import Engine
 from sceneprint.engine import engine as administration
 from sceneprint.engine.search import retrieval
 from sceneprint.errors import InvalidRequest, UnreadableModel
-from sceneprint.index import generation_files
-from sceneprint.index.generation_files import check
+from sceneprint.index import generation, index_manifest, manifests
+from sceneprint.index.index_manifest import read_manifest
+from sceneprint.index.part_files import verify
 from sceneprint.store.tables import models
 from sceneprint_client.api import JobState, NewMap, Query
 
@@ -84,7 +85,7 @@ def test_indexes_of_deleted_maps_are_removed_and_nothing_else(
     (folder,) = engine.settings.indexes.glob("[!.]*")
     (engine.settings.indexes / "notes").mkdir()
     shutil.copytree(
-        folder, engine.settings.indexes / "hall-9-abc-0123456789ab.1"
+        folder, engine.settings.indexes / "hall-9-abc-0123456789ab.2"
     )  # of a map that is no more
     assert engine.publish_due() == 0
     left = [one.name for one in engine.settings.indexes.glob("[!.]*")]
@@ -159,12 +160,13 @@ def test_a_worker_reads_a_file_of_an_index_once(
 
     def noted(folder: Path, name: str, size: int) -> Iterator[None]:
         read.append(name)
-        return check(folder, name, size)
+        return verify(folder, name, size)
 
     fill(engine, uploads, work_off, range(6))
     assert engine.publish_due() == 1
     assert engine.publish_due() == 0  # and all has been scrubbed
-    monkeypatch.setattr(generation_files, "check", noted)
+    monkeypatch.setattr(generation, "verify", noted)
+    monkeypatch.setattr(index_manifest, "verify", noted)
     fill(engine, uploads, work_off, range(6, 8))
     assert engine.publish_due() == 1
     assert read == []
@@ -172,7 +174,7 @@ def test_a_worker_reads_a_file_of_an_index_once(
     fill(other, uploads, work_off, range(8, 11))
     assert other.publish_due() == 1
     assert sorted(name.rpartition(".")[2] for name in read) == ["faiss", "faiss", "keys", "keys"]
-    (number, _), *_ = generation_files.manifests(next(engine.settings.indexes.glob("hall*")))
+    (number, _), *_ = manifests(next(engine.settings.indexes.glob("hall*")))
     assert number == 3
 
 
@@ -189,8 +191,8 @@ def test_purging_removes_what_a_publication_had_only_marked(
     for name in (names[2], names[3]):
         engine.delete_frame("hall", name)
     assert engine.publish_due() == 1
-    ((_, newest), _) = generation_files.manifests(folder)
-    found = generation_files.read_manifest(newest)
+    ((_, newest), _) = manifests(folder)
+    found = read_manifest(newest)
     assert (found.frames, len(found.worn_keys)) == (10, 1)
     assert any(row in one.read_bytes() for one in folder.iterdir())
     assert engine.purging.now().indexes == 1

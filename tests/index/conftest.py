@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sceneprint.index import Generation, publish
-from sceneprint.index.generation_files import Keys
+from sceneprint.index.part_files import Keys
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]

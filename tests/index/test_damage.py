@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index import Generation, generation_files, newest, scrub
+from sceneprint.index import Generation, newest, part_files, scrub
 from sceneprint.index.faiss_index import map_index
-from sceneprint.index.generation_files import GenerationManifest, manifests, read_manifest
+from sceneprint.index.index_manifest import GenerationManifest, manifests, read_manifest
 from sceneprint.index.sketches import map_sketches
+from sceneprint.sealed_record import _checksum as checksum
+from sceneprint.sealed_record import unseal
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -110,7 +112,7 @@ def test_files_removed_while_they_are_opened_are_not_damaged(
             assert not path.exists() or int(path.name[:10]) > 2
         return read_manifest(path)
 
-    monkeypatch.setattr("sceneprint.index.generation_files.read_manifest", late)
+    monkeypatch.setattr("sceneprint.index.generation.read_manifest", late)
     assert number_of(folder) == 4
     assert caplog.record_tuples == []
 
@@ -156,26 +158,25 @@ def test_a_damaged_file_is_written_again_when_its_content_is(
 @pytest.mark.parametrize(
     "change",
     [
-        {"schema_version": 2},
+        {"schema_version": 3},
+        {"number": 8},
         {"segments": [{"files": [], "recall": RECALL}]},
         {"segments": [{"files": [["../../etc/passwd", 1]], "recall": RECALL}]},
         {"segments": [{"files": [[f"{'0' * 64}.keys", 8]], "recall": RECALL}]},
         {"segments": [{"files": [], "recall": None}]},
         {"segments": 3},
         {"segments": None},
-        {"number": None, "unknown": 1},
+        {"number": None},
+        {"unknown": 1},
     ],
 )
 def test_a_manifest_that_means_something_else_is_refused(
     folder: Path, change: dict[str, object]
 ) -> None:
-    """With the name that its content gives: of a later version, or of somebody's own making."""
-    import hashlib
-
-    path = own_files(folder)["json"]
-    data = json.dumps(json.loads(path.read_bytes()) | change).encode()
-    other = path.with_name(f"0000000009-{hashlib.sha256(data).hexdigest()[:32]}.json")
-    other.write_bytes(data)
+    """With a checksum that holds: of a later version, or of somebody's own making."""
+    values = unseal(own_files(folder)["json"].read_bytes()) | {"number": 9} | change
+    other = folder / "0000000009.json"
+    other.write_bytes(json.dumps(values | {"sha256": checksum(values)}).encode())
     with pytest.raises(DamagedIndex):
         read_manifest(other)
     assert number_of(folder) == 2
@@ -194,7 +195,7 @@ def test_scrubbing_names_what_is_damaged(folder: Path, kind: str) -> None:
 
 
 def test_scrubbing_stops_between_blocks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(generation_files, "BLOCK_BYTES", 100)
+    monkeypatch.setattr(part_files, "BLOCK_BYTES", 100)
     steps = list(scrub(folder))
     sizes = [size for _, size in read_manifest(manifests(folder)[0][1]).files]
     assert len(steps) == sum(-(-size // 100) for size in sizes)

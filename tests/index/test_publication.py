@@ -24,7 +24,7 @@ from sceneprint.index import (
     newest_number,
     publish,
 )
-from sceneprint.index.generation_files import Block
+from sceneprint.index.part_files import Block
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -189,7 +189,7 @@ def test_what_is_open_is_taken_from_there(
     second = published(np.arange(100, 150), signatures[100:], first)
     read: list[str] = []
     monkeypatch.setattr(
-        "sceneprint.index.generation_files.check", lambda _, name, __: read.append(name) or iter(())
+        "sceneprint.index.generation.verify", lambda _, name, __: read.append(name) or iter(())
     )
     found = newest(folder, "model", LENGTH, known=first)
     assert found is not None

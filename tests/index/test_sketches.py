@@ -12,9 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sceneprint.index import Generation, Tail, newest, search, sketches
-from sceneprint.index.generation_files import draw
 from sceneprint.index.segment import Segment
-from sceneprint.index.sketches import LEAST_SELECTED, Sketches, make_sketches, neighbours
+from sceneprint.index.sketches import LEAST_SELECTED, Sketches, draw, make_sketches, neighbours
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]

@@ -19,7 +19,7 @@ from sqlalchemy import Connection, event
 from sceneprint import atomic_files
 from sceneprint.engine import Engine
 from sceneprint.index import Generation, generation, newest, publish
-from sceneprint.index.generation_files import GenerationManifest
+from sceneprint.index.index_manifest import GenerationManifest
 from sceneprint.settings import Settings
 from sceneprint.store import FolderBlobs
 from sceneprint.types import Bytes

@@ -8,12 +8,13 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import stat
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,7 @@ from sceneprint.atomic_files import nearest_folder
 from sceneprint.engine.search.local_index import index_folder, is_index_folder
 from sceneprint.engine.serializers import when
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
-from sceneprint.index.generation_files import (
-    GenerationManifest,
-    bytes_of,
-    manifests,
-    read_manifest,
-)
+from sceneprint.index.index_manifest import GenerationManifest, manifests, read_manifest
 from sceneprint.process import merged, quantile
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database, FolderBlobs, Store, frame_queries, store_counts
@@ -69,7 +65,7 @@ def index_state(connection: Connection, indexes: Path, row: MapRow) -> IndexStat
         found = _read(path)
         if found is not None and row.pruned_revision <= found.revision <= row.revision:
             tail = count_indexed(connection, row.number, found.revision)
-            recall = IndexRecall(**asdict(found.recall))
+            recall = IndexRecall(**found.recall.model_dump())
             return IndexState(map=row.name, generation=found.number, tail=tail, recall=recall)
     tail = count_indexed(connection, row.number, 0)
     return IndexState(map=row.name, generation=None, tail=tail, recall=None)
@@ -110,6 +106,16 @@ SPREAD, ASKED = 64, 16
 _HERE = func.current_database()
 
 
+def _bytes_of(folder: Path) -> int:
+    """Return the bytes of all files below a folder; files that are removed meanwhile count 0."""
+    total = 0
+    for path in folder.rglob("*"):
+        with suppress(OSError):
+            found = path.stat()
+            total += found.st_size if stat.S_ISREG(found.st_mode) else 0
+    return total
+
+
 def sizes(settings: Settings, store: Store) -> Sizes:
     """Bytes of all parts of a store."""
     free, disk = _free_of(settings.data_dir)
@@ -117,7 +123,7 @@ def sizes(settings: Settings, store: Store) -> Sizes:
     return Sizes(
         database=_of_database(store.database),
         blobs=_of_blobs(blobs) if isinstance(blobs, Path) else _of_objects(store),
-        index=bytes_of(settings.indexes),
+        index=_bytes_of(settings.indexes),
         free=free,
         disk=disk,
     )
@@ -134,7 +140,7 @@ def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRo
     return Sizes(
         database=signed * total // share,
         blobs=(uploads + artifacts) * total // share,
-        index=bytes_of(index_folder(indexes, row)),
+        index=_bytes_of(index_folder(indexes, row)),
         free=None,
         disk=None,
     )

@@ -35,7 +35,7 @@ from sceneprint.geometry.retrieval.ranking import (
 )
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.map_verification import MapParameters
-from sceneprint.index.generation_files import Keys
+from sceneprint.index.part_files import Keys
 from sceneprint.models import Model
 from sceneprint.pipeline import PairMatch, associate
 from sceneprint.store import Store

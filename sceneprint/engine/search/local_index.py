@@ -36,7 +36,8 @@ from sceneprint.index import (
     search,
     signatures_of,
 )
-from sceneprint.index.generation_files import SCHEMA_VERSION, GenerationManifest, Keys
+from sceneprint.index.index_manifest import SCHEMA_VERSION, GenerationManifest
+from sceneprint.index.part_files import Keys
 from sceneprint.models import Model
 from sceneprint.store.events import holds_anchor
 from sceneprint.store.signatures import SignatureChange, changes_since, count_indexed

@@ -11,7 +11,6 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +19,15 @@ from sqlalchemy import Connection, select
 from sceneprint import errors
 from sceneprint.decoders import Decoders
 from sceneprint.engine.ingest.frame_decoder import read_upload
-from sceneprint.engine.search.local_index import IndexView, Reader, index_folder
-from sceneprint.engine.search.shared_index import IN_USE_S, SharedIndexes
+from sceneprint.engine.search.index_place import IN_USE_S, IndexPlace
+from sceneprint.engine.search.local_index import IndexView, Reader
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.retrieval.ranking import Ranking, ranking_size, similarity
 from sceneprint.index import SearchHits
-from sceneprint.index.generation_files import Keys
+from sceneprint.index.part_files import Keys
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, prepare, sign
 from sceneprint.store import Store
@@ -54,15 +53,11 @@ class Readers:
 
     Parameters
     ----------
-    indexes : folder of all indexes
-    shared : indexes of the fleet, of which maps that are asked are fetched
+    place : where the indexes are
     """
 
-    def __init__(
-        self, signers: Signers, indexes: Path, shared: SharedIndexes | None = None
-    ) -> None:
-        self._shared = shared
-        self._signers, self._indexes = signers, indexes
+    def __init__(self, signers: Signers, place: IndexPlace) -> None:
+        self._signers, self._place = signers, place
         self._database, self._history = signers.database, signers.database.history
         self._lock = threading.Lock()
         self._open: OrderedDict[str, tuple[tuple[int, str], Reader]] = OrderedDict()
@@ -84,7 +79,7 @@ class Readers:
             wanted = (row.number, row.model_id)
             if reader is None or held != wanted:  # made anew, or signed with another model
                 model = self._signers(row.model_id).model
-                reader = Reader(connection, row, index_folder(self._indexes, row), model)
+                reader = Reader(connection, row, self._place.folder(row), model)
                 self._open[row.name] = (wanted, reader)
             self._open.move_to_end(row.name)
             # the one that was asked longest ago first, and never the one that is asked now
@@ -92,8 +87,8 @@ class Readers:
             while len(self._open) > 1 and held_bytes > HELD_BYTES:
                 _, (_, oldest) = self._open.popitem(last=False)
                 held_bytes -= oldest.bytes_held
-        if self._shared is not None and self._signers(row.model_id).model.metric == "l2":
-            self._shared.want(row, reader.generation)
+        if self._place.is_shared and self._signers(row.model_id).model.metric == "l2":
+            self._place.want(row, reader.generation)
         return reader
 
     def forget(self, name: str) -> None:
@@ -123,7 +118,7 @@ class Readers:
             self._tidied = time.monotonic()
             for name in [name for name, (held, _) in self._open.items() if there.get(name) != held]:
                 del self._open[name]
-            for name, (_, reader) in list(self._open.items()) if self._shared is not None else ():
+            for name, (_, reader) in list(self._open.items()) if self._place.is_shared else ():
                 if reader.lost_index(IN_USE_S):  # to make room; its files take it while mapped
                     del self._open[name]
 

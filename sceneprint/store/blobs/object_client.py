@@ -89,6 +89,8 @@ class RangeFile(io.RawIOBase):
 PART, AT_ONCE = 8 << 20, 3
 #: Most parts that a store takes of one object.
 MOST_PARTS = 9_000
+#: Most keys that one request removes.
+MOST_KEYS = 500
 #: Seconds for which nobody tries again a store that was just found away.
 AWAY_S = 1.0
 _REFUSED = ("PermissionDeniedError", "UnauthenticatedError")
@@ -300,20 +302,22 @@ class Objects:
         """
         import obstore
 
-        if not keys:
-            return
         until = time.monotonic() + seconds
-        with self._explained(f"{keys[0]} cannot be removed"):
-            try:
-                obstore.delete(self._once if once else self._small, keys)
-            except FileNotFoundError as error:
-                if _NO_BUCKET.search(str(error)):
-                    raise
-                if len(keys) > 1:  # it stopped at the first that was gone
-                    for key in keys:
-                        if time.monotonic() > until:
-                            raise self._fault(key, "too slow", StoreAway) from None
-                        self.delete(key, once=once)
+        for start in range(0, len(keys), MOST_KEYS):
+            some = keys[start : start + MOST_KEYS]
+            with self._explained(f"{some[0]} cannot be removed"):
+                if start and time.monotonic() > until:
+                    raise self._fault(some[0], "too slow", StoreAway)
+                try:
+                    obstore.delete(self._once if once else self._small, some)
+                except FileNotFoundError as error:
+                    if _NO_BUCKET.search(str(error)):
+                        raise
+                    if len(some) > 1:  # it stopped at the first that was gone
+                        for key in some:
+                            if time.monotonic() > until:
+                                raise self._fault(key, "too slow", StoreAway) from None
+                            self.delete(key, once=once)
 
     def _make_durable(self, key: str) -> None:
         """Of a folder: the library does not sync what it writes."""

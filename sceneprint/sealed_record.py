@@ -1,0 +1,37 @@
+"""Records that are written as JSON with a checksum of their own: manifests.
+
+record  --seal-->  bytes  --unseal-->  values of JSON, which the record's class validates
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+
+class StrictRecord(BaseModel):
+    """An immutable record that takes no other fields and converts no values."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+def seal(record: StrictRecord) -> bytes:
+    """Return a record as JSON with its checksum; equal records give equal bytes."""
+    values = json.loads(record.model_dump_json())
+    return json.dumps(values | {"sha256": _checksum(values)}, indent=1).encode()
+
+
+def unseal(data: bytes) -> dict[str, Any]:
+    """Return the values of a record that was sealed; ValueError where they are changed or none."""
+    values = json.loads(data)
+    if not isinstance(values, dict) or values.pop("sha256", None) != _checksum(values):
+        raise ValueError("its checksum does not fit")
+    return values
+
+
+def _checksum(values: dict[str, Any]) -> str:
+    text = json.dumps(values, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
