@@ -39,20 +39,22 @@ LOOK_S = 1.0
 
 
 class Health(BaseModel):
-    """The service lives."""
+    """The service is running."""
 
     status: str
     version: str
 
 
 class Readiness(Health):
-    """The service can work; `read_only`: it answers, and takes nothing."""
+    """The service is ready; `read_only`: it answers queries, and accepts no changes."""
 
     read_only: bool
     frames: dict[str, int] | None = Field(
-        description="How many are in each state; null for who may not read all maps."
+        description="Number of frames in each state; null if you may not read all maps."
     )
-    jobs: dict[str, int] | None = Field(description="As `frames`.")
+    jobs: dict[str, int] | None = Field(
+        description="Number of jobs in each state; null like `frames`."
+    )
 
 
 @router.head("/healthz", include_in_schema=False)  # as balancers ask

@@ -17,84 +17,86 @@ EVERY = "*"
 
 
 class NewKey(Given):
-    """A key to make."""
+    """A key to create."""
 
     name: Label = Field(
-        description="Who it is for; unique, and told in the audit log.", examples=["robot-7"]
+        description="Name of its user; unique, and shown in the audit log.", examples=["robot-7"]
     )
     grants: Annotated[
         dict[Annotated[str, StringConstraints(pattern=MAP_OR_EVERY)], Scope],
         Field(min_length=1, max_length=1000),
     ] = Field(
-        description="What it may do, by the name of a map, which need not be there yet; `*` stands "
-        "for all maps and for what is of none. `write` may what `read` may, `admin` all.",
+        description="Scope by the name of a map, which need not exist yet; `*` stands for all "
+        "maps, and for operations on no map. `write` includes `read`, and `admin` everything.",
         examples=[{"warehouse-2": "write"}],
     )
     expires_at: AwareDatetime | None = Field(
-        default=None, description="When it opens nothing any more; null: never."
+        default=None, description="Time from which it is invalid; null: never."
     )
     tenant: Label | None = Field(
         default=None,
-        description="Whom it belongs to, which must be there; null: a tenant of the key's name.",
+        description="Tenant that owns it, which must exist; null: a tenant of the key's name.",
     )
 
 
 class Key(ApiRecord):
-    """A key, without its secret, which is kept nowhere."""
+    """An API key without its secret, which the service does not store."""
 
     name: str
-    grants: dict[str, Scope] = Field(description="What it may do, by map; `*` for all.")
+    grants: dict[str, Scope] = Field(description="Scope for each map; `*` for all maps.")
     created_at: datetime
-    expires_at: datetime | None = Field(description="Null: it does not expire.")
-    tenant: str = Field(description="Whom it belongs to: what its keys ask is counted together.")
+    expires_at: datetime | None = Field(description="Null if it does not expire.")
+    tenant: str = Field(
+        description="Tenant that owns it. Limits apply to all keys of a tenant together."
+    )
     previous_until: datetime | None = Field(
         default=None,
-        description="Until when the secret before the last rotation still works; null: none does.",
+        description="Time until which the secret before the last rotation works; null if none "
+        "does.",
     )
     last_used_at: datetime | None = Field(
-        default=None, description="To about an hour; null: it was never used."
+        default=None,
+        description="Time of the last use, accurate to about an hour; null if never used.",
     )
 
 
 class MadeKey(Key):
-    """A key that was just made, or given a new secret."""
+    """A new key, or a key with a new secret."""
 
     secret: str = Field(
-        description="Send it as `Authorization: Bearer SECRET`. It is shown this once: only its "
-        "hash is kept."
+        description="Send it as `Authorization: Bearer SECRET`. It is shown only once: the "
+        "service stores its hash alone."
     )
 
 
 class Me(ApiRecord):
-    """Who asks, as the service sees it."""
+    """The caller as the service sees it."""
 
-    name: str | None = Field(description="Of the key that was shown; null where none is asked for.")
-    grants: dict[str, Scope] = Field(description="What it may do, by map; `*` for all.")
-    expires_at: datetime | None = Field(default=None, description="Null: it does not expire.")
+    name: str | None = Field(description="Name of the key; null if the service requires none.")
+    grants: dict[str, Scope] = Field(description="Scope for each map; `*` for all maps.")
+    expires_at: datetime | None = Field(default=None, description="Null if it does not expire.")
 
 
 class AuditLine(ApiRecord):
-    """A change and who made it, or a request that was refused."""
+    """A change and its author, or a refused request."""
 
-    number: int = Field(description="Grows with each line, and may leave gaps.")
+    number: int = Field(description="Increases with each line; there may be gaps.")
     at: datetime
     actor: str | None = Field(
-        description="Name of the key; null where the service requires none; `command` for a "
+        description="Name of the key; null if the service requires none; `command` for a "
         "command on the data folder."
     )
-    address: str | None = Field(
-        description="Where the request came from; behind a proxy, the proxy's."
-    )
-    tenant: str = Field(description="Of the key; empty where there is none.")
+    address: str | None = Field(description="Address of the caller, or of its proxy.")
+    tenant: str = Field(description="Tenant of the key; empty without a key.")
     action: str = Field(
-        description="The kind of the change's event, such as `map.deleted`, or an action without "
-        "an event, such as `job.cancelled`; `refused` for a request that was refused (401 or 403) "
-        "and changed nothing."
+        description="Kind of the change's event, such as `map.deleted`, or an action without an "
+        "event, such as `job.cancelled`; `refused` for a refused request (401 or 403), which "
+        "changed nothing."
     )
     map: str | None = Field(description="Name of the map that was changed.")
-    target: str | None = Field(description="What was changed: the id or name.")
-    request_id: str | None = Field(description="As in the log.")
-    data: dict[str, Any] = Field(description="More, by action.")
+    target: str | None = Field(description="Id or name of the object that was changed.")
+    request_id: str | None = Field(description="Id of the request, as in the log.")
+    data: dict[str, Any] = Field(description="Further data of the action.")
 
 
 # How a service does, and what it signs with, as JSON.
@@ -104,46 +106,43 @@ class Sizes(ApiRecord):
     """Disk space, bytes."""
 
     database: int | None = Field(
-        description="With its log; null where it is no file. Of one map: its signatures."
+        description="Size of the database with its log; null if it is not a file. For one map: "
+        "of its signatures."
     )
     blobs: int = Field(
-        description="Uploads and what was made of them. Of many files some are measured, and the "
-        "rest is taken to be like them. Of one map: of its frames, without archives and meshes."
+        description="Size of uploads and derived files; of many files it is estimated from a "
+        "sample. For one map: of its frames, without archives and meshes."
     )
-    index: int = Field(description="Search indexes of this machine; a cache.")
-    free: int | None = Field(
-        description="Left on the disk of the data folder; null where a map was asked for."
-    )
+    index: int = Field(description="Size of this machine's search indexes, which are a cache.")
+    free: int | None = Field(description="Free space on the data folder's disk; null for one map.")
     disk: int | None = Field(
         default=None,
-        description="Size of the disk of the data folder, whoever uses it; null as `free`.",
+        description="Size of the data folder's disk; null like `free`.",
     )
 
 
 class IndexRecall(ApiRecord):
-    """What a query without `exact` finds by an index, measured when the index was published."""
+    """Recall of queries without `exact` that use an index, measured at its publication."""
 
     share: float = Field(
-        description="Share of the `near` nearest frames that such a query finds. 1 where it "
+        description="Share of the `near` nearest frames that such a query finds; 1 if it "
         "compares every frame."
     )
-    near: int = Field(description="How many of the nearest frames were looked for.")
+    near: int = Field(description="Number of nearest frames that each lookup had to find.")
     sample: int = Field(
-        description="Frames of the map that were looked up to measure it, each without itself; 0 "
-        "where a query compares every frame, so that there is nothing to measure."
+        description="Number of the map's frames that were looked up, each excluded from its own "
+        "search; 0 if a query compares every frame."
     )
     probes: int = Field(
-        description="Frames that a query compares at least, of a large map: those whose sketches "
-        "(a bit for each byte of a signature) are nearest to its own. 0 where it compares every "
-        "frame."
+        description="Minimum number of frames that a query compares in a large map: those whose "
+        "sketches (a bit for each byte of a signature) are nearest to its own. 0 if it compares "
+        "every frame."
     )
-    frames: int = Field(
-        description="Frames of the index that were there to be found when this was measured."
-    )
+    frames: int = Field(description="Number of frames in the index when it was measured.")
 
 
 class IndexState(ApiRecord):
-    """How far the search index of a map is behind the map; queries read the rest themselves."""
+    """State of a map's search index; queries compare newer frames themselves."""
 
     map: str
     generation: int | None = Field(
@@ -156,19 +155,19 @@ class IndexState(ApiRecord):
     )
     recall: IndexRecall | None = Field(
         default=None,
-        description="Null where the map has no index: a query compares every frame.",
+        description="Null without an index: a query compares every frame.",
     )
 
 
 class WorkerSeen(ApiRecord):
-    """A process that signs frames, or does other jobs, at this moment."""
+    """A worker process that is running."""
 
-    name: str = Field(description="Its host and process id.")
-    job_id: str | None = Field(description="What it is at.")
+    name: str = Field(description="Host and process id.")
+    job_id: str | None = Field(description="Id of its current job.")
 
 
 class Latency(ApiRecord):
-    """Times within which so many of the answers came, seconds; right to a tenth."""
+    """Percentiles of the time to answer, seconds, accurate to a tenth."""
 
     p50: float
     p95: float
@@ -176,124 +175,131 @@ class Latency(ApiRecord):
 
 
 class Counted(ApiRecord):
-    """What happened in some time."""
+    """Counts over a period."""
 
-    received: int = Field(description="Frames stored, or queued once more.")
+    received: int = Field(description="Number of frames that were stored or queued again.")
     indexed: int
-    rejected: int = Field(description="In which nothing can be signed.")
+    rejected: int = Field(description="Number of frames in which nothing can be signed.")
     redundant: int
     failed: int
     deleted: int
     queries: dict[str, int] | None = Field(
-        description="Queries by the status of their answer. Of the whole service alone: null where "
-        "a map was asked for, as are the following."
+        description="Number of queries by the status of the answer, of the whole service. Null "
+        "for a single map, like the following."
     )
-    latency: Latency | None = Field(description="Of queries that were answered; null: none were.")
-    requests: int | None = Field(description="Requests under /v1, answered or refused.")
-    refused: int | None = Field(description="Of these, with 4xx.")
-    busy: int | None = Field(description="Of these, with 503: come back later.")
-    broken: int | None = Field(description="Of these, with any other 5xx.")
+    latency: Latency | None = Field(
+        description="Latency of answered queries; null if there were none."
+    )
+    requests: int | None = Field(description="Number of requests under /v1, answered or refused.")
+    refused: int | None = Field(description="Number of these with 4xx.")
+    busy: int | None = Field(
+        description="Number of these with 503, which ask the caller to retry later."
+    )
+    broken: int | None = Field(description="Number of these with any other 5xx.")
 
 
 class Minute(Counted):
-    """What happened in one minute; requests count for the minute in which they were written
-    down, up to ten seconds later.
+    """Counts over one minute. Requests count for the minute in which they were recorded, up to
+    ten seconds later.
     """
 
-    at: datetime = Field(description="When it began.")
+    at: datetime = Field(description="Start of the minute.")
 
 
 class MapUse(ApiRecord):
-    """What a map has of what it may have; see Map."""
+    """A map's use of its quota and retention; see Map."""
 
-    frames: int = Field(description="That count for the quota.")
-    bytes: int = Field(description="Of their uploads, as they were sent.")
-    quota_frames: int | None = Field(description="Null: no quota.")
-    quota_bytes: int | None = Field(description="Null: no quota.")
-    retention_days: float | None = Field(description="Null: frames are kept.")
+    frames: int = Field(description="Number of frames that count towards the quota.")
+    bytes: int = Field(description="Size of their uploads as they were sent.")
+    quota_frames: int | None = Field(description="Null without a quota.")
+    quota_bytes: int | None = Field(description="Null without a quota.")
+    retention_days: float | None = Field(description="Null if frames are kept.")
 
 
 class ScrubSeen(ApiRecord):
-    """How far stored bytes were read to see that they are sound."""
+    """The progress of verifying stored data."""
 
-    began_at: datetime = Field(description="Of the pass that is under way, or else the last one.")
+    began_at: datetime = Field(description="Start of the current pass, or of the last one.")
     finished_at: datetime | None = Field(
-        description="When the last whole pass ended; null: there was none."
+        description="End of the last complete pass; null if there was none."
     )
-    blobs: int = Field(description="Uploads and artifacts that this pass has read.")
-    bytes: int = Field(description="Of these.")
+    blobs: int = Field(description="Number of uploads and artifacts that this pass has read.")
+    bytes: int = Field(description="Size of these.")
     damaged: int = Field(
-        description="Rows, signatures, uploads and artifacts that it found lost or damaged. Events "
-        "`frame.damaged` name the frames of lost bytes, and `sceneprint fsck` all of them."
+        description="Number of rows, signatures, uploads and artifacts that it found lost or "
+        "damaged. Events `frame.damaged` name the frames of lost data, and `sceneprint fsck` "
+        "lists everything."
     )
 
 
 class Stats(ApiRecord):
-    """How the service, or one map, does now and did lately."""
+    """State and recent activity of the service, or of one map."""
 
     at: datetime
     counted_at: datetime | None = Field(
         default=None,
-        description="When frames, ended jobs, indexes and bytes were counted. From 100,000 frames "
-        "and jobs on they are counted for 1 % of the time.",
+        description="Time at which frames, ended jobs, indexes and bytes were counted. From "
+        "100,000 frames and jobs on, counting takes 1 % of the time at most.",
     )
-    map: str | None = Field(description="Of which alone this tells; null: of all.")
+    map: str | None = Field(description="Name of the map; null for all maps.")
     maps: int
-    frames: dict[str, int] = Field(description="How many frames are in each state.")
-    jobs: dict[str, int] = Field(description="How many jobs are in each state.")
-    waiting: int = Field(description="Jobs that wait for a worker.")
+    frames: dict[str, int] = Field(description="Number of frames in each state.")
+    jobs: dict[str, int] = Field(description="Number of jobs in each state.")
+    waiting: int = Field(description="Number of jobs that wait for a worker.")
     oldest_waiting_s: float | None = Field(
-        description="Seconds since the job was queued that waits for longest; null: none waits."
+        description="Age of the job that has waited longest, seconds; null if none waits."
     )
     indexes: list[IndexState] = Field(
-        description="Of the maps that changed most; 200 at most, those with the longest tail first."
+        description="Indexes of the recently changed maps, those with the longest tail first; "
+        "at most 200."
     )
     workers: list[WorkerSeen] | None = Field(
-        description="On every host of a PostgreSQL database; of SQLite on this machine. Null where "
-        "a map was asked for."
+        description="Workers on every host of a PostgreSQL database, or on this machine with "
+        "SQLite. Null for one map."
     )
-    bytes: Sizes = Field(description="On the disk; measured at most twice a minute.")
+    bytes: Sizes = Field(description="Disk space; measured at most twice a minute.")
     use: MapUse | None = Field(
-        default=None, description="Against quota and retention; null where no map was asked for."
+        default=None, description="Use of quota and retention; null for all maps."
     )
     scrub: ScrubSeen | None = Field(
-        default=None, description="Null where none has begun, or a map was asked for."
+        default=None, description="Null if none has started, and for one map."
     )
-    total: Counted = Field(description="All minutes together.")
-    minutes: list[Minute] = Field(description="The oldest first; the last is not over yet.")
+    total: Counted = Field(description="Sum of all minutes.")
+    minutes: list[Minute] = Field(
+        description="The last minutes, the oldest first; the last is not complete."
+    )
 
 
 class ModelInfo(ApiRecord):
-    """A model: all that decides what signatures look like."""
+    """A model: everything that determines signatures."""
 
     model_id: str
-    label: str = Field(description="Name and first digits of the id, as maps and answers tell it.")
+    label: str = Field(description="Name and first digits of the id, as in maps and answers.")
     name: str
-    preset: bool = Field(description="Whether it ships with this version.")
-    components: int = Field(description="G, of the mixture.")
-    levels: int = Field(description="Of the hierarchy of patches, that signatures are made of.")
+    preset: bool = Field(description="Whether it is part of this version.")
+    components: int = Field(description="G, the number of components of the mixture.")
+    levels: int = Field(description="Number of levels of the hierarchy of patches.")
     signature_bytes: int = Field(
-        description="Of a stored signature: its length d, or 25 G H where psi itself is stored."
+        description="Length of a stored signature, bytes: d, or 25 G H if psi itself is stored."
     )
     metric: Literal["l1", "l2"] = Field(
-        description="Of distances: `l2`, squared, or `l1` where psi itself is stored."
+        description="Metric of distances: `l2`, squared, or `l1` if psi itself is stored."
     )
     unrelated_distance: float = Field(
-        description="d0, median distance of unrelated frames: similarity = 1 - distance / d0."
+        description="d0, the median distance of unrelated frames: similarity = 1 - distance / d0."
     )
-    parameters: dict[str, Any] = Field(description="The numbers of every stage.")
-    provenance: dict[str, Any] = Field(description="What it was trained on and with.")
+    parameters: dict[str, Any] = Field(description="Parameters of every stage.")
+    provenance: dict[str, Any] = Field(description="Training data and method.")
     maps: list[str] = Field(
-        description="Those that you may read and that are signed with it, or are about to be."
+        description="Maps that you may read and that use it, or are switching to it."
     )
 
 
 class NewModel(Given):
-    """Which model a map is to be signed with from now on."""
+    """The model to which a map is to switch."""
 
     model: Label = Field(
-        description="`depth`, `lidar`, `paper`, or the id or label of a model that GET "
-        "/v1/models lists.",
+        description="`depth`, `lidar`, `paper`, or the id or label of a model in GET /v1/models.",
         examples=["depth"],
     )
 
@@ -313,18 +319,23 @@ ImportPhase = Literal["read", "choose", "render", "sign", "test"]
 
 
 class Progress(ApiRecord):
-    """How far a long job has come."""
+    """The progress of a long job."""
 
-    done: int = Field(description="Steps that are over: frames, members of an archive.")
-    total: int | None = Field(default=None, description="Of so many, where that is known.")
+    done: int = Field(description="Number of completed steps: frames, or members of an archive.")
+    total: int | None = Field(default=None, description="Number of all steps, if known.")
     phase: ImportPhase | None = Field(
-        default=None, description="What the import of a map does; null of other jobs, as below."
+        default=None,
+        description="Phase of a map's import; null for other jobs, like the following.",
     )
-    points: int | None = Field(default=None, description="Points that were read.")
-    views: int | None = Field(default=None, description="Viewpoints that were chosen.")
-    rendered: int | None = Field(default=None, description="Views that were rendered and added.")
-    signed: int | None = Field(default=None, description="Views that were signed.")
-    tested: int | None = Field(default=None, description="Other views that were looked up.")
+    points: int | None = Field(default=None, description="Number of points that were read.")
+    views: int | None = Field(default=None, description="Number of selected viewpoints.")
+    rendered: int | None = Field(
+        default=None, description="Number of views that were rendered and added."
+    )
+    signed: int | None = Field(default=None, description="Number of views that were signed.")
+    tested: int | None = Field(
+        default=None, description="Number of test views that were looked up."
+    )
 
 
 class Product(ApiRecord):
@@ -335,45 +346,46 @@ class Product(ApiRecord):
     collection: ClassVar[str]
     request_type: ClassVar[type[Given]]
 
-    job_id: str = Field(description="Also the id of its job: GET /v1/jobs/{job_id}.")
-    map: str | None = Field(description="Null where frames of several maps may be in it.")
+    job_id: str = Field(description="Id of its job as well: GET /v1/jobs/{job_id}.")
+    map: str | None = Field(description="Null if it may have frames of several maps.")
     state: JobState
-    progress: Progress | None = Field(description="Null until it has begun.")
+    progress: Progress | None = Field(description="Null before the job starts.")
     error: str | None
     created_at: datetime
     finished_at: datetime | None
 
 
 class Job(ApiRecord):
-    """A piece of work in the queue."""
+    """A job of the queue."""
 
     job_id: str
     kind: str = Field(
         description="`sign`, `import`, `import-map`, `associate`, `coverage`, `difference`, "
-        "`surface`, `reconstruct`, or `reencode`: that one signs an indexed frame once more, with "
-        "the model to come or as what was made of it is damaged."
+        "`surface`, `reconstruct`, or `reencode`, which signs an indexed frame again, with the "
+        "map's next model or because its signature is damaged."
     )
     state: JobState
-    map: str | None = Field(description="The map that it works on.")
-    frame_id: str | None = Field(description="That it signs; null where it is of no single one.")
-    priority: int = Field(description="Jobs of a greater one are done first.")
+    map: str | None = Field(description="Map that it works on.")
+    frame_id: str | None = Field(description="Frame that it signs; null for other jobs.")
+    priority: int = Field(description="Jobs of higher priority run first.")
     attempts: int
     created_at: datetime
-    started_at: datetime | None = Field(default=None, description="Of the latest try.")
+    started_at: datetime | None = Field(default=None, description="Start of the latest attempt.")
     finished_at: datetime | None
     error: str | None
     traceback: str | None
     progress: Progress | None = Field(
-        default=None, description="Of a long job, which is done in parts; null until it has begun."
+        default=None,
+        description="Progress of a long job, which runs in slices; null before it starts.",
     )
     result: dict[str, Any] | None = Field(
         default=None,
-        description="What a long job came to, in short, when it has succeeded.",
+        description="Summary of a long job's result, when it has succeeded.",
     )
     followed_by: str | None = Field(
         default=None,
-        description="The latest job of the same frame that does the same; null: it is this one. "
-        "What was tried again is followed by the try.",
+        description="Latest job that does the same for the same frame, such as a retry; null "
+        "for the latest itself.",
     )
 
 
@@ -385,11 +397,13 @@ class RefusedRetry(ApiRecord):
 
 
 class RetriedJobs(ApiRecord):
-    """What came of a page of dead jobs that were to be tried again."""
+    """The result of retrying a page of dead jobs."""
 
-    retried: list[Job] = Field(description="The new ones.")
+    retried: list[Job] = Field(description="The new jobs.")
     refused: list[RefusedRetry]
-    next_cursor: str | None = Field(description="Of the next page; null: there is none.")
+    next_cursor: str | None = Field(
+        description="Send it as `cursor` for the next page; null at the end."
+    )
 
 
 # Events as JSON: what happened, in the order in which it happened.
@@ -436,28 +450,28 @@ MISSED = "events.missed"
 
 
 class Event(ApiRecord):
-    """Something that happened."""
+    """An event."""
 
     id: str = Field(
-        description="Of no meaning but to be given back: as `Last-Event-ID` to a stream, as "
-        "`after` to a request. Ids have no order; events are told in theirs."
+        description="Opaque id: send it as `Last-Event-ID` to a stream, or as `after` to a "
+        "request. Ids have no order; events are returned in theirs."
     )
     at: datetime
     kind: str = Field(
-        description="Such as frame.indexed; docs/operations.md lists all. A client may meet "
-        "kinds that it does not know yet. `events.missed` stands where events that were asked for "
-        "are no longer kept: look at the maps themselves, then go on."
+        description="Kind, such as frame.indexed; docs/operations.md lists all. Clients must "
+        "accept unknown kinds. `events.missed` replaces requested events that are no longer "
+        "kept: read the maps themselves, then continue."
     )
-    map: str | None = Field(description="Name of the map that it is about.")
+    map: str | None = Field(description="Name of the map.")
     frame_id: str | None
     job_id: str | None
-    data: dict[str, Any] = Field(description="More, by kind.")
+    data: dict[str, Any] = Field(description="Further data of the kind.")
 
 
 class EventPage(Page[Event]):
-    """A part of the events that are kept."""
+    """A page of the kept events."""
 
     newest: str = Field(
-        description="Id of the newest event of your maps, of whatever kind, when this was asked; "
-        "0 where there was none yet: what follows it is told by a stream with this as `after`."
+        description="Id of the newest event of your maps, of any kind, at the time of the "
+        "request; 0 if there is none. A stream with this id as `after` continues from here."
     )

@@ -107,20 +107,20 @@ class Page(ApiRecord, Generic[T]):
 
     items: list[T]
     next_cursor: str | None = Field(
-        default=None, description="Give it as `cursor` for the next part; null at the end."
+        default=None, description="Send it as `cursor` for the next page; null at the end."
     )
 
 
 class Problem(ApiRecord):
-    """Why a request was refused (RFC 9457)."""
+    """The reason why a request was refused (RFC 9457)."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
 
-    type: str = Field(description="Names the kind of problem; the same for the same kind.")
+    type: str = Field(description="URI of the kind of problem.")
     title: str = Field(description="The kind of problem in words.")
     status: int
     detail: str = Field(description="What happened, why, and what to do.")
-    instance: str = Field(default="", description="The request's id, as in the service's log.")
+    instance: str = Field(default="", description="Id of the request, as in the service's log.")
 
 
 # Rigid transforms as JSON.
@@ -218,7 +218,7 @@ Up = Annotated[
 
 
 class FrameState(StrEnum):
-    """What has become of an uploaded frame; `sentence` says it for people."""
+    """State of an uploaded frame; `sentence` describes it for people."""
 
     RECEIVED = "received"
     SIGNING = "signing"
@@ -235,7 +235,7 @@ class FrameState(StrEnum):
 
 
 class JobState(StrEnum):
-    """What has become of a piece of work; `sentence` says it for people."""
+    """State of a job; `sentence` describes it for people."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -429,7 +429,9 @@ class CameraIntrinsics(Given):
     cx: float
     cy: float
     distortion: list[float] = Field(
-        default=[], max_length=5, description="k1, k2, p1, p2[, k3] of OpenCV; none by default."
+        default=[],
+        max_length=5,
+        description="k1, k2, p1, p2[, k3] of OpenCV; no distortion by default.",
     )
 
 
@@ -455,10 +457,10 @@ class GivenTransform(Given):
     """A rigid transform, as `translation` and `rotation` or as `matrix`."""
 
     translation: GivenVector | None = Field(
-        default=None, description="`position`, as ROS calls it, is taken too."
+        default=None, description="ROS's name `position` is accepted as well."
     )
     rotation: GivenQuaternion | None = Field(
-        default=None, description="`orientation`, as ROS calls it, is taken too."
+        default=None, description="ROS's name `orientation` is accepted as well."
     )
     matrix: Annotated[list[Row4], Field(min_length=4, max_length=4)] | None = None
 
@@ -483,84 +485,82 @@ class GivenPose(GivenTransform):
 
     parent_frame: Label | None = Field(
         default=None,
-        description="Poses are combined within one parent frame; default: ROBOT/SESSION.",
+        description="Poses are only combined within one parent frame; default: ROBOT/SESSION.",
     )
     of: Literal["sensor", "base"] = Field(
         default="sensor",
-        description="`base`, of an upload with `T_base_sensor`: the pose is T_parent_base, and is "
-        "stored as that of the sensor.",
+        description="`base`, for an upload with `T_base_sensor`: the pose is T_parent_base, and "
+        "is stored as that of the sensor.",
     )
 
 
 class GivenBase(GivenTransform):
-    """T_base_sensor: where the sensor sits on the robot; x_base = T_base_sensor @ x_sensor."""
+    """T_base_sensor: the pose of the sensor on the robot; x_base = T_base_sensor @ x_sensor."""
 
-    base_frame: Label = Field(
-        default="base_link", description="What the robot calls the frame of its base."
-    )
+    base_frame: Label = Field(default="base_link", description="Name of the robot's base frame.")
 
 
 class FrameMeta(Given):
-    """What is known of a frame beside its samples."""
+    """Metadata of a frame."""
 
     intrinsics: CameraIntrinsics | None = Field(
-        default=None, description="Of a depth image, which needs them; a point cloud has none."
+        default=None,
+        description="Camera of a depth image, which requires it; a point cloud has none.",
     )
     depth_scale: float = Field(
         default=1000.0,
         gt=0,
-        description="Stored units per metre; floating NPY files are metres whatever it is.",
+        description="Stored units per metre; ignored for floating NPY files, which are in metres.",
     )
     depth_along_ray: bool = Field(
-        default=False, description="Samples are ranges along the pixel's ray."
+        default=False, description="Whether samples are ranges along the pixel's ray."
     )
     trust_depth: bool = Field(
         default=False,
-        description="Take a depth image that does not look like one, such as with more noise than "
-        "any known sensor has.",
+        description="Whether to accept a depth image that does not look like one, such as with "
+        "more noise than any known sensor has.",
     )
     viewpoint: GivenVector | Literal["file"] | None = Field(
         default="file",
-        description="Of a point cloud: where it was seen from, along its own axes, metres; null "
-        "where there is no such place, as of a cloud that is fused of many views. `file`: as the "
-        "file says (a PCD's VIEWPOINT), else the origin of its coordinates.",
+        description="Viewpoint of a point cloud in its own axes, metres; null without one, as "
+        "for clouds fused from many views. `file`: the viewpoint in the file (a PCD's "
+        "VIEWPOINT), else the origin of its coordinates.",
     )
     units_per_metre: float = Field(
-        default=1.0, gt=0, description="Of a point cloud: 1000 where it is in millimetres."
+        default=1.0, gt=0, description="Units of a point cloud: 1000 for millimetres."
     )
     format: CloudFormat | None = Field(
         default=None,
-        description="Of a point cloud: how it is packed. KITTI's files alone do not say so "
-        "themselves; `kitti` has to be given.",
+        description="Format of a point cloud. KITTI's files cannot be recognised: set `kitti`.",
     )
-    robot: Label | None = Field(default=None, description="Who took the frame.")
-    session: Label | None = Field(default=None, description="In which run.")
+    robot: Label | None = Field(default=None, description="Robot that took the frame.")
+    session: Label | None = Field(default=None, description="Name of the run.")
     captured_at: AwareDatetime | None = Field(
         default=None,
-        description="When, with its time zone.",
+        description="Time of capture, with its time zone.",
     )
     name: FileName | None = Field(
         default=None,
-        description="Of the original file or message, such as `frame-000123.depth.png`: to find "
-        "the frame again by. A label: nothing opens it as a path.",
+        description="Name of the original file or message, such as `frame-000123.depth.png`, by "
+        "which you find the frame again. It is a label, and never used as a path.",
     )
     sequence: Place | None = Field(
         default=None,
-        description="Place within the session, such as the number of the file or message: orders "
-        "the frames that have no `captured_at`, whatever the order of upload.",
+        description="Position in the session, such as the number of the file or message. It "
+        "orders frames without `captured_at`, whatever the order of upload.",
     )
     pose: GivenPose | None = None
     T_base_sensor: GivenBase | None = Field(
         default=None,
-        description="Where the sensor sits on the robot: answers then also say where its base is. "
-        "A cloud with a `viewpoint` that is not its origin has the base frame `cloud` without it: "
-        "the coordinates as they were sent.",
+        description="Pose of the sensor on the robot; answers then state the pose of its base "
+        "as well. A cloud with a `viewpoint` other than its origin gets the base frame `cloud` "
+        "by default: the coordinates as they were sent.",
     )
     up: Up | None = Field(
         default=None,
-        description="Up as an IMU has it: a unit vector in the sensor's axes, of a camera x right, "
-        "y down, z forward. A camera held level has (0, -1, 0). Transforms that tilt a query "
-        "against a frame are impossible then.",
+        description="Up direction as an IMU measures it: a unit vector in the sensor's axes, of "
+        "a camera x right, y down, z forward. A level camera has (0, -1, 0). It excludes "
+        "transforms that tilt a query against a frame.",
     )
     tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
 

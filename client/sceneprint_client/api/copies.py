@@ -15,7 +15,7 @@ Digest = Annotated[str, Field(pattern=DIGEST)]
 
 
 class CopyRequest(ApiRecord):
-    """The parts of a map that a robot has already."""
+    """The parts of a map that the caller already has."""
 
     have: list[Digest] = Field(default=[], max_length=MOST_PARTS)
 

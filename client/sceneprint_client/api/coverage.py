@@ -23,10 +23,10 @@ CELL_TRENDS: tuple[CellTrend, ...] = ("better", "worse", "same", "new", "gone")
 
 
 class NewMapCoverage(Given):
-    """Which frames of a map to query against the rest of it, and what counts as right."""
+    """Frames of a map to query against the others, and tolerances for a right answer."""
 
     session: Label | None = Field(
-        default=None, description="Query only frames of this session; default: of all."
+        default=None, description="Query only frames of this session; default: all."
     )
     robot: Label | None = Field(default=None, description="Query only frames of this robot.")
     every: int = Field(
@@ -39,38 +39,38 @@ class NewMapCoverage(Given):
         default=1000,
         ge=1,
         le=MOST_QUERIED,
-        description="Query at most so many frames: of more, evenly spaced ones.",
+        description="Maximum number of queried frames, evenly spaced.",
     )
     not_within_s: float = Field(
         default=10.0,
         ge=0.0,
         le=1e9,
-        description="Leave out frames of the queried frame's own session captured within so many "
-        "seconds of it; 0 leaves out only the frame itself. Of a frame without a session or a time "
-        "only the frame itself is left out.",
+        description="Exclude frames of the queried frame's own session within this many seconds "
+        "of it; 0 excludes only the frame itself, as for frames without a session or time.",
     )
     other_sessions: bool = Field(
         default=False,
-        description="Leave out all frames of the queried frame's own session, of the same robot: "
-        "as if the robot came back on another day.",
+        description="Exclude all frames of the queried frame's own session and robot, as if the "
+        "robot came back on another day.",
     )
     tolerance_m: float = Field(
         default=0.5,
         gt=0.0,
         le=100.0,
-        description="A pose that was found is right within this distance of the frame's own pose.",
+        description="Maximum distance from the frame's own pose at which a found pose is right.",
     )
     tolerance_deg: float = Field(
-        default=15.0, gt=0.0, le=180.0, description="And within this rotation."
+        default=15.0, gt=0.0, le=180.0, description="Maximum rotation from the frame's own pose."
     )
     cell_m: float | None = Field(
         default=None,
         ge=0.1,
         le=1000.0,
-        description="Width of a plan's cells; default: 0.25, 0.5, 1, 2, 5 m and so on, about 20 "
-        "along the longer side. Two results are compared only if their cells are equally wide.",
+        description="Width of the plan's cells; default: 0.25, 0.5, 1, 2, 5 m and so on, with "
+        "about 20 along the longer side. Two results can be compared only if their cells have "
+        "the same width.",
     )
-    seed: int = Field(default=0, ge=0, lt=2**32, description="Of the queries' random choices.")
+    seed: int = Field(default=0, ge=0, lt=2**32, description="Seed of the queries' random choices.")
 
     @model_validator(mode="after")
     def _sensible(self) -> NewMapCoverage:
@@ -82,44 +82,49 @@ class NewMapCoverage(Given):
 class OutcomeCounts(ApiRecord):
     """How many queried frames had each outcome."""
 
-    found: int = Field(description="Found, and right.")
-    wrong: int = Field(description="Found, but not at the frame's own pose.")
+    found: int = Field(description="Number of frames that were found at the right pose.")
+    wrong: int = Field(description="Number of frames that were found at a wrong pose.")
     ambiguous: int
     not_found: int
     unchecked: int = Field(
         default=0,
-        description="Found, and nothing says whether that is right, as frame and answer have no "
-        "poses in one parent frame. Of a share that is found, leave these out.",
+        description="Number of frames that were found but cannot be checked, as frame and "
+        "answer have no poses in one parent frame. Exclude them from percentages.",
     )
 
 
 class CoverageResult(OutcomeCounts):
-    """What a coverage job found, in short."""
+    """Summary of a coverage job's result."""
 
-    frames: int = Field(description="Frames that were queried.")
+    frames: int = Field(description="Number of queried frames.")
     skipped: int = Field(
-        description="Frames that could not be queried: deleted, damaged or edited meanwhile."
+        description="Number of frames that could not be queried: deleted, damaged or edited "
+        "meanwhile."
     )
-    model: str = Field(description="Of the signatures.")
+    model: str = Field(description="Model of the signatures.")
     revision: int = Field(
-        description="Of the map when the job began. It rises with each frame that is indexed or "
-        "deleted."
+        description="Revision of the map when the job started. It increases with each frame "
+        "that is indexed or deleted."
     )
     last_revision: int = Field(
-        description="Of the map when the job ended; if it differs, frames came or went meanwhile."
+        description="Revision of the map when the job ended; if it differs, frames were added "
+        "or deleted meanwhile."
     )
-    map_frames: int = Field(description="Indexed frames of the map when the job ended.")
-    cell_m: float = Field(description="Width of the plans' cells.")
+    map_frames: int = Field(description="Number of indexed frames of the map when the job ended.")
+    cell_m: float = Field(description="Width of the cells.")
 
 
 class CoverageCell(OutcomeCounts):
     """A square of a plan."""
 
     column: int = Field(
-        description="It reaches from `column` times `cell_m` to `column` + 1 times along `x_axis`."
+        description="The cell extends from `column` times `cell_m` to `column` + 1 times along "
+        "`x_axis`."
     )
     row: int = Field(description="The same along `y_axis`.")
-    frames: int = Field(description="Indexed frames of the map that were taken in it.")
+    frames: int = Field(
+        description="Number of the map's indexed frames that were taken in the cell."
+    )
 
 
 class CoveragePlan(ApiRecord):
@@ -133,11 +138,11 @@ class CoveragePlan(ApiRecord):
         min_length=3, max_length=3, description="Unit vector to the top of the plan."
     )
     up_from: UpSource = Field(
-        description="How the vertical is known. `map`: the map's `up`. `frames`: the `up` of its "
-        "frames. `cameras`: guessed, the axis nearest to the cameras' upright."
+        description="Source of the vertical. `map`: the map's `up`. `frames`: the `up` of its "
+        "frames. `cameras`: estimated, the axis nearest to the upright of the cameras."
     )
     cells: list[CoverageCell] = Field(
-        description="Those in which any frame was taken, by row, then by column."
+        description="The cells in which frames were taken, by row, then by column."
     )
 
 
@@ -148,47 +153,52 @@ class MapCoverage(Product):
 
     map: str
     request: NewMapCoverage
-    result: CoverageResult | None = Field(description="When it has succeeded.")
+    result: CoverageResult | None = Field(description="The result of a job that has succeeded.")
     plans: list[CoveragePlan] | None = Field(
         default=None,
-        description="One for each parent frame, that of most queried frames first; null in lists, "
-        "and until it has succeeded.",
+        description="One plan for each parent frame, that with most queried frames first; null "
+        "in lists, and until the job has succeeded.",
     )
 
 
 class CoverageFrame(ApiRecord):
-    """A queried frame, and what became of it."""
+    """A queried frame and its result."""
 
-    number: int = Field(description="From 0, in the order in which frames were queried.")
+    number: int = Field(description="Number from 0 in the order of the queries.")
     frame_id: str
     robot: str | None
     session: str | None
     outcome: CoverageOutcome
-    reason: str = Field(description="Of the answer, in a sentence.")
-    cause: Cause | None = Field(description="Of `not_found`: the likeliest.")
-    parent_frame: str | None = Field(description="Of its own pose; null without one.")
-    position: Vector | None = Field(description="Of its sensor there when it was queried.")
+    reason: str = Field(description="Reason of the answer, in a sentence.")
+    cause: Cause | None = Field(description="If `not_found`: the most likely cause.")
+    parent_frame: str | None = Field(
+        description="Parent frame of its own pose; null without a pose."
+    )
+    position: Vector | None = Field(
+        description="Position of its sensor in the parent frame when it was queried."
+    )
     error_m: float | None = Field(
-        description="Distance of the pose that was found from its own; null where nothing was "
-        "found, or where that cannot be checked."
+        description="Distance of the found pose from the frame's own; null if nothing was "
+        "found, or it cannot be checked."
     )
     error_deg: float | None
     look_alikes: list[str] = Field(
-        description="Ids of frames that it is mistaken for: of `ambiguous`, the match for each "
-        "pose but its own; of `wrong`, the match at the pose that was found."
+        description="Ids of frames that it is confused with: if `ambiguous`, the match for each "
+        "pose but its own; if `wrong`, the match at the found pose."
     )
 
 
 class CellChange(ApiRecord):
-    """A cell in two results."""
+    """The results of a cell in two coverage jobs."""
 
     column: int
     row: int
     trend: CellTrend = Field(
-        description="By the mean over its queried frames: 1 for found, -1 for wrong, 0 otherwise. "
-        "`new` and `gone`: it has queried frames in one of the results only."
+        description="Change of the mean over the cell's queried frames: 1 for found, -1 for "
+        "wrong, 0 otherwise. `new` and `gone`: only one of the results has queried frames in "
+        "the cell."
     )
-    before: CoverageCell | None = Field(description="Null where it had no frames.")
+    before: CoverageCell | None = Field(description="Null if the cell had no frames.")
     after: CoverageCell | None
 
 
@@ -200,12 +210,12 @@ class PlanChanges(ApiRecord):
 
 
 class CoverageChanges(ApiRecord):
-    """Where a map became better or worse between two results."""
+    """The cells in which a map improved or degraded between two results."""
 
-    before: str = Field(description="Id of the earlier result, and of the later one:")
+    before: str = Field(description="Ids of the earlier and the later result:")
     after: str
     cell_m: float
-    trends: dict[CellTrend, int] = Field(description="How many cells have each trend.")
+    trends: dict[CellTrend, int] = Field(description="Number of cells with each trend.")
     result_before: CoverageResult
     result_after: CoverageResult
     plans: list[PlanChanges]

@@ -56,14 +56,14 @@ _MEDIAN_M, _NEAR_M, _FAR_M = (0.2, 5.0), (0.3, 2.3), 10.0
 
 
 class SampleRange(ApiRecord):
-    """Distances of the samples of a frame: depths, or ranges of points from the sensor, metres."""
+    """Range of a frame's samples: depths, or distances of points from the sensor, metres."""
 
-    near: float = Field(description="Metres, as all of these; 5 % of the samples are nearer.")
+    near: float = Field(description="Metres; 5 % of the samples are nearer.")
     median: float
-    far: float = Field(description="5 % of the samples are farther away.")
-    count: int = Field(description="Pixels with depth, or points.")
+    far: float = Field(description="Metres; 5 % of the samples are farther away.")
+    count: int = Field(description="Number of pixels with depth, or of points.")
     valid: float | None = Field(
-        default=None, description="Share of the pixels that have depth; null of a cloud."
+        default=None, description="Share of the pixels that have depth; null for a cloud."
     )
 
     @property
@@ -162,16 +162,18 @@ def upload_summary(
 
 
 class Added(ApiRecord):
-    """What has become of an upload."""
+    """The result of an upload."""
 
     frame_id: str
-    job_id: str = Field(description="The job that signs it: GET /v1/jobs/{job_id}.")
+    job_id: str = Field(description="Id of the job that signs it: GET /v1/jobs/{job_id}.")
     state: FrameState
     reason: str | None = Field(
-        default=None, description="Why it was rejected, or failed, or was not kept."
+        default=None, description="Why the frame was rejected, failed, or was not kept."
     )
-    samples: SampleRange | None = Field(default=None, description="As of Frame.")
-    has_pose: bool = Field(default=False, description="Whether it was sent with a pose.")
+    samples: SampleRange | None = Field(
+        default=None, description="Range of its samples; see Frame."
+    )
+    has_pose: bool = Field(default=False, description="Whether the frame has a pose.")
 
 
 class Frame(ApiRecord):
@@ -180,53 +182,55 @@ class Frame(ApiRecord):
     frame_id: str
     map: str
     state: FrameState
-    reason: str | None = Field(description="Why it was rejected, or failed, or was not kept.")
+    reason: str | None = Field(description="Why the frame was rejected, failed, or was not kept.")
     job_id: str
     content_id: str | None = Field(
-        description="Hash of samples and camera, or of points and viewpoint; null when deleted."
+        description="Hash of samples and camera, or of points and viewpoint; null if deleted."
     )
     kind: Kind = "depth"
     bytes: int = Field(description="Size of the upload.")
-    intrinsics: CameraIntrinsics | None = Field(description="Null of a cloud.")
-    depth_scale: float | None = Field(description="Null of a cloud.")
-    depth_along_ray: bool | None = Field(description="Null of a cloud.")
+    intrinsics: CameraIntrinsics | None = Field(description="Null for a cloud.")
+    depth_scale: float | None = Field(description="Null for a cloud.")
+    depth_along_ray: bool | None = Field(description="Null for a cloud.")
     trust_depth: bool | None = Field(
-        default=None, description="Whether it was taken though it may not look like depth."
+        default=None, description="Whether it was accepted although it may not look like depth."
     )
     samples: SampleRange | None = Field(
-        default=None, description="How far away what it shows is; null when purged."
+        default=None, description="Range of its samples; null if purged."
     )
-    points: int | None = Field(default=None, description="Of a cloud, as it was read.")
+    points: int | None = Field(default=None, description="Number of points of a cloud.")
     viewpoint: Vector | None = Field(
-        default=None, description="Of a cloud, in its own coordinates; null where it has none."
+        default=None, description="Viewpoint of a cloud in its own coordinates; null without one."
     )
-    units_per_metre: float | None = Field(default=None, description="Null of a depth image.")
+    units_per_metre: float | None = Field(default=None, description="Null for a depth image.")
     note: str | None = Field(
-        default=None, description="What was done to the points of a cloud on the way, or null."
+        default=None, description="How the points of a cloud were changed on reading, or null."
     )
     robot: str | None
     session: str | None
-    name: str | None = Field(default=None, description="Of the original file or message.")
-    sequence: int | None = Field(default=None, description="Place within the session.")
+    name: str | None = Field(default=None, description="Name of the original file or message.")
+    sequence: int | None = Field(default=None, description="Position in the session.")
     captured_at: datetime | None
     received_at: datetime
     indexed_at: datetime | None
     pose: Transform | None
     sent_pose: Transform | None = Field(
         default=None,
-        description="The pose as it was sent, where the map joined its parent frame to that of "
+        description="The pose as it was sent, if the map joined its parent frame to that of "
         "`pose`; else null.",
     )
-    base_frame: str | None = Field(default=None, description="Frame of the robot's base.")
+    base_frame: str | None = Field(default=None, description="Name of the robot's base frame.")
     T_base_sensor: Transform | None = Field(
-        default=None, description="Where the sensor sits on the robot, as it was sent."
+        default=None, description="Pose of the sensor on the robot, as it was sent."
     )
-    up: Direction | None = Field(default=None, description="Up in the sensor's axes, as sent.")
+    up: Direction | None = Field(
+        default=None, description="Up direction in the sensor's axes, as it was sent."
+    )
     tags: list[str]
     etag: str | None = Field(
         default=None,
-        description="Stands for what PATCH can change: sent in If-Match, with quotes around it, "
-        "it keeps an edit from overwriting another.",
+        description="Version of what PATCH can change. Sent in If-Match, in quotes, it prevents "
+        "an edit from overwriting another.",
     )
 
 
@@ -248,20 +252,22 @@ FolderName = Annotated[
 
 
 class BatchItem(ApiRecord):
-    """What came of one frame of a batch."""
+    """The result of one frame of a batch."""
 
     status: int = Field(
-        description="As if it had been sent alone: 202 received, 200 the map has it already, 403 "
+        description="Status as for a single upload: 202 received, 200 already in the map, 403 "
         "beyond the map's quota, 409 or 422 refused."
     )
-    frame: Added | None = Field(description="Null where it was refused.")
-    problem: Problem | None = Field(description="Why it was refused, or null.")
+    frame: Added | None = Field(description="Null if the frame was refused.")
+    problem: Problem | None = Field(description="Why the frame was refused, or null.")
 
 
 class Batch(ApiRecord):
-    """What came of a batch; the frames that were taken are safe."""
+    """The result of a batch; received frames are stored durably."""
 
-    items: list[BatchItem] = Field(description="In the order in which the frames were sent.")
+    items: list[BatchItem] = Field(
+        description="One item for each frame, in the order in which they were sent."
+    )
 
 
 #: An axis of a file's coordinates, or its opposite.
@@ -441,15 +447,17 @@ class MapImportResult(ApiRecord):
 
 
 class ImportItem(ApiRecord):
-    """What came of one frame of an archive, or of a member that is none."""
+    """The result of one frame of an archive, or of a member that is no frame."""
 
-    name: str = Field(description="Of the member, as the archive has it, or of a sequence.")
-    status: int = Field(description="As of an item of a batch.")
-    frame_id: str | None = Field(description="Null where it was refused.")
-    job_id: str | None = Field(description="The job that signs it.")
+    name: str = Field(description="Name of the member in the archive, or of a sequence.")
+    status: int = Field(description="Status as of an item of a batch.")
+    frame_id: str | None = Field(description="Null if the frame was refused.")
+    job_id: str | None = Field(description="Id of the job that signs it.")
     problem: Problem | None = Field(description="Why it was refused, or null.")
-    samples: SampleRange | None = Field(default=None, description="As of Frame.")
-    has_pose: bool = Field(default=False, description="Whether the archive has its pose.")
+    samples: SampleRange | None = Field(
+        default=None, description="Range of its samples; see Frame."
+    )
+    has_pose: bool = Field(default=False, description="Whether the archive has a pose of it.")
 
 
 def problem_of(error: SceneprintError) -> Problem:

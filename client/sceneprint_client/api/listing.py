@@ -48,38 +48,49 @@ _Prefix = Annotated[str, Field(min_length=1, max_length=MOST_OF_NAME, pattern=ON
 
 
 class FrameListing(Given):
-    """Which frames a list has; all that is given must hold.
+    """Conditions on the frames of a list; all of them must hold.
 
-    A frame that lacks what a condition asks about, such as a time, is left out.
+    A frame without the property of a condition, such as a time, is omitted.
     """
 
     state: FrameState | None = Field(
-        default=None, description="In this state; by default in any but `deleted`."
+        default=None, description="In this state; by default in any state but `deleted`."
     )
-    robot: _Names = Field(default=[], description="Taken by this one; repeated: by one of them.")
-    session: _Names = Field(default=[], description="Taken in this one; repeated: in one of them.")
-    tag: _Names = Field(default=[], description="It has this tag; repeated: all of them.")
+    robot: _Names = Field(default=[], description="Taken by this robot; repeated: by one of them.")
+    session: _Names = Field(
+        default=[], description="Taken in this session; repeated: in one of them."
+    )
+    tag: _Names = Field(default=[], description="With this tag; repeated: with all of them.")
     captured_after: AwareDatetime | None = Field(
-        default=None, description="Taken then, or later; with a time zone."
+        default=None, description="Taken at this time or later; with a time zone."
     )
-    captured_before: AwareDatetime | None = Field(default=None, description="Then, or earlier.")
+    captured_before: AwareDatetime | None = Field(
+        default=None, description="Taken at this time or earlier."
+    )
     received_after: AwareDatetime | None = Field(
-        default=None, description="Uploaded then, or later."
+        default=None, description="Uploaded at this time or later."
     )
-    received_before: AwareDatetime | None = Field(default=None, description="Then, or earlier.")
-    parent_frame: Label | None = Field(default=None, description="Its pose leads there.")
+    received_before: AwareDatetime | None = Field(
+        default=None, description="Uploaded at this time or earlier."
+    )
+    parent_frame: Label | None = Field(
+        default=None, description="With a pose in this parent frame."
+    )
     has_pose: bool | None = Field(default=None, description="Whether it has a pose.")
     content_id: Annotated[str, Field(pattern=DIGEST)] | None = Field(
-        default=None, description="Of its samples and camera."
+        default=None, description="Hash of its samples and camera."
     )
-    name: _Prefix | None = Field(default=None, description="Its name begins so; case matters.")
+    name: _Prefix | None = Field(
+        default=None, description="Its name starts with this text; case matters."
+    )
     find: _Prefix | None = Field(
-        default=None, description="Its id, its name or its session begins so; case matters."
+        default=None, description="Its id, name or session starts with this text; case matters."
     )
     order: Literal["asc", "desc", "taken"] = Field(
         default="asc",
-        description="As they came; `desc`: the newest first; `taken`, of one session: by "
-        "`captured_at`, those without by `sequence`, the rest as they came.",
+        description="Default: in order of arrival; `desc`: the newest first; `taken`, of one "
+        "session: by `captured_at`, frames without it by `sequence`, others in order of "
+        "arrival.",
     )
 
     @field_validator("order")
@@ -98,19 +109,19 @@ class FramePage(FrameListing):
 
 
 class Session(ApiRecord):
-    """What one robot took in one run."""
+    """The frames of one robot in one run."""
 
     robot: str | None
     session: str | None
-    frames: dict[str, int] = Field(description="How many are in each state that has any.")
-    with_pose: int = Field(description="How many of them have a pose.")
+    frames: dict[str, int] = Field(description="Number of frames in each state.")
+    with_pose: int = Field(description="Number of frames with a pose.")
     first_captured_at: datetime | None
     last_captured_at: datetime | None
     parent_frames: list[str] = Field(
-        description="Where their poses lead, at most 20: those of most frames first."
+        description="Parent frames of their poses, those with most frames first; at most 20."
     )
     tags: list[str] = Field(
-        default=[], description="Of their frames, at most 20: those of most frames first."
+        default=[], description="Tags of their frames, those with most frames first; at most 20."
     )
 
 
@@ -133,7 +144,9 @@ class Run(Given):
     captured_after: AwareDatetime | None = Field(
         default=None, description="A part of it: taken then, or later; with a time zone."
     )
-    captured_before: AwareDatetime | None = Field(default=None, description="Then, or earlier.")
+    captured_before: AwareDatetime | None = Field(
+        default=None, description="Taken at this time or earlier."
+    )
     most: Annotated[int, Field(ge=2, le=10_000)] | None = Field(
         default=None,
         description="At most so many poses, evenly taken along the run, the first and the last "
@@ -154,30 +167,29 @@ class Trajectory(ApiRecord):
     session: str
     robot: str | None
     parent_frame: str | None = Field(
-        description="Where the poses lead; null where no frame of the run has one."
+        description="Parent frame of the poses; null if no frame of the run has one."
     )
     child_frame: str = Field(
         default="optical",
-        description="Of each camera: x right, y down, z forward; of a cloud, its sensor's.",
+        description="Frame of each sensor: of a camera x right, y down, z forward; of a cloud, "
+        "its sensor's.",
     )
     frame_ids: list[str]
     poses: list[list[float]] = Field(
-        description="A row for each frame, as in a TUM file: t tx ty tz qx qy qz qw, stamp as "
-        "`stamps` says, metres, unit quaternion."
+        description="A row for each frame, as in a TUM file: t tx ty tz qx qy qz qw, with t "
+        "according to `stamps`, metres, unit quaternion."
     )
     stamps: Stamp | None = Field(
         default=None,
-        description="What t is: `captured` and `received` in seconds since 1970, or `sequence`, "
-        "places in the session. Null where no pose has a stamp.",
+        description="Meaning of t: `captured` and `received` in seconds since 1970, or "
+        "`sequence`, positions in the session. Null if no pose has a stamp.",
     )
-    posed: int = Field(
-        description="Poses that there are: as many as are told, or more where `most` was given."
-    )
+    posed: int = Field(description="Number of poses, including those beyond `most`.")
     left_out: int = Field(
-        description="Frames of the run that are not in it: without pose or stamp, with a pose that "
-        "leads elsewhere, of a stamp that is there already, or one too many for `most`."
+        description="Number of frames of the run that are omitted: without pose or stamp, in "
+        "another parent frame, with a duplicate stamp, or beyond `most`."
     )
-    reason: str | None = Field(default=None, description="Why there is no pose; else null.")
+    reason: str | None = Field(default=None, description="Why there is no pose; otherwise null.")
 
 
 # Which frames of a map a query may find, as JSON.
@@ -204,10 +216,11 @@ Names = Annotated[_Several, BeforeValidator(_one_or_many, json_schema_input_type
 
 
 class Region(Given):
-    """A box along the axes of the frame that poses lead to; its faces belong to it."""
+    """A box along the axes of a parent frame; it includes its faces."""
 
     parent_frame: Label = Field(
-        description="Frames whose pose leads to another frame, or that have none, are outside."
+        description="Parent frame of the box. Frames with poses in another one, or without "
+        "poses, are outside."
     )
     min: GivenVector
     max: GivenVector
@@ -227,26 +240,34 @@ class Region(Given):
 
 
 class Filter(Given):
-    """What a frame must be for a query to find it; all that is given must hold.
+    """Conditions on the frames that a query may find; all of them must hold.
 
-    A frame that lacks what a condition asks about, such as a time, does not pass it.
+    A frame without the property of a condition, such as a time, does not pass.
     """
 
-    robot: Names | None = Field(default=None, description="Taken by this one, or one of these.")
-    session: Names | None = Field(default=None, description="Taken in this one, or one of these.")
-    captured_after: AwareDatetime | None = Field(default=None, description="Then, or later.")
-    captured_before: AwareDatetime | None = Field(default=None, description="Then, or earlier.")
-    tags: list[Label] = Field(default=[], max_length=MOST_TAGS, description="It has all of them.")
+    robot: Names | None = Field(default=None, description="Taken by this robot, or one of these.")
+    session: Names | None = Field(
+        default=None, description="Taken in this session, or one of these."
+    )
+    captured_after: AwareDatetime | None = Field(
+        default=None, description="Taken at this time or later."
+    )
+    captured_before: AwareDatetime | None = Field(
+        default=None, description="Taken at this time or earlier."
+    )
+    tags: list[Label] = Field(
+        default=[], max_length=MOST_TAGS, description="With all of these tags."
+    )
     not_within_s: float | None = Field(
         default=None,
         gt=0,
-        description="Leaves out frames of the query's own session taken at most so many seconds "
-        "before or after it: for loop closure. Those of the session without a time are left out "
-        "too; a session is another's where both name robots and the robots differ.",
+        description="Excludes frames of the query's own session that were taken within this "
+        "many seconds of it, for loop closure. Frames of the session without a time are "
+        "excluded as well. A session of another robot, if both are named, is another session.",
     )
-    region: Region | None = Field(default=None, description="Its pose lies in there.")
+    region: Region | None = Field(default=None, description="With a pose in this region.")
     exclude_frames: list[Label] = Field(
-        default=[], max_length=1000, description="It is none of these ids."
+        default=[], max_length=1000, description="Not one of these ids."
     )
 
     @field_validator("captured_before")
@@ -262,43 +283,46 @@ class Filter(Given):
 
 
 class FrameEdit(Given):
-    """What to change of a frame: what is left out stays, null removes.
+    """Changes to a frame: omitted fields stay, null removes a value.
 
-    Samples, camera and how they are read are what a frame is, and cannot be edited: delete it and
-    upload it again.
+    Samples, camera, and how they are read cannot be edited: delete the frame and upload it again.
     """
 
-    robot: Label | None = Field(default=None, description="Who took the frame.")
+    robot: Label | None = Field(default=None, description="Robot that took the frame.")
     session: Label | None = Field(
         default=None,
-        description="In which run. The parent frame of a pose that was named after it stays.",
+        description="Name of the run. The parent frame of a pose that was named after the "
+        "former session stays.",
     )
-    captured_at: AwareDatetime | None = Field(default=None, description="When, with its zone.")
-    name: FileName | None = Field(default=None, description="Of the original file or message.")
-    sequence: Place | None = Field(default=None, description="Place within the session.")
+    captured_at: AwareDatetime | None = Field(
+        default=None, description="Time of capture, with its time zone."
+    )
+    name: FileName | None = Field(default=None, description="Name of the original file or message.")
+    sequence: Place | None = Field(default=None, description="Position in the session.")
     tags: Annotated[list[Label], Field(max_length=MOST_TAGS)] | None = Field(
-        default=None, description="All of them: they are replaced together."
+        default=None, description="The complete list of tags, which replaces the former one."
     )
     pose: GivenPose | None = Field(
         default=None,
         description="T_parent_sensor. `parent_frame` alone renames it; `translation` or "
-        "`rotation` alone leave the other; each of them is replaced as a whole.",
+        "`rotation` alone leaves the other unchanged; each is replaced as a whole.",
     )
     T_base_sensor: GivenBase | None = Field(
-        default=None, description="Where the sensor sits on the robot; parts of it as of `pose`."
+        default=None,
+        description="Pose of the sensor on the robot; its parts are edited like those of `pose`.",
     )
-    up: Up | None = Field(default=None, description="Up in the sensor's axes.")
+    up: Up | None = Field(default=None, description="Up direction in the sensor's axes.")
 
 
 class SessionEdit(Given):
-    """What to change on all frames of a session: what is left out stays."""
+    """Changes to all frames of a session: omitted fields stay."""
 
     session: Label | None = Field(
         default=None,
-        description="Its new name; one that another session has joins the two. The parent frame "
-        "of poses that was named after it stays.",
+        description="New name; the name of another session joins the two. The parent frame of "
+        "poses that was named after the session stays.",
     )
-    robot: Label | None = Field(default=None, description="Who took the frames.")
+    robot: Label | None = Field(default=None, description="Robot that took the frames.")
     add_tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
     remove_tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
 
@@ -314,47 +338,48 @@ class FrameDeletion(ApiRecord):
 
     deletion_id: str
     at: datetime
-    until: datetime = Field(description="Until when its frames can be restored.")
-    frames: int = Field(description="How many can be restored.")
+    until: datetime = Field(description="Time until which its frames can be restored.")
+    frames: int = Field(description="Number of frames that can be restored.")
 
 
 class SessionChange(ApiRecord):
-    """What became of a session."""
+    """The result of changing a session."""
 
     map: str
-    session: str = Field(description="Its name now.")
-    robot: str | None = Field(description="Where the frames of one robot were asked for.")
-    frames: int = Field(description="How many this call deleted or edited.")
+    session: str = Field(description="Present name of the session.")
+    robot: str | None = Field(description="Robot, if the request named one.")
+    frames: int = Field(description="Number of frames that this call deleted or edited.")
     remaining: int = Field(
-        default=0, description="How many are left as time was over: repeat the call for these."
+        default=0,
+        description="Number of frames that are left after the time limit: repeat the call.",
     )
     last_frame_id: str | None = Field(
-        default=None, description="Of an edit with frames remaining: send it as `after`."
+        default=None, description="If frames remain after an edit: send it as `after`."
     )
     deletion: FrameDeletion | None = Field(
-        default=None, description="Of a deletion: how to undo this call, where that can be done."
+        default=None, description="The deletion, to undo this call, if it can be undone."
     )
 
 
 class MapEdit(Given):
-    """What to change of a map: what is left out stays, null removes."""
+    """Changes to a map: omitted fields stay, null removes a value."""
 
-    title: Note | None = Field(default=None, description="For people.")
+    title: Note | None = Field(default=None, description="A label for people.")
     quota_frames: Quota | None = Field(
         default=None,
-        description="Most frames that it may hold; what is there beyond it stays. Only the "
-        "operator sets it: `admin` for `*`.",
+        description="Maximum number of frames; frames beyond it stay. Only the operator sets "
+        "it: `admin` for `*`.",
     )
     quota_bytes: Quota | None = Field(
-        default=None, description="Most bytes of uploads that it may hold; as `quota_frames`."
+        default=None, description="Maximum size of its uploads, bytes; see `quota_frames`."
     )
     retention_days: Days | None = Field(
         default=None,
-        description="Days after which a frame is deleted, for good, counted from when it was "
-        "received. Workers delete what is older within minutes.",
+        description="Days after which a frame is deleted permanently, counted from when it was "
+        "received. Workers delete older frames within minutes.",
     )
     up: Up | None = Field(
-        default=None, description="Up in the parent frames of its poses; see NewMap."
+        default=None, description="Up direction in the parent frames of its poses; see NewMap."
     )
 
 
@@ -372,14 +397,14 @@ _Ids = Annotated[list[Label], Field(min_length=1, max_length=MOST_SELECTED)]
 
 
 class FrameSelection(Given):
-    """Which frames of a map: by their ids, or all that pass a filter."""
+    """A selection of a map's frames, by their ids or by a filter."""
 
     frame_ids: _Ids | None = Field(
-        default=None, description="Ids that no frame has, or a deleted one, are passed over."
+        default=None, description="Ids of frames; unknown and deleted ones are ignored."
     )
     filter: FrameListing | None = Field(
         default=None,
-        description="As for GET /frames, with at least one condition; `order` does not matter.",
+        description="Conditions as for GET /frames, at least one; `order` is ignored.",
     )
 
     @model_validator(mode="after")
@@ -395,16 +420,17 @@ class FrameSelection(Given):
 
 
 class FramesEdit(FrameSelection):
-    """What to change on the selected frames: what is left out stays, null removes."""
+    """Changes to the selected frames: omitted fields stay, null removes a value."""
 
     session: Label | None = Field(
-        default=None, description="Moves them to it. The parent frame of their poses stays."
+        default=None,
+        description="Session to which the frames are moved. The parent frame of their poses stays.",
     )
-    robot: Label | None = Field(default=None, description="Who took them.")
+    robot: Label | None = Field(default=None, description="Robot that took the frames.")
     add_tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
     remove_tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
     after: Label | None = Field(
-        default=None, description="`last_frame_id` of the call before, to go on from there."
+        default=None, description="`last_frame_id` of the previous call, to continue from there."
     )
 
     @model_validator(mode="after")
@@ -415,29 +441,35 @@ class FramesEdit(FrameSelection):
 
 
 class FramesEdited(ApiRecord):
-    """What an edit changed."""
+    """The result of an edit."""
 
     map: str
-    frames: int = Field(description="How many this call changed; others were so already.")
+    frames: int = Field(
+        description="Number of frames that this call changed; the others had these values already."
+    )
     remaining: int = Field(
-        description="How many are left, as a call edits at most 1000: repeat it with `after`."
+        description="Number of frames that are left, as a call edits at most 1000: repeat it "
+        "with `after`."
     )
     last_frame_id: str | None = Field(
-        default=None, description="Where frames remain: send it as `after`."
+        default=None, description="If frames remain: send it as `after`."
     )
     inverse: list[dict[str, Any]] = Field(
-        description="Undo: send each as a body to the same path. They name the frames by their ids."
+        description="Bodies of requests that undo the edit: send each to the same path. They "
+        "name the frames by id."
     )
 
 
 class FramesDeleted(ApiRecord):
-    """What a deletion did."""
+    """The result of a deletion."""
 
     map: str
-    frames: int = Field(description="How many this call deleted.")
-    remaining: int = Field(description="How many are left as time was over: repeat the call.")
+    frames: int = Field(description="Number of frames that this call deleted.")
+    remaining: int = Field(
+        description="Number of frames that are left after the time limit: repeat the call."
+    )
     deletion: FrameDeletion | None = Field(
-        description="How to undo this call; null where it cannot be undone."
+        description="The deletion, to undo this call; null if it cannot be undone."
     )
 
 
@@ -449,15 +481,17 @@ class RefusedFrame(ApiRecord):
 
 
 class FramesRestored(ApiRecord):
-    """What became of deleted frames."""
+    """The result of restoring deleted frames."""
 
     map: str
     frames: int = Field(
-        description="How many this call restored. Queries find those that were indexed at once, "
-        "unless the map has another model since: then workers sign them again."
+        description="Number of frames that this call restored. Indexed frames are found by "
+        "queries at once, unless the map has changed its model: then workers sign them again."
     )
     refused: list[RefusedFrame] = Field(
         description=f"Frames that were not restored, at most {MOST_REFUSED} of them: the same "
         "content was uploaded since."
     )
-    remaining: int = Field(description="How many are left as time was over: repeat the call.")
+    remaining: int = Field(
+        description="Number of frames that are left after the time limit: repeat the call."
+    )

@@ -34,32 +34,32 @@ MOST_QUOTA = 2**53 - 1
 MOST_DAYS = 36_525.0
 Quota = Annotated[int, Field(ge=0, le=MOST_QUOTA)]
 Days = Annotated[float, Field(gt=0, le=MOST_DAYS)]
-_INHERITED = "left out: as a map of this name had that was deleted."
+_INHERITED = "omitted: the quota of a deleted map of this name."
 
 
 class NewMap(Given):
-    """A map to make."""
+    """A map to create."""
 
     name: Slug = Field(
-        description="Lower-case letters, digits, - and _, up to 63; never changes.",
+        description="Lower-case letters, digits, - and _, at most 63; it cannot be changed.",
         examples=["warehouse-2"],
     )
-    title: Note | None = Field(default=None, description="For people.")
+    title: Note | None = Field(default=None, description="A label for people.")
     model: Preset = Field(
         default="depth",
-        description="The model that signs its frames, until `sceneprint reencode` changes it: "
-        "`depth` for depth cameras indoors, `lidar` for the ranges of a LiDAR, `paper` for "
-        "research: it stores the long signatures of the paper and compares them all.",
+        description="Model that signs its frames, until `sceneprint reencode` changes it: "
+        "`depth` for depth cameras indoors, `lidar` for LiDAR scanners, `paper` for research, "
+        "which stores the long signatures of the paper and compares all of them.",
     )
     quota_frames: Quota | None = Field(
         default=None,
-        description="Most frames that it may hold; null: as many as there is room for; "
+        description="Maximum number of frames; null: no limit; "
         f"{_INHERITED} Only the operator sets it: `admin` for `*`.",
     )
     quota_bytes: Quota | None = Field(
         default=None,
-        description="Maximum bytes of uploads: frames as they were sent, and archives until their "
-        "imports end; as `quota_frames`.",
+        description="Maximum size of uploads, bytes: frames as they were sent, and archives "
+        "until their imports end; see `quota_frames`.",
     )
     retention_days: Days | None = Field(
         default=None,
@@ -68,24 +68,24 @@ class NewMap(Given):
     )
     up: Up | None = Field(
         default=None,
-        description="Up in the parent frames of its poses, (0, 0, 1) where z points up: what a "
-        "frame with a pose and no `up` of its own has. Null: learnt from frames that have both.",
+        description="Up direction in the parent frames of its poses, (0, 0, 1) if z points up, "
+        "for frames with a pose but without `up`. Null: estimated from frames that have both.",
     )
 
 
 class Reencoding(ApiRecord):
-    """How far a map has come that is being signed with another model."""
+    """The progress of a map's switch to another model."""
 
-    model: str = Field(description="Name and first digits of the id of the model to come.")
+    model: str = Field(description="Name and first digits of the next model's id.")
     model_id: str
-    done: int = Field(description="Frames that it has signed.")
-    left: int = Field(description="Frames that wait for it.")
+    done: int = Field(description="Number of frames that it has signed.")
+    left: int = Field(description="Number of frames that wait.")
     failed: int = Field(
-        description="Frames in which it finds nothing to sign: rejected at the switch."
+        description="Number of frames without anything to sign, which are rejected at the switch."
     )
     dead: int = Field(
-        description="Frames whose jobs broke down in every try: the switch waits until they are "
-        "tried again or deleted."
+        description="Number of frames whose jobs failed in every attempt: the switch waits "
+        "until they are tried again or deleted."
     )
 
 
@@ -97,42 +97,46 @@ class Map(ApiRecord):
     model: str = Field(description="Name and first digits of the id of its model.")
     model_id: str
     reencoding: Reencoding | None = Field(
-        default=None, description="Where the map is on its way to another model."
+        default=None, description="Progress of a switch to another model."
     )
     created_at: datetime
-    revision: int = Field(description="Grows with every frame that is indexed or deleted.")
-    frames: dict[str, int] = Field(description="How many frames are in each state.")
+    revision: int = Field(description="Increases with every frame that is indexed or deleted.")
+    frames: dict[str, int] = Field(description="Number of frames in each state.")
     posed_frames: int = Field(
-        default=0, description="Indexed frames with a pose. Without any, answers have no pose."
+        default=0,
+        description="Number of indexed frames with a pose. Without any, answers have no pose.",
     )
     parent_frames: int = Field(
         default=0,
-        description="Parent frames of these poses. More than one: answers are in that of their "
-        "matches, until an association joins them.",
+        description="Parent frames of these poses. If there are several, answers are in that of "
+        "their matches, until an association joins them.",
     )
     used_frames: int = Field(
-        default=0, description="Frames that count for the quota: neither deleted nor redundant."
+        default=0,
+        description="Number of frames that count towards the quota: neither deleted nor redundant.",
     )
     used_bytes: int = Field(
         default=0,
-        description="Bytes of their uploads as they were sent, and of archives that are being "
-        "imported; not of signatures, artifacts and indexes.",
+        description="Size of its uploads as they were sent, and of archives that are being "
+        "imported; without signatures, artifacts and indexes.",
     )
-    quota_frames: int | None = Field(default=None, description="Null: no quota.")
-    quota_bytes: int | None = Field(default=None, description="Null: no quota.")
+    quota_frames: int | None = Field(default=None, description="Null without a quota.")
+    quota_bytes: int | None = Field(default=None, description="Null without a quota.")
     retention_days: float | None = Field(
         default=None, description="Days after which a frame is deleted; null: never."
     )
     up: Direction | None = Field(
         default=None,
-        description="Up in the parent frames of its poses; null: learnt from its frames.",
+        description="Up direction in the parent frames of its poses; null: estimated from its "
+        "frames.",
     )
     overdue: int | None = Field(
         default=None,
-        description="Frames that are older, and deleted next; null without `retention_days`.",
+        description="Number of frames older than `retention_days`, which are deleted next; null "
+        "without that.",
     )
     etag: str | None = Field(
         default=None,
-        description="Stands for what PATCH can change: sent in If-Match, with quotes around it, "
-        "it keeps an edit from overwriting another.",
+        description="Version of what PATCH can change. Sent in If-Match, in quotes, it prevents "
+        "an edit from overwriting another.",
     )

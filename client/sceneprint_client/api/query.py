@@ -27,14 +27,14 @@ JsonText = BeforeValidator(parsed)
 
 
 class NamedFrame(Given):
-    """A stored frame that is asked about."""
+    """A stored frame, named in a request."""
 
-    map: Named = Field(description="The map it is in.")
+    map: Named = Field(description="Name of its map.")
     frame_id: Named
 
 
 class FrameName(ApiRecord):
-    """A stored frame that was asked about."""
+    """A stored frame that the request named."""
 
     map: str
     frame_id: str
@@ -47,39 +47,45 @@ class Diversity(Given):
         default=1.0,
         ge=0.01,
         le=100.0,
-        description="Times the median distance within the ranking: greater makes more frames "
-        "count as alike.",
+        description="Factor on the median distance within the ranking: with a greater one, more "
+        "frames count as similar.",
     )
     omega: float = Field(
         default=4.0,
         ge=0.01,
         le=1000.0,
-        description="Times the ranking's span of distances: greater lets diversity outweigh rank.",
+        description="Factor on the ranking's span of distances: a greater one gives diversity "
+        "more weight than rank.",
     )
 
 
 class ValidationOptions(Given):
-    """What a match must stand to be accepted.
+    """Requirements on accepted matches.
 
-    What is left out is as the map's model has it; the defaults told are those of `depth`.
+    Omitted values are those of the map's model; the stated defaults are those of `depth`.
     """
 
     mode: Literal["full", "paper"] = Field(
         default="full",
-        description="`paper`: the residual of the two directions alone decides, and more wrong "
+        description="`paper`: only the residual of the two directions decides, and more wrong "
         "matches are accepted.",
     )
     residual_m: float = Field(
-        default=0.08, gt=0, le=1.0, description="Most that both directions may disagree."
+        default=0.08, gt=0, le=1.0, description="Maximum distance between both directions."
     )
-    residual_deg: float = Field(default=5.0, gt=0, le=45.0, description="The same, of the turn.")
+    residual_deg: float = Field(
+        default=5.0, gt=0, le=45.0, description="Maximum rotation between both directions."
+    )
     evidence: Share = Field(
         default=0.2,
-        description="Least `overlap` - `violation_weight` x `free_space_violations`. The default "
-        "lets half of it pass, as a weak match, where little is shared and all of it agrees.",
+        description="Minimum `overlap` - `violation_weight` x `free_space_violations`. By "
+        "default, half of it suffices for a weak match if little is shared and all of it "
+        "agrees.",
     )
     violation_weight: float = Field(default=5.0, ge=0.0, le=100.0)
-    plane_overlap: Share = Field(default=0.15, description="Least, every plane counting alike.")
+    plane_overlap: Share = Field(
+        default=0.15, description="Minimum overlap with every plane counting the same."
+    )
     strong: Share = Field(
         default=0.3, description="Evidence below which an accepted match is weak."
     )
@@ -87,13 +93,13 @@ class ValidationOptions(Given):
         default=0.05, description="`ambiguity` from which on an accepted match is weak."
     )
     ambiguous: Share = Field(
-        default=0.14, description="`ambiguity` from which on nothing is accepted."
+        default=0.14, description="`ambiguity` from which on no match is accepted."
     )
     ambiguous_share: float = Field(
         default=0.5,
         ge=0.0,
         le=10.0,
-        description="Nor from this share of `plane_overlap` on.",
+        description="Share of `plane_overlap` from which on no match is accepted.",
     )
 
 
@@ -103,16 +109,16 @@ ValidationStatus = Literal["accepted", "rejected", "ambiguous", "skipped"]
 
 
 class Residual(ApiRecord):
-    """Both directions composed: the identity if they agreed."""
+    """Both directions composed: the identity if they agree."""
 
     translation_m: float
     rotation_deg: float
 
 
 class Validation(ApiRecord):
-    """What came of aligning the query with a match.
+    """The result of aligning the query with a match.
 
-    An accepted pair is evidence that two frames look alike, not that they are of one place: the
+    An accepted pair is evidence that two frames look alike, not that they show the same place: the
     answer's `status` weighs it against the map.
     """
 
@@ -120,7 +126,7 @@ class Validation(ApiRecord):
         description="`skipped`: it was not tried, and `reason` says why."
     )
     strength: Literal["strong", "weak"] | None = Field(
-        default=None, description="Of an accepted match."
+        default=None, description="Strength of an accepted match."
     )
     reason: str
     residual: Residual | None = None
@@ -128,74 +134,77 @@ class Validation(ApiRecord):
         default=None, description="Share of both frames' points that agree."
     )
     plane_overlap: float | None = Field(
-        default=None, description="The same, every plane counting alike."
+        default=None, description="`overlap` with every plane counting the same."
     )
     free_space_violations: float | None = Field(
         default=None,
-        description="Share that lies where the other frame saw through; null where neither frame "
-        "has a viewpoint, so that nothing is known of free space.",
+        description="Share of points that the other frame saw through; null if neither frame "
+        "has a viewpoint.",
     )
     planes: float | None = Field(
-        default=None, description="Distinct planes that agree, the mean of both frames."
+        default=None, description="Number of distinct planes that agree, the mean of both frames."
     )
     plane_violations: float | None = Field(
-        default=None, description="`free_space_violations` with every plane counting alike."
+        default=None, description="`free_space_violations` with every plane counting the same."
     )
-    inliers: int | None = Field(default=None, description="Points of both frames that agree.")
+    inliers: int | None = Field(
+        default=None, description="Number of points of both frames that agree."
+    )
     ambiguity: float | None = Field(
         default=None,
-        description="Share that the best rival explains.",
+        description="Share of the points that the best rival explains.",
     )
     search: Literal["correspondences", "plans", "guided"] | None = Field(
         default=None,
-        description="What proposed the transform: patches with alike surroundings, or the plans of "
-        "two scans laid on each other. `guided`: other matches and the map's poses; it was refined "
-        "and checked, but not searched for, so it is no vote of its own.",
+        description="Source of the transform: patches with similar surroundings, or the plans "
+        "of two scans. `guided`: other matches and the map's poses; it was refined and checked "
+        "but not searched for, so it is no independent vote.",
     )
     directions: list[Literal["query_to_match", "match_to_query"]] = Field(
         default=[],
-        description="Directions of the search in which it was found. One alone makes an accepted "
-        "match weak.",
+        description="Number of search directions that found it. One direction alone makes an "
+        "accepted match weak.",
     )
     tilt_deg: float | None = Field(
         default=None,
-        description="By how much the transform tilts the query's `up` against the match's; null "
-        "where either is not known.",
+        description="Angle by which the transform tilts the query's `up` against the match's; "
+        "null if either is unknown.",
     )
 
 
 class FreeDirection(ApiRecord):
-    """A direction in which a transform is hardly held, as along a corridor.
+    """A direction in which a transform is poorly constrained, as along a corridor.
 
-    Both parts together are of length 1: the error's metres and radians along it.
+    Both parts together have unit length: the error's metres and radians along the direction.
     """
 
     translation: Vector
     rotation: Vector
     deviation: float = Field(
-        description="Standard deviation along it: metres where it shifts, radians where it turns; "
-        "at most 10, for what nothing holds."
+        description="Standard deviation along it: metres of a shift, radians of a turn; at most "
+        "10, if nothing constrains it."
     )
 
 
 class Uncertainty(ApiRecord):
-    """How far a transform is likely off, if it is not wrong altogether.
+    """The likely error of a transform, if it is not wrong altogether.
 
-    Of errors (x, y, z, rx, ry, rz): metres along the axes of the transform's parent frame, by which
-    the child's origin is off, then the rotation vector, radians about the parent's axes, that the
-    rotation lacks on its left. This is how ROS orders and means PoseWithCovariance.
+    Errors are (x, y, z, rx, ry, rz): the displacement of the child's origin along the axes of the
+    transform's parent frame, metres, then a rotation vector about the parent's axes, radians,
+    multiplied from the left. ROS's PoseWithCovariance has the same order and meaning.
     """
 
     covariance: list[float] = Field(
         min_length=36, max_length=36, description="6 x 6, row by row, in that order."
     )
     method: Literal["information-scaled", "votes-and-spread"] = Field(
-        description="`information-scaled`: of one match, the inverse information of its "
-        "refinement, scaled to the errors of synthetic rooms. `votes-and-spread`: of several "
-        "matches, from theirs and how far they lie apart. What they are worth: docs/uncertainty.md."
+        description="`information-scaled`: for one match, the inverse information of its "
+        "refinement, scaled to the errors in synthetic rooms. `votes-and-spread`: for several "
+        "matches, from their uncertainties and spread. See docs/uncertainty.md."
     )
     degenerate: list[FreeDirection] = Field(
-        description="Directions at least 30 times as uncertain as the best held, the freest first."
+        description="Directions at least 30 times as uncertain as the most certain one, the "
+        "most uncertain first."
     )
 
 
@@ -206,38 +215,42 @@ class Match(ApiRecord):
     map: str
     robot: str | None
     session: str | None
-    name: str | None = Field(default=None, description="Of the original file or message.")
-    sequence: int | None = Field(default=None, description="Place within the session.")
+    name: str | None = Field(default=None, description="Name of the original file or message.")
+    sequence: int | None = Field(default=None, description="Position in the session.")
     rank: int = Field(description="Place in the ranking R, from 1.")
-    distance: int = Field(description="L1 distance of the stored signatures.")
-    similarity: float = Field(description="1 - distance / that of unrelated frames, 0 to 1.")
+    distance: int = Field(description="Distance of the signatures.")
+    similarity: float = Field(description="1 - distance / distance of unrelated frames, 0 to 1.")
     selected: bool | None = Field(
-        description="In the diverse selection C; null without that stage. False: a frame of "
-        "another place, validated as it looks like the query too."
+        description="Whether it is in the diverse selection C; null without that stage. False: "
+        "a frame of another place, which was validated because it looks like the query as well."
     )
-    diversity_gain: float | None = Field(description="1 for the first; near 0 for a duplicate.")
+    diversity_gain: float | None = Field(
+        description="1 for the first match; near 0 for a duplicate."
+    )
     validation: Validation
-    transform: Transform | None = Field(description="Query to match; believe it where accepted.")
+    transform: Transform | None = Field(
+        description="Transform from query to match; trust it only if accepted."
+    )
     predicted: Transform | None = Field(
         default=None,
-        description="Of a guided match: `transform` as the map's poses predict it from the matches "
-        "before, up to 15 cm and 6 deg off.",
+        description="For a guided match: `transform` as predicted from the map's poses and the "
+        "earlier matches, with an error of up to 15 cm and 6 deg.",
     )
     parent_frame: str | None = Field(
         default=None,
-        description="Parent frame that the pose of the frame was sent in; null without a pose. "
-        "Where the map joined it to another, `pose_in_map` is in that.",
+        description="Parent frame in which the frame's pose was sent; null without a pose. If "
+        "the map joined it to another, `pose_in_map` is in that one.",
     )
     pose_in_map: Transform | None = Field(
-        description="The query in the parent frame of the match's pose, where that is known and "
-        "the match is not rejected."
+        description="Pose of the query in the parent frame of the match's pose, if that is "
+        "known and the match is not rejected."
     )
     uncertainty: Uncertainty | None = Field(
-        default=None, description="Of `transform`, where the match is accepted."
+        default=None, description="Uncertainty of `transform`, if the match is accepted."
     )
     base_in_map: Transform | None = Field(
         default=None,
-        description="As `pose_in_map`, of the robot's base: where the query has T_base_sensor.",
+        description="`pose_in_map` for the robot's base, if the query has T_base_sensor.",
     )
 
 
@@ -246,66 +259,75 @@ Verifier = Literal["matches", "map", "prior"]
 
 
 class EvidenceRecord(ApiRecord):
-    """What speaks for and against a pose; its `confidence` is computed from these numbers."""
+    """Evidence for and against a pose, from which its `confidence` is computed."""
 
     score: float = Field(
-        description="How well the map's frames bear the pose out: `share`, less for what they saw "
-        "through; at most 1."
+        description="Degree to which the map's frames confirm the pose: `share`, less the share "
+        "that they saw through; at most 1."
     )
     share: float = Field(
-        description="Share of the query's surface that the map shows there, every plane counting "
+        description="Share of the query's surface that the map shows there; every plane counts "
         "the same."
     )
-    planes: float = Field(description="Distinct planes of the query that agree with the map.")
-    frames: int = Field(description="Frames of the map that agree.")
-    viewpoints: int = Field(description="Different viewpoints of these frames.")
+    planes: float = Field(
+        description="Number of distinct planes of the query that agree with the map."
+    )
+    frames: int = Field(description="Number of the map's frames that agree.")
+    viewpoints: int = Field(description="Number of different viewpoints of these frames.")
     excess: float = Field(
-        description="Share of what should be in sight and is missing, in the query or in the map, "
-        "beyond what the map's own frames miss among themselves."
+        description="Share of the surface that should be in sight and is missing, in the query "
+        "or the map, beyond what the map's own frames miss among themselves."
     )
     weight: float = Field(
-        description="Of the matches that vote for the pose, one for each viewpoint: 1 of a strong "
-        "match, 0.4 of a weak or an ambiguous one."
+        description="Weight of the matches that vote for the pose, one for each viewpoint: 1 "
+        "for a strong match, 0.4 for a weak or ambiguous one."
     )
-    strong: int = Field(description="Different viewpoints of strong matches that vote for it.")
+    strong: int = Field(
+        description="Number of different viewpoints of strong matches that vote for it."
+    )
     accepted: int = Field(
-        description="Different viewpoints of accepted matches that lead to it, guided or not."
+        description="Number of different viewpoints of accepted matches that lead to it, guided "
+        "or not."
     )
     suggested: int = Field(
-        description="Different viewpoints of candidates that suggest it, accepted or not."
+        description="Number of different viewpoints of candidates that suggest it, accepted or not."
     )
     similarity: float = Field(
-        description="Of the signatures of the query and of the nearest of these candidates, 0 to 1."
+        description="Similarity of the signatures of the query and the nearest of these "
+        "candidates, 0 to 1."
     )
     rival: float = Field(
-        description="Score of the best pose at another place, as a share of `score`; 0 where there "
-        "is none. Where the prior decided, of the places that it expects."
+        description="Score of the best pose at another place relative to `score`; 0 without "
+        "one. If the prior decided, of the places that it expects."
     )
     rival_weight: float = Field(
-        description="Largest weight of the matches that vote for another place."
+        description="Largest weight of matches that vote for another place."
     )
     rendered: bool = Field(
         default=False,
-        description="Whether most of these frames are views rendered from a surface that was "
-        "imported as a map. The same numbers then give another confidence.",
+        description="Whether most of these frames are rendered views of an imported map, for "
+        "which the same numbers give another confidence.",
     )
 
 
-_CONFIDENCE = "Probability that the pose is right, 0 to 1. Null where the map was not asked."
+_CONFIDENCE = (
+    "Probability that the pose is right, 0 to 1. Null if it was not compared with the map."
+)
 
 
 class Alternative(ApiRecord):
-    """A pose of the query that the evidence supports; of several, one is right at most."""
+    """A pose of the query that the evidence supports; at most one of several is right."""
 
     pose: Transform
     confidence: float | None = Field(default=None, description=_CONFIDENCE)
     evidence: EvidenceRecord | None = Field(
-        default=None, description="What `confidence` was computed from; null likewise."
+        default=None,
+        description="The numbers from which `confidence` is computed; null if that is null.",
     )
-    map: str | None = Field(default=None, description="Whose parent frame it is given in.")
+    map: str | None = Field(default=None, description="Map whose parent frame the pose is in.")
     support: int = Field(
-        description="Matches from different viewpoints that vote for it; 0 where the map alone "
-        "suggests it."
+        description="Number of matches from different viewpoints that vote for it; 0 if only "
+        "the map suggests it."
     )
 
 
@@ -315,34 +337,35 @@ class Location(ApiRecord):
     pose: Transform
     confidence: float | None = Field(default=None, description=_CONFIDENCE)
     evidence: EvidenceRecord | None = Field(
-        default=None, description="What `confidence` was computed from; null likewise."
+        default=None,
+        description="The numbers from which `confidence` is computed; null if that is null.",
     )
-    map: str | None = Field(default=None, description="Whose frames it is averaged over.")
+    map: str | None = Field(default=None, description="Map of the matches.")
     support: int = Field(
-        description="Matches that agree on it; 0 where the map alone confirms it, and 1 is one "
-        "view."
+        description="Number of matches that agree on it; 1 is a single view, and 0 means that "
+        "only the map confirms it."
     )
     guided: int = Field(
         default=0,
-        description="How many of these were guided by the others: they make the pose more precise, "
-        "and are no evidence of their own.",
+        description="Number of these that were guided by the others: they make the pose more "
+        "precise, and are no independent evidence.",
     )
-    votes: int = Field(description="Accepted matches, whatever pose they vote for.")
+    votes: int = Field(description="Number of accepted matches, whatever pose they vote for.")
     strength: Literal["strong", "weak"] = Field(
-        default="strong", description="`strong` where a match that votes for it is."
+        default="strong", description="`strong` if a strong match votes for it."
     )
     verified_by: Verifier = Field(
         default="matches",
-        description="`matches`: a strong match votes for the pose. `map`: no strong one does, and "
-        "the map's frames bear it out. `prior`: they bear several poses out, and this is the one "
-        "that the prior expects.",
+        description="`matches`: a strong match votes for the pose. `map`: no strong match does, "
+        "but the map's frames confirm it. `prior`: the frames confirm several poses, and the "
+        "prior expects this one.",
     )
     spread_m: float
     spread_deg: float
-    uncertainty: Uncertainty | None = Field(default=None, description="Of `pose`.")
+    uncertainty: Uncertainty | None = Field(default=None, description="Uncertainty of `pose`.")
     base: Transform | None = Field(
         default=None,
-        description="As `pose`, of the robot's base: where the query has T_base_sensor.",
+        description="`pose` for the robot's base, if the query has T_base_sensor.",
     )
 
 
@@ -356,54 +379,57 @@ Lost = Literal[
 
 
 class Explanation(ApiRecord):
-    """How far a frame of the ranking came."""
+    """The last stage that a frame of the ranking reached."""
 
     frame_id: str
     map: str
-    name: str | None = Field(default=None, description="Of the original file or message.")
+    name: str | None = Field(default=None, description="Name of the original file or message.")
     rank: int = Field(description="Place in the ranking R, from 1.")
     distance: int
     similarity: float
-    stage: Stage = Field(description="The furthest that it came to.")
+    stage: Stage = Field(description="The last stage that it reached.")
     outcome: Outcome = Field(
         description="`skipped`: a candidate that was not validated; `not_selected`: not a "
-        "candidate; `ranked`: nothing but the ranking was asked for."
+        "candidate; `ranked`: only the ranking was requested."
     )
     reason: str
 
 
 class ExplainedFrame(ApiRecord):
-    """Why one frame is, or is not, among the matches."""
+    """The reason why a frame is, or is not, among the matches."""
 
     frame_id: str
     map: str
-    name: str | None = Field(default=None, description="Of the original file or message.")
-    state: str = Field(description="Of the frame; only indexed ones are searched.")
-    passes_filter: bool | None = Field(description="Null where it is not searched at all.")
-    distance: int | None = Field(description="Exact, whether or not the query compared it.")
+    name: str | None = Field(default=None, description="Name of the original file or message.")
+    state: str = Field(description="State of the frame; only indexed frames are searched.")
+    passes_filter: bool | None = Field(description="Null if the frame is not searchable.")
+    distance: int | None = Field(
+        description="Exact distance, whether or not the query computed it."
+    )
     similarity: float | None
     rank: int | None = Field(
-        description="From 1 among all frames that pass the filter, each compared exactly: where "
-        "the frame itself does not pass, the rank it would have."
+        description="Rank from 1 among all frames that pass the filter, by exact distance; of a "
+        "frame that does not pass, the rank that it would have."
     )
-    of: int | None = Field(description="How many frames pass the filter.")
+    of: int | None = Field(description="Number of frames that pass the filter.")
     shortlisted: bool | None = Field(
-        description="False where an approximate index missed a frame that is near enough to be "
-        "ranked."
+        description="False if an approximate index missed a frame that is near enough for the "
+        "ranking."
     )
-    ranked: bool | None = Field(description="It is in the ranking R.")
+    ranked: bool | None = Field(description="Whether it is in the ranking R.")
     selected: bool | None = Field(
-        description="It is a candidate: in the selection C, or without that stage of the first "
-        "of R."
+        description="Whether it is a candidate: in the selection C, or, without that stage, "
+        "among the first of R."
     )
     validation: Validation | None = Field(
-        description="Of the alignment with it, made for this even if the query never came to it; "
-        "null where validation was not asked for."
+        description="Validation of the frame, computed for this explanation even if the query "
+        "did not reach it; null if validation was not requested."
     )
-    transform: Transform | None = Field(description="Query to the frame, of that alignment.")
+    transform: Transform | None = Field(description="Transform from the query to the frame.")
     lost_at: Lost | None = Field(
-        description="Where it was lost; null where it is a match. `turn`: enough were accepted "
-        "before it, or `k` others are listed before it; `query`: it is the query itself."
+        description="Stage at which it was dropped; null for a match. `turn`: enough frames "
+        "were accepted before it, or `k` others are listed before it; `query`: it is the query "
+        "itself."
     )
     reason: str
 
@@ -426,26 +452,29 @@ Cause = Literal[
 
 
 class Prior(Given):
-    """What a robot believes of its pose before it asks: T_parent_query and how sure that is."""
+    """The robot's belief about its pose: T_parent_query and its uncertainty."""
 
     pose: GivenPose = Field(
-        description="Of the query's sensor in a parent frame of the map; `parent_frame` is needed. "
-        f"Along each axis {FARTHEST_PRIOR:,.0f} m from the origin at most."
+        description="Pose of the query's sensor in a parent frame of the map; `parent_frame` is "
+        f"required. At most {FARTHEST_PRIOR:,.0f} m from the origin along each axis."
     )
     covariance: Annotated[list[float], Field(min_length=36, max_length=36)] | None = Field(
         default=None,
-        description="6 x 6, row by row, of errors (x, y, z, rx, ry, rz) in the parent's axes, as "
-        "ROS orders PoseWithCovariance: metres and radians. The deviations, which are the roots of "
-        f"its diagonal, are from {LEAST_DEVIATION} to {MOST_DEVIATION:.0f}.",
+        description="6 x 6, row by row, of errors (x, y, z, rx, ry, rz) along the parent's axes, "
+        "ordered as in ROS's PoseWithCovariance: metres and radians. The square roots of its "
+        f"diagonal are from {LEAST_DEVIATION} to {MOST_DEVIATION:.0f}.",
     )
     deviation_m: float = Field(
         default=0.3,
         ge=LEAST_DEVIATION,
         le=20,
-        description="In place of `covariance`: along each axis.",
+        description="Instead of `covariance`: deviation along each axis.",
     )
     deviation_deg: float = Field(
-        default=10.0, ge=1e-4, le=180, description="In place of `covariance`: about each axis."
+        default=10.0,
+        ge=1e-4,
+        le=180,
+        description="Instead of `covariance`: deviation about each axis.",
     )
 
     @model_validator(mode="after")
@@ -585,11 +614,11 @@ class SeveralQuery(Query):
 
 
 class Counts(ApiRecord):
-    """How many frames each stage saw."""
+    """Number of frames at each stage."""
 
-    map: int = Field(description="Frames of the map that can be found.")
-    passed: int = Field(description="Of them those that pass the filter; all without one.")
-    compared: int = Field(description="Of these those whose distance was computed.")
+    map: int = Field(description="Number of searchable frames in the map.")
+    passed: int = Field(description="Number of these that pass the filter; all without a filter.")
+    compared: int = Field(description="Number of these whose distance was computed.")
     ranked: int
     selected: int
     validated: int
@@ -597,7 +626,7 @@ class Counts(ApiRecord):
 
 
 class OfMap(ApiRecord):
-    """What one of several maps had of a query."""
+    """The result of a query in one of several maps."""
 
     index_generation: int = Field(
         description="0 where it was searched without an index of this node."
@@ -606,31 +635,30 @@ class OfMap(ApiRecord):
 
 
 class Answer(ApiRecord):
-    """What a query comes back with."""
+    """The answer to a query."""
 
     query_id: str
     status: AnswerStatus = Field(
-        description="`found`: the confidence of one pose reaches that of the query; where no "
-        "accepted match has a pose, a match is accepted. `ambiguous`: the evidence supports one "
-        "pose or several, and none with that confidence: never drive on it. `not_found`: nothing "
-        "is supported, "
-        "see `cause`. `unvalidated`: validation was not asked for, or the deadline came before a "
-        "match was accepted."
+        description="`found`: the confidence of one pose reaches that of the query; if no "
+        "accepted match has a pose, at least one match is accepted. `ambiguous`: the evidence "
+        "supports one or several poses, none with that confidence: never drive on it. "
+        "`not_found`: the evidence supports no pose, see `cause`. `unvalidated`: validation was "
+        "not requested, or the deadline passed before a match was accepted."
     )
     reason: str = Field(
-        default="", description="Why, in a sentence; of `not_found` with what to do next."
+        default="", description="The reason in a sentence; if `not_found`, with advice."
     )
-    cause: Cause | None = Field(default=None, description="The likeliest of `not_found`.")
+    cause: Cause | None = Field(default=None, description="If `not_found`: the most likely cause.")
     matches: list[Match] = Field(
-        description="Accepted ones first, strong before weak, then the most precise, or, of scans "
-        "all around, the nearest first; then the others that were tried."
+        description="The accepted matches, strong before weak, then the most precise first (for "
+        "full-turn scans, the nearest first); then the other matches that were validated."
     )
     location: Location | None = Field(
-        description="Where the query was taken: where it is `found`, and the matches have poses."
+        description="Pose of the query, if the answer is `found` and the matches have poses."
     )
     alternatives: list[Alternative] = Field(
         default=[],
-        description="Of `ambiguous`: the poses that the evidence supports, the best first.",
+        description="If `ambiguous`: the poses that the evidence supports, the best first.",
     )
     seed: int
     model: str
@@ -638,40 +666,44 @@ class Answer(ApiRecord):
         description="0 where the map was searched without an index of this node: a small one, "
         "one that PostgreSQL searched, or one whose model stores psi. Of several maps the least."
     )
-    exact: bool = Field(description="Every frame that passes the filter was compared.")
+    exact: bool = Field(description="Whether every frame that passes the filter was compared.")
     counts: Counts
     milliseconds: dict[str, float] = Field(
         description="`prepare` (signature and geometry of the query), `retrieve`, `diversify`, "
         "`validate`, `locate`, `explain` where it was asked for, `earlier` for the earlier frames "
         "of a sequence, `total`."
     )
-    maps: list[str] = Field(default=[], description="The maps that were asked.")
+    maps: list[str] = Field(default=[], description="The maps that were searched.")
     frame: FrameName | None = Field(
         default=None,
-        description="The stored frame that was asked for; null for an upload. Transforms call its "
-        "sensor by its id where its own map alone was asked, and `query` else.",
+        description="The stored frame of the query; null for an upload. Transforms name its "
+        "sensor by its id if only its own map was searched, and `query` otherwise.",
     )
     kind: Kind = Field(
         default="depth",
-        description="Of the frame that was asked for. Transforms call the sensor of a depth image "
+        description="Kind of the query's frame. Transforms name the sensor of a depth image "
         "`ID.optical` (x right, y down, z forward), and that of a cloud, which keeps its axes, "
         "`ID.sensor`.",
     )
     frames: int = Field(
-        default=1, description="Of the query: with a sequence, `matches` are those of the last."
+        default=1,
+        description="Number of frames in the query. With a sequence, `matches` are those of the "
+        "last frame.",
     )
     per_map: dict[str, OfMap] | None = Field(
-        default=None, description="What each of several maps had; null where one was asked."
+        default=None, description="Result of each map if several were searched; null for one."
     )
     deadline_reached: bool | None = Field(
         default=None,
-        description="Whether candidates were left out for want of time; null without a deadline.",
+        description="Whether candidates were omitted because of the deadline; null without a "
+        "deadline.",
     )
     explanations: list[Explanation] | None = Field(
-        default=None, description="With `explain`: every frame of the ranking, the nearest first."
+        default=None,
+        description="With `explain`: explanations of all frames of the ranking, the nearest first.",
     )
     explained_frame: ExplainedFrame | None = Field(
-        default=None, description="With `explain_frame`: what became of that one."
+        default=None, description="With `explain_frame`: the explanation of that frame."
     )
 
 
@@ -681,55 +713,57 @@ LocalizationStatus = Literal["found", "ambiguous", "not_found"]
 
 
 class Localization(ApiRecord):
-    """Where the query was taken, if that is known."""
+    """The pose of the query, if it is known."""
 
     status: LocalizationStatus = Field(
-        description="`found`: the confidence of one pose reaches that of the query. `ambiguous`: "
-        "none does, see `alternatives`: move on and ask again. `not_found`: no pose is supported, "
-        "see `cause`, or the deadline came before."
+        description="`found`: the confidence of one pose reaches that of the query. "
+        "`ambiguous`: none does, see `alternatives`: move, and query again. `not_found`: no "
+        "pose is supported, see `cause`, or the deadline passed before."
     )
     reason: str
-    cause: Cause | None = Field(default=None, description="The likeliest of `not_found`.")
+    cause: Cause | None = Field(default=None, description="If `not_found`: the most likely cause.")
     map: str
     pose: Transform | None = Field(
         description="T_parent_query: the query's camera in the parent frame of its matches' "
-        "poses. Null unless `found`, and where no accepted match has a pose: see `best`."
+        "poses. Null unless `found`, and if no accepted match has a pose: see `best`."
     )
     confidence: float | None = Field(
         default=None,
-        description="Probability that `pose` is right, 0 to 1; of `ambiguous`, that the first of "
-        "`alternatives` is. Null where there is no pose, or the map was not asked.",
+        description="Probability that `pose` is right, 0 to 1; if `ambiguous`, of the first of "
+        "`alternatives`. Null without a pose, or if it was not compared with the map.",
     )
     evidence: EvidenceRecord | None = Field(
-        default=None, description="What `confidence` was computed from; null likewise."
+        default=None,
+        description="The numbers from which `confidence` is computed; null if that is null.",
     )
     support: int = Field(
-        description="Matches that agree on the pose; 1 is one view, and 0 the map alone."
+        description="Number of matches that agree on the pose; 1 is a single view, and 0 means "
+        "that only the map confirms it."
     )
-    votes: int = Field(description="Accepted matches, whatever pose they vote for.")
-    spread_m: float | None = Field(description="Of the votes; null without a pose.")
+    votes: int = Field(description="Number of accepted matches, whatever pose they vote for.")
+    spread_m: float | None = Field(description="Spread of the votes; null without a pose.")
     spread_deg: float | None
-    uncertainty: Uncertainty | None = Field(default=None, description="Of `pose`.")
+    uncertainty: Uncertainty | None = Field(default=None, description="Uncertainty of `pose`.")
     base: Transform | None = Field(
         default=None,
-        description="As `pose`, of the robot's base: where the query has T_base_sensor.",
+        description="`pose` for the robot's base, if the query has T_base_sensor.",
     )
     strength: Literal["strong", "weak"] | None = Field(
-        description="`strong` where a match that votes for the pose is; null unless `found`."
+        description="`strong` if a strong match votes for the pose; null unless `found`."
     )
     verified_by: Verifier | None = Field(
         default=None,
-        description="What decided, as in `location` of an answer; null unless `found`.",
+        description="What decided the answer, as in `location`; null unless `found`.",
     )
     alternatives: list[Alternative] = Field(
         default=[],
-        description="Of `ambiguous`: the poses that the evidence supports, the best first.",
+        description="If `ambiguous`: the poses that the evidence supports, the best first.",
     )
-    best: Match | None = Field(
-        description="The accepted match to believe first, with the transform to it."
+    best: Match | None = Field(description="The best accepted match, with the transform to it.")
+    matches: list[str] = Field(description="Ids of the accepted matches, the best first.")
+    frames: int = Field(
+        default=1, description="Number of frames in the query; those of a sequence count together."
     )
-    matches: list[str] = Field(description="Ids of the accepted matches, in the order of belief.")
-    frames: int = Field(default=1, description="Of the query, those of a sequence together.")
     query_id: str
     seed: int
     model: str

@@ -44,67 +44,70 @@ class RecordedPose(ApiRecord):
 
 
 class KeepOptions(Given):
-    """How to keep an answer."""
+    """Options of keeping an answer."""
 
     title: Note | None = Field(default=None, description="A label for people.")
 
 
 class QueryRecord(ApiRecord):
-    """A past query and its outcome; nothing of what its frame shows."""
+    """A past query and its outcome, without the content of its frame."""
 
     query_id: str = Field(
-        description="While `stored` is true, GET /v1/queries/{query_id} returns the answer."
+        description="GET /v1/queries/{query_id} returns the answer while `stored` is true."
     )
-    at: datetime = Field(description="When the query came.")
+    at: datetime = Field(description="Time of the query.")
     map: str = Field(
-        description="Of several maps that were searched: the one it was found in, that of the "
-        "first alternative or match, or the first that was named."
+        description="If several maps were searched: the map in which the query was found, that "
+        "of the first alternative or match, or the first in the request."
     )
     maps: list[str] = Field(description="All maps that were searched and that you may read.")
-    robot: str | None = Field(description="Who sent it, if the query said so.")
+    robot: str | None = Field(description="Robot that sent it, if the query named it.")
     session: str | None
-    key: str | None = Field(description="Name of the API key; null without one, or once revoked.")
+    key: str | None = Field(
+        description="Name of the API key; null without one, or after its revocation."
+    )
     status: RecordStatus = Field(
-        description="Of the answer. `failed`: there was none, and `reason` says why."
+        description="Status of the answer. `failed`: there was no answer, and `reason` says why."
     )
     cause: str | None = Field(
-        description="Of `not_found`, and of a deadline, as in the answer; of `failed` the type of "
-        "the problem, such as `busy`."
+        description="Cause of `not_found`, or of a deadline, as in the answer; for `failed`, "
+        "the type of the problem, such as `busy`."
     )
     reason: str
-    pose: RecordedPose | None = Field(description="Of `found`, where the matches have poses.")
+    pose: RecordedPose | None = Field(description="Pose if `found` and the matches have poses.")
     confidence: float | None = Field(
-        description="Probability that `pose` is right, or of `ambiguous` the best alternative; "
-        "null where the map was not asked."
+        description="Probability that `pose`, or the best alternative, is right; null if the "
+        "pose was not compared with the map."
     )
     support: int | None = Field(description="Number of matches that agree on `pose`.")
     alternatives: int = Field(
-        description="Of `ambiguous`: number of poses that the evidence supports."
+        description="If `ambiguous`: number of poses that the evidence supports."
     )
     milliseconds: float
-    kind: Kind | None = Field(description="Of the frame; null where it was not read.")
+    kind: Kind | None = Field(description="Kind of the frame; null if it was not read.")
     frame: FrameName | None = Field(
-        description="The stored frame that was the query; null for an upload, and where you may "
-        "not read its map."
+        description="The stored frame of the query; null for an upload, and if you may not read "
+        "its map."
     )
-    stored: bool = Field(description="Whether the answer can still be looked at.")
+    stored: bool = Field(description="Whether the answer is still stored.")
     expires_at: datetime | None = Field(
-        description="When the record and the answer are removed; the answer earlier where room is "
-        "needed. Null: the answer is kept."
+        description="Time at which the record and the answer are removed; the answer may be "
+        "removed earlier to make room. Null for a kept answer."
     )
-    kept_at: datetime | None = Field(description="Since when somebody keeps the answer.")
-    title: str | None = Field(description="Of a kept answer.")
+    kept_at: datetime | None = Field(description="Time since which the answer is kept.")
+    title: str | None = Field(description="Title of a kept answer.")
 
 
 class StoredQuery(QueryRecord):
-    """A past query whose answer is stored, and how it was sent."""
+    """A past query whose answer is stored, with its options."""
 
     validates: bool = Field(
-        description="Its points are stored, so that it can be repeated with the stage `validate`."
+        description="Whether its points are stored, so that it can be repeated with the stage "
+        "`validate`."
     )
     model: str
     options: dict[str, Any] = Field(
-        description="The options that the request set. Every other option had its default."
+        description="Options that the request set; the others had their defaults."
     )
 
 
@@ -128,7 +131,7 @@ Triple = tuple[float, float, float]
 
 
 class PatchLevel(ApiRecord):
-    """Surface patches, a place in each list for each of them.
+    """Surface patches. Each list has one entry for each patch.
 
     Metres are rounded to a tenth of a millimetre, normals to four digits, areas to a tenth of a
     square centimetre.
@@ -137,20 +140,22 @@ class PatchLevel(ApiRecord):
     mean: list[Triple] = Field(description="x, y, z in metres.")
     normal: list[Triple] = Field(description="Unit length, towards the sensor.")
     area_m2: list[float]
-    size: list[int] = Field(description="Pixels of the surface map, which is about 160 x 120.")
+    size: list[int] = Field(
+        description="Number of pixels of the surface map, which is about 160 x 120."
+    )
 
 
 class FramePatches(ApiRecord):
-    """The patches of a frame, as its model segments it."""
+    """The patches of a frame, as its model segments them."""
 
     frame_id: str
     map: str
-    frame: str = Field(description="Frame of the coordinates: the sensor's.")
+    frame: str = Field(description="Name of the sensor's frame, in which the coordinates are.")
     model: str
     levels: list[PatchLevel] = Field(
         description="The hierarchy that the signature describes, the finest first."
     )
-    validation: PatchLevel = Field(description="The patches that matches are validated with.")
+    validation: PatchLevel = Field(description="The patches used to validate matches.")
 
 
 class FrameSignature(ApiRecord):
@@ -159,12 +164,16 @@ class FrameSignature(ApiRecord):
     frame_id: str
     map: str
     model: str
-    model_id: str = Field(description="Signatures of two models are never compared.")
+    model_id: str = Field(
+        description="Id of the model. Signatures of different models cannot be compared."
+    )
     dtype: Literal["uint8"] = "uint8"
-    length: int = Field(description="Bytes.")
-    n_patches: list[int] = Field(description="Of each level, the finest first.")
-    n_pairs: list[int] = Field(description="Ordered pairs of patches of each level.")
-    base64: str = Field(description="The bytes. Compare two by the sum of absolute differences.")
+    length: int = Field(description="Number of bytes.")
+    n_patches: list[int] = Field(description="Number of patches at each level, the finest first.")
+    n_pairs: list[int] = Field(description="Number of ordered pairs of patches at each level.")
+    base64: str = Field(
+        description="The bytes of the signature. Compare two by the sum of absolute differences."
+    )
 
 
 #: What an overlay's colours tell.
@@ -181,61 +190,67 @@ MOST_POINTS = 2000
 
 
 class Similarities(ApiRecord):
-    """How alike a query and the frames of its ranking are, each to each: for a heat map."""
+    """Similarities of a query and the frames of its ranking, each to each, for a heat map."""
 
     query_id: str
     model: str
     frames: list[FrameName] = Field(
-        description="Of the ranking, the nearest first; those deleted since are left out."
+        description="Frames of the ranking, the nearest first, without those deleted since."
     )
     names: list[str | None] = Field(
-        default=[], description="What the files of `frames` were called, in their order."
+        default=[], description="Names of the files of `frames`, in their order."
     )
     similarity: list[list[float]] = Field(
-        description="1 - distance / that of unrelated frames, 0 to 1. The first row and column are "
-        "the query's, the others those of `frames`, in their order."
+        description="1 - distance / distance of unrelated frames, 0 to 1. The first row and "
+        "column are the query's, the others those of `frames`, in their order."
     )
 
 
 class Coincidences(ApiRecord):
-    """Patches of both frames that coincide under the transform, a place in each list for each."""
+    """Patches of both frames that coincide under the transform. Each list has one entry for each
+    pair.
+    """
 
-    query: list[int] = Field(description="Index among the query's validation patches.")
-    match: list[int] = Field(description="Index among the match's: see its `/patches`.")
-    query_mean: list[Triple] = Field(description="Metres, in the query's sensor's frame.")
+    query: list[int] = Field(description="Index of the query's validation patch.")
+    match: list[int] = Field(description="Index of the match's patch; see its `/patches`.")
+    query_mean: list[Triple] = Field(description="Metres, in the frame of the query's sensor.")
     query_normal: list[Triple]
-    match_mean: list[Triple] = Field(description="Metres, in the match's sensor's frame.")
+    match_mean: list[Triple] = Field(description="Metres, in the frame of the match's sensor.")
     match_normal: list[Triple]
-    distance_m: list[float] = Field(description="Between the means under the transform, rising.")
+    distance_m: list[float] = Field(
+        description="Distance of the means under the transform, in increasing order."
+    )
 
 
 class Points(ApiRecord):
-    """Points of one frame, in its own sensor's frame, that evidence is counted on."""
+    """Points of one frame, in its sensor's frame, on which the evidence is counted."""
 
-    sampled: int = Field(description="How many were looked up in the other frame.")
+    sampled: int = Field(description="Number of points that were looked up in the other frame.")
     inliers: list[Triple] = Field(
-        description=f"They lie on the other's surface; {MOST_POINTS} at most."
+        description=f"Points on the other frame's surface; at most {MOST_POINTS}."
     )
     violations: list[Triple] = Field(
-        description=f"They lie where the other saw through; {MOST_POINTS} at most."
+        description=f"Points that the other frame saw through; at most {MOST_POINTS}."
     )
 
 
 class MatchDetails(ApiRecord):
-    """One match of a query, validated once more as the query had it, with what it rests on."""
+    """One match of a query, validated again as in the query, with its evidence."""
 
     query_id: str
     frame_id: str
     map: str
-    name: str | None = Field(default=None, description="Of the original file or message.")
-    sequence: int | None = Field(default=None, description="Place within the session.")
+    name: str | None = Field(default=None, description="Name of the original file or message.")
+    sequence: int | None = Field(default=None, description="Position in the session.")
     validation: Validation
     transform: Transform | None = Field(
-        description="Query to match; null where the frames gave no hypothesis."
+        description="Transform from query to match; null if the frames gave no hypothesis."
     )
-    uncertainty: Uncertainty | None = Field(description="Of `transform`, where it is accepted.")
+    uncertainty: Uncertainty | None = Field(
+        description="Uncertainty of `transform`, if it is accepted."
+    )
     rival: Transform | None = Field(
-        description="The other transform that explains the frames best and is not refuted."
+        description="The best other transform that explains the frames and is not refuted."
     )
     patches: Coincidences | None = Field(description="Null without a transform.")
     query: Points | None
@@ -274,22 +289,22 @@ class Comparison(Given):
 
 
 class Similarity(ApiRecord):
-    """How alike two frames are."""
+    """The similarity of two frames."""
 
     distance: int = Field(
-        description="Of their signatures: squared L2, or L1 where psi itself is stored."
+        description="Distance of their signatures: squared L2, or L1 if psi itself is stored."
     )
-    similarity: float = Field(description="1 - distance / that of unrelated frames, 0 to 1.")
+    similarity: float = Field(description="1 - distance / distance of unrelated frames, 0 to 1.")
     model: str
     a: FrameName | None = Field(description="The stored frame; null for an upload.")
     b: FrameName | None
-    validation: Validation | None = Field(description="Null where it was not asked for.")
+    validation: Validation | None = Field(description="Null if it was not requested.")
     transform: Transform | None = Field(
-        description="x_a = matrix @ x_b. Where the validation accepts it, it is right if the two "
-        "frames are of one place, which a pair alone cannot show."
+        description="x_a = matrix @ x_b. If it is accepted, it is right if both frames show the "
+        "same place, which a pair alone cannot prove."
     )
     uncertainty: Uncertainty | None = Field(
-        default=None, description="Of `transform`, where the validation accepts it."
+        default=None, description="Uncertainty of `transform`, if it is accepted."
     )
     seed: int
     milliseconds: dict[str, float] = Field(

@@ -19,52 +19,54 @@ GraphFormat = Literal["g2o", "tum", "json"]
 
 
 class NewAssociation(Given):
-    """Which sessions of a map to associate, frame by frame."""
+    """Sessions of a map that are to be associated, frame by frame."""
 
     sessions: Annotated[list[Label], Field(min_length=1, max_length=2)] = Field(
-        description="Two: each frame of the first is looked up among those of the second. One: "
-        "loop closures, each frame is looked up among those taken before it."
+        description="Two sessions: each frame of the first is looked up in the second. One "
+        "session: loop closures; each frame is looked up among those taken before it."
     )
     robots: Annotated[list[Label], Field(min_length=1, max_length=2)] | None = Field(
         default=None,
-        description="Who took each of the sessions, in their order; needed where several robots "
-        "call their sessions alike.",
+        description="Robot of each session, in the same order; required if several robots use "
+        "the same session name.",
     )
     filter: Filter | None = Field(
-        default=None, description="Only frames that pass it are taken, of either session."
+        default=None, description="Conditions on the frames of both sessions."
     )
     apart: int | None = Field(
         default=None,
         ge=1,
         le=1_000_000,
-        description="Of one session: frames that come between, in the order of time; default: "
-        f"{APART}, or 1 where `not_within_s` is given.",
+        description="For one session: minimum number of frames in between, in order of time; "
+        f"default: {APART}, or 1 with `not_within_s`.",
     )
     not_within_s: float | None = Field(
         default=None,
         gt=0,
-        description="Of one session: seconds that come between; frames without a time are left "
-        "out.",
+        description="For one session: minimum time in between, seconds; frames without a time "
+        "are omitted.",
     )
-    k: int = Field(default=3, ge=1, le=10, description="Accepted edges wanted of each frame.")
+    k: int = Field(
+        default=3, ge=1, le=10, description="Number of accepted edges wanted for each frame."
+    )
     candidates: int = Field(
         default=10,
         ge=1,
         le=100,
-        description="How many of a frame's ranking are selected and validated until `k` are "
-        "accepted, some 20 ms each.",
+        description="Number of frames of each ranking that are selected and validated until `k` "
+        "are accepted, some 20 ms each.",
     )
     join: bool = Field(
         default=True,
-        description="Of two sessions: where the join between their parent frames is strong, let "
-        "all poses of the map in these frames lead to one of them.",
+        description="For two sessions: if the join of their parent frames is strong, move all "
+        "poses of the map into one of them.",
     )
-    seed: int = Field(default=0, ge=0, lt=2**32, description="Of the random choices.")
+    seed: int = Field(default=0, ge=0, lt=2**32, description="Seed of the random choices.")
     min_overlap: float = Field(
-        default=0.0, ge=0.0, le=1.0, description="Least overlap of an edge that is kept."
+        default=0.0, ge=0.0, le=1.0, description="Minimum overlap of an edge."
     )
     validation: ValidationOptions | None = Field(
-        default=None, description="What an edge must stand to be accepted."
+        default=None, description="Requirements on accepted edges."
     )
 
     @model_validator(mode="after")
@@ -89,7 +91,7 @@ class Edge(ApiRecord):
     `consistent` is true.
     """
 
-    number: int = Field(description="From 0, in the order in which edges were found.")
+    number: int = Field(description="Number from 0 in the order in which edges were found.")
     from_frame: str = Field(description="The frame that was looked up.")
     to_frame: str = Field(description="The frame that was found.")
     from_session: str | None
@@ -98,35 +100,39 @@ class Edge(ApiRecord):
     to_robot: str | None
     transform: Transform = Field(description="x_to = matrix @ x_from, between the sensors' frames.")
     information: list[float] | None = Field(
-        description="36 numbers, row by row in the order x y z rx ry rz, metres and radians: the "
-        "inverse of the covariance of an error that comes after the transform, along the axes of "
+        description="36 numbers, row by row in the order x y z rx ry rz, metres and radians: "
+        "the inverse covariance of an error that follows the transform, along the axes of "
         "`from_frame`: T_true = matrix @ exp(error)."
     )
     overlap: float = Field(description="Share of both frames' points that agree.")
-    residual_m: float = Field(description="Both directions composed: 0 if they agreed.")
+    residual_m: float = Field(
+        description="Translation of both directions composed: 0 if they agree."
+    )
     residual_deg: float
     strength: Literal["strong", "weak"]
-    inliers: int = Field(description="Points of both frames that agree.")
-    ambiguity: float = Field(description="Share that the best other transform explains.")
-    similarity: float = Field(description="Of the signatures, 0 to 1.")
-    from_pose: Transform | None = Field(
-        default=None, description="Of `from_frame`, in the parent frame that its pose is in now."
+    inliers: int = Field(description="Number of points of both frames that agree.")
+    ambiguity: float = Field(
+        description="Share of the points that the best other transform explains."
     )
-    to_pose: Transform | None = Field(default=None, description="Of `to_frame`.")
-    from_name: str | None = Field(default=None, description="What the file was called.")
+    similarity: float = Field(description="Similarity of the signatures, 0 to 1.")
+    from_pose: Transform | None = Field(
+        default=None, description="Pose of `from_frame`, in its present parent frame."
+    )
+    to_pose: Transform | None = Field(default=None, description="Pose of `to_frame`.")
+    from_name: str | None = Field(default=None, description="Name of its file.")
     to_name: str | None = None
     consistent: bool | None = Field(
-        description="Whether a second edge supports it. `true`: a loop with an edge near by of "
-        "another viewpoint closes, or it agrees with the join. `false`: it was outvoted, and is "
-        "left out of graphs and joins. null: nothing from another viewpoint checks it, or there "
-        "are no poses, or the association is not over."
+        description="Whether a second edge supports it. `true`: a loop with a nearby edge from "
+        "another viewpoint closes, or the edge agrees with the join. `false`: it was outvoted, "
+        "and is omitted from graphs and joins. Null: nothing from another viewpoint checks it, "
+        "there are no poses, or the association has not ended."
     )
-    loops: int | None = Field(description="Edges near by that it was compared with.")
-    closed: int | None = Field(description="Of them those that agree with it.")
+    loops: int | None = Field(description="Number of nearby edges that it was compared with.")
+    closed: int | None = Field(description="Number of these that agree with it.")
 
 
 class Join(ApiRecord):
-    """How the parent frames of two sessions lie to each other, by consensus of the edges."""
+    """The relative pose of the parent frames of two sessions, by consensus of the edges."""
 
     from_session: str
     to_session: str
@@ -135,62 +141,69 @@ class Join(ApiRecord):
     from_parent: str = Field(description="Parent frame of the poses of `from_session`.")
     to_parent: str
     transform: Transform | None = Field(
-        description="x_to = matrix @ x_from, between the parent frames; null where the edges do "
+        description="x_to = matrix @ x_from, between the parent frames; null if the edges do "
         "not agree on one."
     )
     strength: Literal["strong", "weak"] | None = Field(
-        description="`strong` where many edges of several frames agree that reach over a metre; "
-        "null without a transform."
+        description="`strong` if many edges of several frames agree that extend over more than "
+        "a metre; null without a transform."
     )
-    support: int = Field(description="Edges that agree with it.")
-    votes: int = Field(description="Edges between the two parent frames that were not outvoted.")
-    rival: int = Field(description="Edges that agree on the best other transform.")
+    support: int = Field(description="Number of edges that agree with it.")
+    votes: int = Field(
+        description="Number of edges between the two parent frames that were not outvoted."
+    )
+    rival: int = Field(description="Number of edges that agree on the best other transform.")
     spread_m: float | None = Field(
-        description="Root mean square of what edges that agree differ by, where their frames are."
+        description="Root mean square of the differences of the agreeing edges, at their frames."
     )
     spread_deg: float | None
     reason: str
     root: str | None = Field(
         default=None,
-        description="Parent frame that the poses of both are in from then on, the one whose "
-        "frames came first; null where nothing was moved, or where that was undone.",
+        description="Parent frame that the poses of both are in after the join, the one whose "
+        "frames came first; null if no pose was moved, or the join was undone.",
     )
     undone: bool = Field(
         default=False,
-        description="Whether poses were moved and are back: no graph and no automatic association "
-        "joins these parent frames.",
+        description="Whether poses were moved and moved back: no graph and no automatic "
+        "association joins these parent frames.",
     )
 
 
 class AssociationResult(ApiRecord):
-    """What an association came to."""
+    """The result of an association."""
 
-    frames: int = Field(description="Frames that were looked up.")
-    skipped: int = Field(description="Frames that could not be, as they were deleted meanwhile.")
-    validated: int = Field(description="Pairs of frames that were validated.")
+    frames: int = Field(description="Number of frames that were looked up.")
+    skipped: int = Field(
+        description="Number of frames that were skipped because they were deleted meanwhile."
+    )
+    validated: int = Field(description="Number of pairs of frames that were validated.")
     edges: int = Field(
-        description="Of them accepted: places that look alike, of which those that are "
-        "`consistent` may be taken for one."
+        description="Number of accepted pairs: places that look alike. Treat only those that "
+        "are `consistent` as the same place."
     )
     consistent: int = Field(
-        description="Edges that another one of another viewpoint, or a join, supports."
+        description="Number of edges that a second edge from another viewpoint, or a join, "
+        "supports."
     )
-    inconsistent: int = Field(description="Edges that were outvoted.")
-    unchecked: int = Field(description="Edges that nothing near by confirms or denies.")
+    inconsistent: int = Field(description="Number of edges that were outvoted.")
+    unchecked: int = Field(
+        description="Number of edges that no nearby edge confirms or contradicts."
+    )
     joins: list[Join] = Field(
-        description="How the sessions lie to each other; of one session only where its frames "
+        description="Relative poses of the sessions; of a single session, only if its frames "
         "have several parent frames."
     )
 
 
 class Association(Product):
-    """An association of sessions: a job and what it came to. Its steps are frames."""
+    """An association of sessions: a job with its result. Its steps are frames."""
 
     noun, collection, request_type = "association", "associations", NewAssociation
 
     map: str
     request: NewAssociation
-    result: AssociationResult | None = Field(description="When it has succeeded.")
+    result: AssociationResult | None = Field(description="The result of a job that has succeeded.")
 
 
 class Vertex(ApiRecord):
@@ -201,11 +214,11 @@ class Vertex(ApiRecord):
     robot: str | None
     session: str | None
     captured_at: datetime | None
-    name: str | None = Field(default=None, description="Of the original file or message.")
-    sequence: int | None = Field(default=None, description="Place within the session.")
+    name: str | None = Field(default=None, description="Name of the original file or message.")
+    sequence: int | None = Field(default=None, description="Position in the session.")
     pose: Transform | None = Field(
-        description="In `frame` of the graph where the sessions are joined; else in its own "
-        "parent frame. null where it has none and no edge leads to one that has."
+        description="In `frame` of the graph if the sessions are joined, else in its own parent "
+        "frame. Null if it has none and no edge leads to a frame with one."
     )
 
 
@@ -223,9 +236,11 @@ class GraphEdge(ApiRecord):
 
 
 class Graph(ApiRecord):
-    """What an optimiser needs: where frames are, and how they lie to each other."""
+    """A pose graph for an optimiser: poses of frames, and relative poses between them."""
 
-    frame: str | None = Field(description="That joined poses are in; null where none has a pose.")
+    frame: str | None = Field(
+        description="Parent frame of joined poses; null if no frame has a pose."
+    )
     vertices: list[Vertex]
     edges: list[GraphEdge]
 
@@ -239,7 +254,7 @@ SAME, GONE, NEW, UNSEEN_AFTER, UNSEEN_BEFORE = 0, 1, 2, 3, 4
 
 
 class NewDifference(Given):
-    """Which two sessions of a map to compare."""
+    """The two sessions of a map to compare."""
 
     before: Label = Field(description="The earlier session.")
     after: Label = Field(description="The later session.")
@@ -257,23 +272,26 @@ class NewDifference(Given):
 
 
 class DifferenceResult(ApiRecord):
-    """How many cells are in both sessions, and how many in one."""
+    """Number of cells that both sessions have, and that one of them has."""
 
-    same: int = Field(description="Cells of `after` that `before` has too.")
-    gone: int = Field(description="Cells of `before` that frames of `after` saw through.")
-    new: int = Field(description="Cells of `after` that frames of `before` saw through.")
+    same: int = Field(description="Number of cells of `after` that `before` has as well.")
+    gone: int = Field(description="Number of cells of `before` that frames of `after` saw through.")
+    new: int = Field(description="Number of cells of `after` that frames of `before` saw through.")
     unseen_after: int = Field(
-        description="Cells of `before` of which `after` shows nothing: hidden, or not looked at."
+        description="Number of cells of `before` that `after` does not show: hidden, or out of "
+        "view."
     )
-    unseen_before: int = Field(description="Cells of `after` of which `before` shows nothing.")
+    unseen_before: int = Field(
+        description="Number of cells of `after` that `before` does not show."
+    )
     cell_m: float = Field(description="Width of a cell.")
-    parent_frame: str = Field(description="Of all points.")
+    parent_frame: str = Field(description="Parent frame of all points.")
     up: list[float] = Field(
         min_length=3, max_length=3, description="Unit vector upwards, in the parent frame."
     )
-    frames_before: int = Field(description="Frames of `before` that were compared.")
-    frames_after: int = Field(description="Frames of `after` that were compared.")
-    skipped: int = Field(description="Frames that were deleted meanwhile, or are damaged.")
+    frames_before: int = Field(description="Number of frames of `before` that were compared.")
+    frames_after: int = Field(description="Number of frames of `after` that were compared.")
+    skipped: int = Field(description="Number of frames that were deleted meanwhile or are damaged.")
 
 
 class Difference(Product):
@@ -283,4 +301,4 @@ class Difference(Product):
 
     map: str
     request: NewDifference
-    result: DifferenceResult | None = Field(description="When it has succeeded.")
+    result: DifferenceResult | None = Field(description="The result of a job that has succeeded.")

@@ -20,36 +20,39 @@ PLAN_WIDTH, PLAN_WIDTHS = 1024, (16, 4096)
 
 
 class SurfaceLevel(ApiRecord):
-    """All tiles of a parent frame that have cells of one width."""
+    """All tiles of a parent frame whose cells have the same width."""
 
-    level: int = Field(description="0 has the finest cells; those of each next one are 4 times as "
-                       "wide.")  # fmt: skip
+    level: int = Field(
+        description="0 has the finest cells; those of each next level are 4 times as wide."
+    )
     cell_m: float = Field(description="Width of a cell.")
     tile_m: float = Field(description="Width of a tile: 64 cells.")
     tiles: int
-    cells: int = Field(description="Of all tiles together.")
+    cells: int = Field(description="Number of cells of all tiles.")
     bytes: int
 
 
 class SurfacePlan(ApiRecord):
-    """Where the picture of a parent frame lies, as `plan.png` has it without `width`."""
+    """Position of a parent frame's picture, as `plan.png` shows it without `width`."""
 
     m_per_pixel: float
-    width: int = Field(description="Pixels.")
+    width: int = Field(description="Width, pixels.")
     height: int
-    left: float = Field(description="Of the picture's upper left corner along `x_axis`, metres.")
-    top: float = Field(description="The same along `y_axis`.")
+    left: float = Field(
+        description="Position of the picture's upper left corner along `x_axis`, metres."
+    )
+    top: float = Field(description="Position of that corner along `y_axis`, metres.")
 
 
 class SurfaceParent(ApiRecord):
     """The surface in one parent frame."""
 
     parent_frame: str
-    frames: int = Field(description="Frames whose surfaces are fused.")
+    frames: int = Field(description="Number of fused frames.")
     up: Vector = Field(description="Unit vector, in the parent frame.")
     up_from: UpSource = Field(
-        description="How the vertical is known. `map`: the map's `up`. `frames`: the `up` of its "
-        "frames. `cameras`: guessed, the axis nearest to the cameras' upright."
+        description="Source of the vertical. `map`: the map's `up`. `frames`: the `up` of its "
+        "frames. `cameras`: estimated, the axis nearest to the upright of the cameras."
     )
     x_axis: list[float] = Field(
         min_length=3, max_length=3, description="Unit vector to the right of the plan."
@@ -57,56 +60,60 @@ class SurfaceParent(ApiRecord):
     y_axis: list[float] = Field(
         min_length=3, max_length=3, description="Unit vector to the top of the plan."
     )
-    low: Vector = Field(description="Corner of the box that holds all cells, and the other one:")
+    low: Vector = Field(description="Opposite corners of the box that contains all cells:")
     high: Vector
-    levels: list[SurfaceLevel] = Field(description="The finest first.")
+    levels: list[SurfaceLevel] = Field(description="Levels, the finest first.")
     plan: SurfacePlan
 
 
 class MapSurface(ApiRecord):
-    """What the posed frames of a map saw, fused; and whether that is up to date."""
+    """The fused surface of a map's posed frames, and whether it is up to date."""
 
     map: str
     state: SurfaceState = Field(
-        description="`none`: not built. `building`: a job is at it; the tiles that are there can "
-        "be read. `ready`: of all indexed frames that have poses. `stale`: frames came, went or "
-        "moved since."
+        description="`none`: not built. `building`: a job builds it, and existing tiles can be "
+        "read. `ready`: it has all indexed frames with poses. `stale`: frames were added, "
+        "removed or moved since."
     )
-    job_id: str | None = Field(description="Of the latest job: GET /v1/jobs/{job_id}.")
-    error: str | None = Field(description="Of that job, where it failed.")
-    frames: int = Field(description="Frames whose surfaces are fused.")
-    frames_left: int = Field(description="Frames that are to be added or taken out, about.")
-    updated_at: datetime | None = Field(description="When a tile last changed.")
-    sessions: list[str] = Field(description="A cell names its session by its place in this list.")
-    first_taken: datetime | None = Field(description="Of the fused frames with `captured_at`.")
+    job_id: str | None = Field(description="Id of the latest job: GET /v1/jobs/{job_id}.")
+    error: str | None = Field(description="Error of that job, if it failed.")
+    frames: int = Field(description="Number of fused frames.")
+    frames_left: int = Field(description="Approximate number of frames to add or remove.")
+    updated_at: datetime | None = Field(description="Time of the last change of a tile.")
+    sessions: list[str] = Field(
+        description="Names of sessions; a cell refers to its session by its index in this list."
+    )
+    first_taken: datetime | None = Field(description="Earliest `captured_at` of the fused frames.")
     last_taken: datetime | None
     taken_from: datetime | None = Field(
-        description="A cell was last seen at `taken_from` plus `taken` times `taken_step_s`. Null "
-        "where no fused frame has `captured_at`."
+        description="A cell was last seen at `taken_from` plus `taken` times `taken_step_s`. "
+        "Null if no fused frame has `captured_at`."
     )
     taken_step_s: float
-    parents: list[SurfaceParent] = Field(description="The one of most frames first; at most 20.")
+    parents: list[SurfaceParent] = Field(
+        description="Surfaces in each parent frame, that with most frames first; at most 20."
+    )
 
 
 class SurfaceTile(ApiRecord):
     """A cube of 64 cells along each side."""
 
     column: int = Field(
-        description="It reaches from `column` times `tile_m` to `column` + 1 times along the x "
-        "axis of the parent frame."
+        description="The tile extends from `column` times `tile_m` to `column` + 1 times along "
+        "the x axis of the parent frame."
     )
     row: int = Field(description="The same along y.")
     floor: int = Field(description="The same along z.")
-    cells: int = Field(description="Cells that are not empty.")
+    cells: int = Field(description="Number of cells that are not empty.")
     bytes: int
     digest: str = Field(
-        description="GET /v1/maps/{map}/surface/tiles/{digest} has its cells. Another one when "
-        "they change."
+        description="GET /v1/maps/{map}/surface/tiles/{digest} returns its cells. It changes "
+        "with them."
     )
 
 
 class SurfaceSighting(ApiRecord):
-    """A frame that saw a spot, or was taken in a box."""
+    """A frame that saw a point, or was taken in a box."""
 
     frame_id: str
     name: str | None
@@ -115,9 +122,10 @@ class SurfaceSighting(ApiRecord):
     session: str | None
     captured_at: datetime | None
     parent_frame: str
-    position: Vector = Field(description="Of its sensor, in the parent frame.")
+    position: Vector = Field(description="Position of its sensor in the parent frame.")
     distance_m: float | None = Field(
-        description="From its sensor to the spot; null of a frame that was taken in a box."
+        description="Distance from its sensor to the point; null for a frame that was taken in "
+        "a box."
     )
 
 
@@ -128,31 +136,31 @@ MOST_VIEWS = 32
 
 
 class NewReconstruction(Given):
-    """Which views of an answer to fuse, and to what."""
+    """Views of an answer to fuse, and the kind of result."""
 
     frames: tuple[Named, ...] | None = Field(
         default=None,
         min_length=1,
         max_length=64,
-        description="Ids of accepted matches; default: all accepted ones, at most "
-        f"{MOST_VIEWS - 1}, the first of the ranking.",
+        description="Ids of accepted matches; default: all accepted ones, at most the first "
+        f"{MOST_VIEWS - 1} of the ranking.",
     )
     strength: Literal["strong", "any"] = Field(
-        default="any", description="`strong`: leave out matches whose acceptance is weak."
+        default="any", description="`strong`: exclude matches whose acceptance is weak."
     )
     include_query: bool = Field(
         default=True,
-        description="Fuse what the query itself saw as well, as the first view; but no cloud.",
+        description="Whether to fuse the query itself, as the first view; clouds cannot be fused.",
     )
     voxel_m: float | None = Field(
         default=None,
         ge=0.002,
         le=0.5,
-        description="Edge of a voxel, metres; default: as fine as the samples lie, at least "
-        "0.01, and as memory allows.",
+        description="Edge of a voxel, metres; default: the spacing of the samples, at least "
+        "0.01, as far as memory allows.",
     )
     output: Literal["mesh", "cloud"] = Field(
-        default="mesh", description="What mesh.ply holds: triangles, or points alone."
+        default="mesh", description="Content of mesh.ply: triangles, or points only."
     )
 
 
@@ -162,19 +170,22 @@ class FusedView(ApiRecord):
     frame_id: str | None = Field(description="Null for the query's own view.")
     map: str | None
     rank: int | None = Field(description="Place in the ranking R, from 1.")
-    strength: Literal["strong", "weak"] | None = Field(description="Of the match's acceptance.")
-    source: Literal["upload", "geometry"] = Field(
-        description="`upload`: its depth as it was sent. `geometry`: the reduced depth that "
-        "validation compares; so it is for the query, and where an upload is lost."
+    strength: Literal["strong", "weak"] | None = Field(
+        description="Strength of the match's acceptance."
     )
-    samples: int = Field(description="Depth samples within the range that is fused.")
+    source: Literal["upload", "geometry"] = Field(
+        description="`upload`: the depth that was sent. `geometry`: the reduced depth that "
+        "validation compares, used for the query and for lost uploads."
+    )
+    samples: int = Field(description="Number of depth samples within the fused range.")
     added_m2: float = Field(
-        description="Square metres of the surface that this view sees and none before it does."
+        description="Area of the surface that this view sees and no earlier view does, square "
+        "metres."
     )
 
 
 class LeftOut(ApiRecord):
-    """A match that could not be fused: point clouds are not, as only depth images carve space."""
+    """A match that was not fused; clouds are not fused, as only depth images carve space."""
 
     frame_id: str
     map: str
@@ -182,34 +193,38 @@ class LeftOut(ApiRecord):
 
 
 class Coverage(ApiRecord):
-    """What the views show together: the paper's last figure."""
+    """The surface and volume that the views show together, as in the paper's last figure."""
 
-    views: list[FusedView] = Field(description="In the order of the ranking, the query first.")
+    views: list[FusedView] = Field(
+        description="The views in the order of the ranking, the query first."
+    )
     left_out: list[LeftOut]
-    area_m2: float = Field(description="Of the fused surface; the sum of all `added_m2`.")
+    area_m2: float = Field(description="Area of the fused surface; the sum of all `added_m2`.")
     observed_volume_m3: float = Field(
-        description="Space known to be empty or surface: between the cameras and what they saw."
+        description="Volume known to be empty or surface: between the cameras and the surfaces "
+        "that they saw."
     )
     query_explained: float = Field(
-        description="Share of the query's points that the other views see too, 0 to 1."
+        description="Share of the query's points that the other views see as well, 0 to 1."
     )
     voxel_m: float
     points: int
-    triangles: int = Field(description="0 where a cloud was asked for.")
+    triangles: int = Field(description="Number of triangles; 0 for a cloud.")
 
 
 class Reconstruction(Product):
-    """Views of an answer, fused by a worker."""
+    """A fusion of an answer's views: a job with its result."""
 
     noun, collection, request_type = "reconstruction", "reconstructions", NewReconstruction
 
     query_id: str
-    maps: list[str] = Field(description="Whose frames are fused.")
+    maps: list[str] = Field(description="Maps of the fused frames.")
     request: NewReconstruction
     parent_frame: str = Field(
-        description="Coordinates of mesh.ply: those of the query's sensor, metres; of a camera "
-        "x right, y down, z forward."
+        description="Frame of mesh.ply: that of the query's sensor, metres; of a camera x "
+        "right, y down, z forward."
     )
     result: Coverage | None = Field(
-        description="When it has succeeded; GET /v1/reconstructions/{job_id}/mesh.ply then."
+        description="The result of a job that has succeeded; then GET "
+        "/v1/reconstructions/{job_id}/mesh.ply returns the surface."
     )
